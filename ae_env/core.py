@@ -1,0 +1,361 @@
+"""The episodes behind both environments: n of them side by side, in one process.
+
+`AutoExposureEnv` runs one, `AutoExposureVectorEnv` many; everything that happens in an episode
+happens here, so that the two cannot differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from ae_env.lighting import Lighting, make_lighting
+from ae_env.observation import PEDESTAL, encode_observation, encode_sensors, encode_settings
+from ae_env.options import COSTS, EnvOptions
+from ae_env.score_table import ScoreTable, ScoreTables, describe_captures, scene_latent
+from ae_env.scorers.protocol import DependsOn
+from simulator.capture import add_noise, clip_and_quantise, sensor_light
+from simulator.noise import noise_generator
+
+#: Share of the episodes in which nothing moves.
+STATIC_SHARE = 1.0 / 3.0
+#: Standard deviation of the natural logarithm of the image speed.
+SPEED_SIGMA = 1.3
+#: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
+DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
+#: A sample below this signal is counted as clipped low: ten stops below white.
+LOW_CLIP = 2.0**-10
+#: Frames that are processed together: a chunk this small stays in the processor's cache.
+CHUNK_PIXELS = 4 * 64 * 64 * 8
+
+
+@dataclass
+class Episode:
+    """One scene being photographed."""
+
+    scene: int
+    state: int
+    speed: float
+    defocus: float
+    phase: float
+    noise_seed: int
+    frame: int = 0
+    pending: list[int] = field(default_factory=list)
+    image_mean: float = float("nan")
+    table: tuple[float, ScoreTable] | None = None
+    closed_parts: dict[str, np.ndarray] | None = None
+
+
+@dataclass
+class Frames:
+    """What n episodes show after a reset or a step.
+
+    Args:
+        observation: Arrays by name, n long; new ones every time.
+        info: Columns by name, n long; ``rewards`` is a dictionary of columns.
+        reward: (n,) float64.
+    """
+
+    observation: dict[str, np.ndarray]
+    info: dict[str, Any]
+    reward: np.ndarray
+
+
+class EpisodeCore:
+    """Scenes, grid, camera and scorer, and the episodes that run on them.
+
+    Args:
+        options: The environment's arguments.
+        num_envs: Number of episodes side by side.
+    """
+
+    def __init__(self, options: EnvOptions, num_envs: int) -> None:
+        self.options = options
+        self.grid = options.make_grid()
+        self.camera = options.make_camera()
+        self.scorer = options.make_scorer()
+        self.lighting = make_lighting(options.lighting)
+        self.scenes = options.load_scenes()
+        self.tables = ScoreTables(self.grid, self.camera, self.scorer)
+        self.episodes: list[Episode | None] = [None] * num_envs
+        self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
+        states = self.grid.states
+        self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
+        self._nlf = [self.camera.nlf(s.iso) for s in states]
+        self._bounds = np.array([[s.iso, s.exposure_time, s.f_number, s.ev100] for s in states])
+
+    # -- spaces -------------------------------------------------------------------------------
+
+    def observation_space(self) -> gym.spaces.Dict:
+        """Space of one episode's observation."""
+        shape = (4, self.options.resolution, self.options.resolution)
+        raw: gym.spaces.Box = {
+            "uint8": lambda: gym.spaces.Box(0, 255, shape, np.uint8),
+            "linear": lambda: gym.spaces.Box(-PEDESTAL, 1.0, shape, np.float32),
+            "dn": lambda: gym.spaces.Box(0, int(self.camera.white_level), shape, np.uint16),
+        }[self.options.observation]()
+        spaces: dict[str, gym.Space] = {
+            "raw": raw,
+            "settings": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
+        }
+        if self.options.sensors:
+            spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        return gym.spaces.Dict(spaces)
+
+    def action_masks(self) -> np.ndarray:
+        """(S,) bool: states that may be chosen. Every aperture is exact here, so all of them."""
+        return np.ones(len(self.grid), dtype=bool)
+
+    # -- life of an episode -------------------------------------------------------------------
+
+    def start(self, index: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        """Begins episode `index`: draws the scene, the start state, the motion and the defocus.
+
+        The draws do not depend on `options`, which only replace what was drawn.
+        """
+        scene = int(rng.integers(len(self.scenes)))
+        state = int(rng.integers(len(self.grid)))
+        moves, speed, defocus = rng.random() >= STATIC_SHARE, *rng.standard_normal(2)
+        phase, noise_seed = rng.random(), int(rng.integers(2**62))
+        scene = self._chosen_scene(options.get("scene"), scene)
+        median = self.scenes[scene].median_speed
+        drawn_speed = moves * median * np.exp(SPEED_SIGMA * speed)
+        drawn_defocus = DEFOCUS_MEDIAN * np.exp(DEFOCUS_SIGMA * defocus)
+        self.episodes[index] = Episode(
+            scene=scene,
+            state=self._chosen("state", options.get("state"), state, len(self.grid)),
+            speed=_fixed_or_drawn(self.options.motion, "none", float(drawn_speed)),
+            defocus=_fixed_or_drawn(
+                self.options.depth, "far", float(np.clip(drawn_defocus, DEFOCUS_MIN, DEFOCUS_MAX))
+            ),
+            phase=float(phase),
+            noise_seed=noise_seed,
+            frame=self._chosen("frame", options.get("frame"), 0, 2**31),
+        )
+        episode = self.episode(index)
+        episode.pending = [episode.state] * int(self.options.delay)
+
+    def _chosen_scene(self, wanted: Any, drawn: int) -> int:
+        if wanted is None:
+            return drawn
+        if isinstance(wanted, str) and wanted in self._scene_index:
+            return self._scene_index[wanted]
+        if isinstance(wanted, int | np.integer) and 0 <= wanted < len(self.scenes):
+            return int(wanted)
+        raise ValueError(
+            f"`options['scene']` (={wanted!r}) must be a scene id, such as "
+            f"{self.scenes[0].scene_id!r}, or an index below {len(self.scenes)}"
+        )
+
+    @staticmethod
+    def _chosen(name: str, wanted: Any, drawn: int, limit: int) -> int:
+        if wanted is None:
+            return drawn
+        if isinstance(wanted, int | np.integer) and 0 <= wanted < limit:
+            return int(wanted)
+        raise ValueError(f"`options[{name!r}]` (={wanted!r}) must be an integer in [0, {limit})")
+
+    def episode(self, index: int) -> Episode:
+        """Running episode `index`."""
+        episode = self.episodes[index]
+        if episode is None:
+            raise gym.error.ResetNeeded("call reset() before step(), render() or scores")
+        return episode
+
+    def act(self, index: int, action: Any) -> None:
+        """Lets episode `index` go on by one frame with `action`, applied after the delay."""
+        if not (isinstance(action, int | np.integer) and 0 <= action < len(self.grid)):
+            number = np.asarray(action)
+            if number.ndim or number.dtype.kind not in "iu" or not 0 <= number < len(self.grid):
+                raise ValueError(f"`action` (={action!r}) must be in [0, {len(self.grid)})")
+        episode = self.episode(index)
+        episode.pending.append(int(action))
+        episode.state = episode.pending.pop(0)
+        episode.frame += 1
+
+    def gain(self, episode: Episode, exposure_time: float) -> float:
+        """Light of an exposure in the current frame relative to the scene's own."""
+        return self.lighting.gain(episode.frame, exposure_time, episode.phase)
+
+    def expected_scores(self, index: int) -> ScoreTable:
+        """Scores of all states in the current frame of episode `index`."""
+        episode = self.episode(index)
+        gain = self.gain(episode, 0.0)
+        if episode.table is None or episode.table[0] != gain:
+            table = self.tables.table(
+                self.scenes[episode.scene],
+                speed=episode.speed,
+                defocus=episode.defocus,
+                gain=gain,
+            )
+            episode.table = (gain, table)
+        return episode.table[1]
+
+    def _closed_parts(self, episode: Episode) -> dict[str, np.ndarray]:
+        if episode.closed_parts is None:
+            scene = self.scenes[episode.scene]
+            episode.closed_parts = self.tables.closed_parts(
+                scene, speed=episode.speed, defocus=episode.defocus
+            )
+        return episode.closed_parts
+
+    # -- what the camera records --------------------------------------------------------------
+
+    def observe(self, indices: Sequence[int], previous: Sequence[int] | None = None) -> Frames:
+        """Photographs the episodes `indices`, each in its current state.
+
+        Args:
+            indices: Episodes.
+            previous: State of each before this step, for the costs; None after a reset.
+        """
+        size = self.options.resolution
+        per_chunk = max(1, CHUNK_PIXELS // (4 * size * size))
+        chunks = [
+            self._capture(indices[i : i + per_chunk]) for i in range(0, len(indices), per_chunk)
+        ]
+        raw = np.concatenate([c[0] for c in chunks]) if len(chunks) > 1 else chunks[0][0]
+        columns = {
+            name: np.concatenate([np.atleast_1d(c[1][name]) for c in chunks])
+            for name in chunks[0][1]
+        }
+        episodes = [self.episode(i) for i in indices]
+        rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
+        rewards["score"] = self._scores(rewards, indices)
+        costs = self._costs(episodes, columns.pop("image_mean"), previous)
+        reward = rewards["score"].copy()
+        for name, cost in costs.items():
+            rewards[name] = cost
+            reward -= self.options.costs[name] * cost
+        observation = {"raw": raw, "settings": encode_settings(self._apex[[e.state for e in episodes]])}
+        if self.options.sensors:
+            observation["sensors"] = self._sensors(episodes)
+        info = self._info(indices, episodes) | columns | {"rewards": rewards}
+        if self.options.with_oracle:
+            tables = [self.expected_scores(i) for i in indices]
+            best = np.array([t.mean[t.oracle] for t in tables])
+            info["oracle_state"] = np.array([t.oracle for t in tables])
+            info["regret"] = best - [t.mean[e.state] for t, e in zip(tables, episodes, strict=True)]
+        return Frames(observation, info, reward)
+
+    def _scores(self, parts: dict[str, np.ndarray], indices: Sequence[int]) -> np.ndarray:
+        if self.options.reward == "expected":
+            return np.array([self.expected_scores(i).mean[self.episode(i).state] for i in indices])
+        return np.asarray(self.scorer.combine(parts), dtype=np.float64)
+
+    def _capture(self, indices: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        episodes = [self.episode(i) for i in indices]
+        settings = [self.grid[e.state] for e in episodes]
+        gains = [self.gain(e, s.exposure_time) for e, s in zip(episodes, settings, strict=True)]
+        exposures, lights = [], []
+        for episode, state, gain in zip(episodes, settings, gains, strict=True):
+            latent = scene_latent(
+                self.scenes[episode.scene],
+                self.camera,
+                speed=episode.speed,
+                defocus=episode.defocus,
+                gain=gain,
+            )
+            exposures.append(latent.exposure(state))
+            lights.append(sensor_light(latent.light, exposures[-1]))
+        light = torch.stack(lights)
+        excess = np.zeros(len(episodes))
+        if self.options.noise:
+            generators = [noise_generator(e.noise_seed, e.frame) for e in episodes]
+            light, excess = add_noise(light, exposures, generators)
+        frames = clip_and_quantise(light, self.camera)
+
+        columns: dict[str, np.ndarray] = {
+            "clipped_high": (frames >= 1.0 - 1e-6).float().mean(dim=(1, 2, 3)).double().numpy(),
+            "clipped_low": (frames <= LOW_CLIP).float().mean(dim=(1, 2, 3)).double().numpy(),
+            "excess_noise": excess,
+            "modules": np.array([_modules(e, self.options.noise) for e in exposures], object),
+        }
+        columns |= self._part_scores(indices, frames, gains)
+        codes = encode_observation(frames)
+        columns["image_mean"] = codes.float().mean(dim=(1, 2, 3)).double().numpy() / 255.0
+        return self._encode(frames, codes), columns
+
+    def _encode(self, frames: torch.Tensor, codes: torch.Tensor) -> np.ndarray:
+        if self.options.observation == "uint8":
+            return codes.numpy()
+        if self.options.observation == "linear":
+            return frames.clamp(-PEDESTAL, 1.0).numpy()
+        span = np.array(self.camera.span)[:, None, None]
+        black = np.array(self.camera.black_level)[:, None, None]
+        return np.rint(frames.numpy() * span + black).astype(np.uint16)
+
+    def _part_scores(
+        self, indices: Sequence[int], frames: torch.Tensor, gains: Sequence[float]
+    ) -> dict[str, np.ndarray]:
+        episodes = [self.episode(i) for i in indices]
+        scores: dict[str, np.ndarray] = {}
+        kinds: list[DependsOn] = [] if self.scorer.closed_form else ["image"]
+        if type(self.lighting) is Lighting:  # one table per scene serves every frame
+            closed = [self._closed_parts(e) for e in episodes]
+            for name in self.scorer.names("light", "blur"):
+                pairs = zip(closed, episodes, strict=True)
+                scores[f"score:{name}"] = np.array([parts[name][e.state] for parts, e in pairs])
+        else:
+            kinds += ["light", "blur"]
+        if kinds:
+            captures = describe_captures(
+                [self.scenes[e.scene] for e in episodes],
+                [self.grid[e.state] for e in episodes],
+                self.camera,
+                speed=np.array([e.speed for e in episodes]),
+                defocus=np.array([e.defocus for e in episodes]),
+                gain=np.array(gains),
+            )
+            images = frames.clamp(0.0, 1.0)
+            for name, values in self.scorer.score_parts(images, captures, tuple(kinds)).items():
+                scores[f"score:{name}"] = values.numpy()
+        return scores
+
+    def _sensors(self, episodes: list[Episode]) -> np.ndarray:
+        seeds = ((e.noise_seed, 1, e.frame) for e in episodes)
+        noise = np.stack([np.random.default_rng(seed).standard_normal(2) for seed in seeds])
+        speed = np.array([e.speed for e in episodes])
+        return encode_sensors(speed, np.array([e.defocus for e in episodes]), noise)
+
+    def _costs(
+        self, episodes: list[Episode], means: np.ndarray, previous: Sequence[int] | None
+    ) -> dict[str, np.ndarray]:
+        costs = {name: np.zeros(len(episodes)) for name in COSTS if name in self.options.costs}
+        for i, (episode, mean) in enumerate(zip(episodes, means, strict=True)):
+            if previous is not None:
+                if "flicker" in costs:
+                    costs["flicker"][i] = abs(mean - episode.image_mean)
+                if "switch" in costs:
+                    before, after = self.grid.controls(np.array([previous[i], episode.state]))
+                    costs["switch"][i] = np.mean(before != after)
+            episode.image_mean = float(mean)
+        return costs
+
+    def _info(self, indices: Sequence[int], episodes: list[Episode]) -> dict[str, Any]:
+        states = np.array([e.state for e in episodes])
+        bounds = self._bounds[states]
+        return {
+            "scene_id": np.array([self.scenes[e.scene].scene_id for e in episodes], object),
+            "state": states,
+            "iso": bounds[:, 0],
+            "exposure_time": bounds[:, 1],
+            "f_number": bounds[:, 2],
+            "ev100": bounds[:, 3],
+        }
+
+
+def _fixed_or_drawn(option: str | float, off: str, drawn: float) -> float:
+    if option == "random":
+        return drawn
+    return 0.0 if option == off else float(option)
+
+
+def _modules(exposure: Any, noise: bool) -> str:
+    names = ["exposure"]
+    names += ["defocus"] * (exposure.defocus_px > 0) + ["motion_blur"] * (exposure.motion_px > 0)
+    return "+".join(names + ["noise"] * noise)

@@ -1,0 +1,183 @@
+"""`ae_env/AutoExposure-v0`, one episode at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ae_env.core import EpisodeCore, Frames
+from ae_env.grid import ExposureGrid
+from ae_env.options import EnvOptions
+from ae_env.scenes import Scene
+from simulator.camera import CameraProfile
+
+Observation = dict[str, np.ndarray]
+
+
+class AutoExposureEnv(gym.Env[Observation, np.int64]):
+    """Choose ISO, shutter and aperture, frame by frame, for a scene on a simulated raw sensor.
+
+    ## Description
+
+    Each episode photographs one scene. An action picks one of the exposure states of a grid; the
+    camera simulator turns the scene's light into the raw that the camera would have recorded there,
+    with the noise, the blur and the clipping of these settings; a scorer rates it. The image may
+    move and may be out of focus: only a shorter exposure or a smaller aperture helps, at the price
+    of noise.
+
+    ## Action Space
+
+    `Discrete(64)`: index into `ExposureGrid.default()`,
+    `(iso_index * 4 + time_index) * 4 + aperture_index`.
+
+    | control | values |
+    |---|---|
+    | ISO | 100, 400, 1600, 6400 |
+    | exposure time [s] | 1/1000, 1/125, 1/15, 1/2 |
+    | f-number | 4, 5.6, 8, 11 |
+
+    `action_masks()` tells which states may be chosen. Wrappers in `ae_env.wrappers` offer the
+    controls one by one, relative steps, and continuous APEX values.
+
+    ## Observation Space
+
+    A `Dict`; `ae_env.observation` has the functions that invert each entry.
+
+    | key | space | meaning |
+    |---|---|---|
+    | `raw` | `Box(0, 255, (4, R, R), uint8)` | planes R, G1, G2, B, `255 sqrt((x + p) / (1 + p))`, x clipped to [-p, 1], p = 1/1024 |
+    | `settings` | `Box(-1, 1, (3,), float32)` | Av, Tv, Sv of the current state, from [0, 10], [-5, 15], [4, 17] |
+    | `sensors` | `Box(-1, 1, (2,), float32)` | log2 image speed [frame heights/s] from [-9, 3] and log2 defocus [pixel of a 64-pixel frame at f/4] from [-4, 4], each with 15 % noise |
+
+    ## Rewards
+
+    Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`.
+
+    ## Starting State
+
+    `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
+    log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
+    defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
+    in [0.1, 8]). `reset(options={"scene": id, "state": index, "frame": 0})` chooses.
+
+    ## Episode End
+
+    A scene never terminates; `max_episode_steps` truncates, by default after 8 steps.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `scenes` | `"bundled"` | name, path, glob, mapping, `"package.module:name"` or list of `Scene` |
+    | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
+    | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
+    | `scorer` | `"balanced"` | name, mapping of names to weights, `"package.module:name"`, or a callable |
+    | `costs` | `{}` | weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
+    | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
+    | `sensors` | `True` | whether `sensors` is observed |
+    | `resolution` | 64 | height and width R of the packed frame, >= 36 |
+    | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |
+    | `motion` | `"random"` | `"random"`, `"none"`, or a speed [frame heights/s] |
+    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), or a blur diameter at f/4 |
+    | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, or a mapping with options |
+    | `delay` | 0 | frames between an action and the first capture that has it |
+    | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
+    | `noise` | `True` | whether captures are noisy |
+    | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
+    | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+
+    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"`render_mode` (={render_mode!r}) must be None or 'rgb_array'")
+        self.render_mode = render_mode
+        self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs=1)
+        self.action_space = gym.spaces.Discrete(len(self.core.grid))
+        self.observation_space = self.core.observation_space()
+        self._last: Frames | None = None
+
+    @property
+    def grid(self) -> ExposureGrid:
+        """The states that actions choose from."""
+        return self.core.grid
+
+    @property
+    def camera(self) -> CameraProfile:
+        """The simulated body."""
+        return self.core.camera
+
+    @property
+    def scenes(self) -> list[Scene]:
+        """Scenes that episodes draw from."""
+        return self.core.scenes
+
+    @property
+    def state(self) -> int:
+        """Index of the current exposure state."""
+        return self.core.episode(0).state
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begins an episode; see the class for `options`."""
+        super().reset(seed=seed)
+        self.core.start(0, self.np_random, _checked_options(options))
+        self._last = self.core.observe([0])
+        return _first(self._last.observation), single_info(self._last.info, 0)
+
+    def step(
+        self, action: np.int64
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Takes the next frame with the state `action`."""
+        before = self.state
+        self.core.act(0, action)
+        self._last = self.core.observe([0], previous=[before])
+        info = single_info(self._last.info, 0)
+        return _first(self._last.observation), float(self._last.reward[0]), False, False, info
+
+    def action_masks(self) -> np.ndarray:
+        """(S,) bool: states that may be chosen."""
+        return self.core.action_masks()
+
+    def expected_scores(self) -> np.ndarray:
+        """(S,) float64: expectation over noise of every state's score in the current frame."""
+        return self.core.expected_scores(0).mean
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        """(H, W, 3) uint8: the developed capture with its settings and score written on it."""
+        from ae_env.rendering import render_frame
+
+        if self._last is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        return render_frame(self.core, 0, self._last)
+
+
+def _checked_options(options: dict[str, Any] | None) -> dict[str, Any]:
+    known = ("scene", "state", "frame")
+    for name in options or {}:
+        if name not in known:
+            raise ValueError(f"`options` has {name!r}; it may have {list(known)}")
+    return dict(options or {})
+
+
+def _first(observation: Observation) -> Observation:
+    return {name: values[0] for name, values in observation.items()}
+
+
+def single_info(columns: dict[str, Any], row: int) -> dict[str, Any]:
+    """Row `row` of the info columns as the plain numbers that one environment returns."""
+    info: dict[str, Any] = {}
+    for name, values in columns.items():
+        if isinstance(values, dict):
+            info[name] = single_info(values, row)
+        else:
+            info[name] = values[row].item() if values.dtype != object else values[row]
+    return info

@@ -1,0 +1,115 @@
+"""The exposure states that an agent can choose from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from simulator.settings import CameraSettings
+
+
+@dataclass(frozen=True)
+class ExposureGrid:
+    """Every combination of some ISO speeds, exposure times and f-numbers.
+
+    The index of a state is ``(iso_index * T + time_index) * N + aperture_index``.
+
+    Args:
+        isos: ISO speeds, ascending.
+        exposure_times: Exposure times [s], ascending (shortest first).
+        f_numbers: F-numbers, ascending.
+
+    Raises:
+        ValueError: If a list is empty, out of range, or not strictly ascending.
+
+    >>> grid = ExposureGrid.default()
+    >>> len(grid), str(grid[0]), str(grid[63])
+    (64, 'ISO 100, 1/1000 s, f/4', 'ISO 6400, 1/2 s, f/11')
+    """
+
+    isos: tuple[float, ...]
+    exposure_times: tuple[float, ...]
+    f_numbers: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for name in ("isos", "exposure_times", "f_numbers"):
+            values = tuple(float(v) for v in getattr(self, name))
+            if not values or any(a >= b for a, b in zip(values, values[1:], strict=False)):
+                raise ValueError(f"`{name}` (={values}) must be a strictly ascending list")
+            object.__setattr__(self, name, values)
+        assert self.states  # every combination is checked by CameraSettings
+
+    @classmethod
+    def default(cls) -> ExposureGrid:
+        """64 states over 18 stops, EV100 -1 (1 lux) to 17 (full sun, the top for highlights)."""
+        return cls((100, 400, 1600, 6400), (1 / 1000, 1 / 125, 1 / 15, 1 / 2), (4, 5.6, 8, 11))
+
+    @classmethod
+    def third_stop(cls) -> ExposureGrid:
+        """The same ranges in third stops of ISO and time, full stops of aperture: 2128 states."""
+        isos = tuple(100.0 * 2 ** (i / 3) for i in range(19))
+        times = tuple(2.0 ** (-i / 3) for i in range(30, 2, -1))
+        return cls(isos, times, (4, 5.6, 8, 11))
+
+    @classmethod
+    def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Sequence[float]]) -> ExposureGrid:
+        """A grid from a name, ``"default"`` or ``"third_stop"``, or a mapping of the three lists."""
+        if isinstance(spec, ExposureGrid):
+            return spec
+        named = {"default": cls.default, "third_stop": cls.third_stop}
+        if isinstance(spec, str) and spec in named:
+            return named[spec]()
+        fields = {"isos", "exposure_times", "f_numbers"}
+        if isinstance(spec, Mapping) and set(spec) == fields:
+            return cls(**{name: tuple(spec[name]) for name in fields})
+        raise ValueError(
+            f"`grid` (={spec!r}) must be one of {sorted(named)}, an ExposureGrid, or a mapping "
+            f"with exactly the keys {sorted(fields)}"
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of ISO speeds, exposure times and f-numbers."""
+        return len(self.isos), len(self.exposure_times), len(self.f_numbers)
+
+    @cached_property
+    def states(self) -> tuple[CameraSettings, ...]:
+        """Settings of every state, by index."""
+        return tuple(
+            CameraSettings(iso, time, f_number)
+            for iso in self.isos
+            for time in self.exposure_times
+            for f_number in self.f_numbers
+        )
+
+    @cached_property
+    def ev100(self) -> np.ndarray:
+        """(S,) float64, EV100 of each state with the effective f-number (see `CameraSettings`)."""
+        return np.array([-s.log2_exposure for s in self.states])
+
+    def index(self, iso_index: int, time_index: int, aperture_index: int) -> int:
+        """Index of the state with these positions in the three lists."""
+        return int(np.ravel_multi_index((iso_index, time_index, aperture_index), self.shape))
+
+    def controls(self, states: np.ndarray | int) -> np.ndarray:
+        """(..., 3) int64: positions of `states` in the three lists, ISO, time, aperture."""
+        return np.stack(np.unravel_index(np.asarray(states), self.shape), axis=-1).astype(np.int64)
+
+    def nearest(self, ev100: float) -> int:
+        """Index of the state nearest to `ev100`; ties to the lower ISO."""
+        if not math.isfinite(ev100):
+            raise ValueError(f"`ev100` (={ev100!r}) must be finite")
+        return int(np.argmin(np.abs(self.ev100 - ev100).round(9)))
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __getitem__(self, state: int) -> CameraSettings:
+        return self.states[state]
+
+    def __iter__(self) -> Iterator[CameraSettings]:
+        return iter(self.states)

@@ -1,0 +1,95 @@
+"""What an agent sees, and how to turn it back into light, settings and speeds.
+
+The raw is companded to eight bits with a square root, which gives every signal level about the
+same number of codes per standard deviation of photon noise.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+#: Most negative signal that an observation shows; the offset under the square root.
+PEDESTAL = 1.0 / 1024.0
+#: Fixed ranges of Av, Tv and Sv that map to [-1, 1].
+SETTINGS_RANGES = np.array([[0.0, 10.0], [-5.0, 15.0], [4.0, 17.0]])
+#: Fixed ranges of log2 image speed [frame heights/s] and log2 defocus [pixel of a 64-pixel frame].
+SENSOR_RANGES = np.array([[-9.0, 3.0], [-4.0, 4.0]])
+#: Relative standard deviation of both sensors.
+SENSOR_NOISE = 0.15
+#: Frame height that the defocus spread is stated for [pixel].
+DEFOCUS_FRAME = 64
+
+
+def encode_observation(signal: torch.Tensor) -> torch.Tensor:
+    """Signal on the scale where white is 1 to 8-bit codes.
+
+    Args:
+        signal: Float tensor of any shape.
+
+    Returns:
+        uint8: ``round(255 sqrt((x + p) / (1 + p)))``, x clipped to [-p, 1], p = 1/1024.
+    """
+    codes = signal.clamp(-PEDESTAL, 1.0).add_(PEDESTAL).div_(1.0 + PEDESTAL)
+    return codes.sqrt_().mul_(255.0).round_().byte()
+
+
+def decode_observation(raw: np.ndarray) -> np.ndarray:
+    """8-bit codes back to the signal, float32 in [-1/1024, 1]; inverts `encode_observation`.
+
+    >>> decode_observation(np.array([0, 255], np.uint8))
+    array([-0.00097656,  1.        ], dtype=float32)
+    """
+    table = (1.0 + PEDESTAL) * (np.arange(256) / 255.0) ** 2 - PEDESTAL
+    return table.astype(np.float32)[raw]
+
+
+def _to_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    low, high = ranges[:, 0], ranges[:, 1]
+    return np.clip(2.0 * (values - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+
+
+def _from_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    low, high = ranges[:, 0], ranges[:, 1]
+    return low + (np.asarray(values, np.float64) + 1.0) * 0.5 * (high - low)
+
+
+def encode_settings(apex: np.ndarray) -> np.ndarray:
+    """(..., 3) Av, Tv, Sv to float32 in [-1, 1]."""
+    return _to_unit(apex, SETTINGS_RANGES)
+
+
+def decode_settings(settings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(..., 3) in [-1, 1] to Av, Tv and Sv. The frame's EV100 is ``Av + Tv - (Sv - 5)``."""
+    apex = _from_unit(settings, SETTINGS_RANGES)
+    return apex[..., 0], apex[..., 1], apex[..., 2]
+
+
+def encode_sensors(speed: np.ndarray, defocus: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Readings of the gyro and the focus drive.
+
+    Args:
+        speed: (...,) image speed [frame heights/s], >= 0.
+        defocus: (...,) blur diameter at f/4 [pixel of a 64-pixel frame], > 0.
+        noise: (..., 2) standard normals; the readings are off by 15 % times these.
+
+    Returns:
+        (..., 2) float32 in [-1, 1]; no motion reads -1.
+    """
+    tiny = np.finfo(np.float64).tiny
+    values = np.log2(np.maximum(np.stack([speed, defocus], axis=-1), tiny))
+    return _to_unit(values + SENSOR_NOISE / np.log(2.0) * noise, SENSOR_RANGES)
+
+
+def decode_sensors(sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(..., 2) in [-1, 1] to speed [frame heights/s] and defocus [pixel of a 64-pixel frame].
+
+    A speed at the lower end of the range is returned as 0.
+    """
+    values = 2.0 ** _from_unit(sensors, SENSOR_RANGES)
+    speed = np.where(np.asarray(sensors)[..., 0] <= -1.0, 0.0, values[..., 0])
+    return speed, values[..., 1]

@@ -1,0 +1,118 @@
+"""Arguments of the environment, checked in one place."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scorers import CompositeScorer, make_scorer
+from simulator.camera import CameraProfile, get_camera
+
+#: Smallest frame that the default networks of the common libraries take.
+MIN_RESOLUTION = 36
+COSTS = ("flicker", "switch")
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """Arguments of `AutoExposureEnv` and `AutoExposureVectorEnv`; see there for their meaning."""
+
+    scenes: Any = "bundled"
+    split: str = "train"
+    grid: Any = "default"
+    scorer: Any = "balanced"
+    costs: Mapping[str, float] = field(default_factory=dict)
+    observation: str = "uint8"
+    sensors: bool = True
+    resolution: int = 64
+    crop: str = "box"
+    motion: str | float = "random"
+    depth: str | float = "random"
+    lighting: Any = "static"
+    delay: int = 0
+    camera: Any = "nikon_z6"
+    noise: bool = True
+    reward: str = "capture"
+    with_oracle: bool = False
+
+    def __post_init__(self) -> None:
+        _one_of("split", self.split, ("train", "test", "all"))
+        _one_of("observation", self.observation, ("uint8", "linear", "dn"))
+        _one_of("crop", self.crop, ("box", "native"))
+        _one_of("reward", self.reward, ("capture", "expected"))
+        if isinstance(self.resolution, bool) or not isinstance(self.resolution, int):
+            raise ValueError(f"`resolution` (={self.resolution!r}) must be an integer")
+        if not MIN_RESOLUTION <= self.resolution <= 4096:
+            raise ValueError(
+                f"`resolution` (={self.resolution}) must be in [{MIN_RESOLUTION}, 4096]: the "
+                "default CNNs of RL libraries take no smaller image"
+            )
+        for name, off in (("motion", "none"), ("depth", "far")):
+            value = getattr(self, name)
+            if isinstance(value, str):
+                _one_of(name, value, ("random", off))
+            elif isinstance(value, bool) or not 0.0 <= float(value) < 1e3:
+                raise ValueError(f"`{name}` (={value!r}) must be 'random', {off!r} or in [0, 1000)")
+        if isinstance(self.delay, bool) or not 0 <= int(self.delay) <= 16:
+            raise ValueError(f"`delay` (={self.delay!r}) must be in [0, 16] frames")
+        for name, weight in self.costs.items():
+            _one_of("costs", name, COSTS)
+            if not 0.0 <= float(weight) < float("inf"):
+                raise ValueError(f"`costs[{name!r}]` (={weight!r}) must be finite and >= 0")
+
+    @classmethod
+    def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
+        """Options from keyword arguments; an unknown one is refused with the nearest name."""
+        known = [f.name for f in fields(cls)]
+        for name in kwargs:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"; did you mean `{near[0]}`?" if near else ""
+                raise ValueError(f"unknown argument `{name}`: the arguments are {known}{hint}")
+        return cls(**kwargs)
+
+    def make_grid(self) -> ExposureGrid:
+        """The exposure grid."""
+        return ExposureGrid.from_spec(self.grid)
+
+    def make_camera(self) -> CameraProfile:
+        """The camera body."""
+        return self.camera if isinstance(self.camera, CameraProfile) else get_camera(self.camera)
+
+    def make_scorer(self) -> CompositeScorer:
+        """The scorer."""
+        return make_scorer(self.scorer)
+
+    def load_scenes(self) -> list[Scene]:
+        """The scenes of the split at this resolution; kept for the next environment like this."""
+        camera = self.make_camera()
+        key = (repr(self.scenes), self.split, camera.name, self.resolution, self.crop)
+        by_name = isinstance(self.scenes, str) and ":" not in self.scenes.removeprefix("bundled:")
+        if by_name and key in _LOADED:
+            return _LOADED[key]
+        scenes = load_scenes(
+            self.scenes,
+            self.split,  # type: ignore[arg-type]
+            camera=camera,
+            resolution=self.resolution,
+            crop=self.crop,  # type: ignore[arg-type]
+        )
+        if not scenes:
+            raise ValueError(f"`scenes` (={self.scenes!r}) has none in split {self.split!r}")
+        if by_name and self.scenes.startswith("bundled"):
+            _LOADED[key] = scenes
+        return scenes
+
+
+_LOADED: dict[tuple[Any, ...], list[Scene]] = {}
+
+
+def _one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
+    if value not in known:
+        near = difflib.get_close_matches(str(value), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"`{name}` (={value!r}) must be one of {list(known)}{hint}")

@@ -1,0 +1,347 @@
+"""A scene: light at known settings, the noise left in it, and what is known about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from ae_env.scenes.colour import camera_from_srgb
+from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.raw_image import RawImage, check_packed
+from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
+
+#: Signal of a perfectly white diffuse surface at the incident-light exposure, ``x = 0.663 * R``.
+#: Luminance R E / pi in ISO 12232's ``x = 100 L t / (120 N^2)`` with ``E = 2.5 * 2**EV100``.
+WHITE_SIGNAL = 100.0 * LUX_AT_EV0 / (SATURATION_CONSTANT * math.pi)
+#: Mean of green, clipped at white, that a scene of unknown light is anchored to.
+MEAN_SIGNAL = 0.12
+#: f-number and ISO of the reference settings made here; the exposure time carries the EV.
+_REFERENCE_ISO, _REFERENCE_F_NUMBER = 100.0, 4.0
+#: EV100 of a radiance map of unknown scale, unless the caller knows better.
+DEFAULT_EV100 = 10.0
+#: Median image speed of a moving episode [frame heights / s].
+DEFAULT_SPEED = 0.125
+
+Crop = Literal["box", "native"]
+
+
+def reference_settings(ev100: float) -> CameraSettings:
+    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`.
+
+    >>> reference_settings(10.0)
+    CameraSettings(iso=100.0, exposure_time=0.015625, f_number=4.0)
+    """
+    unit = CameraSettings(_REFERENCE_ISO, 1.0, _REFERENCE_F_NUMBER)
+    return replace(unit, exposure_time=2.0 ** (-unit.log2_exposure - ev100))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a camera looks at, as the raw it would record at reference settings without clipping.
+
+    Args:
+        scene_id: Unique and stable, such as ``"snow-012"``.
+        group: Source group: the photograph, panorama or physical subject. All scenes of a group
+            stay in one split and are resampled together.
+        light: (4, H, W) float32 packed latent at `reference`, planes R, G1, G2, B, 1.0 at sensor
+            white; not clipped, so lamps exceed 1. At least 0 where noise-free.
+        reference: Settings at which `light` is. With `illuminance` known, an 18 % grey card under
+            it has 0.119 of white in green there.
+        camera: In whose colour space `light` is.
+        nlf: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
+        illuminance: Light that falls on the subject [lux], what an incident-light meter held at
+            the subject reads; None where unknown.
+        white_balance: Gains of R, G, B that make a grey card grey.
+        kind: What sort of scene, such as ``"snow"``.
+        hard: Whether it belongs to the hard part (back light, snow, night, spot light, motion).
+        median_speed: Median image speed of a moving episode [frame heights / s].
+        box_factor: Sensor pixels averaged per side into one pixel of `light`.
+        source: Provenance and licence in one line.
+        saturated: (H, W) bool, pixels whose light is only a lower bound because the source raw
+            was saturated there; None if there are none.
+
+    Raises:
+        ValueError: If a value has the wrong shape or lies outside its range.
+    """
+
+    scene_id: str
+    group: str
+    light: torch.Tensor
+    reference: CameraSettings
+    camera: CameraProfile
+    nlf: NoiseLevelFunction
+    illuminance: float | None
+    white_balance: tuple[float, float, float]
+    kind: str
+    hard: bool = False
+    median_speed: float = DEFAULT_SPEED
+    box_factor: int = 1
+    source: str = ""
+    saturated: torch.Tensor | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("scene_id", "group", "kind"):
+            if not isinstance(getattr(self, name), str) or not getattr(self, name):
+                raise ValueError(f"`{name}` (={getattr(self, name)!r}) must be a non-empty string")
+        object.__setattr__(self, "light", check_packed("light", self.light).contiguous())
+        if self.illuminance is not None:
+            incident_ev100(self.illuminance)  # refuses what is not positive and finite
+        gains = tuple(float(gain) for gain in self.white_balance)
+        if len(gains) != 3 or not all(math.isfinite(gain) and gain > 0 for gain in gains):
+            raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
+        object.__setattr__(self, "white_balance", gains)
+        if not (math.isfinite(self.median_speed) and self.median_speed >= 0):
+            raise ValueError(f"`median_speed` (={self.median_speed!r}) must be finite and >= 0")
+        if self.box_factor < 1:
+            raise ValueError(f"`box_factor` (={self.box_factor}) must be at least 1")
+        self._check_saturated()
+
+    def _check_saturated(self) -> None:
+        mask = self.saturated
+        if mask is None:
+            return
+        if mask.dtype != torch.bool or mask.shape != self.light.shape[1:]:
+            raise ValueError(
+                f"`saturated` ({mask.dtype}, shape {tuple(mask.shape)}) must be bool of shape "
+                f"{tuple(self.light.shape[1:])}"
+            )
+        if not bool(mask.any()):
+            object.__setattr__(self, "saturated", None)
+
+    @property
+    def noise_free(self) -> bool:
+        """Whether no noise is left in `light`."""
+        return not any((*self.nlf.shot, *self.nlf.read))
+
+    @property
+    def ev100(self) -> float:
+        """EV100 of the right exposure: the incident light's, or the frame's where it is unknown.
+
+        With `illuminance` unknown, the EV100 at which the mean of the recorded green (clipped at
+        white, as a meter on the sensor sees it) is 0.12.
+        """
+        if self.illuminance is not None:
+            return incident_ev100(self.illuminance)
+        green = self.light[1:3].mean(dim=0)
+        return -self.reference.log2_exposure - math.log2(_mean_anchor(green))
+
+    @classmethod
+    def from_array(
+        cls,
+        packed: torch.Tensor | np.ndarray,
+        reference: CameraSettings,
+        camera: CameraProfile,
+        *,
+        scene_id: str,
+        group: str | None = None,
+        nlf: NoiseLevelFunction | None = None,
+        illuminance: float | None = None,
+        white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        kind: str = "array",
+        **fields: Any,
+    ) -> Scene:
+        """A scene from a packed raw of one's own.
+
+        Args:
+            packed: (4, H, W) float, planes R, G1, G2, B; 1.0 at sensor white, may exceed it.
+            reference: Settings at which `packed` is.
+            camera: In whose colour space it is.
+            scene_id: Unique name.
+            group: Source group; `scene_id` by default.
+            nlf: Noise left in `packed`; none by default.
+            illuminance: Light on the subject [lux], if known.
+            white_balance: Gains of R, G, B.
+            kind: What sort of scene.
+            **fields: Further fields of `Scene`.
+        """
+        return cls(
+            scene_id=scene_id,
+            group=scene_id if group is None else group,
+            light=check_packed("packed", packed),
+            reference=reference,
+            camera=camera,
+            nlf=NoiseLevelFunction.zero() if nlf is None else nlf,
+            illuminance=illuminance,
+            white_balance=white_balance,
+            kind=kind,
+            **fields,
+        )
+
+    @classmethod
+    def from_raw(
+        cls,
+        raw: RawImage,
+        *,
+        scene_id: str,
+        group: str | None = None,
+        illuminance: float | None = None,
+        kind: str = "raw",
+        **fields: Any,
+    ) -> Scene:
+        """A scene from a raw photograph: its light, its noise, its saturated pixels.
+
+        Args:
+            raw: The photograph; its settings become the reference.
+            scene_id: Unique name.
+            group: Source group; `scene_id` by default.
+            illuminance: Light on the subject [lux], if it was measured.
+            kind: What sort of scene.
+            **fields: Further fields of `Scene`.
+
+        Raises:
+            ValueError: If neither the raw nor its camera knows the noise.
+        """
+        return cls.from_array(
+            raw.data,
+            raw.settings,
+            raw.camera,
+            scene_id=scene_id,
+            group=group,
+            nlf=raw.noise,
+            illuminance=illuminance,
+            white_balance=raw.white_balance,
+            kind=kind,
+            box_factor=raw.box_factor,
+            saturated=raw.saturated,
+            **fields,
+        )
+
+    @classmethod
+    def from_radiance(
+        cls,
+        rgb: torch.Tensor | np.ndarray,
+        camera: CameraProfile,
+        *,
+        scene_id: str,
+        group: str | None = None,
+        illuminance: float | None = None,
+        ev100: float = DEFAULT_EV100,
+        illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        kind: str = "radiance",
+        **fields: Any,
+    ) -> Scene:
+        """A noise-free scene from linear light, taken into the camera's colours.
+
+        Args:
+            rgb: (3, H, W) linear light, sRGB primaries, at least 0 and finite. With `illuminance`
+                given, 1.0 is a perfectly white surface under it (so the values of surfaces are
+                reflectances); without, the scale is arbitrary.
+            camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
+            scene_id: Unique name.
+            group: Source group; `scene_id` by default.
+            illuminance: Light on the subject [lux]; None where the scale is unknown.
+            ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped
+                at white, is set to 0.12.
+            illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`; decides the white
+                balance.
+            kind: What sort of scene.
+            **fields: Further fields of `Scene`.
+        """
+        image = _check_rgb(rgb)
+        matrix, white = camera_from_srgb(camera, illuminant)
+        planes = torch.from_numpy(matrix).float() @ image.reshape(3, -1)
+        planes = planes.clamp_(min=0.0).reshape(image.shape)
+        light = planes[[0, 1, 1, 2]]
+        if illuminance is not None:
+            reference = reference_settings(incident_ev100(illuminance))
+            light *= WHITE_SIGNAL
+        else:
+            reference = reference_settings(ev100)
+            light *= _mean_anchor(light[1])
+        return cls.from_array(
+            light,
+            reference,
+            camera,
+            scene_id=scene_id,
+            group=group,
+            illuminance=illuminance,
+            white_balance=(white[1] / white[0], 1.0, white[1] / white[2]),
+            kind=kind,
+            **fields,
+        )
+
+    def resized(self, resolution: int | None, crop: Crop = "box") -> Scene:
+        """The central square of this scene at `resolution` packed pixels a side.
+
+        Args:
+            resolution: Packed pixels R; None keeps the scene as it is.
+            crop: ``"box"`` averages ``k * k`` pixels per plane, ``k = min(H, W) // R``;
+                ``"native"`` cuts R x R pixels out of the middle, ``k = 1``.
+
+        Returns:
+            The scene with ``nlf / k**2`` and ``box_factor * k``; a pixel counts as saturated if
+            any pixel averaged into it was.
+
+        Raises:
+            ValueError: If the scene is smaller than `resolution` or an argument is invalid.
+        """
+        if crop not in ("box", "native"):
+            raise ValueError(f"`crop` (={crop!r}) must be 'box' or 'native'")
+        if resolution is None:
+            return self
+        if not isinstance(resolution, int) or resolution < 1:
+            raise ValueError(f"`resolution` (={resolution!r}) must be a positive integer or None")
+        height, width = self.light.shape[1:]
+        if min(height, width) < resolution:
+            raise ValueError(
+                f"scene {self.scene_id!r} ({height} x {width} packed) must be at least "
+                f"`resolution` (={resolution}) on both sides"
+            )
+        k = min(height, width) // resolution if crop == "box" else 1
+        if k == 1 and height == width == resolution:
+            return self
+        top, left = (height - k * resolution) // 2, (width - k * resolution) // 2
+        window = (slice(top, top + k * resolution), slice(left, left + k * resolution))
+        tiles = (resolution, k, resolution, k)
+        light = self.light[:, window[0], window[1]].reshape(4, *tiles).double().mean(dim=(2, 4))
+        mask = self.saturated
+        if mask is not None:
+            mask = mask[window].reshape(tiles).permute(0, 2, 1, 3).flatten(2).any(dim=2)
+        return replace(
+            self,
+            light=light.float(),
+            nlf=self.nlf.scaled(1.0 / k**2),
+            box_factor=self.box_factor * k,
+            saturated=mask,
+        )
+
+    def __repr__(self) -> str:
+        _, height, width = self.light.shape
+        light = "unknown light" if self.illuminance is None else f"{self.illuminance:.4g} lux"
+        return f"Scene({self.scene_id!r}, {self.kind}, {height} x {width} packed, {light})"
+
+
+def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
+    image = torch.as_tensor(rgb)
+    if image.ndim != 3 or image.shape[0] != 3 or min(image.shape) < 1:
+        raise ValueError(f"`rgb` (shape {tuple(image.shape)}) must be (3, H, W)")
+    if not image.dtype.is_floating_point:
+        raise ValueError(f"`rgb` (dtype {image.dtype}) must be floating point and linear")
+    if not bool(torch.isfinite(image).all()) or bool((image < 0).any()):
+        raise ValueError("`rgb` must be finite and at least 0 everywhere")
+    return image.float()
+
+
+def _mean_anchor(green: torch.Tensor) -> float:
+    """Factor at which the mean of `green`, clipped at 1, is `MEAN_SIGNAL`.
+
+    Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
+    """
+    values = green.double().clamp(min=0.0).flatten()
+    if float((values > 0).double().mean()) <= MEAN_SIGNAL:
+        raise ValueError(
+            f"`light` is 0 in all but {float((values > 0).double().mean()):.1%} of its pixels: no "
+            f"exposure brings its mean to {MEAN_SIGNAL}; give `illuminance`"
+        )
+    low, high = -40.0, 40.0  # log2 of the factor
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if float((values * 2.0**middle).clamp_(max=1.0).mean()) < MEAN_SIGNAL:
+            low = middle
+        else:
+            high = middle
+    return 2.0 ** (0.5 * (low + high))

@@ -1,0 +1,288 @@
+"""Expected scores of every exposure state of a scene, and their cache.
+
+``q(s)`` is the expectation of a state's score over noise. Parts of a scorer with a closed form are
+evaluated once on noise-free light; the others are averaged over common noise seeds, with their
+standard error.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import zipfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ae_env.cache import cache_dir, write_bytes
+from ae_env.grid import ExposureGrid
+from ae_env.scenes.scene import Scene
+from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.protocol import Captures, DependsOn
+from ae_env.scorers.registry import scorer_fingerprint
+from simulator.camera import CameraProfile
+from simulator.camera_simulator import Latent
+from simulator.settings import CameraSettings, exposure_ratio, incident_ev100
+
+_LOGGER = logging.getLogger(__name__)
+#: Bumped when the way that scores are computed changes.
+TABLE_VERSION = 1
+#: States evaluated at once: more only spends time in memory paging.
+_CHUNK = 16
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """Expected scores of S states.
+
+    Args:
+        mean: (S,) float64, q of each state.
+        standard_error: (S,) float64, 0 where the closed form was used.
+        parts: (S,) float64 of each part of the scorer.
+    """
+
+    mean: np.ndarray
+    standard_error: np.ndarray
+    parts: dict[str, np.ndarray]
+
+    @property
+    def oracle(self) -> int:
+        """The best state; ties go to the lower index, that is the lower ISO."""
+        return int(np.argmax(self.mean))
+
+
+def scene_latent(
+    scene: Scene,
+    camera: CameraProfile,
+    *,
+    speed: float = 0.0,
+    defocus: float = 0.0,
+    gain: float = 1.0,
+) -> Latent:
+    """What `camera` sees of `scene` in an episode.
+
+    Args:
+        scene: The scene.
+        camera: The body that takes the captures.
+        speed: Image speed [frame heights per second].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        gain: Light relative to the scene's own.
+    """
+    reference = scene.reference
+    if gain != 1.0:  # more light is the same as a reference of a shorter exposure
+        reference = replace(reference, exposure_time=reference.exposure_time / gain)
+    return Latent(
+        light=scene.light,
+        reference=reference,
+        camera=camera,
+        nlf=scene.nlf,
+        saturated=scene.saturated,
+        white_balance=scene.white_balance,
+        box_factor=scene.box_factor,
+        image_speed=speed,
+        defocus=defocus * scene.light.shape[-2] / 64.0,
+    )
+
+
+def describe_captures(
+    scenes: list[Scene],
+    settings: list[CameraSettings],
+    camera: CameraProfile,
+    *,
+    speed: np.ndarray,
+    defocus: np.ndarray,
+    gain: np.ndarray,
+    light: torch.Tensor | None = None,
+) -> Captures:
+    """`Captures` of one state each of `scenes`, all (B,) long.
+
+    Args:
+        scenes: Scene of each capture.
+        settings: Settings of each capture.
+        camera: The body.
+        speed: (B,) image speed [frame heights per second].
+        defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
+        gain: (B,) light relative to the scenes' own.
+        light: (B, 4, H, W) the scenes' light where it is at hand already.
+    """
+    height = scenes[0].light.shape[-2]
+    times = np.array([s.exposure_time for s in settings])
+    openings = np.array([4.0 / s.effective_f_number for s in settings])
+    blur = np.hypot(speed * times * height, defocus * openings * height / 64.0)
+    ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
+    incident = [np.nan if c.illuminance is None else incident_ev100(c.illuminance) for c in scenes]
+    return Captures(
+        settings=settings,
+        scene_ids=[c.scene_id for c in scenes],
+        scene_light=torch.stack([c.light for c in scenes]) if light is None else light,
+        ratio=torch.from_numpy(np.array(ratios) * gain),
+        nlf=[camera.nlf(s.iso) for s in settings],
+        incident_ev=torch.from_numpy(np.array(incident) + np.log2(gain)),
+        blur_px=torch.from_numpy(blur),
+        white_balance=torch.tensor([c.white_balance for c in scenes]),
+        colour_matrix=camera.colour_matrix,
+    )
+
+
+class ScoreTables:
+    """Score tables of scenes under one scorer, camera and grid.
+
+    Args:
+        grid: The states.
+        camera: The body that takes the captures.
+        scorer: What rates them.
+        noise_seeds: Captures per state that the parts without a closed form are averaged over.
+        use_cache: Whether to keep the per-scene parts on disk.
+    """
+
+    def __init__(
+        self,
+        grid: ExposureGrid,
+        camera: CameraProfile,
+        scorer: CompositeScorer,
+        *,
+        noise_seeds: int = 2,
+        use_cache: bool = True,
+    ) -> None:
+        if noise_seeds < 1:
+            raise ValueError(f"`noise_seeds` (={noise_seeds}) must be at least 1")
+        self.grid, self.camera, self.scorer = grid, camera, scorer
+        self.noise_seeds = noise_seeds
+        fingerprint = scorer_fingerprint(scorer) if use_cache else None
+        self._fingerprint = fingerprint
+        self._light_parts: dict[tuple[int, float], dict[str, np.ndarray]] = {}
+        self._keep: dict[int, Scene] = {}  # keeps id(scene) valid as a key
+
+    def table(
+        self, scene: Scene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+    ) -> ScoreTable:
+        """Expected scores of all states of `scene` in an episode (see `scene_latent`)."""
+        parts = self.closed_parts(scene, speed=speed, defocus=defocus, gain=gain)
+        errors = np.zeros(len(self.grid))
+        if not self.scorer.closed_form:
+            means, errors = self._sampled_parts(scene, parts, speed, defocus, gain)
+            parts |= means
+        parts = {name: parts[name] for name in self.scorer.parts}
+        return ScoreTable(np.asarray(self.scorer.combine(parts)), errors, parts)
+
+    def closed_parts(
+        self, scene: Scene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+    ) -> dict[str, np.ndarray]:
+        """Scores (S,) of those parts of the scorer that have a closed form."""
+        blur_parts = self._parts(scene, ("blur",), speed=speed, defocus=defocus, gain=gain)
+        return {**self._scene_parts(scene, gain), **blur_parts}
+
+    def _scene_parts(self, scene: Scene, gain: float) -> dict[str, np.ndarray]:
+        key = (id(scene), gain)
+        if key not in self._light_parts:
+            self._keep[id(scene)] = scene
+            if len(self._light_parts) > 4096:  # changing light: keep memory flat
+                self._light_parts.clear()
+                self._keep = {id(scene): scene}
+            path = self._cache_path(scene) if gain == 1.0 else None
+            parts = _load_parts(path) if path is not None else None
+            if parts is None or set(parts) != set(self.scorer.names("light")):
+                parts = self._parts(scene, ("light",), speed=0.0, defocus=0.0, gain=gain)
+                if path is not None and parts:
+                    _save_parts(path, parts)
+            self._light_parts[key] = parts
+        return self._light_parts[key]
+
+    def _parts(
+        self,
+        scene: Scene,
+        kinds: tuple[DependsOn, ...],
+        *,
+        speed: float,
+        defocus: float,
+        gain: float,
+    ) -> dict[str, np.ndarray]:
+        if not self.scorer.names(*kinds):
+            return {}
+        chunks = []
+        for states in _chunks(list(self.grid.states)):
+            captures = self._captures(scene, states, speed, defocus, gain)
+            scores = self.scorer.score_parts(None, captures, kinds)
+            chunks.append({name: values.numpy() for name, values in scores.items()})
+        return {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
+
+    def _captures(
+        self, scene: Scene, states: list[CameraSettings], speed: float, defocus: float, gain: float
+    ) -> Captures:
+        count = len(states)
+        return describe_captures(
+            [scene] * count,
+            states,
+            self.camera,
+            speed=np.full(count, speed),
+            defocus=np.full(count, defocus),
+            gain=np.full(count, gain),
+            light=scene.light.expand(count, -1, -1, -1),
+        )
+
+    def _sampled_parts(
+        self,
+        scene: Scene,
+        closed: dict[str, np.ndarray],
+        speed: float,
+        defocus: float,
+        gain: float,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        latent = scene_latent(scene, self.camera, speed=speed, defocus=defocus, gain=gain)
+        names = self.scorer.names("image")
+        samples = {name: np.zeros((self.noise_seeds, len(self.grid))) for name in names}
+        start = 0
+        for states in _chunks(list(self.grid.states)):
+            captures = self._captures(scene, states, speed, defocus, gain)
+            for seed in range(self.noise_seeds):
+                images = latent.expose(states, seed=seed).clamp_(0.0, 1.0)
+                for name, values in self.scorer.score_parts(images, captures, ("image",)).items():
+                    samples[name][seed, start : start + len(states)] = values.numpy()
+            start += len(states)
+        totals = self.scorer.combine({**closed, **samples})
+        spread = totals.std(axis=0, ddof=1) if self.noise_seeds > 1 else np.full(len(self.grid), np.nan)
+        means = {name: values.mean(axis=0) for name, values in samples.items()}
+        return means, spread / np.sqrt(self.noise_seeds)
+
+    def _cache_path(self, scene: Scene) -> Path | None:
+        if self._fingerprint is None or not self.scorer.names("light"):
+            return None
+        digest = hashlib.sha256(scene.light.numpy().tobytes())
+        description = [
+            TABLE_VERSION,
+            self._fingerprint,
+            self.grid.isos,
+            self.grid.exposure_times,
+            self.grid.f_numbers,
+            self.camera.name,
+            [(iso, n.shot, n.read) for iso, n in sorted(self.camera.nlf_by_iso.items())],
+            scene.reference.log2_exposure,
+            scene.illuminance,
+        ]
+        digest.update(json.dumps(description).encode())
+        return cache_dir() / "score_tables" / f"{digest.hexdigest()[:32]}.npz"
+
+
+def _chunks(states: list[CameraSettings]) -> list[list[CameraSettings]]:
+    return [states[i : i + _CHUNK] for i in range(0, len(states), _CHUNK)]
+
+
+def _load_parts(path: Path) -> dict[str, np.ndarray] | None:
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        _LOGGER.warning("unreadable score table %s is made anew: %s", path, error)
+        return None
+
+
+def _save_parts(path: Path, parts: dict[str, np.ndarray]) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, **parts)  # type: ignore[arg-type]
+    write_bytes(path, buffer.getvalue())

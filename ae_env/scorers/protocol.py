@@ -1,0 +1,86 @@
+"""What a scorer is, and what it is told about the images that it scores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+
+from simulator.camera import NoiseLevelFunction
+from simulator.settings import CameraSettings
+
+Domain = Literal["raw", "srgb"]
+#: What a score varies with: the recorded image (noise and all); the noise-free light on the sensor;
+#: or also (or only) the extent of the blur, which changes from episode to episode. The last two have
+#: a closed form, without noise seeds, and ``"light"`` is worked out once per scene and state.
+DependsOn = Literal["image", "light", "blur"]
+
+
+@runtime_checkable
+class Scorer(Protocol):
+    """Rates images between 0 and 1; higher is better.
+
+    A scorer has ``domain``, ``"raw"`` or ``"srgb"``, and may have ``depends_on``, by default
+    ``"image"``. Called with images (B, C, H, W) in [0, 1] (C = 4 for raw, 3 for sRGB) and the
+    `Captures` they come from, it returns (B,) in [0, 1]. A scorer with ``depends_on`` ``"light"``
+    or ``"blur"`` reads the captures only and is called with ``images=None``.
+    """
+
+    domain: Domain
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of the images."""
+
+
+@dataclass(frozen=True, eq=False)
+class Captures:
+    """What is known about a batch of B captures besides their pixels.
+
+    Args:
+        settings: Settings of each capture, B long.
+        scene_ids: Scene of each capture, B long.
+        scene_light: (B, 4, H, W) linear light of the scenes at their reference settings.
+        ratio: (B,) float64, exposure ratio from that reference to the capture.
+        nlf: Noise of a native sensor pixel at the settings, B long.
+        incident_ev: (B,) float64, EV100 of the incident light; NaN where it is unknown.
+        blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame].
+        white_balance: (B, 3) gains of R, G, B.
+        colour_matrix: XYZ (D65) to camera RGB, 3 x 3; None if unknown.
+    """
+
+    settings: Sequence[CameraSettings]
+    scene_ids: Sequence[str]
+    scene_light: torch.Tensor
+    ratio: torch.Tensor
+    nlf: Sequence[NoiseLevelFunction]
+    incident_ev: torch.Tensor
+    blur_px: torch.Tensor
+    white_balance: torch.Tensor
+    colour_matrix: tuple[tuple[float, float, float], ...] | None = None
+
+    def __len__(self) -> int:
+        return len(self.settings)
+
+    @cached_property
+    def light(self) -> torch.Tensor:
+        """(B, 4, H, W) noise-free signal at the settings, before blur and clip; white is 1."""
+        return self.scene_light * self.ratio.to(self.scene_light.dtype)[:, None, None, None]
+
+    @cached_property
+    def log2_light(self) -> torch.Tensor:
+        """log2 of `light`, with 2**-40 in place of zero."""
+        base = self.scene_light.clamp(min=2.0**-40).log2()
+        return base + self.ratio.log2().to(base.dtype)[:, None, None, None]
+
+    @cached_property
+    def ev100(self) -> torch.Tensor:
+        """(B,) float64, EV100 of the settings, with the effective f-numbers."""
+        return torch.tensor([-s.log2_exposure for s in self.settings], dtype=torch.float64)
+
+    @property
+    def frame_height(self) -> int:
+        """Height of the packed frame [pixel]."""
+        return self.scene_light.shape[-2]

@@ -1,0 +1,98 @@
+"""The five built-in scorers, each with a closed form on the noise-free light.
+
+Their constants were frozen before any agent was trained.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from ae_env.scorers.protocol import Captures, DependsOn, Domain
+
+#: Mean signal that a well-exposed frame has where the incident light is unknown: an 18 % grey card
+#: under incident-light metering records 0.119 of sensor white.
+MEAN_TARGET = 0.12
+
+
+class Brightness:
+    """Exposure against the incident light: snow stays white and night stays dark.
+
+    ``exp(-(sqrt(1 + e^2) - 1))`` with e the stops of over-exposure: EV of the incident light minus
+    EV of the settings; where the light is unknown, log2 of the mean signal over 0.12.
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        mean = captures.light.mean(dim=(1, 2, 3), dtype=torch.float64).clamp(min=1e-12)
+        metered = (mean / MEAN_TARGET).log2()
+        error = captures.incident_ev - captures.ev100
+        error = torch.where(error.isnan(), metered, error)
+        return torch.exp(1.0 - torch.sqrt(1.0 + error**2))
+
+
+class Highlights:
+    """Blown highlights: ``exp(-f / 0.15)``.
+
+    f is the mean over the pixels of the largest ``sigmoid(log2(x) / 0.12)`` of its planes: the
+    share of the frame at or above sensor white.
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+    scale = 0.15
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        brightest = captures.log2_light.amax(dim=1)  # (B, H, W); the sigmoid is monotone
+        fraction = torch.sigmoid(brightest / 0.12).mean(dim=(1, 2), dtype=torch.float64)
+        return torch.exp(-fraction / self.scale)
+
+
+class Shadows:
+    """Blocked shadows: ``exp(-f / 0.20)``, f the mean of ``sigmoid(-(log2(x) + 9) / 0.5)``."""
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+    scale = 0.20
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        dark = torch.sigmoid((captures.log2_light + 9.0).mul_(-2.0))
+        return torch.exp(-dark.mean(dim=(1, 2, 3), dtype=torch.float64) / self.scale)
+
+
+class Noise:
+    """Signal-to-noise ratio of a native sensor pixel: mean of ``s / (s + 18^1.5)``, s = SNR^1.5.
+
+    SNR is ``min(x, 1) / sqrt(shot x + read)``. The NLF is that of the sensor's own pixels, not of
+    the box-averaged frame: otherwise ISO would be nearly free.
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        shot = torch.tensor([n.shot for n in captures.nlf])[:, :, None, None]
+        read = torch.tensor([n.read for n in captures.nlf])[:, :, None, None]
+        light = captures.light.clamp(min=0.0)
+        variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
+        power = (light.clamp_(max=1.0).square_() / variance).pow_(0.75)  # SNR**1.5
+        return (power / (power + 18.0**1.5)).mean(dim=(1, 2, 3), dtype=torch.float64)
+
+
+class Sharpness:
+    """Motion and defocus blur: ``1 / (1 + (b / b0)^2)``.
+
+    b is the extent of both blurs together in pixels of the frame, b0 a 64th of its height.
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "blur"
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 / (1.0 + (captures.blur_px * 64.0 / captures.frame_height) ** 2)

@@ -1,0 +1,241 @@
+"""Camera profiles: what a sensor does to light, and how noisy it is at each ISO."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from importlib import resources
+
+
+class BayerPattern(str, Enum):
+    """Colour filter array, the 2 x 2 tile read row by row."""
+
+    RGGB = "RGGB"
+    BGGR = "BGGR"
+    GRBG = "GRBG"
+    GBRG = "GBRG"
+
+    @property
+    def offsets(self) -> tuple[tuple[int, int], ...]:
+        """(row, column) inside the tile of R, G1, G2, B; G1 shares its rows with R.
+
+        >>> BayerPattern("GRBG").offsets
+        ((0, 1), (0, 0), (1, 1), (1, 0))
+        """
+        red, blue = self.value.index("R"), self.value.index("B")
+        green_with_red = red ^ 1  # the other column of red's row
+        green_with_blue = blue ^ 1
+        return tuple(divmod(i, 2) for i in (red, green_with_red, green_with_blue, blue))
+
+
+@dataclass(frozen=True)
+class NoiseLevelFunction:
+    """Variance of a pixel as a function of its signal: ``read + shot * max(signal, 0)``.
+
+    Args:
+        shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1.
+        read: Variance at zero signal per plane.
+        extrapolated: Whether the ISO lies outside the calibrated table.
+        source: Where the numbers come from.
+    """
+
+    shot: tuple[float, float, float, float]
+    read: tuple[float, float, float, float]
+    extrapolated: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("shot", "read"):
+            values = tuple(float(v) for v in getattr(self, name))
+            if len(values) != 4 or not all(math.isfinite(v) and v >= 0 for v in values):
+                raise ValueError(f"`{name}` (={values}) must be 4 finite values >= 0 (R, G1, G2, B)")
+            object.__setattr__(self, name, values)
+
+    @classmethod
+    def zero(cls) -> NoiseLevelFunction:
+        """The NLF of a source without noise."""
+        return cls((0.0,) * 4, (0.0,) * 4, source="noise-free")
+
+    @property
+    def is_zero(self) -> bool:
+        """Whether there is no noise at all."""
+        return max(*self.shot, *self.read) == 0.0
+
+    def scaled(self, factor: float) -> NoiseLevelFunction:
+        """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
+        shot = tuple(v * factor for v in self.shot)
+        read = tuple(v * factor for v in self.read)
+        return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
+
+    def exposed(self, ratio: float) -> NoiseLevelFunction:
+        """NLF of this noise after the raw was multiplied by `ratio` (paper, section 3.2)."""
+        shot = tuple(v * ratio for v in self.shot)
+        read = tuple(v * ratio * ratio for v in self.read)
+        return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class CameraProfile:
+    """A camera body.
+
+    Args:
+        name: Unique lower-case name, such as ``"nikon_z6"``.
+        make: Maker as EXIF spells it.
+        model: Model as EXIF spells it.
+        cfa: Order of the colour filter array.
+        black_level: Digital number of no light, per plane R, G1, G2, B.
+        white_level: Digital number at which the sensor saturates.
+        bit_depth: Bits per sample of its raw files.
+        nlf_by_iso: Calibrated noise level function by ISO; empty if unknown.
+        segments: ISO at which a new conversion-gain segment begins; interpolation never crosses it.
+        colour_matrix: XYZ (D65) to camera RGB, row by row (3 x 3); None if unknown.
+        colour_matrix_source: Where the matrix comes from.
+        pixel_pitch_um: Distance between sensor pixels [micrometre]; None if unknown.
+        row_time: Read-out time of one sensor row [s].
+        source: Where the noise calibration comes from.
+    """
+
+    name: str
+    cfa: BayerPattern
+    black_level: tuple[float, float, float, float]
+    white_level: float
+    bit_depth: int
+    make: str = "unknown"
+    model: str = "unknown"
+    nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict)
+    segments: tuple[float, ...] = ()
+    colour_matrix: tuple[tuple[float, float, float], ...] | None = None
+    colour_matrix_source: str = ""
+    pixel_pitch_um: float | None = None
+    row_time: float = 0.0
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        try:
+            object.__setattr__(self, "cfa", BayerPattern(self.cfa))
+        except ValueError:
+            known = ", ".join(p.value for p in BayerPattern)
+            raise ValueError(f"`cfa` (={self.cfa!r}) must be one of {known}") from None
+        black = self.black_level
+        black = (float(black),) * 4 if isinstance(black, int | float) else tuple(map(float, black))
+        if len(black) != 4:
+            raise ValueError(f"`black_level` (={black}) must be one number or 4 (R, G1, G2, B)")
+        object.__setattr__(self, "black_level", black)
+        if not 1 <= self.bit_depth <= 16:
+            raise ValueError(f"`bit_depth` (={self.bit_depth}) must be in [1, 16]")
+        if not all(0 <= b < self.white_level for b in black):
+            raise ValueError(
+                f"`white_level` (={self.white_level}) must be above every black level (={black})"
+            )
+        if self.white_level > 2**16 - 1:
+            raise ValueError(f"`white_level` (={self.white_level}) must fit in 16 bits")
+
+    @property
+    def span(self) -> tuple[float, float, float, float]:
+        """Digital numbers from black to white, per plane R, G1, G2, B."""
+        return tuple(self.white_level - b for b in self.black_level)  # type: ignore[return-value]
+
+    @property
+    def pedestal(self) -> tuple[float, float, float, float]:
+        """How far below zero a packed raw can go, per plane: black / (white - black)."""
+        return tuple(b / (self.white_level - b) for b in self.black_level)  # type: ignore[return-value]
+
+    @property
+    def full_well(self) -> float | None:
+        """Electrons at sensor white at the base ISO, 1 / shot of green; None without an NLF."""
+        if not self.nlf_by_iso:
+            return None
+        shot = self.nlf_by_iso[min(self.nlf_by_iso)].shot[1]
+        return 1.0 / shot if shot > 0 else None
+
+    def nlf(self, iso: float) -> NoiseLevelFunction:
+        """Noise level function at `iso`.
+
+        Log-log interpolation between calibrated ISOs, inside a conversion-gain segment; outside
+        the table shot noise scales with ISO and read noise with its square, flagged as
+        extrapolated.
+
+        Raises:
+            ValueError: If the profile has no noise calibration or `iso` is not positive.
+        """
+        if not self.nlf_by_iso:
+            raise ValueError(
+                f"camera {self.name!r} has no noise calibration; give `nlf`, or estimate one with "
+                "simulator.estimate_nlf"
+            )
+        if not (math.isfinite(iso) and iso > 0):
+            raise ValueError(f"`iso` (={iso!r}) must be positive and finite")
+        return _interpolate_nlf(self, float(iso))
+
+    def with_nlf(self, iso: float, nlf: NoiseLevelFunction) -> CameraProfile:
+        """This camera with its noise calibrated by one measurement at `iso`."""
+        return replace(self, nlf_by_iso={float(iso): nlf}, segments=(), source=nlf.source)
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.cfa, self.black_level, self.white_level))
+
+
+def _interpolate_nlf(camera: CameraProfile, iso: float) -> NoiseLevelFunction:
+    table = camera.nlf_by_iso
+    if iso in table:
+        return table[iso]
+    bounds = [0.0, *camera.segments, math.inf]
+    index = sum(iso >= b for b in bounds) - 1
+    isos = sorted(i for i in table if bounds[index] <= i < bounds[index + 1]) or sorted(table)
+    if not isos[0] < iso < isos[-1]:
+        nearest = min(isos, key=lambda i: abs(math.log(iso / i)))
+        nlf = table[nearest].exposed(iso / nearest)
+        return replace(nlf, extrapolated=not min(table) <= iso <= max(table))
+    high = next(i for i in isos if i > iso)
+    low = isos[isos.index(high) - 1]
+    t = math.log(iso / low) / math.log(high / low)
+
+    def blend(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
+        return tuple(x ** (1 - t) * y**t for x, y in zip(a, b, strict=True))
+
+    first, second = table[low], table[high]
+    return NoiseLevelFunction(
+        shot=blend(first.shot, second.shot),  # type: ignore[arg-type]
+        read=blend(first.read, second.read),  # type: ignore[arg-type]
+        source=first.source,
+    )
+
+
+@functools.cache
+def _built_in() -> dict[str, CameraProfile]:
+    text = resources.files("simulator").joinpath("cameras.json").read_text(encoding="utf-8")
+    cameras = {}
+    for name, entry in json.loads(text).items():
+        nlf_by_iso = {}
+        for iso, values in entry.pop("nlf_by_iso").items():
+            shot, read = ([v[0], v[1], v[1], v[2]] for v in (values["shot"], values["read"]))
+            nlf_by_iso[float(iso)] = NoiseLevelFunction(shot, read, source=entry["source"])  # type: ignore[arg-type]
+        entry["colour_matrix"] = tuple(tuple(row) for row in entry["colour_matrix"])
+        entry["segments"] = tuple(entry["segments"])
+        cameras[name] = CameraProfile(name=name, nlf_by_iso=nlf_by_iso, **entry)
+    return cameras
+
+
+def list_cameras() -> list[str]:
+    """Names of the built-in cameras."""
+    return sorted(_built_in())
+
+
+def get_camera(name: str) -> CameraProfile:
+    """The built-in camera called `name`.
+
+    Raises:
+        ValueError: If there is none; the message proposes the nearest name.
+    """
+    try:
+        return _built_in()[name]
+    except KeyError:
+        known = list_cameras()
+        near = difflib.get_close_matches(str(name), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"`camera` (={name!r}) must be one of {known}{hint}") from None

@@ -1,0 +1,137 @@
+"""A raw photograph as the simulator handles it, and its digital numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.settings import CameraSettings
+
+PLANES = ("R", "G1", "G2", "B")
+
+
+def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
+    """Bayer mosaic of digital numbers to a packed raw.
+
+    Args:
+        mosaic: (2H, 2W) digital numbers, any integer or float dtype. An odd last row or column is
+            dropped.
+        camera: Gives the CFA order and the black and white levels.
+
+    Returns:
+        (4, H, W) float32, planes R, G1, G2, B; black-subtracted, 1.0 at sensor white.
+
+    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
+
+        R  G1
+        G2 B
+    """
+    if mosaic.ndim != 2 or min(mosaic.shape) < 2:
+        raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
+    height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
+    planes = np.empty((4, height, width), np.float32)
+    for plane, (row, column) in enumerate(camera.cfa.offsets):
+        values = mosaic[row : 2 * height : 2, column : 2 * width : 2].astype(np.float64)
+        planes[plane] = (values - camera.black_level[plane]) / camera.span[plane]
+    return torch.from_numpy(planes)
+
+
+def unpack_mosaic(data: torch.Tensor, camera: CameraProfile) -> np.ndarray:
+    """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W) of digital numbers; inverts `pack_mosaic`."""
+    planes = data.detach().cpu().double().numpy()
+    mosaic = np.empty((2 * planes.shape[1], 2 * planes.shape[2]), np.uint16)
+    for plane, (row, column) in enumerate(camera.cfa.offsets):
+        numbers = np.rint(planes[plane] * camera.span[plane] + camera.black_level[plane])
+        mosaic[row::2, column::2] = np.clip(numbers, 0, camera.white_level)
+    return mosaic
+
+
+def check_packed(name: str, data: object, *, ndim: int = 3) -> torch.Tensor:
+    """`data` as a float32 packed raw, or a `ValueError` that names `name`, its value and the rule."""
+    if isinstance(data, np.ndarray):
+        data = torch.from_numpy(np.ascontiguousarray(data))
+    if not isinstance(data, torch.Tensor):
+        raise ValueError(f"`{name}` (={type(data).__name__}) must be a torch tensor or numpy array")
+    shape = "(4, H, W)" if ndim == 3 else "(B, 4, H, W)"
+    if data.ndim != ndim or data.shape[-3] != 4 or min(data.shape) < 1:
+        raise ValueError(f"`{name}` (shape {tuple(data.shape)}) must be {shape}, planes R, G1, G2, B")
+    if not data.dtype.is_floating_point:
+        raise ValueError(
+            f"`{name}` (dtype {data.dtype}) must be floating point with white at 1.0; digital "
+            "numbers go through RawImage.from_mosaic"
+        )
+    if not bool(torch.isfinite(data).all()):
+        bad = int((~torch.isfinite(data)).sum())
+        raise ValueError(f"`{name}` ({bad} values NaN or infinite) must be finite everywhere")
+    return data.float()
+
+
+@dataclass(frozen=True, eq=False)
+class RawImage:
+    """A raw photograph: packed sensor data with the settings and camera that made it.
+
+    Args:
+        data: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative
+            values are real.
+        settings: ISO, exposure time and f-number of the exposure.
+        camera: The body that recorded it.
+        nlf: Noise of this very raw, where the file states it (DNG NoiseProfile) or it was
+            estimated; by default the camera's at this ISO.
+        white_balance: Gains of R, G, B that make a grey card grey, green 1.
+        box_factor: Sensor pixels averaged per side into one pixel of `data`.
+        metadata: Whatever else is known: file name, how the NLF was found, excess noise.
+
+    Raises:
+        ValueError: If the data has the wrong shape or dtype, or is not finite.
+    """
+
+    data: torch.Tensor
+    settings: CameraSettings
+    camera: CameraProfile
+    nlf: NoiseLevelFunction | None = None
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    box_factor: int = 1
+    metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "data", check_packed("data", self.data))
+        gains = tuple(float(g) for g in self.white_balance)
+        if len(gains) != 3 or not all(np.isfinite(g) and g > 0 for g in gains):
+            raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
+        object.__setattr__(self, "white_balance", gains)
+
+    @classmethod
+    def from_mosaic(
+        cls, mosaic: np.ndarray, settings: CameraSettings, camera: CameraProfile, **fields: Any
+    ) -> RawImage:
+        """A raw from a (2H, 2W) mosaic of digital numbers in the camera's CFA order."""
+        return cls(pack_mosaic(np.asarray(mosaic), camera), settings, camera, **fields)
+
+    def to_mosaic(self) -> np.ndarray:
+        """Digital numbers as the sensor would record them, (2H, 2W) uint16."""
+        return unpack_mosaic(self.data, self.camera)
+
+    @property
+    def noise(self) -> NoiseLevelFunction:
+        """NLF of this raw's pixels: its own or its camera's, after the box averaging.
+
+        Raises:
+            ValueError: If neither is known.
+        """
+        nlf = self.nlf if self.nlf is not None else self.camera.nlf(self.settings.iso)
+        return nlf.scaled(1.0 / self.box_factor**2)
+
+    @property
+    def saturated(self) -> torch.Tensor:
+        """(H, W) bool: some plane of the pixel is within half a digital number of white."""
+        limit = torch.tensor([1.0 - 0.5 / s for s in self.camera.span], device=self.data.device)
+        return (self.data >= limit[:, None, None]).any(dim=0)
+
+    def __repr__(self) -> str:
+        _, height, width = self.data.shape
+        return f"RawImage({height} x {width} packed, {self.settings}, {self.camera.name})"

@@ -1,0 +1,164 @@
+"""Camera settings and the photographic arithmetic between them.
+
+Everything is computed in log2 and float64; callers cast last.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+#: Calibration constant of reflected-light meters in the saturation-based ISO 12232 relation used
+#: throughout: a surface of luminance L gives ``x = L * t * ISO / (120 * N**2)`` of sensor white.
+SATURATION_CONSTANT = 120.0
+#: Incident-light calibration: an EV100 of 0 is 2.5 lux.
+LUX_AT_EV0 = 2.5
+#: A recorded shutter time this close (relative) to a nominal stop stands for the exact stop.
+SNAP_TOLERANCE = 0.03
+
+_NOMINAL_SHUTTERS = (
+    *(8000, 6400, 5000, 4000, 3200, 2500, 2000, 1600, 1250, 1000, 800, 640, 500, 400, 320, 250, 200),
+    *(160, 125, 100, 80, 60, 50, 40, 30, 25, 20, 15, 13, 10, 8, 6, 5, 4),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, order=True)
+class CameraSettings:
+    """The three settings that decide an exposure.
+
+    Args:
+        iso: ISO speed, in (0, 1e8].
+        exposure_time: Time the shutter is open, in seconds, in (0, 1e5].
+        f_number: Aperture f-number as marked on the lens, in [0.5, 1024].
+
+    Raises:
+        ValueError: If a value is not a finite number in its range.
+
+    >>> CameraSettings(iso=100, exposure_time=1 / 125, f_number=16).ev100
+    14.965784284662087
+    """
+
+    iso: float
+    exposure_time: float
+    f_number: float
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("iso", 0.0, 1e8),
+            ("exposure_time", 0.0, 1e5),
+            ("f_number", 0.5, 1024.0),
+        ):
+            value = getattr(self, name)
+            try:
+                number = float(value)
+            except (TypeError, ValueError):
+                raise ValueError(f"`{name}` (={value!r}) must be a number") from None
+            if not math.isfinite(number) or number > high or number < low or number == 0.0:
+                bracket = "(" if low == 0.0 else "["
+                raise ValueError(f"`{name}` (={value!r}) must be in {bracket}{low:g}, {high:g}]")
+            object.__setattr__(self, name, number)
+
+    @classmethod
+    def from_exif(cls, iso: float, exposure_time: float, f_number: float) -> CameraSettings:
+        """Settings as a camera recorded them: a rounded shutter speed becomes the exact stop.
+
+        >>> CameraSettings.from_exif(100, 1 / 60, 2.8).exposure_time == 1 / 64
+        True
+        """
+        settings = cls(iso, exposure_time, f_number)
+        return cls(settings.iso, snap_exposure_time(settings.exposure_time), settings.f_number)
+
+    @property
+    def aperture_stop(self) -> int:
+        """Aperture in sixths of the f-number's octave (thirds of a stop): ``round(6 log2 N)``."""
+        return round(6.0 * math.log2(self.f_number))
+
+    @property
+    def effective_f_number(self) -> float:
+        """The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper, section 3.1)."""
+        return 2.0 ** (self.aperture_stop / 6.0)
+
+    @property
+    def log2_exposure(self) -> float:
+        """log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective f-number."""
+        return math.log2(self.exposure_time) + math.log2(self.iso / 100.0) - self.aperture_stop / 3.0
+
+    @property
+    def ev100(self) -> float:
+        """Exposure value at ISO 100: ``log2(N**2 / t) - log2(ISO / 100)``, N as marked."""
+        return self.aperture_value + self.time_value - math.log2(self.iso / 100.0)
+
+    @property
+    def aperture_value(self) -> float:
+        """APEX Av: ``2 log2(N)``."""
+        return 2.0 * math.log2(self.f_number)
+
+    @property
+    def time_value(self) -> float:
+        """APEX Tv: ``-log2(t)``."""
+        return -math.log2(self.exposure_time)
+
+    @property
+    def speed_value(self) -> float:
+        """APEX Sv: ``log2(ISO / 3.125)``, 5 at ISO 100."""
+        return math.log2(self.iso / 3.125)
+
+    def __str__(self) -> str:
+        return f"ISO {self.iso:g}, {format_exposure_time(self.exposure_time)}, f/{self.f_number:g}"
+
+
+def exposure_ratio(source: CameraSettings, target: CameraSettings) -> float:
+    """How much brighter the same scene is recorded at `target` than at `source`.
+
+    ``alpha = alpha_t * alpha_g * alpha_n`` (paper, section 3.1), the aperture through its rounded
+    stop because recorded f-numbers are rounded.
+
+    >>> exposure_ratio(CameraSettings(100, 0.5, 4), CameraSettings(200, 0.25, 5.6))
+    0.5
+    """
+    return 2.0 ** (target.log2_exposure - source.log2_exposure)
+
+
+def incident_ev100(illuminance: float) -> float:
+    """EV100 that an incident-light meter reads at `illuminance` [lux].
+
+    >>> round(incident_ev100(20_000), 1)
+    13.0
+    """
+    if not (math.isfinite(illuminance) and illuminance > 0):
+        raise ValueError(f"`illuminance` (={illuminance!r}) must be positive and finite")
+    return math.log2(illuminance / LUX_AT_EV0)
+
+
+def sensor_signal(luminance: float, settings: CameraSettings) -> float:
+    """Signal, 1.0 at sensor white, of a surface of `luminance` [cd/m^2].
+
+    Saturation-based speed of ISO 12232 (H = 0.65 L t / N^2, H_sat = 78 / ISO).
+    """
+    return luminance * 100.0 * 2.0**settings.log2_exposure / SATURATION_CONSTANT
+
+
+def snap_exposure_time(exposure_time: float) -> float:
+    """The exact third-stop that a recorded `exposure_time` [s] stands for, or the value itself.
+
+    1/60 stands for 1/64, 1/1000 for 1/1024. Nominal speeds are third-stops; a value more than 3 %
+    from every nominal stop is kept. Industrial cameras run at exactly what they say: use
+    `CameraSettings` directly for them.
+    """
+    nominal = [1.0 / n for n in _NOMINAL_SHUTTERS]
+    nominal += [0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.3, 1.6, 2, 2.5, 3, 3.2, 4, 5, 6, 8, 10, 13, 15, 20, 25, 30]
+    nearest = min(nominal, key=lambda n: abs(math.log(exposure_time / n)))
+    if abs(exposure_time / nearest - 1.0) > SNAP_TOLERANCE:
+        return exposure_time
+    return 2.0 ** (round(3.0 * math.log2(nearest)) / 3.0)
+
+
+def format_exposure_time(exposure_time: float) -> str:
+    """`exposure_time` [s] as photographers write it.
+
+    >>> format_exposure_time(1 / 125), format_exposure_time(2.0)
+    ('1/125 s', '2 s')
+    """
+    if exposure_time >= 0.4:
+        return f"{exposure_time:g} s" if exposure_time != 0.5 else "1/2 s"
+    return f"1/{1.0 / exposure_time:.4g} s"
