@@ -36,7 +36,7 @@ def cache_key(parts: Mapping[str, Any]) -> str:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write `content` under a temporary name beside `path` and rename: readers see all or nothing."""
+    """Write `content` under a temporary name beside `path`, then rename: all of it or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

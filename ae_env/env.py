@@ -10,13 +10,14 @@ import numpy as np
 from ae_env.core import EpisodeCore, Frames
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
+from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]
 
 
-class AutoExposureEnv(gym.Env[Observation, np.int64]):
+class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     """Choose ISO, shutter and aperture, frame by frame, for a scene on a simulated raw sensor.
 
     ## Description

@@ -26,7 +26,7 @@ from ae_env.scorers.protocol import Captures, DependsOn
 from ae_env.scorers.registry import scorer_fingerprint
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import Latent
-from simulator.settings import CameraSettings, exposure_ratio, incident_ev100
+from simulator.settings import CameraSettings, exposure_ratio
 
 _LOGGER = logging.getLogger(__name__)
 #: Bumped when the way that scores are computed changes.
@@ -114,14 +114,13 @@ def describe_captures(
     openings = np.array([4.0 / s.effective_f_number for s in settings])
     blur = np.hypot(speed * times * height, defocus * openings * height / 64.0)
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
-    incident = [np.nan if c.illuminance is None else incident_ev100(c.illuminance) for c in scenes]
     return Captures(
         settings=settings,
         scene_ids=[c.scene_id for c in scenes],
         scene_light=torch.stack([c.light for c in scenes]) if light is None else light,
         ratio=torch.from_numpy(np.array(ratios) * gain),
         nlf=[camera.nlf(s.iso) for s in settings],
-        incident_ev=torch.from_numpy(np.array(incident) + np.log2(gain)),
+        proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
         blur_px=torch.from_numpy(blur),
         white_balance=torch.tensor([c.white_balance for c in scenes]),
         colour_matrix=camera.colour_matrix,
@@ -261,7 +260,7 @@ class ScoreTables:
             self.camera.name,
             [(iso, n.shot, n.read) for iso, n in sorted(self.camera.nlf_by_iso.items())],
             scene.reference.log2_exposure,
-            scene.illuminance,
+            scene.ev100,
         ]
         digest.update(json.dumps(description).encode())
         return cache_dir() / "score_tables" / f"{digest.hexdigest()[:32]}.npz"

@@ -15,13 +15,16 @@ from ae_env.core import EpisodeCore, Frames
 from ae_env.env import single_info
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
+from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]
 
 
-class AutoExposureVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
+class AutoExposureVectorEnv(
+    SpecProperty, gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]
+):
     """`num_envs` episodes of `AutoExposureEnv`, photographed in batches; see there.
 
     Environment i behaves exactly as a single environment seeded with ``seed + i``.
@@ -120,7 +123,7 @@ class AutoExposureVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.nda
                 self._rngs[i], _ = seeding.np_random(seeds[i])
         self._begin(indices, per_env)
         frames = self.core.observe(indices)
-        self._remember(frames)
+        self._remember(frames, indices)
         shown = self._place(frames.observation, indices)
         return shown, self._vector_info(frames.info, indices)
 
@@ -167,7 +170,7 @@ class AutoExposureVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.nda
         else:
             self._done = truncated.copy()
             self._remember(frames)
-        self._shown = observation if self.autoreset_mode == AutoresetMode.DISABLED else None
+        self._shown = observation
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
@@ -233,9 +236,17 @@ class AutoExposureVectorEnv(gym.vector.VectorEnv[Observation, np.ndarray, np.nda
             join(first.reward, second.reward),
         )
 
-    def _remember(self, frames: Frames) -> None:
-        if self.render_mode is not None and len(frames.reward) == self.num_envs:
-            self._last = frames
+    def _remember(self, frames: Frames, rows: list[int] | None = None) -> None:
+        if self.render_mode is None:
+            return
+        if self._last is not None and rows is not None and len(rows) < self.num_envs:
+            last = self._last
+            frames = Frames(
+                _overwrite(last.observation, frames.observation, rows),
+                _overwrite(last.info, frames.info, rows),
+                _overwrite(last.reward, frames.reward, rows),
+            )
+        self._last = frames
 
     def _place(self, observation: Observation, indices: list[int]) -> Observation:
         if len(indices) == self.num_envs:

@@ -6,7 +6,7 @@ import json
 import logging
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -120,8 +120,6 @@ def _procedural_scene(entry: _Entry, camera: CameraProfile) -> Scene:
 
 def _rounded(scene: Scene) -> Scene:
     """The scene with its light as the cache keeps it, so that a cached run equals a fresh one."""
-    from dataclasses import replace
-
     return replace(scene, light=scene.light.clamp(max=65504.0).half().float())
 
 

@@ -44,7 +44,7 @@ class LeafStyle:
 
 
 def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np.ndarray:
-    """Periodic Gaussian noise (size, size) float32 with amplitude ``1 / f**slope``, mean 0, std 1."""
+    """Periodic noise (size, size) float32 of amplitude ``1 / f**slope``, mean 0, deviation 1."""
     white = np.fft.rfft2(rng.standard_normal((size, size), dtype=np.float32))
     fy, fx = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :]
     radius = np.hypot(fy, fx)
@@ -133,7 +133,9 @@ def _paint(
     along, across = radius * elongation, radius / elongation  # semi-axes
     boxes = is_box.astype(bool)
     reach_x, reach_y = (
-        np.where(boxes, _SQUARE_HALF_SIDE * (along * a + across * b), np.hypot(along * a, across * b))
+        np.where(
+            boxes, _SQUARE_HALF_SIDE * (along * a + across * b), np.hypot(along * a, across * b)
+        )
         for a, b in ((cosine, sine), (sine, cosine))
     )
     top = np.clip(np.ceil(centre_y - reach_y), 0, size).astype(np.int32)
@@ -173,7 +175,7 @@ def _paint(
 def _texture(
     rng: np.random.Generator, size: int, label: np.ndarray, number: int, style: LeafStyle
 ) -> np.ndarray:
-    """Natural-log texture: each leaf shows its own stretch of a fractal field, at its own strength."""
+    """Natural-log texture: a stretch of a fractal field for each leaf, at a strength of its own."""
     field = fractal_noise(rng, size, 0.8)
     strength = (style.texture * rng.random(number) ** 2).astype(np.float32)
     shift = rng.integers(0, size * size, number)

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import difflib
+import importlib
+import inspect
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from ae_env.scenes.bundled import Split, bundled_scenes
+from ae_env.scenes.folder import FolderOptions, folder_scenes
 from ae_env.scenes.scene import Crop, Scene
 from simulator.camera import CameraProfile
+
+#: Names of the scenes that come with the package.
+BUNDLED = ("bundled", "bundled:small")
+_ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
 def load_scenes(
@@ -19,11 +29,124 @@ def load_scenes(
     resolution: int | None = 64,
     crop: Crop = "box",
 ) -> list[Scene]:
-    """The scenes that `spec` names."""
-    if split not in ("train", "test", "all"):
-        raise ValueError(f"`split` (={split!r}) must be 'train', 'test' or 'all'")
-    if spec in ("bundled", "bundled:small"):
+    """The scenes that `spec` names, of one split, all at one resolution.
+
+    Args:
+        spec: What to load:
+
+            - ``"bundled"``, or ``"bundled:small"``: the first two source groups of each kind;
+            - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
+            - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
+              given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
+            - a list of `Scene`;
+            - a mapping ``{"path": file, folder or glob, ...}`` with any fields of `FolderOptions`.
+
+        split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
+            of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
+            made them has split them.
+        camera: In whose colours bundled scenes and radiance maps are made. A raw brings its own
+            camera.
+        resolution: Packed pixels a side; None keeps each scene's own size.
+        crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
+
+    Returns:
+        At least one scene, in a stable order, with unique ids.
+
+    Raises:
+        ValueError: If `spec` names nothing known or no scene of `split`, if a file cannot be read,
+            or if a scene is smaller than `resolution`.
+    """
+    if split not in get_args(Split):
+        raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
+    if isinstance(spec, Mapping):
+        path, options = _options(spec)
+        scenes = folder_scenes(path, split, camera, resolution, crop, options)
+    elif isinstance(spec, Path):
+        scenes = folder_scenes(spec, split, camera, resolution, crop)
+    elif isinstance(spec, str):
+        scenes = _by_name(spec, split, camera, resolution, crop)
+    elif isinstance(spec, Sequence):
+        scenes = _checked(spec, "scenes", resolution, crop)
+    else:
+        raise ValueError(
+            f"`scenes` (={spec!r}) must be a name, a path, a mapping or a list of Scene"
+        )
+    _check_result(scenes, spec, split)
+    return scenes
+
+
+def _by_name(
+    spec: str, split: Split, camera: CameraProfile, resolution: int | None, crop: Crop
+) -> list[Scene]:
+    if spec in BUNDLED:
         return bundled_scenes(split, camera, resolution, crop, small=spec == "bundled:small")
-    if isinstance(spec, Sequence) and not isinstance(spec, str):
-        return [scene.resized(resolution, crop) for scene in spec]
-    raise ValueError(f"`scenes` (={spec!r}) is not known")
+    if not Path(spec).expanduser().exists():
+        if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
+            known = {"split": split, "camera": camera, "resolution": resolution}
+            return _checked(_attribute(spec, known), spec, resolution, crop)
+        near = difflib.get_close_matches(spec, BUNDLED, n=1, cutoff=0.7)
+        if near:
+            raise ValueError(
+                f"`scenes` (={spec!r}) must be one of {list(BUNDLED)}, an existing file, folder or "
+                f"glob, or 'pkg.mod:attr'; did you mean {near[0]!r}?"
+            )
+    return folder_scenes(spec, split, camera, resolution, crop)
+
+
+def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
+    known = [field.name for field in fields(FolderOptions)]
+    if not isinstance(spec.get("path"), str | Path):
+        raise ValueError(
+            f"`scenes` (={dict(spec)!r}) must have a 'path'; the other fields are {known}"
+        )
+    for name in spec:
+        if name != "path" and name not in known:
+            near = difflib.get_close_matches(str(name), known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"`scenes` field {name!r} must be one of {['path', *known]}{hint}")
+    if spec["path"] in BUNDLED:
+        raise ValueError(
+            f"`scenes` (={dict(spec)!r}): 'path' must be a file, folder or glob; give the name "
+            f"{spec['path']!r} itself for the bundled scenes"
+        )
+    return spec["path"], FolderOptions(**{k: v for k, v in spec.items() if k != "path"})
+
+
+def _attribute(spec: str, known: Mapping[str, Any]) -> Any:
+    """What ``"pkg.mod:attr"`` names; called if it can be."""
+    module_name, _, attribute = spec.partition(":")
+    try:
+        value: Any = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise ValueError(f"`scenes` (={spec!r}): cannot import: {error}") from error
+    for name in attribute.split("."):
+        if not hasattr(value, name):
+            near = difflib.get_close_matches(name, dir(value), n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"`scenes` (={spec!r}): {module_name} has no attribute {name!r}{hint}")
+        value = getattr(value, name)
+    if not callable(value):
+        return value
+    parameters = inspect.signature(value).parameters
+    return value(**{name: given for name, given in known.items() if name in parameters})
+
+
+def _checked(spec: Any, name: str, resolution: int | None, crop: Crop) -> list[Scene]:
+    if isinstance(spec, str | bytes) or not isinstance(spec, Sequence):
+        raise ValueError(
+            f"`scenes` (={name!r}) must give a list of Scene, not {type(spec).__name__}"
+        )
+    for i, scene in enumerate(spec):
+        if not isinstance(scene, Scene):
+            raise ValueError(f"{name}[{i}] (={type(scene).__name__}) must be a Scene")
+    return [scene.resized(resolution, crop) for scene in spec]
+
+
+def _check_result(scenes: Sequence[Scene], spec: object, split: str) -> None:
+    if not scenes:
+        raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
+    seen: set[str] = set()
+    for scene in scenes:
+        if scene.scene_id in seen:
+            raise ValueError(f"`scene_id` (={scene.scene_id!r}) must be unique, but occurs twice")
+        seen.add(scene.scene_id)

@@ -67,7 +67,7 @@ def list_kinds() -> list[str]:
 
 
 def day(rng: np.random.Generator, size: int) -> Drawing:
-    """Dead leaves outdoors, 300 to 100,000 lux, some with cast shadows; metered in the key light."""
+    """Dead leaves outdoors, 300 to 100,000 lux, some with cast shadows; metered in the sun."""
     light = dead_leaves(rng, size, _varied_style(rng))
     illuminance = _lux(rng, 300.0, 100_000.0)
     if rng.random() < 0.5:
@@ -75,7 +75,9 @@ def day(rng: np.random.Generator, size: int) -> Drawing:
         depth = rng.uniform(0.12, 0.5)
         light = light * _shadows(rng, size, share=rng.uniform(0.05, 0.4), depth=depth)
     if rng.random() < 0.5:
-        _add_lamps(rng, light, number=rng.integers(1, 9), radius=(0.003, 0.008), value=(2.0, 60.0))
+        _add_lamps(
+            rng, light, number=int(rng.integers(1, 9)), radius=(0.003, 0.008), value=(2.0, 60.0)
+        )
     return Drawing(light, illuminance, temperature_tint(rng.normal(0.05, 0.12)))
 
 
@@ -84,7 +86,9 @@ def indoor(rng: np.random.Generator, size: int) -> Drawing:
     style = _varied_style(rng)
     light = dead_leaves(rng, size, style) * _falloff(rng, size, stops=rng.uniform(0.3, 1.5))
     if rng.random() < 0.7:
-        _add_lamps(rng, light, number=rng.integers(1, 5), radius=(0.01, 0.035), value=(5.0, 120.0))
+        _add_lamps(
+            rng, light, number=int(rng.integers(1, 5)), radius=(0.01, 0.035), value=(5.0, 120.0)
+        )
     tint = temperature_tint(rng.uniform(0.1, 1.1))
     return Drawing(light, _lux(rng, 10.0, 2000.0), tint)
 
@@ -108,12 +112,12 @@ def snow(rng: np.random.Generator, size: int) -> Drawing:
         shade = _shadows(rng, size, share=rng.uniform(0.05, 0.2), depth=rng.uniform(0.3, 0.6))
         blue = np.array([0.85, 1.0, 1.25], np.float32)[:, None, None]
         light = light * (shade + (1.0 - shade) * (blue - 1.0) * 0.5).clip(0.2, 1.0)
-    _add_lamps(rng, light, number=rng.integers(0, 25), radius=(0.002, 0.003), value=(1.5, 8.0))
+    _add_lamps(rng, light, number=int(rng.integers(0, 25)), radius=(0.002, 0.003), value=(1.5, 8.0))
     return Drawing(light, _lux(rng, 1500.0, 100_000.0), temperature_tint(rng.normal(0.0, 0.1)))
 
 
 def back_light(rng: np.random.Generator, size: int) -> Drawing:
-    """A subject before a sky or window 3 to 6 stops brighter; metered at the subject, 20 to 8000 lux.
+    """A subject before a sky or window 3 to 6 EV brighter, in 20 to 8000 lux; metered at it.
 
     The incident light is what falls on the side that faces the camera. The background's mean
     luminance lies 3 to 6 EV above that of a grey card in this light.
@@ -199,7 +203,7 @@ def _lux(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _varied_style(rng: np.random.Generator, mean: float | None = None) -> LeafStyle:
-    """Leaves of varied size; `mean` defaults to that of natural scenes, 17 % give or take 0.3 EV."""
+    """Leaves of varied size; the default `mean` is that of nature, 17 % give or take 0.3 EV."""
     if mean is None:
         mean = float(np.clip(0.17 * np.exp(rng.normal(0.0, 0.2)), 0.1, 0.3))
     return LeafStyle(
@@ -314,7 +318,7 @@ def _add_lamps(
     top: float = 1.0,
 ) -> None:
     """Add `number` near-white lamps or glints at random places above `top`, in place."""
-    for _ in range(int(number)):
+    for _ in range(number):
         y, x = rng.uniform(0.02, 0.98) * top, rng.uniform(0.02, 0.98)
         strength = np.exp(rng.uniform(np.log(value[0]), np.log(value[1])))
         _add_lamp(light, y, x, rng.uniform(*radius), strength, np.ones(3, np.float32))
@@ -339,7 +343,11 @@ def _add_lit_windows(rng: np.random.Generator, light: np.ndarray) -> None:
         for column in range(int(left), int(right), pitch):
             if rng.random() < 0.15:
                 value = np.exp(rng.uniform(0.0, np.log(8.0))) * _warm(rng)
-                box = (slice(None), slice(row, row + pitch // 3), slice(column, column + pitch // 3))
+                box = (
+                    slice(None),
+                    slice(row, row + pitch // 3),
+                    slice(column, column + pitch // 3),
+                )
                 light[box] = value[:, None, None]
 
 

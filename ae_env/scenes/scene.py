@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -117,7 +118,7 @@ class Scene:
         """Whether no noise is left in `light`."""
         return not any((*self.nlf.shot, *self.nlf.read))
 
-    @property
+    @cached_property
     def ev100(self) -> float:
         """EV100 of the right exposure: the incident light's, or the frame's where it is unknown.
 
@@ -127,7 +128,7 @@ class Scene:
         if self.illuminance is not None:
             return incident_ev100(self.illuminance)
         green = self.light[1:3].mean(dim=0)
-        return -self.reference.log2_exposure - math.log2(_mean_anchor(green))
+        return -self.reference.log2_exposure - math.log2(mean_anchor(green))
 
     @classmethod
     def from_array(
@@ -251,7 +252,7 @@ class Scene:
             light *= WHITE_SIGNAL
         else:
             reference = reference_settings(ev100)
-            light *= _mean_anchor(light[1])
+            light *= mean_anchor(light[1])
         return cls.from_array(
             light,
             reference,
@@ -326,8 +327,8 @@ def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
     return image.float()
 
 
-def _mean_anchor(green: torch.Tensor) -> float:
-    """Factor at which the mean of `green`, clipped at 1, is `MEAN_SIGNAL`.
+def mean_anchor(green: torch.Tensor) -> float:
+    """Factor at which the mean of `green` (any shape), clipped at 1, is `MEAN_SIGNAL`.
 
     Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
     """

@@ -45,7 +45,8 @@ class Captures:
         scene_light: (B, 4, H, W) linear light of the scenes at their reference settings.
         ratio: (B,) float64, exposure ratio from that reference to the capture.
         nlf: Noise of a native sensor pixel at the settings, B long.
-        incident_ev: (B,) float64, EV100 of the incident light; NaN where it is unknown.
+        proper_ev: (B,) float64, EV100 of the right exposure: that of the incident light, or, where
+            it is unknown, the one at which the mean of the recorded green is 0.12.
         blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame].
         white_balance: (B, 3) gains of R, G, B.
         colour_matrix: XYZ (D65) to camera RGB, 3 x 3; None if unknown.
@@ -56,7 +57,7 @@ class Captures:
     scene_light: torch.Tensor
     ratio: torch.Tensor
     nlf: Sequence[NoiseLevelFunction]
-    incident_ev: torch.Tensor
+    proper_ev: torch.Tensor
     blur_px: torch.Tensor
     white_balance: torch.Tensor
     colour_matrix: tuple[tuple[float, float, float], ...] | None = None

@@ -9,16 +9,12 @@ import torch
 
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
 
-#: Mean signal that a well-exposed frame has where the incident light is unknown: an 18 % grey card
-#: under incident-light metering records 0.119 of sensor white.
-MEAN_TARGET = 0.12
-
 
 class Brightness:
     """Exposure against the incident light: snow stays white and night stays dark.
 
     ``exp(-(sqrt(1 + e^2) - 1))`` with e the stops of over-exposure: EV of the incident light minus
-    EV of the settings; where the light is unknown, log2 of the mean signal over 0.12.
+    EV of the settings. Where the light is unknown, e is against a mean of 0.12 of white.
     """
 
     domain: Domain = "raw"
@@ -26,10 +22,7 @@ class Brightness:
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        mean = captures.light.mean(dim=(1, 2, 3), dtype=torch.float64).clamp(min=1e-12)
-        metered = (mean / MEAN_TARGET).log2()
-        error = captures.incident_ev - captures.ev100
-        error = torch.where(error.isnan(), metered, error)
+        error = captures.proper_ev - captures.ev100
         return torch.exp(1.0 - torch.sqrt(1.0 + error**2))
 
 

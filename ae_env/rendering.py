@@ -1,0 +1,378 @@
+"""Pictures to look at: one capture with its settings and score, and all states of a scene."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image, ImageDraw, ImageFont
+
+from ae_env.grid import ExposureGrid
+from ae_env.observation import decode_observation
+from ae_env.scenes.scene import Scene
+from ae_env.score_table import ScoreTable, ScoreTables, scene_latent
+from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.registry import make_scorer
+from simulator.camera import CameraProfile
+from simulator.isp import develop
+from simulator.settings import format_exposure_time
+
+if TYPE_CHECKING:
+    from ae_env.core import EpisodeCore, Frames
+
+#: Least side of a rendered frame [pixel].
+FRAME_PIXELS = 256
+#: A contact sheet of more states than this would be unreadable.
+MAX_SHEET_STATES = 256
+#: Height of one picture on the contact sheet [pixel]; and the height that scenes are averaged to.
+THUMB_PIXELS, CAPTURE_PIXELS = 104, 192
+#: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
+PATH_COLOURS = ("#E69F00", "#56B4E9", "#D55E00", "#F0E442", "#CC79A7", "#009E73", "#0072B2")
+_BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
+_BORDER, _GAP, _MARGIN, _PANEL_GAP, _LABEL_WIDTH, _LABEL_HEIGHT = 5, 4, 18, 22, 48, 20
+
+
+def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
+    """The latest capture of an episode, developed, with its settings and score written on it.
+
+    Args:
+        core: Where the episode runs.
+        index: Which of its episodes.
+        frames: What all its episodes show.
+
+    Returns:
+        (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
+    """
+    raw = frames.observation["raw"][index]
+    if raw.dtype == np.uint8:
+        signal = decode_observation(raw)
+    elif raw.dtype == np.uint16:
+        black = np.array(core.camera.black_level)[:, None, None]
+        signal = ((raw - black) / np.array(core.camera.span)[:, None, None]).astype(np.float32)
+    else:
+        signal = raw
+    scene = core.scenes[core.episode(index).scene]
+    image = developed(torch.from_numpy(signal)[None], scene, core.camera)[0]
+    factor = -(-FRAME_PIXELS // min(image.shape[:2]))
+    picture = Image.fromarray(np.repeat(np.repeat(image, factor, 0), factor, 1))
+    info = frames.info
+    settings = core.grid[int(info["state"][index])]
+    lines = (
+        str(settings),
+        f"EV100 {info['ev100'][index]:.1f}   score {info['rewards']['score'][index]:.3f}",
+    )
+    return np.asarray(_captioned(picture, lines)).copy()
+
+
+def developed(signal: torch.Tensor, scene: Scene, camera: CameraProfile) -> np.ndarray:
+    """Captures (B, 4, H, W) of `scene` as sRGB pictures (B, H, W, 3) uint8."""
+    rgb = develop(signal, scene.white_balance, camera.colour_matrix)
+    return rgb.mul(255.0).round_().byte().permute(0, 2, 3, 1).numpy()
+
+
+def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
+    size = max(12, picture.height // 20)
+    height = int(1.35 * size * len(lines) + 0.5 * size)
+    band = Image.new("RGBA", (picture.width, height), (0, 0, 0, 150))
+    draw = ImageDraw.Draw(band)
+    for i, line in enumerate(lines):
+        font = _font(size)
+        while draw.textlength(line, font) > picture.width - size and font.size > 6:
+            font = _font(int(font.size) - 1)
+        draw.text((size // 2, size // 4 + int(1.35 * size * i)), line, _INK, font)
+    captioned = picture.convert("RGBA")
+    captioned.alpha_composite(band, (0, picture.height - height))
+    return captioned.convert("RGB")
+
+
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)
+
+
+# -- the contact sheet ----------------------------------------------------------------------------
+
+
+def contact_sheet(
+    scene: Scene,
+    *,
+    camera: CameraProfile | None = None,
+    grid: ExposureGrid | None = None,
+    scorer: str | Mapping[str, float] | CompositeScorer = "balanced",
+    speed: float = 0.0,
+    defocus: float = 0.0,
+    path: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
+    seed: int = 0,
+) -> Image.Image:
+    """All exposure states of a scene as one picture.
+
+    One panel per ISO; in it the exposure time grows to the right and the f-number downwards. The
+    frame of each capture shows its expected score, a star marks the oracle, and numbered lines show
+    which states policies chose, frame by frame.
+
+    Args:
+        scene: The scene, of any size and shape; large ones are averaged down first.
+        camera: The body; that of the scene by default.
+        grid: The states; the default grid's 64 by default.
+        scorer: What rates them, as `make_scorer` takes it.
+        speed: Image speed [frame heights per second].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        path: States that a policy went through, the start state first; or several by name.
+        seed: Seed of the noise.
+
+    Raises:
+        ValueError: If the grid has more than 256 states, or a path leaves it.
+    """
+    camera = scene.camera if camera is None else camera
+    grid = ExposureGrid.default() if grid is None else grid
+    if len(grid) > MAX_SHEET_STATES:
+        raise ValueError(
+            f"`grid` ({len(grid)} states) must have at most {MAX_SHEET_STATES} states to be shown "
+            "on one contact sheet"
+        )
+    paths = _checked_paths(path, len(grid))
+    scene = _averaged(scene, CAPTURE_PIXELS)
+    tables = ScoreTables(grid, camera, make_scorer(scorer), use_cache=False)
+    table = tables.table(scene, speed=speed, defocus=defocus)
+    latent = scene_latent(scene, camera, speed=speed, defocus=defocus)
+    frames = latent.stream(grid.states, seed=seed)
+    pictures = [Image.fromarray(developed(frame[None], scene, camera)[0]) for frame in frames]
+    title = _title(scene, speed, defocus, grid, table)
+    return _Sheet(grid, table, pictures, paths).draw(title)
+
+
+def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
+    if path is None:
+        return {}
+    named = dict(path) if isinstance(path, Mapping) else {"policy": path}
+    paths = {}
+    for name, states in named.items():
+        values = np.asarray(states)
+        if values.ndim != 1 or not values.size or values.dtype.kind not in "iu":
+            raise ValueError(f"`path` of {name!r} (={states!r}) must be a list of states")
+        if values.min() < 0 or values.max() >= count:
+            raise ValueError(f"`path` of {name!r} (={values.tolist()}) must be in [0, {count})")
+        paths[str(name)] = values.tolist()
+    return paths
+
+
+def _averaged(scene: Scene, size: int) -> Scene:
+    """`scene` box-averaged by the largest whole factor that leaves at least `size` pixels."""
+    factor = min(scene.light.shape[1:]) // size
+    if factor < 2:
+        return scene
+    mask = scene.saturated
+    if mask is not None:
+        mask = F.max_pool2d(mask[None].float(), factor)[0].bool()
+    return replace(
+        scene,
+        light=F.avg_pool2d(scene.light.double(), factor).float(),
+        nlf=scene.nlf.scaled(1.0 / factor**2),
+        box_factor=scene.box_factor * factor,
+        saturated=mask,
+    )
+
+
+def _title(
+    scene: Scene, speed: float, defocus: float, grid: ExposureGrid, table: ScoreTable
+) -> tuple[str, str]:
+    light = "light unknown" if scene.illuminance is None else f"{scene.illuminance:,.4g} lux"
+    parts = [scene.scene_id, f"{light} (EV100 {scene.ev100:.1f})"]
+    parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
+    parts.append(f"defocus {defocus:.3g} px of 64 at f/4" if defocus else "all in focus")
+    best = f"best state: {grid[table.oracle]}, expected score {table.mean[table.oracle]:.3f}"
+    return "   ·   ".join(parts), best
+
+
+def _visits(states: Sequence[int]) -> dict[int, str]:
+    """For each state visited, its frames: ``{5: "0", 9: "1-3,5"}``."""
+    labels: dict[int, list[str]] = {}
+    frame = 0
+    for state, run in itertools.groupby(states):
+        last = frame + len(list(run)) - 1
+        labels.setdefault(state, []).append(str(frame) if last == frame else f"{frame}-{last}")
+        frame = last + 1
+    return {state: ",".join(names) for state, names in labels.items()}
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """Where everything goes on the sheet."""
+
+    grid: ExposureGrid
+    table: ScoreTable
+    pictures: list[Image.Image]
+    paths: dict[str, list[int]]
+
+    @property
+    def thumb(self) -> tuple[int, int]:
+        """Width and height of one picture."""
+        width, height = self.pictures[0].size
+        return max(24, min(2 * THUMB_PIXELS, THUMB_PIXELS * width // height)), THUMB_PIXELS
+
+    @property
+    def panel(self) -> tuple[int, int]:
+        """Width and height of the captures of one ISO, without labels."""
+        _, times, apertures = self.grid.shape
+        return times * (self.thumb[0] + _GAP) - _GAP, apertures * (THUMB_PIXELS + _GAP) - _GAP
+
+    @property
+    def panel_columns(self) -> int:
+        """Panels side by side, so that the sheet comes out about square."""
+        count = self.grid.shape[0]
+        width, height = self.panel
+
+        def lopsidedness(columns: int) -> float:
+            rows = -(-count // columns)
+            return abs(float(np.log(columns * width / (rows * height))))
+
+        return min(range(1, count + 1), key=lopsidedness)
+
+    @property
+    def top(self) -> int:
+        """Height of the title."""
+        return 76
+
+    def corner(self, state: int) -> tuple[int, int]:
+        """Upper left corner of the picture of `state`."""
+        iso, time, aperture = self.grid.controls(state)
+        row, column = divmod(int(iso), self.panel_columns)
+        x, y = self.panel_corner(row, column)
+        return x + int(time) * (self.thumb[0] + _GAP), y + int(aperture) * (THUMB_PIXELS + _GAP)
+
+    def panel_corner(self, row: int, column: int) -> tuple[int, int]:
+        """Upper left corner of a panel's first picture."""
+        width, height = self.panel
+        x = _MARGIN + _LABEL_WIDTH + column * (width + _LABEL_WIDTH + _PANEL_GAP)
+        return x, self.top + 2 * _LABEL_HEIGHT + row * (height + 2 * _LABEL_HEIGHT + _PANEL_GAP)
+
+    def draw(self, title: tuple[str, str]) -> Image.Image:
+        """The finished sheet."""
+        rows = -(-self.grid.shape[0] // self.panel_columns)
+        right, bottom = self.panel_corner(rows, self.panel_columns)
+        width = max(right - _LABEL_WIDTH - _PANEL_GAP + _MARGIN, 560)
+        height = bottom - 2 * _LABEL_HEIGHT + 58
+        sheet = Image.new("RGB", (width, height), _BACKGROUND)
+        draw = ImageDraw.Draw(sheet)
+        font = _fitting_font(draw, title[0], 20, width - 2 * _MARGIN)
+        draw.text((_MARGIN, 14), title[0], _INK, font)
+        font = _fitting_font(draw, title[1], int(font.size) - 2, width - 2 * _MARGIN)
+        draw.text((_MARGIN, 44), title[1], _FAINT, font)
+        self._draw_labels(draw)
+        for state, picture in enumerate(self.pictures):
+            self._draw_picture(sheet, draw, state, picture)
+        self._draw_legend(sheet, draw)
+        overlay = Image.new("RGBA", (2 * width, 2 * height))  # at twice the size: smooth lines
+        self._draw_paths(ImageDraw.Draw(overlay))
+        self._draw_star(ImageDraw.Draw(overlay))
+        sheet.paste(overlay.reduce(2).convert("RGB"), mask=overlay.reduce(2).getchannel("A"))
+        return sheet
+
+    def _colour(self, score: float) -> tuple[int, int, int]:
+        from matplotlib import colormaps
+
+        position = float(np.clip(score / max(float(self.table.mean.max()), 1e-9), 0.0, 1.0))
+        red, green, blue, _ = colormaps["viridis"](position, bytes=True)
+        return int(red), int(green), int(blue)
+
+    def _draw_labels(self, draw: ImageDraw.ImageDraw) -> None:
+        width, _ = self.thumb
+        for i, iso in enumerate(self.grid.isos):
+            x, y = self.panel_corner(*divmod(i, self.panel_columns))
+            draw.text((x, y - 2 * _LABEL_HEIGHT - 2), f"ISO {iso:.5g}", _INK, _font(17))
+            for j, time in enumerate(self.grid.exposure_times):
+                text, at = format_exposure_time(time), x + j * (width + _GAP) + width // 2
+                draw.text((at, y - 5), text, _FAINT, _font(13), anchor="md")
+            for k, f_number in enumerate(self.grid.f_numbers):
+                at = y + k * (THUMB_PIXELS + _GAP) + THUMB_PIXELS // 2
+                draw.text((x - 6, at), f"f/{f_number:g}", _FAINT, _font(13), anchor="rm")
+
+    def _draw_picture(
+        self, sheet: Image.Image, draw: ImageDraw.ImageDraw, state: int, picture: Image.Image
+    ) -> None:
+        (x, y), (width, height) = self.corner(state), self.thumb
+        score = float(self.table.mean[state])
+        draw.rectangle((x, y, x + width - 1, y + height - 1), self._colour(score))
+        inner = (width - 2 * _BORDER, height - 2 * _BORDER)
+        sheet.paste(picture.resize(inner, Image.Resampling.BICUBIC), (x + _BORDER, y + _BORDER))
+        corner = (x + _BORDER, y + height - _BORDER)
+        text = f"{score:.2f}"
+        box = draw.textbbox((corner[0] + 4, corner[1] - 2), text, _font(12), anchor="lb")
+        draw.rectangle((corner[0], box[1] - 3, box[2] + 3, corner[1] - 1), (0, 0, 0))
+        draw.text((corner[0] + 4, corner[1] - 2), text, _INK, _font(12), anchor="lb")
+
+    def _draw_paths(self, draw: ImageDraw.ImageDraw) -> None:
+        width, height = self.thumb
+        columns = min(3, len(self.paths)) or 1
+        rows = -(-len(self.paths) // columns)
+        for i, states in enumerate(self.paths.values()):
+            row, column = divmod(i, columns)
+            dx = int(width * (column + 1) / (columns + 1))
+            dy = int((height - 16) * (row + 1) / (rows + 1)) + 2
+            spots = {
+                s: (2 * (self.corner(s)[0] + dx), 2 * (self.corner(s)[1] + dy)) for s in states
+            }
+            colour = PATH_COLOURS[i % len(PATH_COLOURS)]
+            route = [spots[s] for s, _ in itertools.groupby(states)]
+            for ink, thickness in (("black", 11), (colour, 6)):
+                if len(route) > 1:
+                    draw.line(route, ink, thickness, joint="curve")
+            for state, label in _visits(states).items():
+                _draw_pill(draw, spots[state], label, colour)
+
+    def _draw_star(self, draw: ImageDraw.ImageDraw) -> None:
+        x, y = self.corner(self.table.oracle)
+        width, height = self.thumb
+        draw.rectangle(
+            (2 * x - 4, 2 * y - 4, 2 * (x + width) + 3, 2 * (y + height) + 3), None, "white", 6
+        )
+        draw.polygon(_star(2 * (x + width - 18), 2 * (y + 18), 24), "white", "black")
+
+    def _draw_legend(self, sheet: Image.Image, draw: ImageDraw.ImageDraw) -> None:
+        best, y = float(self.table.mean.max()), sheet.height - 40
+        for i in range(150):
+            draw.line((_MARGIN + i, y, _MARGIN + i, y + 12), self._colour(best * i / 149))
+        draw.text((_MARGIN, y + 15), "0", _FAINT, _font(12))
+        draw.text((_MARGIN + 150, y + 15), f"{best:.2f}", _FAINT, _font(12), anchor="ra")
+        draw.text((_MARGIN + 75, y + 15), "expected score", _FAINT, _font(12), anchor="ma")
+        x = _MARGIN + 180
+        draw.polygon(_star(x, y + 7, 10), "white")
+        draw.text((x + 15, y + 7), "oracle", _INK, _font(14), anchor="lm")
+        x += 84
+        for name, colour in zip(self.paths, itertools.cycle(PATH_COLOURS), strict=False):
+            length = 40 + int(draw.textlength(name, _font(14)))
+            if x + length > sheet.width:
+                x, y = _MARGIN + 264, y + 20
+            draw.line((x, y + 7, x + 24, y + 7), colour, 4)
+            draw.text((x + 30, y + 7), name, _INK, _font(14), anchor="lm")
+            x += length + 12
+
+
+def _draw_pill(draw: ImageDraw.ImageDraw, centre: tuple[int, int], label: str, colour: str) -> None:
+    half = max(17, int(draw.textlength(label, _font(24))) // 2 + 9)
+    x, y = centre
+    draw.rounded_rectangle((x - half, y - 17, x + half, y + 17), 17, colour, "black", 3)
+    draw.text((x, y), label, "black", _font(24), anchor="mm")
+
+
+def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
+    """Corners of a five-pointed star."""
+    angles = np.arange(10) * np.pi / 5
+    radii = np.where(np.arange(10) % 2, 0.4 * radius, radius)
+    return list(
+        zip(
+            (x + radii * np.sin(angles)).tolist(),
+            (y - radii * np.cos(angles)).tolist(),
+            strict=True,
+        )
+    )
+
+
+def _fitting_font(draw: ImageDraw.ImageDraw, line: str, size: int, width: int) -> Any:
+    while size > 9 and draw.textlength(line, _font(size)) > width:
+        size -= 1
+    return _font(size)

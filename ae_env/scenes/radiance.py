@@ -1,0 +1,257 @@
+"""Radiance maps (.hdr, .exr) as scenes: views cut from panoramas, light of unknown scale.
+
+A radiance map is linear but relative: nothing in it says how many lux it shows. The views of one
+map are therefore put at an EV100 between 3 and 14 drawn by a stable hash of the source group (an
+assumption, stated in each scene's `source`), and their `illuminance` is None unless given.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ae_env.scenes.colour import camera_from_srgb
+from ae_env.scenes.procedural import NATIVE_SIZE
+from ae_env.scenes.scene import Crop, Scene, mean_anchor
+from simulator.camera import CameraProfile
+
+logger = logging.getLogger(__name__)
+
+#: File endings read here.
+RADIANCE_SUFFIXES = (".hdr", ".exr")
+#: Directions of the views cut from a panorama [degrees], and their field of view.
+AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
+FIELD_OF_VIEW = 60.0
+#: Range of the EV100 assumed for a map of unknown light.
+EV100_RANGE = (3.0, 14.0)
+
+
+def read_radiance(path: str | Path) -> np.ndarray:
+    """Linear light of an .hdr or .exr file.
+
+    Values that are not light are repaired, and the repair is logged: NaN and negative values
+    (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
+
+    Args:
+        path: The file. Its primaries are taken to be sRGB's, as those files usually have; alpha and
+            further channels are ignored; a file with luminance only is grey.
+
+    Returns:
+        (3, H, W) float32 of arbitrary scale, finite and at least 0.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ImportError: If the extra ``hdr`` is not installed.
+        ValueError: If the file cannot be read, is empty of light or is neither kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` (={str(path)!r}) must be an existing file")
+    suffix = path.suffix.lower()
+    if suffix not in RADIANCE_SUFFIXES:
+        raise ValueError(f"`path` (={path.name!r}) must end in one of {list(RADIANCE_SUFFIXES)}")
+    image = _read_hdr(path) if suffix == ".hdr" else _read_exr(path)
+    return _clean(image.astype(np.float32), path)
+
+
+def radiance_scenes(
+    path: str | Path,
+    camera: CameraProfile,
+    *,
+    name: str,
+    group: str,
+    resolution: int | None = 64,
+    crop: Crop = "box",
+    ev100: float | None = None,
+    **fields: Any,
+) -> Iterator[Scene]:
+    """The scenes of one radiance map, all in one source group.
+
+    A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
+    with a field of view of 60 degrees; any other gives its central square. Both are sampled to
+    about 256 packed pixels a side, as the bundled scenes have, before `Scene.resized`.
+
+    Args:
+        path: The file.
+        camera: Whose colours the light is taken to.
+        name: Prefix of the scene ids.
+        group: Source group.
+        resolution: Packed pixels a side; None keeps 256.
+        crop: See `Scene.resized`.
+        ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
+            their relative brightness), if known; see `assumed_ev100`.
+        **fields: Further arguments of `Scene.from_radiance`.
+    """
+    image = read_radiance(path)
+    height, width = image.shape[1:]
+    if "illuminance" not in fields and ev100 is None:
+        ev100 = assumed_ev100(group)
+        fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
+    fields.setdefault("source", Path(path).name)
+    if abs(width / height - 2.0) <= 0.01:
+        size = native_size(resolution)
+        views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
+    else:
+        size = native_size(resolution, min(height, width))
+        views = [(name, _central_square(image, size, Path(path).name))]
+    try:
+        levels = [_log2_level(view, camera) for _, view in views]
+    except ValueError as error:
+        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
+    for (scene_id, view), level in zip(views, levels, strict=True):
+        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
+            fields["ev100"] = ev100 + level - float(np.mean(levels))
+        try:
+            scene = Scene.from_radiance(view, camera, scene_id=scene_id, group=group, **fields)
+        except ValueError as error:
+            raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
+        yield scene.resized(resolution, crop)
+
+
+def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
+    """log2 of the exposure that a view asks for: its mean, clipped at white, against 0.12."""
+    matrix, _ = camera_from_srgb(camera)
+    green = torch.from_numpy(np.tensordot(matrix[1], view, axes=1))
+    return -math.log2(mean_anchor(green))
+
+
+def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
+    """Packed pixels a side of a view before it is resized to `resolution`.
+
+    The largest multiple of `resolution` up to 256 and up to the `available` pixels, and at least
+    `resolution` itself.
+
+    >>> native_size(64), native_size(100), native_size(512), native_size(64, 150)
+    (256, 200, 512, 128)
+    """
+    size = min(NATIVE_SIZE, available)
+    if resolution is None:
+        return size
+    return resolution * max(1, size // max(resolution, 1))
+
+
+def assumed_ev100(group: str) -> float:
+    """EV100 of a map of unknown light, in [3, 14], by a hash of its source group.
+
+    >>> assumed_ev100("forest") == assumed_ev100("forest")
+    True
+    """
+    fraction = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+    low, high = EV100_RANGE
+    return round(low + fraction * (high - low), 2)
+
+
+def perspective(
+    panorama: np.ndarray, azimuth: float, size: int, field_of_view: float = FIELD_OF_VIEW
+) -> np.ndarray:
+    """A level pin-hole view into an equirectangular panorama (gnomonic projection).
+
+    Args:
+        panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
+            latitudes from +90 degrees.
+        azimuth: Longitude of the view's middle [degrees].
+        size: Height and width of the view [pixels].
+        field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
+
+    Returns:
+        (3, size, size) float32. Sampled bilinearly at least as densely as the panorama has
+        pixels, then box-averaged, so that small lamps keep their energy.
+    """
+    if not 0.0 < field_of_view <= 150.0:
+        raise ValueError(f"`field_of_view` (={field_of_view!r}) must be in (0, 150] degrees")
+    half = math.tan(math.radians(field_of_view) / 2.0)
+    per_radian = panorama.shape[2] / (2.0 * math.pi)
+    dense = max(1, math.ceil(per_radian / (size / (2.0 * half))))
+    axis = half * ((np.arange(size * dense) + 0.5) / (size * dense) * 2.0 - 1.0)
+    longitude = math.radians(azimuth) + np.arctan(axis)[None, :]
+    latitude = np.arctan2(-axis[:, None], np.hypot(1.0, axis)[None, :])
+    column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
+    row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
+    view = _bilinear(panorama, row, np.broadcast_to(column, row.shape))
+    return view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
+
+
+def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Values of (3, H, W) at fractional positions: columns wrap around, rows are clamped."""
+    height, width = image.shape[1:]
+    row = np.clip(row, 0.0, height - 1.0)
+    y0, x0 = np.floor(row).astype(int), np.floor(column).astype(int)
+    fy, fx = (row - y0).astype(np.float32), (column - x0).astype(np.float32)
+    y1, x1 = np.minimum(y0 + 1, height - 1), (x0 + 1) % width
+    x0 = x0 % width
+    above = (1.0 - fx) * image[:, y0, x0] + fx * image[:, y0, x1]
+    below = (1.0 - fx) * image[:, y1, x0] + fx * image[:, y1, x1]
+    return (1.0 - fy) * above + fy * below
+
+
+def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
+    """The middle of `image`, box-averaged by the largest integer that leaves `size` pixels."""
+    height, width = image.shape[1:]
+    k = min(height, width) // size
+    if k == 0:
+        raise ValueError(
+            f"radiance map {name!r} ({height} x {width}) must have at least {size} pixels a side"
+        )
+    top, left = (height - k * size) // 2, (width - k * size) // 2
+    square = image[:, top : top + k * size, left : left + k * size]
+    return square.reshape(3, size, k, size, k).mean(axis=(2, 4))
+
+
+def _read_hdr(path: Path) -> np.ndarray:
+    try:
+        import cv2
+    except ImportError:
+        raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    try:
+        image = (
+            cv2.imdecode(content, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR) if content.size else None
+        )
+    except cv2.error as error:
+        raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+    if image is None or image.dtype != np.float32:
+        raise ValueError(f"radiance map {str(path)!r} must be a complete Radiance RGBE file")
+    return image[:, :, ::-1].transpose(2, 0, 1)
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: c.pixels for name, c in file.channels().items()}
+    except (RuntimeError, ValueError, OSError) as error:
+        raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+    names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
+    missing = sorted({n for n in names if n not in channels})
+    if missing:
+        raise ValueError(
+            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G, B or Y"
+        )
+    planes = [np.asarray(channels[n], np.float32) for n in names]
+    if len({p.shape for p in planes}) != 1:
+        raise ValueError(f"radiance map {str(path)!r} must have R, G and B of the same size")
+    return np.stack(planes)
+
+
+def _clean(image: np.ndarray, path: Path) -> np.ndarray:
+    undefined, infinite, negative = np.isnan(image), np.isposinf(image), image < 0
+    if undefined.any() or infinite.any() or negative.any():
+        finite = np.where(undefined | negative | infinite, 0.0, image)
+        image = np.where(infinite, finite.max(), finite)
+        logger.info(
+            "radiance map %s: %d NaN and %d negative values set to 0, %d infinite to the maximum",
+            *(path.name, undefined.sum(), negative.sum(), infinite.sum()),
+        )
+    if not image.any():
+        raise ValueError(f"radiance map {str(path)!r} must hold some light, but is 0 everywhere")
+    return np.ascontiguousarray(image, np.float32)

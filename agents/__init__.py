@@ -1,0 +1,42 @@
+"""Exposure policies, from a spot meter to PPO, and the protocol that compares them."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+_EXPORTS = {
+    "EvaluationResult": "evaluation_result",
+    "MeteringPolicy": "programs",
+    "Policy": "policy",
+    "PolicyContext": "policy",
+    "evaluate": "evaluation",
+    "fit_policies": "evaluation",
+    "list_policies": "policy",
+    "make_policy": "policy",
+    "result_rows": "result_rows",
+    "write_report": "report",
+}
+__all__ = sorted(_EXPORTS)
+
+if TYPE_CHECKING:
+    from agents.evaluation import evaluate as evaluate
+    from agents.evaluation import fit_policies as fit_policies
+    from agents.evaluation_result import EvaluationResult as EvaluationResult
+    from agents.policy import Policy as Policy
+    from agents.policy import PolicyContext as PolicyContext
+    from agents.policy import list_policies as list_policies
+    from agents.policy import make_policy as make_policy
+    from agents.programs import MeteringPolicy as MeteringPolicy
+    from agents.report import write_report as write_report
+    from agents.result_rows import result_rows as result_rows
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(importlib.import_module(f"agents.{_EXPORTS[name]}"), name)
+    raise AttributeError(f"module 'agents' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *globals()]

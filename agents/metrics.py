@@ -1,0 +1,203 @@
+"""What is measured of a policy: pure functions of scores, states and exposure values.
+
+Axes: ``S`` states of the grid, ``T`` frames of an episode, ``E`` episodes; leading axes broadcast.
+All scores are expected scores q, never those of one noisy capture.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: A state counts as right if its q is this near to the best.
+SCORE_TOLERANCE = 0.01
+#: A third of a stop, with room for the rounding of f-numbers.
+THIRD_EV = 1.0 / 3.0 + 1e-6
+#: EVs nearer than this are the same exposure: 1/15 s stands for 1/16 s, 0.09 EV from it.
+SAME_EV = 1.0 / 6.0
+
+
+def score_of(scores: Floats, states: Ints) -> Floats:
+    """q of the chosen states.
+
+    Args:
+        scores: ``(..., T, S)``.
+        states: ``(..., T)`` indices; leading axes broadcast against those of `scores`.
+
+    >>> score_of(np.array([[0.1, 0.9], [0.3, 0.2]]), np.array([1, 0]))
+    array([0.9, 0.3])
+    """
+    shape = np.broadcast_shapes(scores.shape[:-1], states.shape)
+    table = np.broadcast_to(scores, (*shape, scores.shape[-1]))
+    return np.take_along_axis(table, np.broadcast_to(states, shape)[..., None], axis=-1)[..., 0]
+
+
+def oracle_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
+    """Best q among the allowed states, ``(..., T)``."""
+    best: Floats = np.where(allowed, scores, -np.inf).max(axis=-1)
+    return best
+
+
+def random_score(scores: Floats, allowed: NDArray[np.bool_]) -> Floats:
+    """Exact mean q of a uniform draw from the allowed states, ``(..., T)``.
+
+    >>> random_score(np.array([0.0, 1.0, 0.5]), np.array([True, False, True]))
+    np.float64(0.25)
+    """
+    mean: Floats = np.where(allowed, scores, 0.0).sum(axis=-1) / allowed.sum(axis=-1)
+    return mean
+
+
+def regret_given_ev(
+    scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bool_]
+) -> Floats:
+    """How much better the best split of the *chosen* EV would have scored, ``(..., T)``.
+
+    Best q among the allowed states whose EV100 is that of the chosen one (within 1/6 EV), minus q
+    of the chosen: what is lost between ISO, shutter and aperture, not through the brightness.
+
+    Args:
+        scores: ``(..., T, S)``.
+        states: ``(..., T)``.
+        ev100: EV100 of every state, ``(S,)``.
+        allowed: Action masks, broadcastable to `scores`.
+    """
+    same = np.abs(ev100 - ev100[states][..., None]) < SAME_EV
+    best = np.where(same & allowed, scores, -np.inf).max(axis=-1)
+    return best - score_of(scores, states)
+
+
+def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bool_]) -> Floats:
+    """Distance in EV to the nearest allowed state whose q is within 0.01 of the best, ``(..., T)``.
+
+    Zero wherever the brightness is right, however it is split.
+    """
+    good = (scores >= oracle_score(scores, allowed)[..., None] - SCORE_TOLERANCE) & allowed
+    distance = np.abs(ev100 - ev100[states][..., None])
+    error: Floats = np.where(good, distance, np.inf).min(axis=-1)
+    return error
+
+
+def frames_to_converge(errors: Floats, tolerance: float = THIRD_EV) -> tuple[Ints, Any]:
+    """First frame from which the EV error stays within `tolerance` until the episode's end.
+
+    Args:
+        errors: EV errors after each action, ``(..., T)``.
+        tolerance: Largest error that counts as converged [EV].
+
+    Returns:
+        Frames, ``(...)``, 1 for the first; censored at T where the error never stays within; and
+        whether it converged.
+
+    >>> frames_to_converge(np.array([[2.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 2.0]]))
+    (array([4, 4]), array([ True, False]))
+    """
+    outside = errors > tolerance
+    frames = errors.shape[-1]
+    last_outside = np.where(outside.any(-1), frames - np.argmax(outside[..., ::-1], axis=-1), 0)
+    return np.minimum(last_outside + 1, frames), last_outside < frames
+
+
+def overshoot(evs: Floats) -> Floats:
+    """How far the exposure passes beyond where it ends, in the direction it came from [EV].
+
+    Args:
+        evs: EV100 of the start state and after each action, ``(..., T + 1)``.
+
+    Returns:
+        ``(...)``, >= 0; where start and end are equal, the largest excursion to either side.
+
+    >>> overshoot(np.array([[0.0, 5.0, 3.0], [0.0, 2.0, 3.0]]))
+    array([2., 0.])
+    """
+    final = evs[..., -1:]
+    direction = np.sign(final - evs[..., :1])
+    beyond = evs - final
+    along = np.where(direction == 0, np.abs(beyond), beyond * direction)
+    return np.maximum(along.max(axis=-1), 0.0)
+
+
+def reversals(evs: Floats) -> Ints:
+    """Changes of direction of the exposure: sign changes between successive EV steps.
+
+    Args:
+        evs: EV100 of the start state and after each action, ``(..., T + 1)``.
+
+    >>> reversals(np.array([0.0, 3.0, 3.0, 2.0, 4.0]))
+    np.int64(2)
+    """
+    steps = np.diff(evs, axis=-1)
+    steps = np.where(np.abs(steps) < SAME_EV, 0.0, np.sign(steps))
+    count = np.zeros(evs.shape[:-1], dtype=np.int64)
+    heading = np.zeros(evs.shape[:-1])
+    for i in range(steps.shape[-1]):  # frames without a step keep the heading
+        step = steps[..., i]
+        count += (step * heading) < 0
+        heading = np.where(step != 0, step, heading)
+    return count[()]
+
+
+def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
+    """Mean absolute change of the image mean between successive frames of the same light.
+
+    Args:
+        image_means: Mean linear signal of each frame after an action, in [0, 1], ``(..., T)``.
+        static: Whether the light is that of the frame before, ``(..., T - 1)``.
+
+    Returns:
+        ``(...)``; 0 where no two frames have the same light.
+    """
+    change = np.abs(np.diff(image_means, axis=-1))
+    static = np.broadcast_to(static, change.shape)
+    total: Floats = (change * static).sum(axis=-1) / np.maximum(static.sum(axis=-1), 1)
+    return total
+
+
+def delayed_oracle_score(
+    scores: Floats, allowed: NDArray[np.bool_], start_states: Ints, delay: int
+) -> Floats:
+    """q of the oracle whose decisions take effect `delay` frames later, ``(E, T)``.
+
+    Args:
+        scores: ``(E, T, S)``.
+        allowed: ``(E, S)``.
+        start_states: State that is kept until the first decision takes effect, ``(E,)``.
+        delay: Frames.
+    """
+    best = np.where(allowed[:, None], scores, -np.inf).argmax(axis=-1)
+    waiting = np.repeat(start_states[:, None], min(delay, best.shape[1]), axis=1)
+    return score_of(scores, np.concatenate([waiting, best], axis=1)[:, : best.shape[1]])
+
+
+def normalised_score(score: Floats, random: Floats, oracle: Floats) -> float:
+    """``sum(q - q_random) / sum(q_oracle - q_random)``: 0 is random, 1 the oracle.
+
+    Args:
+        score: Mean q per source group, ``(G,)``.
+        random: Mean q of a random policy per source group.
+        oracle: Mean q of the oracle per source group.
+
+    >>> round(normalised_score(np.array([0.8, 0.6]), np.array([0.2, 0.2]), np.array([1.0, 0.8])), 3)
+    0.714
+    """
+    return float(np.sum(score - random) / np.sum(oracle - random))
+
+
+def group_means(values: NDArray[Any], groups: NDArray[Any]) -> tuple[Floats, NDArray[Any]]:
+    """Means over the episodes of each source group.
+
+    Args:
+        values: ``(..., E)``.
+        groups: Source group of each episode, ``(E,)``.
+
+    Returns:
+        ``(..., G)`` and the names of the groups, sorted.
+    """
+    names, index = np.unique(groups, return_inverse=True)
+    member = (index[:, None] == np.arange(len(names))).astype(np.float64)
+    return np.asarray(values, np.float64) @ (member / member.sum(axis=0)), names

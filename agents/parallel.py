@@ -1,0 +1,99 @@
+"""Several trainings at once, one process each, with progress in the process that waits."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from agents.training import AgentConfig, is_trained, train_agent
+
+#: Seconds between two looks at the queue.
+_PATIENCE = 0.2
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """An agent to train.
+
+    Args:
+        name: Shown to the user.
+        config: What to train.
+        out: File name of the agent, without suffix.
+    """
+
+    name: str
+    config: AgentConfig
+    out: Path
+
+
+def train_in_parallel(
+    jobs: Sequence[TrainingJob],
+    *,
+    workers: int | None = None,
+    progress: Callable[[str, int, int, dict[str, float]], None] | None = None,
+) -> None:
+    """Trains every job that is not trained yet.
+
+    Args:
+        jobs: What to train.
+        workers: Processes at a time, each with its share of the cores; by default one per core.
+        progress: Called with the job's name, frames done, frames in all, and losses.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C; every job has its checkpoint, the same call resumes.
+    """
+    waiting = [job for job in jobs if not is_trained(job.config, job.out)]
+    if not waiting:
+        return
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = min(workers or cores, len(waiting))
+    threads = max(1, cores // workers)
+    context = multiprocessing.get_context("spawn")
+    with (
+        context.Manager() as manager,
+        ProcessPoolExecutor(workers, mp_context=context) as executor,
+    ):
+        messages = manager.Queue()
+        running: set[Future[None]] = {
+            executor.submit(_train, job, threads, messages) for job in waiting
+        }
+        try:
+            while running:
+                done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                _deliver(messages, progress)
+                for future in done:
+                    future.result()
+        except BaseException:
+            executor.shutdown(wait=True, cancel_futures=True)
+            raise
+
+
+def _deliver(messages: Any, progress: Callable[..., None] | None) -> None:
+    while True:
+        try:
+            message = messages.get_nowait()
+        except queue.Empty:
+            return
+        if progress is not None:
+            progress(*message)
+
+
+def _train(job: TrainingJob, threads: int, messages: Any) -> None:
+    import torch
+
+    torch.set_num_threads(threads)
+    last = 0
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        nonlocal last
+        if done == total or done - last >= total // 200:
+            last = done
+            messages.put((job.name, done, total, values))
+
+    train_agent(job.config, job.out, progress=report)

@@ -1,0 +1,243 @@
+"""What a policy is, and how a name becomes one."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from ae_env.grid import ExposureGrid
+    from simulator.camera import CameraProfile
+
+Observations = Mapping[str, NDArray[Any]]
+
+METERS = ("average", "centre_weighted", "matrix", "spot")
+PROGRAMS = ("P", "A", "S", "tuned", "tuned_blind")
+_SIMPLE = {"best_fixed": "BestFixed", "oracle": "Oracle", "random": "Random"}
+_TRAINED = {"ppo": "PPOPolicy", "regression": "RegressionPolicy"}
+
+
+@dataclass(frozen=True)
+class PolicyContext:
+    """What every policy is told about the camera it drives.
+
+    Args:
+        grid: The exposure states; an action is an index into it.
+        camera: The camera body.
+        observation_space: Observation of a single environment (a `Dict` with ``raw``,
+            ``settings`` and, where the camera has them, ``sensors``).
+        frame_rate: Frames per second.
+        delay: Frames between a decision and the frame that it exposes.
+    """
+
+    grid: ExposureGrid
+    camera: CameraProfile
+    observation_space: gym.spaces.Dict
+    frame_rate: float = 30.0
+    delay: int = 0
+
+    @classmethod
+    def from_envs(cls, envs: gym.vector.VectorEnv) -> PolicyContext:
+        """The context of the environments that `envs` runs."""
+        base: Any = envs.unwrapped
+        delay = int(base.core.options.delay)
+        return cls(base.grid, base.camera, base.single_observation_space, delay=delay)
+
+    @property
+    def has_sensors(self) -> bool:
+        """Whether the observation tells image speed and defocus spread."""
+        return "sensors" in self.observation_space.spaces
+
+
+class Policy:
+    """Base class of everything that chooses exposures, for a batch of cameras at once.
+
+    A policy is causal: `act` sees the frames so far and nothing else. Override `reset` (call it
+    through `super`) and `act`; override `fit` where the policy has something to learn from the
+    training scenes. Per-camera memory lives in arrays of length `num_envs`.
+
+    Args:
+        context: The camera, the grid and the observation.
+    """
+
+    #: Only a privileged policy's `act` gets ``info=`` as well; its scores are upper bounds.
+    privileged: bool = False
+    #: Frames a policy takes for one decision (a bracketing policy takes more).
+    captures_per_decision: float = 1.0
+
+    def __init__(self, context: PolicyContext) -> None:
+        self.context = context
+        self.num_envs = 0
+        self.name = type(self).__name__
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forget the past: the next observations begin new episodes of `num_envs` cameras."""
+        self.num_envs = num_envs
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Choose the next frame's state for each camera.
+
+        Args:
+            observations: Arrays with a leading axis of `num_envs`.
+            action_masks: ``(num_envs, len(grid))``, False where a state is not allowed.
+
+        Returns:
+            Indices into the grid, int64, shape ``(num_envs,)``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must implement `act`")
+
+    def fit(self, envs: gym.vector.VectorEnv, seed: int = 0) -> None:
+        """Learn from the training scenes of `envs`; called once, before evaluation."""
+
+
+def masked_argmax(
+    utility: NDArray[np.floating], action_masks: NDArray[np.bool_] | None
+) -> NDArray[np.int64]:
+    """Index of the highest allowed utility per row, ties to the lower index.
+
+    >>> masked_argmax(np.array([[1.0, 3.0, 2.0]]), np.array([[True, False, True]]))
+    array([2])
+    """
+    if action_masks is not None:
+        utility = np.where(action_masks, utility, -np.inf)
+    return np.argmax(utility, axis=-1).astype(np.int64)
+
+
+def list_policies() -> list[str]:
+    """Names of the built-in policies that need no file."""
+    return sorted([*_SIMPLE, *(f"{m}:{p}" for m in METERS for p in PROGRAMS)])
+
+
+def make_policy(name: str, context: PolicyContext, **options: Any) -> Policy:
+    """The policy called `name`.
+
+    Args:
+        name: ``"random"``, ``"best_fixed"``, ``"oracle"``; a meter and a program such as
+            ``"centre_weighted:P"`` (the program defaults to P); ``"regression:PATH"`` and
+            ``"ppo:PATH"`` with the weights of a trained agent; ``"package.module:Class"`` or
+            ``"path/to/file.py:Class"`` for a policy of one's own.
+        context: What the policy is told about the camera.
+        options: Passed to the class.
+
+    Raises:
+        ValueError: If there is no such policy, or the class found is not one.
+    """
+    head, _, tail = str(name).rpartition(":") if ".py:" in str(name) else name.partition(":")
+    if not tail:
+        head = head or name
+    if head.endswith(".py"):
+        return _construct(_class_in_file(head, tail, name), name, context, options)
+    if head in _SIMPLE and not tail:
+        return _construct(_class_in("agents.simple", _SIMPLE[head]), name, context, options)
+    if head in METERS and tail in ("", *PROGRAMS):
+        cls = _class_in("agents.programs", "MeteringPolicy")
+        return _construct(cls, name, context, {"meter": head, "program": tail or "P", **options})
+    if head in _TRAINED:
+        if tail:
+            options = {"weights": tail, **options}
+        elif "weights" not in options:
+            raise ValueError(f"`policy` (={name!r}) needs its weights: '{head}:PATH'")
+        return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)
+    if tail and (head not in METERS and head not in _SIMPLE):
+        return _construct(_class_in_module(head, tail, name), name, context, options)
+    raise ValueError(_unknown(name))
+
+
+def _unknown(name: str) -> str:
+    known = [*METERS, *list_policies(), *(f"{t}:PATH" for t in _TRAINED)]
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return (
+        f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
+        f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
+        f"regression:PATH, ppo:PATH; package.module:Class or path.py:Class{hint}"
+    )
+
+
+def _class_in(module: str, name: str) -> Any:
+    return getattr(importlib.import_module(module), name)
+
+
+def _class_in_module(module: str, name: str, policy: str) -> Any:
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise ValueError(_unknown(policy))
+    try:
+        loaded = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not (module == error.name or module.startswith(f"{error.name}.")):
+            raise  # the module is there, but something that it imports is not
+        raise ValueError(f"{_unknown(policy)} (there is no module {error.name!r})") from None
+    return _attribute(loaded, name, policy)
+
+
+def _class_in_file(path: str, name: str, policy: str) -> Any:
+    if not name:
+        raise ValueError(f"`policy` (={policy!r}) must name a class of the file: '{path}:MyPolicy'")
+    file = Path(path).expanduser()
+    if not file.is_file():
+        raise ValueError(f"`policy` (={policy!r}): there is no file {path!r}")
+    key = f"ae_env_user_policy_{file.stem}_{abs(hash(str(file.resolve())))}"
+    spec = importlib.util.spec_from_file_location(key, file)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"`policy` (={policy!r}): {path!r} cannot be loaded as Python")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[key] = module  # dataclasses look their module up while it loads
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[key]
+        raise
+    return _attribute(module, name, policy)
+
+
+def _attribute(module: ModuleType, name: str, policy: str) -> Any:
+    try:
+        return getattr(module, name)
+    except AttributeError:
+        own = [
+            key
+            for key, value in vars(module).items()
+            if inspect.isclass(value) and value.__module__ == module.__name__
+        ]
+        found = ", ".join(own) or "no class at all"
+        raise ValueError(
+            f"`policy` (={policy!r}): no class {name!r} there; found {found}"
+        ) from None
+
+
+def _construct(cls: Any, name: str, context: PolicyContext, options: dict[str, Any]) -> Policy:
+    if not inspect.isclass(cls):
+        raise ValueError(f"`policy` (={name!r}) must name a class, not a {type(cls).__name__}")
+    missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
+    if not missing and issubclass(cls, Policy) and cls.act is Policy.act:
+        missing = ["act"]
+    if missing:
+        methods = " and ".join(f"`{m}`" for m in missing)
+        raise ValueError(
+            f"`policy` (={name!r}): {cls.__name__} is not a policy, it has no {methods}; "
+            "derive it from agents.Policy"
+        )
+    try:
+        inspect.signature(cls).bind(context, **options)
+    except TypeError as error:
+        raise ValueError(
+            f"`policy` (={name!r}): {cls.__name__} does not take (context"
+            f"{''.join(f', {key}=' for key in options)}): {error}"
+        ) from None
+    policy: Policy = cls(context, **options)
+    return policy

@@ -1,0 +1,263 @@
+"""The regression agent: predict the score of every state from one frame, take the best.
+
+After the auto-exposure application of Ouyang et al. (CVPR 2021): a small CNN learns from score
+tables that the simulator makes for free. Predictions are accumulated over the frames of an episode,
+each weighted by the network's own confidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from agents.networks import ExposureFeatures
+from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.weights import check_context, describe_context, load_agent, save_agent
+
+#: Bounds of the predicted log variance.
+_LOG_VARIANCE = (-8.0, 0.0)
+
+
+class ScoreRegressor(nn.Module):
+    """Predicts the score of each state, and how sure it is.
+
+    Args:
+        observation_space: Observation of a single environment.
+        num_states: States of the grid.
+        width: Hidden features.
+    """
+
+    def __init__(
+        self, observation_space: gym.spaces.Dict, num_states: int, width: int = 256
+    ) -> None:
+        super().__init__()
+        self.features = ExposureFeatures(observation_space, width)
+        self.scores = nn.Linear(width, num_states)
+        self.log_variance = nn.Linear(width, num_states)
+
+    def forward(
+        self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Expected score and log variance of the prediction, both (B, S)."""
+        features = self.features(codes, settings, sensors)
+        log_variance = self.log_variance(features).clamp(*_LOG_VARIANCE)
+        return torch.sigmoid(self.scores(features)), log_variance
+
+
+def observation_tensors(
+    observations: Observations, device: torch.device | str = "cpu"
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """The network's three inputs from batched observations."""
+    codes = torch.as_tensor(observations["raw"], device=device).float().div_(255.0)
+    settings = torch.as_tensor(observations["settings"], device=device)
+    sensors = observations.get("sensors")
+    return codes, settings, None if sensors is None else torch.as_tensor(sensors, device=device)
+
+
+class RegressionPolicy(Policy):
+    """Takes the state with the highest accumulated prediction.
+
+    Args:
+        context: The camera, the grid and the observation.
+        weights: File written by `train_regression`; or give `network`.
+        network: A network in memory.
+
+    Raises:
+        ValueError: If the weights were trained for another grid or observation.
+    """
+
+    def __init__(
+        self,
+        context: PolicyContext,
+        weights: str | Path | None = None,
+        network: ScoreRegressor | None = None,
+    ) -> None:
+        super().__init__(context)
+        if (weights is None) == (network is None):
+            raise ValueError("give either `weights` or `network`")
+        if network is None:
+            tensors, card = load_agent(str(weights), "regression")
+            check_context(card, context)
+            network = ScoreRegressor(context.observation_space, len(context.grid), card["width"])
+            network.load_state_dict(tensors)
+        self.network = network.eval()
+        self._weighted = np.zeros((0, len(context.grid)))
+        self._precision = np.zeros((0, len(context.grid)))
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forgets the frames so far."""
+        super().reset(num_envs, seed)
+        self._weighted = np.zeros((num_envs, len(self.context.grid)))
+        self._precision = np.zeros_like(self._weighted)
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Best state (N,) after this frame and those before it."""
+        device = next(self.network.parameters()).device
+        with torch.inference_mode():
+            scores, log_variance = self.network(*observation_tensors(observations, device))
+        precision = torch.exp(-log_variance).double().cpu().numpy()
+        self._weighted += precision * scores.double().cpu().numpy()
+        self._precision += precision
+        return masked_argmax(self._weighted / self._precision, action_masks)
+
+    def forget(self, done: NDArray[np.bool_]) -> None:
+        """Begins anew in those environments whose episode is over."""
+        self._weighted[done] = 0.0
+        self._precision[done] = 0.0
+
+
+@dataclass(frozen=True)
+class RegressionTraining:
+    """How the regression agent is trained.
+
+    Args:
+        frames: Frames that it takes.
+        learning_rate: Peak of the one-cycle schedule of AdamW.
+        weight_decay: Of AdamW.
+        replay: Frames of the recent past that each optimiser step sees again, per new frame.
+        memory: Frames that are remembered for it.
+        explore: Share of random actions; the others are the agent's own, so that it learns from
+            the frames it will meet.
+        width: Hidden features of the network.
+        seed: Of scenes, noise and weights.
+    """
+
+    frames: int = 100_000
+    learning_rate: float = 2e-3
+    weight_decay: float = 1e-3
+    replay: int = 2
+    memory: int = 8192
+    explore: float = 0.5
+    width: int = 256
+    seed: int = 0
+
+
+def train_regression(
+    envs: gym.vector.VectorEnv,
+    training: RegressionTraining,
+    *,
+    checkpoint: Path | None = None,
+    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    device: str = "cpu",
+) -> ScoreRegressor:
+    """Trains a regression agent on the training scenes of `envs` (autoreset mode SAME_STEP).
+
+    Args:
+        envs: Vector environments.
+        training: Hyperparameters.
+        checkpoint: Where to keep the state of the training every half a minute or so; a second run
+            resumes there.
+        progress: Called with frames done, frames in all, and losses.
+        device: Torch device of the network.
+
+    Returns:
+        The trained network.
+    """
+    from agents.checkpoint import Checkpoint
+
+    context = PolicyContext.from_envs(envs)
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(training.seed)
+        network = ScoreRegressor(context.observation_space, len(context.grid), training.width)
+    network.to(device)
+    optimiser = torch.optim.AdamW(
+        network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
+    )
+    steps = max(2, training.frames // envs.num_envs)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, max_lr=training.learning_rate, total_steps=steps + 1, pct_start=0.1
+    )
+    store = Checkpoint(
+        checkpoint, {"network": network, "optimiser": optimiser, "schedule": schedule}
+    )
+    first = store.restore()
+    frames = _rollout(envs, RegressionPolicy(context, network=network), training, first)
+    replay = _Replay(training, np.random.default_rng([training.seed, first, 1]))
+    for step in range(first, steps):
+        observations, target = replay.batch(*next(frames))
+        network.train()
+        scores, log_variance = network(*observation_tensors(observations, device))
+        error = (scores - torch.from_numpy(target).float().to(device)).square()
+        # The mean learns from the plain squared error, the confidence from the likelihood.
+        likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
+        loss = error.mean() + 0.01 * likelihood
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimiser.step()
+        schedule.step()
+        network.eval()
+        if progress is not None:
+            progress(
+                (step + 1) * envs.num_envs, steps * envs.num_envs, {"mse": error.mean().item()}
+            )
+        store.save(step + 1)
+    store.remove()
+    return network
+
+
+class _Replay:
+    """The last frames and their scores, to be seen again mirrored or not."""
+
+    def __init__(self, training: RegressionTraining, rng: np.random.Generator) -> None:
+        self.training, self.rng = training, rng
+        self.memory: list[dict[str, NDArray[Any]]] = []
+
+    def batch(
+        self, observations: Observations, target: NDArray[np.float64]
+    ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
+        """The new frames and some old ones."""
+        new = {**observations, "target": target}
+        count = max(1, self.training.memory // len(target))
+        parts = [new]
+        for _ in range(min(self.training.replay, len(self.memory))):
+            chosen = [self.memory[i] for i in self.rng.integers(len(self.memory), size=4)]
+            rows = self.rng.integers(len(target), size=(4, max(1, len(target) // 4)))
+            mixed = {k: np.concatenate([c[k][r] for c, r in zip(chosen, rows, strict=True)]) for k in new}
+            if self.rng.random() < 0.5:
+                mixed["raw"] = mixed["raw"][..., ::-1]
+            parts.append(mixed)
+        self.memory = [*self.memory[-count + 1 :], new]
+        merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
+        return merged, merged.pop("target")
+
+
+def _rollout(
+    envs: gym.vector.VectorEnv, policy: RegressionPolicy, training: RegressionTraining, first: int
+) -> Iterator[tuple[Observations, NDArray[np.float64]]]:
+    """Frames and the scores of all states, from episodes that the policy itself drives."""
+    base: Any = envs.unwrapped
+    rng = np.random.default_rng([training.seed, first])
+    observations, _ = envs.reset(seed=int(rng.integers(2**31)))
+    policy.reset(envs.num_envs)
+    while True:
+        yield observations, base.expected_scores()
+        actions = policy.act(observations)
+        random = rng.random(envs.num_envs) < training.explore
+        actions = np.where(
+            random, rng.integers(len(policy.context.grid), size=len(actions)), actions
+        )
+        observations, _, terminated, truncated, _ = envs.step(actions)
+        policy.forget(terminated | truncated)
+
+
+def save_regression(
+    path: Path, network: ScoreRegressor, context: PolicyContext, training: dict[str, Any]
+) -> None:
+    """Writes the agent as ``path.safetensors`` and ``path.json``."""
+    description = {
+        "width": network.scores.in_features,
+        "context": describe_context(context),
+        "training": training,
+    }
+    save_agent(path, "regression", network, description)

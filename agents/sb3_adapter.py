@@ -1,0 +1,102 @@
+"""The native vector environment in Stable-Baselines3's own vector interface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.vec_env import VecEnv
+
+from ae_env.env import single_info
+
+
+class SB3VectorAdapter(VecEnv):
+    """Lets SB3 train on a Gymnasium vector environment with autoreset mode SAME_STEP.
+
+    Rollouts are those of SB3's `DummyVecEnv` over single environments with the same seeds, without
+    the cost of stepping them one by one.
+
+    Args:
+        envs: The vector environment.
+
+    Raises:
+        ValueError: If its autoreset mode is another one.
+    """
+
+    def __init__(self, envs: gym.vector.VectorEnv) -> None:
+        mode = envs.metadata.get("autoreset_mode")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f"`envs` must have autoreset_mode='SAME_STEP', got {mode}")
+        self.envs = envs
+        self.render_mode = envs.render_mode
+        self._actions: np.ndarray | None = None
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+
+    def reset(self) -> Any:
+        """Begins episodes everywhere, with the seeds of the last `seed`."""
+        seeds = None if all(s is None for s in self._seeds) else self._seeds
+        observations, infos = self.envs.reset(seed=seeds)
+        self.reset_infos = [self._info(infos, i) for i in range(self.num_envs)]
+        self._reset_seeds()
+        return observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keeps the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """Takes the step: observations, float32 rewards, dones and infos."""
+        observations, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        dones = terminated | truncated
+        final = infos.get("final_obs")
+        rows: list[dict[str, Any]] = []
+        for i in range(self.num_envs):
+            row: dict[str, Any] = {"TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
+            if dones[i] and final is not None:
+                self.reset_infos[i] = self._info(infos, i)
+                row |= self._info(infos["final_info"], i)
+                row["terminal_observation"] = final[i]
+            else:
+                row |= self._info(infos, i)
+            rows.append(row)
+        return observations, rewards.astype(np.float32), dones, rows
+
+    @staticmethod
+    def _info(infos: dict[str, Any], index: int) -> dict[str, Any]:
+        skipped = ("final_obs", "final_info")
+        columns = {k: v for k, v in infos.items() if not k.startswith("_") and k not in skipped}
+        nested = {k: v for k, v in columns.items() if isinstance(v, dict)}
+        info = single_info({k: v for k, v in columns.items() if k not in nested}, index)
+        return info | {k: SB3VectorAdapter._info(v, index) for k, v in nested.items()}
+
+    def close(self) -> None:
+        """Closes the vector environment."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The attribute, once per environment: all share one object."""
+        value = getattr(self.envs.unwrapped, attr_name)
+        return [value for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refused: the environments share one object."""
+        raise AttributeError(f"`{attr_name}` cannot be set on the environments of a batch")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Calls the method of the batch and returns its rows."""
+        rows = getattr(self.envs.unwrapped, method_name)(*method_args, **method_kwargs)
+        return [rows[i] for i in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """No single environment is wrapped."""
+        return [False for _ in self._get_indices(indices)]
+
+    def _get_indices(self, indices: None | int | Sequence[int]) -> list[int]:
+        if indices is None:
+            return list(range(self.num_envs))
+        return [indices] if isinstance(indices, int) else list(indices)

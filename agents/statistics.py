@@ -1,0 +1,123 @@
+"""Bootstrap intervals over source groups and training seeds, paired between policies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+RESAMPLES = 10_000
+#: Below this many source groups an interval would promise too much: values only.
+MIN_GROUPS = 15
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its percentile-bootstrap interval.
+
+    Args:
+        value: The estimate from all groups and seeds.
+        low: Lower end, None below 15 groups.
+        high: Upper end, None below 15 groups.
+        num_groups: Source groups.
+        num_seeds: Training seeds (1 where there is nothing to train).
+    """
+
+    value: float
+    low: float | None
+    high: float | None
+    num_groups: int
+    num_seeds: int = 1
+
+    @property
+    def pair(self) -> list[float] | None:
+        """``[low, high]``, or None."""
+        return None if self.low is None or self.high is None else [self.low, self.high]
+
+    def __str__(self) -> str:
+        if self.low is None or self.high is None:
+            return f"{self.value:+.3f} ({self.num_groups} groups: no interval)"
+        return f"{self.value:+.3f} [{self.low:+.3f}, {self.high:+.3f}]"
+
+
+def score_interval(
+    gains: Floats,
+    span: Floats,
+    *,
+    resamples: int = RESAMPLES,
+    level: float = 0.95,
+    seed: int = 0,
+) -> Interval:
+    """Normalised score of a policy and its interval.
+
+    ``sum over groups of the seeds' mean gain / sum of the span``. Each resample draws G groups with
+    replacement and, independently, K training seeds with replacement (Efron and Tibshirani 1993;
+    crossed factors as in Owen 2007).
+
+    Args:
+        gains: ``q - q_random`` per training seed and source group, ``(K, G)`` or ``(G,)``.
+        span: ``q_oracle - q_random`` per source group, ``(G,)``.
+        resamples: Number of resamples.
+        level: Coverage.
+        seed: Seed of the resampling; policies compared under one seed see the same groups.
+    """
+    zero = np.zeros_like(np.atleast_2d(gains)[:1])
+    return difference_interval(gains, zero, span, resamples=resamples, level=level, seed=seed)
+
+
+def difference_interval(
+    gains: Floats,
+    other: Floats,
+    span: Floats,
+    *,
+    resamples: int = RESAMPLES,
+    level: float = 0.95,
+    seed: int = 0,
+) -> Interval:
+    """Paired difference of two policies' normalised scores and its interval.
+
+    Both policies are evaluated on the same groups, which are resampled together; the training
+    seeds of each are resampled on their own.
+
+    Args:
+        gains: ``q - q_random`` of the first policy, ``(K1, G)`` or ``(G,)``.
+        other: The same of the second policy, ``(K2, G)`` or ``(G,)``.
+        span: ``q_oracle - q_random`` per source group, ``(G,)``.
+        resamples: Number of resamples.
+        level: Coverage.
+        seed: Seed of the resampling.
+
+    Raises:
+        ValueError: If the shapes do not agree.
+    """
+    first, second = np.atleast_2d(gains), np.atleast_2d(other)
+    groups = len(span)
+    if first.shape[1] != groups or second.shape[1] != groups:
+        raise ValueError(
+            f"`gains` (={first.shape}) and `other` (={second.shape}) must have one column for each "
+            f"of the {groups} groups of `span`"
+        )
+    value = float((first.mean(0) - second.mean(0)).sum() / span.sum())
+    seeds = max(len(first), len(second))
+    if groups < MIN_GROUPS:
+        return Interval(value, None, None, groups, seeds)
+    rng = np.random.default_rng(seed)
+    weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)  # (R, G)
+    difference = _seed_means(first, resamples, rng) - _seed_means(second, resamples, rng)
+    statistic = (weights * difference).sum(axis=1) / (weights @ span)
+    tail = 50.0 * (1.0 - level)
+    low, high = np.percentile(statistic, [tail, 100.0 - tail])
+    return Interval(value, float(low), float(high), groups, seeds)
+
+
+def _seed_means(values: Floats, resamples: int, rng: np.random.Generator) -> Floats:
+    """Mean over training seeds drawn with replacement, ``(R, G)`` or ``(1, G)`` for one seed."""
+    count = len(values)
+    if count == 1:
+        return values
+    weights = rng.multinomial(count, np.full(count, 1 / count), size=resamples) / count
+    means: Floats = weights @ values
+    return means

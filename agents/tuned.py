@@ -1,0 +1,160 @@
+"""Which state was best on the training scenes, given what the meter and the sensors read?"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
+EV_BANDWIDTHS = (0.35, 0.6, 1.0)
+SENSOR_BANDWIDTHS = (1.0, 1.5, 2.2)
+FOLDS = 8
+#: Weight of the prior that the local fit shrinks to: the fit with all bandwidths widened.
+SHRINKAGE = 1.0
+WIDER = 3.0
+#: Ridge on the slopes of the local fit, relative to the kernel's weight.
+RIDGE = 0.05
+
+
+@dataclass(frozen=True)
+class ScoreRegression:
+    """Kernel regression of the scores of all states on a few readings (Fan and Gijbels 1996).
+
+    A local linear fit, weighted by a Gaussian kernel; where few training samples are near, it
+    shrinks to the same fit with three times the bandwidths, and that one to the mean.
+
+    Args:
+        features: Readings of the training episodes [stops], ``(n, d)``.
+        scores: Expected score of every state there, ``(n, S)``.
+        bandwidths: Standard deviation of the kernel per reading [stops], ``(d,)``.
+    """
+
+    features: NDArray[np.float64]
+    scores: NDArray[np.float64]
+    bandwidths: NDArray[np.float64]
+
+    @classmethod
+    def fit(
+        cls, features: NDArray[np.float64], scores: NDArray[np.float64], groups: NDArray[Any]
+    ) -> ScoreRegression:
+        """Choose the bandwidths by cross-validation over source groups.
+
+        The criterion is the mean score of the state that the regression picks for the groups left
+        out (8 folds); the bandwidth of the EV is chosen first, then that of the sensors.
+
+        Args:
+            features: ``(n, d)``, the metered EV first.
+            scores: ``(n, S)``.
+            groups: Source group of each sample, ``(n,)``: a group is never split.
+        """
+        dimensions = features.shape[1]
+        folds = np.unique(groups, return_inverse=True)[1] % FOLDS
+
+        def bandwidths(ev: float, sensors: float) -> NDArray[np.float64]:
+            return np.array([ev, *[sensors] * (dimensions - 1)])
+
+        def criterion(candidate: NDArray[np.float64]) -> float:
+            return _left_out_score(features, scores, folds, candidate)
+
+        sensors = SENSOR_BANDWIDTHS[1]
+        ev = max(EV_BANDWIDTHS, key=lambda b: criterion(bandwidths(b, sensors)))
+        if dimensions > 1:
+            sensors = max(SENSOR_BANDWIDTHS, key=lambda b: criterion(bandwidths(ev, b)))
+        return cls(features, scores, bandwidths(ev, sensors))
+
+    def predict(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Expected scores of all states at these readings, ``(N, S)``."""
+        mean = self.scores.mean(axis=0)
+        prior = np.broadcast_to(mean, (len(features), self.scores.shape[1]))
+        for widen in (WIDER, 1.0):
+            prior = self._local_fit(features, self.bandwidths * widen, prior)
+        return prior
+
+    def _local_fit(
+        self,
+        features: NDArray[np.float64],
+        bandwidths: NDArray[np.float64],
+        prior: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Ridge-regularised local linear fit around each query, shrunk to `prior`."""
+        known, query = self.features / bandwidths, features / bandwidths
+        # Squared distances through the inner product: no (N, n, d) array.
+        square = (query**2).sum(1)[:, None] + (known**2).sum(1)[None] - 2.0 * query @ known.T
+        weights = np.exp(-0.5 * np.maximum(square, 0.0))  # (N, n)
+        count, d = len(features), known.shape[1]
+        design = np.concatenate([np.ones((len(known), 1)), known], axis=1)  # (n, d + 1)
+        products = (design[:, :, None] * design[:, None, :]).reshape(len(known), -1)
+        gram = (weights @ products).reshape(count, d + 1, d + 1)
+        targets = (design[:, :, None] * self.scores[:, None, :]).reshape(len(known), -1)
+        moment = (weights @ targets).reshape(count, d + 1, -1)
+        # Move the origin to the query: z - z_q, so that the intercept is the prediction.
+        shift = np.broadcast_to(np.eye(d + 1), (count, d + 1, d + 1)).copy()
+        shift[:, 1:, 0] = -query
+        gram = shift @ gram @ shift.transpose(0, 2, 1)
+        moment = shift @ moment
+        gram[:, 0, 0] += SHRINKAGE
+        moment[:, 0] += SHRINKAGE * prior
+        diagonal = np.arange(1, d + 1)
+        gram[:, diagonal, diagonal] += RIDGE * gram[:, :1, 0] + 1e-9
+        solution: NDArray[np.float64] = np.linalg.solve(gram, moment)[:, 0]
+        return solution
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the regression as a safetensors file."""
+        from safetensors.numpy import save_file
+
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+        arrays = {
+            "features": self.features,
+            "scores": self.scores,
+            "bandwidths": self.bandwidths,
+        }
+        try:
+            save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, temporary)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return target
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> ScoreRegression:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: If the file is missing or is not one of these.
+        """
+        from safetensors import SafetensorError
+        from safetensors.numpy import load_file
+
+        try:
+            arrays = load_file(path)
+        except (OSError, SafetensorError) as error:
+            raise ValueError(f"`path` (={str(path)!r}) cannot be read: {error}") from None
+        if set(arrays) != {"features", "scores", "bandwidths"}:
+            raise ValueError(f"`path` (={str(path)!r}) holds no tuned program: {sorted(arrays)}")
+        return cls(**arrays)
+
+
+def _left_out_score(
+    features: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    folds: NDArray[np.intp],
+    bandwidths: NDArray[np.float64],
+) -> float:
+    """Mean score of the states picked for each fold by the regression on the others."""
+    total = 0.0
+    for fold in np.unique(folds):
+        held = folds == fold
+        if held.all():  # a single group: nothing to choose by
+            return float(scores.mean())
+        model = ScoreRegression(features[~held], scores[~held], bandwidths)
+        picked = model.predict(features[held]).argmax(axis=1)
+        total += float(np.take_along_axis(scores[held], picked[:, None], axis=1).sum())
+    return total / len(scores)

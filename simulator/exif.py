@@ -1,0 +1,104 @@
+"""Who made a raw file: the camera's make and model, whatever the container."""
+
+from __future__ import annotations
+
+import re
+import struct
+
+from simulator.tiff import Directory, read_directories
+
+MAKE, MODEL, SOFTWARE = 271, 272, 305
+UNKNOWN_FILE = "a file of unknown type"
+_CIFF_MAKE_MODEL = 0x080A
+_CIFF_HEAP_TYPES = (0x2800, 0x3000)
+_SIGNATURES: tuple[tuple[bytes, str], ...] = (
+    (b"\xff\xd8\xff", "a JPEG file"),
+    (b"\x89PNG\r\n", "a PNG file"),
+    (b"GIF8", "a GIF file"),
+    (b"BM", "a BMP file"),
+    (b"RIFF", "a RIFF file (WebP or video)"),
+    (b"#?R", "a Radiance HDR file"),
+    (b"v/1\x01", "an OpenEXR file"),
+    (b"%PDF", "a PDF file"),
+    (b"PK\x03\x04", "a ZIP archive"),
+    (b"\x1f\x8b", "a gzip archive"),
+    (b"\x93NUMPY", "a NumPy array"),
+    (b"\0MRM", "a Minolta MRW file"),
+    (b"ARRI", "an ARRIRAW file"),
+    (b"NOKIARAW", "a Nokia raw file"),
+    (b"FUJIFILM", "a Fujifilm RAF file"),
+    (b"FOVb", "a Sigma X3F file (Foveon: three colours at every pixel)"),
+)
+
+
+def describe_file(data: bytes) -> str:
+    """What a file is, from its first bytes, in words for an error message."""
+    for signature, words in _SIGNATURES:
+        if data.startswith(signature):
+            return words
+    if not data:
+        return "an empty file"
+    if data[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"):
+        return "a HEIF or AVIF file"
+    if data[6:14] == b"HEAPCCDR":
+        return "a Canon CRW file"
+    if data[:2] in (b"II", b"MM"):
+        return "a TIFF-structured file"
+    if b"\0" not in data[:4096] and all(b >= 32 or b in b"\t\n\r\f" for b in data[:4096]):
+        return "a text file"
+    return UNKNOWN_FILE
+
+
+def camera_identity(data: bytes, directories: list[Directory]) -> tuple[str, str]:
+    """Make and model as the camera recorded them; ``("", "")`` where the file does not say.
+
+    Args:
+        data: The file.
+        directories: Its TIFF directories, empty for other containers.
+    """
+    for tags in directories:
+        if MODEL in tags:
+            return str(tags.get(MAKE, ("",))[0]), str(tags[MODEL][0])
+    if data[6:14] == b"HEAPCCDR":
+        return _ciff_identity(data, struct.unpack_from("<I", data, 2)[0], len(data))
+    if data.startswith(b"FUJIFILM"):
+        return "FUJIFILM", data[28:60].split(b"\0")[0].decode("ascii", "replace").strip()
+    if data.startswith(b"\0MRM"):  # Minolta MRW: a TIFF directory in its block TTW
+        block = data[:65536].find(b"\0TTW")
+        return camera_identity(b"", read_directories(data[block + 8 :])) if block > 0 else ("", "")
+    box = data[:65536].find(b"CMT1")  # Canon CR3: a TIFF directory in a box of that name
+    if data[4:8] == b"ftyp" and box > 0:
+        return camera_identity(b"", read_directories(data[box + 4 :]))
+    return "", ""
+
+
+def _ciff_identity(data: bytes, start: int, end: int, depth: int = 0) -> tuple[str, str]:
+    """Make and model from a Canon CIFF heap, whose directory stands at its end."""
+    if depth > 4 or end > len(data) or end - start < 6:
+        return "", ""
+    table = start + struct.unpack_from("<I", data, end - 4)[0]
+    if not start <= table <= end - 6:
+        return "", ""
+    (count,) = struct.unpack_from("<H", data, table)
+    for at in range(table + 2, min(table + 2 + 10 * count, end - 9), 10):
+        kind, size, offset = struct.unpack_from("<HII", data, at)
+        first, last = start + offset, start + offset + size
+        if kind == _CIFF_MAKE_MODEL and last <= end:
+            make, model = (*data[first:last].split(b"\0"), b"", b"")[:2]
+            return make.decode("ascii", "replace"), model.decode("ascii", "replace")
+        if kind & 0x3800 in _CIFF_HEAP_TYPES and kind & 0xC000 == 0:
+            found = _ciff_identity(data, first, last, depth + 1)
+            if found[1]:
+                return found
+    return "", ""
+
+
+def normalised_model(make: str, model: str) -> str:
+    """Make and model for comparison: lower case, letters and digits, the maker's name once.
+
+    >>> normalised_model("NIKON CORPORATION", "NIKON Z 6"), normalised_model("Nikon", "Z 6")
+    ('nikonz6', 'nikonz6')
+    """
+    words = re.findall(r"[a-z0-9]+", make.lower())
+    maker = words[0] if words else ""
+    return maker + "".join(re.findall(r"[a-z0-9]+", model.lower())).removeprefix(maker)

@@ -1,0 +1,206 @@
+"""TIFF directories: the tags of TIFF-based files (DNG, NEF, CR2, ARW ...), read and written.
+
+Only what raw files need: tags are read without their pixels, and a file of one uncompressed image
+with an EXIF directory is written. Numbers follow TIFF 6.0 and EXIF 2.3.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+Directory = dict[int, tuple[Any, ...]]
+
+#: Tags that point to further directories: SubIFDs, EXIF.
+SUB_DIRECTORIES = (330, 34665)
+EXIF_DIRECTORY = 34665
+_STRIPS, _TILES = (273, 279), (324, 325)
+_MAX_DIRECTORIES = 64
+#: 42 is TIFF; the others are the same structure under Olympus' and Panasonic's own magic.
+_MAGIC = (42, 0x4F52, 0x5352, 0x55)
+
+
+class TiffType(IntEnum):
+    """Field types of TIFF 6.0 that are written here."""
+
+    BYTE = 1
+    ASCII = 2
+    SHORT = 3
+    LONG = 4
+    RATIONAL = 5
+    UNDEFINED = 7
+    SRATIONAL = 10
+    DOUBLE = 12
+
+
+_FORMATS = {1: "B", 2: "c", 3: "H", 4: "I", 5: "II", 6: "b", 7: "c", 8: "h", 9: "i"}
+_FORMATS |= {10: "ii", 11: "f", 12: "d", 13: "I"}
+
+
+@dataclass(frozen=True)
+class Tag:
+    """One field to write: its type and its values (rationals as numbers, text as ``str``)."""
+
+    type: TiffType
+    values: Sequence[Any] | str | bytes
+
+
+def as_rational(value: float, *, signed: bool = False) -> tuple[int, int]:
+    """Numerator and denominator, each in 32 bits, nearest to `value`.
+
+    >>> as_rational(1 / 60), as_rational(2.8), as_rational(0.0)
+    ((1, 60), (14, 5), (0, 1))
+    """
+    limit = 2**31 - 1 if signed else 2**32 - 1
+    exact = Fraction(value)
+    if abs(exact) > limit or (exact < 0 and not signed):
+        raise ValueError(f"`value` (={value!r}) must fit a {'signed ' * signed}32-bit rational")
+    # The simplest fraction that is the same float64 keeps 1/60 as 1/60.
+    bound = limit if abs(exact) <= 1 else max(1, int(limit / abs(exact)))
+    for denominator in (1000, 100_000, bound):
+        candidate = exact.limit_denominator(min(denominator, bound))
+        if candidate.numerator / candidate.denominator == value:
+            break
+    return candidate.numerator, candidate.denominator
+
+
+def _encode(tag: Tag) -> tuple[int, bytes]:
+    """Count and bytes of a field, little endian."""
+    if isinstance(tag.values, str):
+        data = tag.values.encode("ascii", "replace") + b"\0"
+        return len(data), data
+    if isinstance(tag.values, bytes):
+        return len(tag.values), tag.values
+    values = list(tag.values)
+    if tag.type in (TiffType.RATIONAL, TiffType.SRATIONAL):
+        signed = tag.type == TiffType.SRATIONAL
+        flat = [part for v in values for part in as_rational(v, signed=signed)]
+        return len(values), struct.pack(f"<{len(flat)}{_FORMATS[tag.type][0]}", *flat)
+    return len(values), struct.pack(f"<{len(values)}{_FORMATS[tag.type]}", *values)
+
+
+def _pack_directory(tags: Mapping[int, Tag], offset: int) -> bytes:
+    """A directory that begins at `offset` of the file, followed by its out-of-line values."""
+    entries, outside = [], b""
+    values_at = offset + 2 + 12 * len(tags) + 4
+    for number in sorted(tags):
+        count, data = _encode(tags[number])
+        if len(data) > 4:
+            field = struct.pack("<I", values_at + len(outside))
+            outside += data + b"\0" * (len(data) % 2)
+        else:
+            field = data.ljust(4, b"\0")
+        entries.append(struct.pack("<HHI", number, tags[number].type, count) + field)
+    return struct.pack("<H", len(tags)) + b"".join(entries) + b"\0\0\0\0" + outside
+
+
+def pack_tiff(tags: Mapping[int, Tag], exif: Mapping[int, Tag], strip: bytes) -> bytes:
+    """A little-endian TIFF file: one directory, its EXIF directory and one strip of pixels.
+
+    The strip's offset and length (tags 273, 279) and the EXIF pointer (34665) are filled in.
+    """
+    layout = dict(tags)
+    layout[273] = layout[EXIF_DIRECTORY] = Tag(TiffType.LONG, [0])
+    layout[279] = Tag(TiffType.LONG, [len(strip)])
+    exif_at = 8 + len(_pack_directory(layout, 8))
+    packed_exif = _pack_directory(exif, exif_at)
+    strip_at = -(-(exif_at + len(packed_exif)) // 16) * 16
+    layout[273] = Tag(TiffType.LONG, [strip_at])
+    layout[EXIF_DIRECTORY] = Tag(TiffType.LONG, [exif_at])
+    head = struct.pack("<2sHI", b"II", 42, 8) + _pack_directory(layout, 8) + packed_exif
+    return head.ljust(strip_at, b"\0") + strip
+
+
+def _decode(kind: int, data: bytes, order: str) -> tuple[Any, ...]:
+    if kind == TiffType.ASCII:
+        return (data.split(b"\0")[0].decode("utf-8", "replace").strip(),)
+    if kind == TiffType.UNDEFINED:
+        return (data,)
+    values = struct.unpack(f"{order}{len(data) // struct.calcsize(_FORMATS[kind][0])}"
+                           f"{_FORMATS[kind][0]}", data)  # fmt: skip
+    if kind in (TiffType.RATIONAL, TiffType.SRATIONAL):
+        pairs = zip(values[::2], values[1::2], strict=True)
+        return tuple(a / b if b else float("nan") for a, b in pairs)
+    return values
+
+
+def _read_directory(data: bytes, offset: int, order: str) -> tuple[Directory, int]:
+    """Tags of the directory at `offset`, without broken fields, and where the next one is."""
+    if not 8 <= offset <= len(data) - 2:
+        return {}, 0
+    (count,) = struct.unpack_from(f"{order}H", data, offset)
+    end = offset + 2 + 12 * count
+    if end > len(data):
+        return {}, 0
+    tags: Directory = {}
+    for at in range(offset + 2, end, 12):
+        number, kind, length = struct.unpack_from(f"{order}HHI", data, at)
+        if kind not in _FORMATS:
+            continue
+        size = length * struct.calcsize("=" + _FORMATS[kind])
+        start = at + 8 if size <= 4 else struct.unpack_from(f"{order}I", data, at + 8)[0]
+        if start + size <= len(data):
+            tags[number] = _decode(kind, data[start : start + size], order)
+    following = struct.unpack_from(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
+    return tags, following
+
+
+def read_directories(data: bytes) -> list[Directory]:
+    """All directories of a TIFF-structured file, SubIFDs and EXIF included, in reading order.
+
+    Args:
+        data: The file. Maker notes are not followed.
+
+    Returns:
+        One ``{tag: values}`` per directory; rationals as floats, ASCII as one ``str``, UNDEFINED
+        as one ``bytes``. Empty if `data` is not TIFF-structured.
+    """
+    order = {b"II": "<", b"MM": ">"}.get(data[:2])
+    if order is None or len(data) < 8:
+        return []
+    magic, first = struct.unpack_from(f"{order}HI", data, 2)
+    if magic not in _MAGIC:
+        return []
+    pending, seen = [first], set()
+    found: list[Directory] = []
+    while pending and len(found) < _MAX_DIRECTORIES:
+        offset = pending.pop(0)
+        if offset in seen:
+            continue
+        seen.add(offset)
+        tags, following = _read_directory(data, offset, order)
+        if not tags:
+            continue
+        found.append(tags)
+        for number in SUB_DIRECTORIES:
+            pending += [v for v in tags.get(number, ()) if isinstance(v, int)]
+        if following:
+            pending.append(following)
+    return found
+
+
+def missing_bytes(directories: Sequence[Directory], size: int) -> int:
+    """How many bytes of pixels lie beyond the end of a file of `size` bytes; 0 if it is whole."""
+    end = size
+    for tags in directories:
+        for offsets, counts in (_STRIPS, _TILES):
+            pairs = zip(tags.get(offsets, ()), tags.get(counts, ()), strict=False)
+            end = max([end, *(a + b for a, b in pairs)])
+    return end - size
+
+
+def read_file(path: Path) -> bytes:
+    """The bytes of `path`.
+
+    Raises:
+        FileNotFoundError: If there is no such file; also for a folder.
+    """
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
+    return path.read_bytes()

@@ -1,0 +1,165 @@
+"""Blind noise estimation against noise that was put in, at the built-in cameras' levels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage.data
+from scipy.ndimage import gaussian_filter
+
+from simulator import NoiseLevelFunction, estimate_nlf, get_camera, read_raw
+
+LEVELS = (0.02, 0.1, 0.18, 0.5)
+
+
+def ramp() -> np.ndarray:
+    course = np.linspace(0.0, 1.0, 384) ** 2
+    return np.stack([np.broadcast_to(0.002 + k * course, (256, 384)) for k in (0.6, 0.9, 0.9, 0.5)])
+
+
+def patches() -> np.ndarray:
+    row = np.repeat([0.01, 0.05, 0.2, 0.5], 50)
+    return np.broadcast_to(row, (4, 200, 200))
+
+
+def photograph(name: str) -> np.ndarray:
+    """A photograph in linear light, a little softer than the pixel grid, as planes of one raw."""
+    encoded = getattr(skimage.data, name)() / 255.0
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    red, green, blue = np.moveaxis(linear * [0.5, 1.0, 0.65], -1, 0)
+    return gaussian_filter(np.stack([red, green, green, blue]), (0, 1, 1))
+
+
+def with_noise(light: np.ndarray, nlf: NoiseLevelFunction, seed: int) -> np.ndarray:
+    """Gaussian noise of the NLF's variance, clipped with a pedestal and quantised to 14 bits."""
+    rng = np.random.default_rng(seed)
+    shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
+    noisy = light + np.sqrt(shot * light + read) * rng.standard_normal(light.shape)
+    return np.round(np.clip(noisy, -0.065, 1.0) * 15000) / 15000
+
+
+def worst_ratio(estimate: NoiseLevelFunction, truth: NoiseLevelFunction) -> tuple[float, float]:
+    """Lowest and highest variance, estimated over true, over `LEVELS`, plane-averaged truth."""
+    shot, read = np.mean(truth.shot), np.mean(truth.read)
+    ratios = [(estimate.read[0] + estimate.shot[0] * x) / (read + shot * x) for x in LEVELS]
+    return min(ratios), max(ratios)
+
+
+@pytest.mark.parametrize("light", [ramp(), patches()], ids=["ramp", "patches"])
+@pytest.mark.parametrize(
+    ("camera", "iso"), [("nikon_z6", 1600), ("nikon_z6", 12800), ("canon_70d", 100)]
+)
+def test_flat_fields(light: np.ndarray, camera: str, iso: int) -> None:
+    nlf = get_camera(camera).nlf(iso)
+    low, high = worst_ratio(estimate_nlf(with_noise(light, nlf, seed=1)), nlf)
+    assert low > 0.88
+    assert high < 1.12
+
+
+@pytest.mark.parametrize("name", ["astronaut", "coffee"])
+@pytest.mark.parametrize(("camera", "iso"), [("canon_70d", 100), ("canon_70d", 6400)])
+def test_photographs(name: str, camera: str, iso: int) -> None:
+    nlf = get_camera(camera).nlf(iso)
+    low, high = worst_ratio(estimate_nlf(with_noise(photograph(name), nlf, seed=2)), nlf)
+    assert low > 0.80
+    assert high < 1.25
+
+
+def test_texture_everywhere_errs_upwards_only() -> None:
+    """Every other pixel of a sharp photograph: no level is smooth; the bound is the docs'."""
+    encoded = skimage.data.astronaut()[::2, ::2] / 255.0
+    light = np.moveaxis(encoded**2.2, -1, 0)[[0, 1, 1, 2]]
+    nlf = get_camera("canon_70d").nlf(800)
+    low, high = worst_ratio(estimate_nlf(with_noise(light, nlf, seed=3)), nlf)
+    assert low > 0.9
+    assert high < 3.0
+
+
+def test_clipped_half_does_not_count() -> None:
+    nlf = get_camera("canon_70d").nlf(1600)
+    light = np.concatenate(
+        [ramp(), np.full((4, 256, 200), 1.2), np.full((4, 256, 90), -0.2)], axis=2
+    )
+    low, high = worst_ratio(estimate_nlf(with_noise(np.maximum(light, 0), nlf, seed=4)), nlf)
+    assert low > 0.85
+    assert high < 1.15
+
+
+def test_black_clipped_at_zero() -> None:
+    """No pedestal: the dark half-noise is left out, the rest still tells."""
+    nlf = get_camera("canon_70d").nlf(6400)
+    noisy = np.maximum(with_noise(ramp(), nlf, seed=5), 0.0)
+    estimate = estimate_nlf(noisy)
+    for x in (0.1, 0.18, 0.5):
+        variance = estimate.read[0] + estimate.shot[0] * x
+        assert variance == pytest.approx(nlf.read[0] + nlf.shot[0] * x, rel=0.15)
+
+
+def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level() -> None:
+    rng = np.random.default_rng(6)
+    noise = rng.standard_normal((4, 128, 128))
+    dark = estimate_nlf(1e-3 * noise)
+    assert dark.read[0] + 1e-3 * dark.shot[0] == pytest.approx(1e-6, rel=0.15)
+    card = estimate_nlf(0.3 + 1e-2 * noise)
+    assert card.read == (0.0,) * 4
+    assert 0.3 * card.shot[0] == pytest.approx(1e-4, rel=0.1)
+
+
+def test_noise_free_is_zero_on_a_slope() -> None:
+    light = np.broadcast_to(np.linspace(0.1, 0.9, 128), (4, 128, 128))
+    estimate = estimate_nlf(light.astype(np.float32))
+    assert max(estimate.shot) < 1e-10
+
+
+def test_scaling_the_raw_scales_the_estimate() -> None:
+    nlf = get_camera("canon_70d").nlf(800)
+    noisy = with_noise(ramp(), nlf, seed=7)
+    full, half = estimate_nlf(noisy), estimate_nlf(noisy / 2)
+    assert half.shot[0] == pytest.approx(full.shot[0] / 2, rel=1e-3)
+    assert half.read[0] == pytest.approx(full.read[0] / 4, rel=1e-2)
+
+
+def test_large_raws_are_sampled() -> None:
+    nlf = get_camera("canon_70d").nlf(800)
+    light = np.tile(ramp(), (1, 6, 4))  # 1536 x 1536 a plane
+    low, high = worst_ratio(estimate_nlf(with_noise(light, nlf, seed=8)), nlf)
+    assert low > 0.9
+    assert high < 1.1
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (np.zeros((3, 32, 32)), r"`data` \(shape"),
+        (np.full((4, 32, 32), np.nan), "finite"),
+        (np.random.default_rng(0).random((4, 8, 8)), "unclipped blocks"),
+        (np.ones((4, 64, 64)), "0 unclipped blocks"),
+    ],
+)
+def test_bad_input(data: np.ndarray, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        estimate_nlf(data)
+
+
+@pytest.mark.real_data
+def test_real_raws_of_one_camera_agree(data_dir: Path) -> None:
+    """Shot noise is the camera's, whatever the subject; the chart's patches are the reference."""
+    folder = data_dir / "canon_crw_cc0"
+    raws = {n: read_raw(folder / f"CRW_{n}.CRW") for n in ("0101", "0105", "0113", "0118")}
+    shots = [raw.noise.shot[1] for raw in raws.values()]
+    assert max(shots) / min(shots) < 1.15
+    nlf = raws["0101"].noise
+    # Neutral patches of the ColorChecker, a quadratic surface taken out, variance by least squares.
+    y, x = np.mgrid[-1:1:24j, -1:1:24j]
+    design = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1).reshape(-1, 6)
+    ratios = []
+    for left in (165, 320, 475):
+        for plane in (0, 1, 2, 3):
+            patch = raws["0101"].data[plane, 610:634, left : left + 24].double().numpy()
+            coefficients = np.linalg.lstsq(design, patch.ravel(), rcond=None)[0]
+            residual = patch.ravel() - design @ coefficients
+            variance = (residual**2).sum() / (residual.size - 6)
+            ratios.append(variance / (nlf.read[plane] + nlf.shot[plane] * patch.mean()))
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.15)
