@@ -23,7 +23,7 @@ _EXPORTS = {
     "make_scorer": "scorers",
     "register_scorer": "scorers",
 }
-__all__ = sorted(_EXPORTS)  # noqa: PLE0605
+__all__ = sorted(_EXPORTS)
 __version__ = "0.1.0"
 
 

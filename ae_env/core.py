@@ -94,13 +94,13 @@ class EpisodeCore:
     def observation_space(self) -> gym.spaces.Dict:
         """Space of one episode's observation."""
         shape = (4, self.options.resolution, self.options.resolution)
-        raw: gym.spaces.Box = {
-            "uint8": lambda: gym.spaces.Box(0, 255, shape, np.uint8),
-            "linear": lambda: gym.spaces.Box(-PEDESTAL, 1.0, shape, np.float32),
-            "dn": lambda: gym.spaces.Box(0, int(self.camera.white_level), shape, np.uint16),
-        }[self.options.observation]()
+        low, high, dtype = {
+            "uint8": (0.0, 255.0, np.uint8),
+            "linear": (-PEDESTAL, 1.0, np.float32),
+            "dn": (0.0, self.camera.white_level, np.uint16),
+        }[self.options.observation]
         spaces: dict[str, gym.Space] = {
-            "raw": raw,
+            "raw": gym.spaces.Box(low, high, shape, dtype),
             "settings": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
         }
         if self.options.sensors:
@@ -231,7 +231,8 @@ class EpisodeCore:
         for name, cost in costs.items():
             rewards[name] = cost
             reward -= self.options.costs[name] * cost
-        observation = {"raw": raw, "settings": encode_settings(self._apex[[e.state for e in episodes]])}
+        apex = self._apex[[e.state for e in episodes]]
+        observation = {"raw": raw, "settings": encode_settings(apex)}
         if self.options.sensors:
             observation["sensors"] = self._sensors(episodes)
         info = self._info(indices, episodes) | columns | {"rewards": rewards}

@@ -102,7 +102,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         self.render_mode = render_mode
         self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs=1)
         self.action_space = gym.spaces.Discrete(len(self.core.grid))
-        self.observation_space = self.core.observation_space()
+        self.observation_space: Any = self.core.observation_space()
         self._last: Frames | None = None
 
     @property
@@ -134,9 +134,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         self._last = self.core.observe([0])
         return _first(self._last.observation), single_info(self._last.info, 0)
 
-    def step(
-        self, action: np.int64
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
         before = self.state
         self.core.act(0, action)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class ExposureGrid:
     def __post_init__(self) -> None:
         for name in ("isos", "exposure_times", "f_numbers"):
             values = tuple(float(v) for v in getattr(self, name))
-            if not values or any(a >= b for a, b in zip(values, values[1:], strict=False)):
+            if not values or any(a >= b for a, b in pairwise(values)):
                 raise ValueError(f"`{name}` (={values}) must be a strictly ascending list")
             object.__setattr__(self, name, values)
         assert self.states  # every combination is checked by CameraSettings
@@ -57,7 +58,7 @@ class ExposureGrid:
 
     @classmethod
     def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Sequence[float]]) -> ExposureGrid:
-        """A grid from a name, ``"default"`` or ``"third_stop"``, or a mapping of the three lists."""
+        """A grid from a name, ``"default"`` or ``"third_stop"``, or a mapping of its lists."""
         if isinstance(spec, ExposureGrid):
             return spec
         named = {"default": cls.default, "third_stop": cls.third_stop}

@@ -33,6 +33,8 @@ _LOGGER = logging.getLogger(__name__)
 TABLE_VERSION = 1
 #: States evaluated at once: more only spends time in memory paging.
 _CHUNK = 16
+#: Scores closer than this are equal: rounding moves them by 1e-8, noise seeds by 1e-5.
+TIE = 1e-7
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,12 @@ class ScoreTable:
 
     @property
     def oracle(self) -> int:
-        """The best state; ties go to the lower index, that is the lower ISO."""
-        return int(np.argmax(self.mean))
+        """The best state; ties go to the lower index, that is the lower ISO.
+
+        States of equal exposure score alike but for the rounding of their settings: a tie is
+        whatever comes within `TIE` of the best.
+        """
+        return int(np.argmax(self.mean >= self.mean.max() - TIE))
 
 
 def scene_latent(
@@ -243,7 +249,9 @@ class ScoreTables:
                     samples[name][seed, start : start + len(states)] = values.numpy()
             start += len(states)
         totals = self.scorer.combine({**closed, **samples})
-        spread = totals.std(axis=0, ddof=1) if self.noise_seeds > 1 else np.full(len(self.grid), np.nan)
+        spread = np.full(len(self.grid), np.nan)  # one sample has no standard error
+        if self.noise_seeds > 1:
+            spread = totals.std(axis=0, ddof=1)
         means = {name: values.mean(axis=0) for name, values in samples.items()}
         return means, spread / np.sqrt(self.noise_seeds)
 
@@ -272,11 +280,12 @@ def _chunks(states: list[CameraSettings]) -> list[list[CameraSettings]]:
 
 def _load_parts(path: Path) -> dict[str, np.ndarray] | None:
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        content = path.read_bytes()  # given a path, numpy leaves a damaged file open
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         _LOGGER.warning("unreadable score table %s is made anew: %s", path, error)
         return None
 

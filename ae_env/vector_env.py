@@ -322,4 +322,5 @@ def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
         return mode
     if mode in AutoresetMode.__members__:
         return AutoresetMode[mode]
-    raise ValueError(f"`autoreset_mode` (={mode!r}) must be one of {list(AutoresetMode.__members__)}")
+    known = list(AutoresetMode.__members__)
+    raise ValueError(f"`autoreset_mode` (={mode!r}) must be one of {known}")

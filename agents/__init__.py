@@ -14,7 +14,7 @@ _EXPORTS = {
     "fit_policies": "evaluation",
     "list_policies": "policy",
     "make_policy": "policy",
-    "result_rows": "result_rows",
+    "result_rows": "result_table",
     "write_report": "report",
 }
 __all__ = sorted(_EXPORTS)
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from agents.policy import make_policy as make_policy
     from agents.programs import MeteringPolicy as MeteringPolicy
     from agents.report import write_report as write_report
-    from agents.result_rows import result_rows as result_rows
+    from agents.result_table import result_rows as result_rows
 
 
 def __getattr__(name: str) -> Any:

@@ -54,7 +54,9 @@ class Checkpoint:
             for name, part in self.parts.items():
                 part.load_state_dict(_unflatten(structure["parts"][name], tensors))
         except (SafetensorError, json.JSONDecodeError, KeyError, ValueError, RuntimeError) as error:
-            _LOGGER.warning("checkpoint %s does not fit, training begins anew: %s", self.path, error)
+            _LOGGER.warning(
+                "checkpoint %s does not fit, training begins anew: %s", self.path, error
+            )
             return 0
         return int(structure["step"])
 

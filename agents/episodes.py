@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.policy import Observations
+
+if TYPE_CHECKING:
+    from ae_env.scenes import Scene
 
 ENV_ID = "ae_env/AutoExposure-v0"
 
@@ -34,6 +37,12 @@ def make_envs(
     options = {**env_options, "with_oracle": with_oracle, "autoreset_mode": "DISABLED"}
     # One frame more than is used: the episode must not end inside the evaluation.
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
+
+
+def scenes_of(envs: gym.vector.VectorEnv) -> list[Scene]:
+    """The scenes that the episodes of `envs` draw from."""
+    base: Any = envs.unwrapped
+    return list(base.scenes)
 
 
 def expected_scores(envs: gym.vector.VectorEnv) -> Floats:
@@ -76,7 +85,7 @@ def episode_batches(
     defocus and noise are those of every other run with that seed.
     """
     base: Any = envs.unwrapped
-    scenes = base.scenes
+    scenes = scenes_of(envs)
     order = np.tile(np.arange(len(scenes)), episodes_per_scene)
     for begin in range(0, len(order), envs.num_envs):
         chosen = order[begin : begin + envs.num_envs]

@@ -157,8 +157,9 @@ def matrix_reading(observations: Observations, camera: CameraProfile) -> Reading
     """Multi-zone metering: contrast-aware zones, then highlight and shadow constraints.
 
     The frame is cut into 5 x 5 zones, as in modern AGCs. The reading is the centre-weighted mean of
-    the zones' *log2* signals, so a lamp or the sun in one zone does not darken the rest. Then, as in the ``normal`` and ``highlight`` constraint modes of the Raspberry
-    Pi's AGC, the brightest 2 % of the pixels should be recorded between 0.5 and 0.8 of white at the
+    the zones' *log2* signals, so a lamp or the sun in one zone does not darken the rest. Then, as
+    in the ``normal`` and ``highlight`` constraint modes of the Raspberry Pi's AGC, the brightest
+    2 % of the pixels should be recorded between 0.5 and 0.8 of white at the
     metered EV: snow is lifted, a lit figure in front of the dark is held.
     """
     signal = linear_signal(observations["raw"], camera, GREEN).mean(axis=1)  # (N, h, w)
@@ -210,9 +211,10 @@ class EVTracker:
     """Continuous metered EV of each camera over the frames of an episode.
 
     A reading far from the estimate replaces it; within a stop the two are averaged, which settles
-    what would otherwise flip between neighbouring states. Readings of saturated or black frames
-    only bound the light, so they move the estimate in their own direction alone; a frame that is
-    all white or all black moves it half of the way to the end of the range.
+    what would otherwise flip between neighbouring states. A mostly saturated frame only says that
+    the light is not below a bound, a black one that it is not above: an estimate that agrees with
+    the bound is kept. A frame that is all white or all black moves any other estimate half of the
+    way to the end of the range.
 
     Args:
         num_envs: Cameras.
@@ -227,14 +229,11 @@ class EVTracker:
         """Take in one frame's reading; returns the estimates, ``(N,)``."""
         old, new = self.ev100, reading.ev100
         low, high = self.ev_range
-        new = np.where(reading.black, np.minimum(new, 0.5 * (new + low)), new)
+        bound = new - SATURATED_STEP_EV * reading.saturated
+        agrees = (reading.saturated > 0.5) & (old >= bound) | reading.black & (old <= new)
         white = reading.saturated >= ALL_SATURATED
-        new = np.where(white, np.maximum(new, 0.5 * (new - SATURATED_STEP_EV + high)), new)
-        first = np.isnan(old)
-        old = np.where(first, new, old)
+        new = np.where(reading.black, np.minimum(new, 0.5 * (new + low)), new)
+        new = np.where(white, np.maximum(new, 0.5 * (bound + high)), new)
         blended = np.where(np.abs(new - old) > 1.0, new, 0.5 * (new + old))
-        bounded_below = reading.saturated > 0.5
-        blended = np.where(bounded_below, np.maximum(old, blended), blended)
-        blended = np.where(reading.black, np.minimum(old, blended), blended)
-        self.ev100 = np.where(first, new, blended)
+        self.ev100 = np.where(np.isnan(old), new, np.where(agrees, old, blended))
         return self.ev100.copy()

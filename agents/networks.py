@@ -49,7 +49,9 @@ class ExposureFeatures(nn.Module):
         with torch.no_grad():
             flat = self.cnn(torch.zeros(1, 6, *(s // 2 for s in raw.shape[1:]))).shape[1]
         self.head = nn.Sequential(nn.Linear(flat + self.numbers, width), nn.ReLU())
-        self.register_buffer("ranges", torch.tensor(SETTINGS_RANGES, dtype=torch.float32))
+        self.ranges: torch.Tensor
+        ranges = torch.tensor(SETTINGS_RANGES, dtype=torch.float32)
+        self.register_buffer("ranges", ranges, persistent=False)
 
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
@@ -61,7 +63,7 @@ class ExposureFeatures(nn.Module):
             settings: (B, 3) float in [-1, 1].
             sensors: (B, 2) float in [-1, 1]; None where they are not observed.
         """
-        low, high = self.ranges[:, 0], self.ranges[:, 1]
+        low, high = self.ranges.unbind(dim=1)
         apex = low + (settings + 1.0) * 0.5 * (high - low)  # Av, Tv, Sv
         ev100 = apex[:, 0] + apex[:, 1] - apex[:, 2] + 5.0
         green = 0.5 * (codes[:, 1:2] + codes[:, 2:3])

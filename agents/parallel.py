@@ -51,7 +51,9 @@ def train_in_parallel(
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
     if not waiting:
         return
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     workers = min(workers or cores, len(waiting))
     threads = max(1, cores // workers)
     context = multiprocessing.get_context("spawn")

@@ -129,7 +129,7 @@ class PPOPolicy(Policy):
         """Most probable allowed state (N,)."""
         with torch.inference_mode():
             tensors, _ = self.network.obs_to_tensor(dict(observations))
-            distribution = self.network.get_distribution(tensors).distribution
+            distribution: Any = self.network.get_distribution(tensors).distribution
         return masked_argmax(distribution.logits.cpu().numpy(), action_masks)
 
 

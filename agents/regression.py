@@ -223,7 +223,9 @@ class _Replay:
         for _ in range(min(self.training.replay, len(self.memory))):
             chosen = [self.memory[i] for i in self.rng.integers(len(self.memory), size=4)]
             rows = self.rng.integers(len(target), size=(4, max(1, len(target) // 4)))
-            mixed = {k: np.concatenate([c[k][r] for c, r in zip(chosen, rows, strict=True)]) for k in new}
+            mixed = {
+                k: np.concatenate([c[k][r] for c, r in zip(chosen, rows, strict=True)]) for k in new
+            }
             if self.rng.random() < 0.5:
                 mixed["raw"] = mixed["raw"][..., ::-1]
             parts.append(mixed)

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents import metrics
 from agents.evaluation_result import CONDITIONS, EvaluationResult
-from agents.result_rows import (
+from agents.result_table import (
     best_meter,
     difference,
     oracle_histogram,

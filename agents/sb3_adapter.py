@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -37,7 +37,7 @@ class SB3VectorAdapter(VecEnv):
 
     def reset(self) -> Any:
         """Begins episodes everywhere, with the seeds of the last `seed`."""
-        seeds = None if all(s is None for s in self._seeds) else self._seeds
+        seeds: Any = None if all(s is None for s in self._seeds) else self._seeds
         observations, infos = self.envs.reset(seed=seeds)
         self.reset_infos = [self._info(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
@@ -96,7 +96,7 @@ class SB3VectorAdapter(VecEnv):
         """No single environment is wrapped."""
         return [False for _ in self._get_indices(indices)]
 
-    def _get_indices(self, indices: None | int | Sequence[int]) -> list[int]:
+    def _get_indices(self, indices: int | Iterable[int] | None) -> list[int]:
         if indices is None:
             return list(range(self.num_envs))
         return [indices] if isinstance(indices, int) else list(indices)

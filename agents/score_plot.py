@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from simulator.files import write_atomically
 
 #: Okabe and Ito's colour-blind-safe palette, and a shape for print without colour.
 _STYLE = {"all": ("#000000", "o"), "hard": ("#D55E00", "v"), "rest": ("#0072B2", "^")}
@@ -60,13 +63,6 @@ def plot_scores(
     axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=3, frameon=False)
     if title:
         figure.suptitle(title, fontsize=11)
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            canvas.print_png(file)
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return target
+    picture = io.BytesIO()
+    canvas.print_png(picture)
+    return write_atomically(path, picture.getvalue())

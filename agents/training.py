@@ -1,4 +1,4 @@
-"""From a YAML file to a trained agent on disk: the one place where configurations become objects."""
+"""From a YAML file to a trained agent: the one place where configurations become objects."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def train_agent(
         autoreset_mode="SAME_STEP",
         **config.environment,
     )
-    arguments = {"checkpoint": out.with_suffix(".checkpoint"), "device": device}
+    arguments: dict[str, Any] = {"checkpoint": out.with_suffix(".checkpoint"), "device": device}
     callback = _logged(progress, tensorboard)
     network: Any
     if config.agent == "regression":

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from simulator.files import write_atomically
+
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
 EV_BANDWIDTHS = (0.35, 0.6, 1.0)
 SENSOR_BANDWIDTHS = (1.0, 1.5, 2.2)
@@ -106,22 +108,14 @@ class ScoreRegression:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the regression as a safetensors file."""
-        from safetensors.numpy import save_file
+        from safetensors.numpy import save
 
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
         arrays = {
             "features": self.features,
             "scores": self.scores,
             "bandwidths": self.bandwidths,
         }
-        try:
-            save_file({k: np.ascontiguousarray(v) for k, v in arrays.items()}, temporary)
-            temporary.replace(target)
-        finally:
-            temporary.unlink(missing_ok=True)
-        return target
+        return write_atomically(path, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ScoreRegression:

@@ -25,7 +25,7 @@ _EXPORTS = {
     "sensor_signal": "settings",
     "write_dng": "dng",
 }
-__all__ = sorted(_EXPORTS)  # noqa: PLE0605
+__all__ = sorted(_EXPORTS)
 
 if TYPE_CHECKING:
     from simulator.camera import BayerPattern as BayerPattern

@@ -8,11 +8,11 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum
+from enum import StrEnum
 from importlib import resources
 
 
-class BayerPattern(str, Enum):
+class BayerPattern(StrEnum):
     """Colour filter array, the 2 x 2 tile read row by row."""
 
     RGGB = "RGGB"
@@ -53,7 +53,7 @@ class NoiseLevelFunction:
         for name in ("shot", "read"):
             values = tuple(float(v) for v in getattr(self, name))
             if len(values) != 4 or not all(math.isfinite(v) and v >= 0 for v in values):
-                raise ValueError(f"`{name}` (={values}) must be 4 finite values >= 0 (R, G1, G2, B)")
+                raise ValueError(f"`{name}` (={values}) must be 4 finite values >= 0")
             object.__setattr__(self, name, values)
 
     @classmethod
@@ -121,8 +121,8 @@ class CameraProfile:
         except ValueError:
             known = ", ".join(p.value for p in BayerPattern)
             raise ValueError(f"`cfa` (={self.cfa!r}) must be one of {known}") from None
-        black = self.black_level
-        black = (float(black),) * 4 if isinstance(black, int | float) else tuple(map(float, black))
+        given: float | Sequence[float] = self.black_level
+        black = (float(given),) * 4 if isinstance(given, int | float) else tuple(map(float, given))
         if len(black) != 4:
             raise ValueError(f"`black_level` (={black}) must be one number or 4 (R, G1, G2, B)")
         object.__setattr__(self, "black_level", black)

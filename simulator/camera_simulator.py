@@ -177,9 +177,7 @@ class Latent:
         """
         exposure = self.exposure(settings)
         light = sensor_light(self.light, exposure)
-        generator = noise_generator(
-            seed, settings.iso, settings.exposure_time, settings.f_number
-        )
+        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
         noisy, excess_noise = add_noise(light[None], [exposure], [generator])
         return clip_and_quantise(noisy[0], self.camera), float(excess_noise[0])
 
@@ -263,7 +261,7 @@ class CameraSimulator:
     def plan(
         self, source: RawImage | Latent | HasLatent, settings: CameraSettings, **scene: Any
     ) -> SimulationPlan:
-        """Which steps the change to `settings` takes, why each other is left out, error and cost."""
+        """Which steps the change to `settings` takes, why others are left out, error and cost."""
         return self.prepare(source, **scene).plan(settings)
 
     def simulate(

@@ -16,10 +16,16 @@ LUX_AT_EV0 = 2.5
 #: A recorded shutter time this close (relative) to a nominal stop stands for the exact stop.
 SNAP_TOLERANCE = 0.03
 
-_NOMINAL_SHUTTERS = (
-    *(8000, 6400, 5000, 4000, 3200, 2500, 2000, 1600, 1250, 1000, 800, 640, 500, 400, 320, 250, 200),
-    *(160, 125, 100, 80, 60, 50, 40, 30, 25, 20, 15, 13, 10, 8, 6, 5, 4),
-)  # fmt: skip
+# fmt: off
+_FRACTIONS = (
+    8000, 6400, 5000, 4000, 3200, 2500, 2000, 1600, 1250, 1000, 800, 640, 500, 400, 320, 250, 200,
+    160, 125, 100, 80, 60, 50, 40, 30, 25, 20, 15, 13, 10, 8, 6, 5, 4,
+)
+_SECONDS = (
+    0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.3, 1.6, 2, 2.5, 3, 3.2, 4, 5, 6, 8, 10, 13, 15, 20, 25, 30,
+)
+# fmt: on
+_NOMINAL_TIMES = (*(1.0 / n for n in _FRACTIONS), *_SECONDS)
 
 
 @dataclass(frozen=True, order=True)
@@ -81,7 +87,9 @@ class CameraSettings:
     @property
     def log2_exposure(self) -> float:
         """log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective f-number."""
-        return math.log2(self.exposure_time) + math.log2(self.iso / 100.0) - self.aperture_stop / 3.0
+        return (
+            math.log2(self.exposure_time) + math.log2(self.iso / 100.0) - self.aperture_stop / 3.0
+        )
 
     @property
     def ev100(self) -> float:
@@ -104,7 +112,8 @@ class CameraSettings:
         return math.log2(self.iso / 3.125)
 
     def __str__(self) -> str:
-        return f"ISO {self.iso:g}, {format_exposure_time(self.exposure_time)}, f/{self.f_number:g}"
+        time = format_exposure_time(self.exposure_time)
+        return f"ISO {self.iso:g}, {time}, f/{self.f_number:.3g}"
 
 
 def exposure_ratio(source: CameraSettings, target: CameraSettings) -> float:
@@ -145,9 +154,7 @@ def snap_exposure_time(exposure_time: float) -> float:
     from every nominal stop is kept. Industrial cameras run at exactly what they say: use
     `CameraSettings` directly for them.
     """
-    nominal = [1.0 / n for n in _NOMINAL_SHUTTERS]
-    nominal += [0.3, 0.4, 0.5, 0.6, 0.8, 1, 1.3, 1.6, 2, 2.5, 3, 3.2, 4, 5, 6, 8, 10, 13, 15, 20, 25, 30]
-    nearest = min(nominal, key=lambda n: abs(math.log(exposure_time / n)))
+    nearest = min(_NOMINAL_TIMES, key=lambda n: abs(math.log(exposure_time / n)))
     if abs(exposure_time / nearest - 1.0) > SNAP_TOLERANCE:
         return exposure_time
     return 2.0 ** (round(3.0 * math.log2(nearest)) / 3.0)

@@ -33,14 +33,16 @@ Split = Literal["train", "test", "all"]
 
 #: Source groups of each procedural kind: (train, test).
 GROUPS_PER_KIND = {
-    "dead_leaves": (46, 24),
-    "indoor": (36, 18),
-    "back_light": (23, 11),
-    "snow": (22, 10),
-    "night": (24, 11),
-    "spot_light": (22, 10),
-    "motion": (21, 10),
+    "dead_leaves": (90, 24),
+    "indoor": (70, 18),
+    "back_light": (90, 11),
+    "snow": (70, 10),
+    "night": (80, 11),
+    "spot_light": (80, 10),
+    "motion": (60, 10),
 }
+#: Index of the first test group of a kind: the test scenes stay when training scenes are added.
+FIRST_TEST_INDEX = 1000
 #: Groups of each kind and split in "bundled:small"; the same scenes as the first of "bundled".
 SMALL_GROUPS = 2
 
@@ -95,7 +97,7 @@ def _make(
 
 def _entries(split: str, small: bool) -> Iterator[_Entry]:
     for kind, (train, test) in GROUPS_PER_KIND.items():
-        first, count = (0, train) if split == "train" else (train, test)
+        first, count = (0, train) if split == "train" else (FIRST_TEST_INDEX, test)
         for index in range(first, first + (min(count, SMALL_GROUPS) if small else count)):
             yield _Entry(kind, index, split)
 
@@ -137,7 +139,7 @@ def _cache_path(
     key = cache_key(
         {
             "generator": GENERATOR_VERSION,
-            "groups": GROUPS_PER_KIND,
+            "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,
             "colour_matrix": camera.colour_matrix,

@@ -14,8 +14,8 @@ from simulator.settings import CameraSettings
 
 Domain = Literal["raw", "srgb"]
 #: What a score varies with: the recorded image (noise and all); the noise-free light on the sensor;
-#: or also (or only) the extent of the blur, which changes from episode to episode. The last two have
-#: a closed form, without noise seeds, and ``"light"`` is worked out once per scene and state.
+#: or also (or only) the extent of the blur, which changes from episode to episode. The last two
+#: have a closed form, without noise seeds, and ``"light"`` is worked out once per scene and state.
 DependsOn = Literal["image", "light", "blur"]
 
 

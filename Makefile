@@ -1,0 +1,43 @@
+# make demo   sets up .venv and runs the quickstart
+# make test   sets up .venv and runs the test suite
+# make check  lint, format and types
+# make bench  the measurements in docs/results, except the long training
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+STAMP := $(VENV)/.installed
+BIN := $(VENV)/bin
+
+.PHONY: demo test check format bench clean $(VENV)
+
+demo: $(STAMP)
+	$(BIN)/ae-env quickstart
+
+test: $(STAMP)
+	$(BIN)/python -m pytest
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(STAMP)
+	$(BIN)/ae-env bench scorers
+	$(BIN)/ae-env bench throughput
+	@echo "the agents' long training (about an hour): $(BIN)/ae-env bench agents"
+
+$(VENV): $(STAMP)
+
+# Made anew when it is missing or older than what it is made from.
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("ae-env needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" if sys.version_info < (3, 11) else 0)'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $(STAMP)
+
+clean:
+	rm -rf $(VENV) quickstart build *.egg-info

@@ -1,0 +1,370 @@
+"""The command line: every command is a thin layer over a function of the three packages."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import logging
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from agents.evaluation_result import EvaluationResult
+    from simulator.raw_image import RawImage
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`.",
+)
+console = Console()
+BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "throughput")
+
+Seed = Annotated[int, typer.Option(help="Seed of everything that is random.", min=0)]
+Scenes = Annotated[
+    str, typer.Option(help="'bundled', or a folder or file of raws or .hdr/.exr radiance maps.")
+]
+Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
+
+
+def main() -> None:
+    """Runs the command line; errors of the user's become one line and exit status 2."""
+    logging.basicConfig(
+        level=logging.WARNING,
+        format="%(message)s",
+        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
+    )
+    try:
+        app()
+    except (ValueError, FileNotFoundError, ImportError) as error:
+        if "--debug" in sys.argv:
+            raise
+        Console(stderr=True).print(f"[bold red]error[/] {_escape(str(error))}", soft_wrap=True)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        Console(stderr=True).print("\nstopped; the same command goes on where it was")
+        raise SystemExit(130) from None
+
+
+@app.callback()
+def _root(
+    debug: Annotated[bool, typer.Option(help="Show the traceback of an error.")] = False,
+) -> None:
+    """Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`."""
+
+
+@app.command()
+def quickstart(
+    scenes: Scenes = "bundled",
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("quickstart"),
+    seed: Seed = 0,
+) -> None:
+    """Train two agents, compare them with light meters on unseen scenes: about 5 minutes.
+
+    Example: `ae-env quickstart --scenes ~/my_raws --out my_raws_result`
+    """
+    from agents.quickstart import next_commands, run_quickstart
+
+    with _bars() as progress:
+        done = run_quickstart(scenes, out, seed=seed, progress=progress, command=_command())
+    if done.zero_shot:
+        console.print(f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes")
+    _print_scores(done.result)
+    _print_files(done.files)
+    console.print("\nTry next:")
+    for line in next_commands(scenes, out, done.agents):
+        console.print(f"  {line}", soft_wrap=True, highlight=False)
+
+
+@app.command()
+def simulate(
+    raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
+    iso: Annotated[float, typer.Option(help="Target ISO speed.")],
+    shutter: Annotated[str, typer.Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
+    aperture: Annotated[float, typer.Option(help="Target f-number.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="DNG to write.")] = Path("out.dng"),
+    png: Annotated[Path | None, typer.Option(help="Also write the developed picture here.")] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """Simulate one raw at other settings and write it as a DNG; prints the plan.
+
+    Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
+    """
+    from simulator import CameraSettings, CameraSimulator, read_raw, write_dng
+
+    settings = CameraSettings(iso, _seconds(shutter), aperture)
+    if out.suffix.lower() != ".dng":
+        raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
+    source = read_raw(raw)
+    simulator = CameraSimulator(device=device)
+    latent = simulator.prepare(source)
+    console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
+    console.print(str(latent.plan(settings)), highlight=False, soft_wrap=True)
+    result = simulator.simulate(source, settings, seed=seed)
+    write_dng(out, result)
+    files = {"DNG": out}
+    if png is not None:
+        files["PNG"] = _write_png(png, result)
+    _print_files(files)
+
+
+@app.command()
+def sweep(
+    raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("sweep"),
+    dngs: Annotated[bool, typer.Option(help="Also write the 64 DNGs, full size.")] = False,
+    seed: Seed = 0,
+    device: Device = "auto",
+) -> None:
+    """All 64 exposure states of one raw as a contact sheet, coloured by score.
+
+    Example: `ae-env sweep IMG_0001.CRW --out sweep`
+    """
+    from ae_env.grid import ExposureGrid
+    from ae_env.rendering import contact_sheet
+    from ae_env.scenes import Scene
+    from simulator import CameraSimulator, read_raw, write_dng
+
+    source = read_raw(raw)
+    scene = Scene.from_raw(source, scene_id=raw.stem).resized(128)
+    out.mkdir(parents=True, exist_ok=True)
+    sheet = out / "contact_sheet.png"
+    _save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
+    files = {"contact sheet": sheet}
+    if dngs:
+        grid, simulator = ExposureGrid.default(), CameraSimulator(device=device)
+        with _bars() as progress, progress("DNGs") as task:
+            for i, settings in enumerate(grid):
+                path = out / f"{raw.stem}-{i:02d}.dng"
+                write_dng(path, simulator.simulate(source, settings, seed=seed))
+                task(i + 1, len(grid))
+        files["DNGs"] = out
+    _print_files(files)
+
+
+@app.command()
+def train(
+    config: Annotated[Path, typer.Argument(help="YAML such as configs/regression.yaml.")],
+    out: Annotated[Path, typer.Option(help="File name of the agent, without suffix.")] = Path(
+        "runs/agent"
+    ),
+    seed: Annotated[int | None, typer.Option(help="Instead of the YAML's.", min=0)] = None,
+    device: Device = "cpu",
+    tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
+) -> None:
+    """Train an agent; a second run goes on where the first was stopped.
+
+    Example: `ae-env train configs/ppo.yaml --out runs/ppo`
+    """
+    import torch
+
+    from agents.training import load_config, train_agent
+
+    agent = load_config(config)
+    if seed is not None:
+        agent = agent.with_seed(seed)
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    with _bars() as progress, progress(f"training {agent.agent}") as task:
+
+        def report(done: int, total: int, values: dict[str, float]) -> None:
+            task(done, total, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
+
+        train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
+    console.print(f"wrote {out}.safetensors and {out}.json")
+    console.print(f"next: ae-env evaluate --policy {agent.agent}:{out}", highlight=False)
+
+
+@app.command()
+def evaluate(
+    policy: Annotated[list[str], typer.Option(help="A policy; give the option several times.")],
+    scenes: Scenes = "bundled",
+    split: Annotated[str, typer.Option(help="train, test or all.")] = "test",
+    grid: Annotated[str, typer.Option(help="default or third_stop.")] = "default",
+    lighting: Annotated[str, typer.Option(help="static, step, ramp, sine, tunnel...")] = "static",
+    delay: Annotated[int, typer.Option(help="Frames from a decision to its frame.", min=0)] = 0,
+    sensors: Annotated[bool, typer.Option(help="Whether speed and defocus are observed.")] = True,
+    episodes: Annotated[int, typer.Option(help="Episodes per scene.", min=1)] = 2,
+    frames: Annotated[int, typer.Option(help="Frames per episode.", min=1)] = 8,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("evaluation"),
+    seed: Seed = 0,
+) -> None:
+    """Compare policies on the same episodes: scores, regret, convergence, flicker.
+
+    Example: `ae-env evaluate --policy matrix:tuned --policy my_policy.py:MyPolicy`
+    """
+    from agents import PolicyContext, fit_policies, make_policy, write_report
+    from agents import evaluate as run
+    from agents.episodes import make_envs
+    from agents.quickstart import training_scenes
+
+    options: dict[str, Any] = {
+        "scenes": scenes,
+        "split": split,
+        "grid": grid,
+        "lighting": lighting,
+        "delay": delay,
+        "sensors": sensors,
+    }
+    envs = make_envs(options, num_envs=1, frames=1)
+    context = PolicyContext.from_envs(envs)
+    policies = {name: make_policy(name, context) for name in policy}
+    training = {**options, "scenes": training_scenes(scenes)[0], "lighting": "static", "delay": 0}
+    with _bars() as progress:
+        with progress("fitting on training scenes") as task:
+            fit_policies(policies, training, seed=seed, progress=task)
+        with progress("evaluation") as task:
+            result = run(
+                policies,
+                options,
+                episodes_per_scene=episodes,
+                frames=frames,
+                seed=seed,
+                progress=task,
+            )
+    files = write_report(result, out, command=_command(), source=scenes, split=split)
+    _print_scores(result)
+    _print_files(files)
+
+
+@app.command()
+def bench(
+    name: Annotated[str, typer.Argument(help=", ".join(BENCHMARKS))],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("docs/results"),
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
+) -> None:
+    """Run one of the measurements whose results are in docs/results.
+
+    Example: `ae-env bench throughput --quick --out /tmp/results`
+    """
+    if name not in BENCHMARKS:
+        near = difflib.get_close_matches(name, BENCHMARKS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"`name` (={name!r}) must be one of {list(BENCHMARKS)}{hint}")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        module = importlib.import_module(f"benchmarks.{name}")
+    except ModuleNotFoundError as error:
+        if error.name not in ("benchmarks", f"benchmarks.{name}"):
+            raise
+        raise ValueError(
+            "the benchmarks are not part of the installed package: run this in a clone of the "
+            "repository"
+        ) from None
+    module.run(out, seed=seed, quick=quick)
+
+
+# -- what the commands share ------------------------------------------------------------------
+
+
+@contextmanager
+def _bars() -> Iterator[Any]:
+    """Progress bars with time left; yields a function that opens one."""
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("[dim]{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console) as display:
+
+        @contextmanager
+        def bar(title: str) -> Iterator[Any]:
+            task = display.add_task(title, total=None, note="")
+
+            def move(done: int, total: int, note: str = "") -> None:
+                display.update(task, completed=done, total=total, note=note)
+
+            yield move
+
+        yield bar
+
+
+def _print_scores(result: EvaluationResult) -> None:
+    from rich.table import Table
+
+    from agents.result_table import result_rows
+
+    rows = result_rows(result, source="", split="", resamples=2000)
+    conditions = list(dict.fromkeys(row["condition"] for row in rows))
+    table = Table(title="normalised score: 0 is random, 1 the oracle")
+    table.add_column("policy")
+    for condition in conditions:
+        table.add_column(condition, justify="right")
+    table.add_column("95 % interval (all)", justify="right")
+    by_policy: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        by_policy.setdefault(row["policy"], {})[row["condition"]] = row
+    for policy, own in by_policy.items():
+        pair = own["all"]["ci95"]
+        interval = f"{pair[0]:.3f} to {pair[1]:.3f}" if pair else "too few groups"
+        scores = [f"{own[c]['normalised_score']:.3f}" for c in conditions]
+        table.add_row(policy, *scores, interval)
+    console.print(table)
+
+
+def _print_files(files: Mapping[str, Path]) -> None:
+    for name, path in files.items():
+        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True)
+
+
+def _write_png(path: Path, raw: RawImage) -> Path:
+    from PIL import Image
+
+    from simulator import render_srgb
+
+    picture = render_srgb(raw).permute(1, 2, 0).cpu().numpy()
+    return _save_picture(path, Image.fromarray(picture))
+
+
+def _save_picture(path: Path, picture: Any) -> Path:
+    import io
+
+    from simulator.files import write_atomically
+
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return write_atomically(path, buffer.getvalue())
+
+
+def _seconds(text: str) -> float:
+    """Seconds from ``"1/60"`` or ``"0.5"``."""
+    numerator, _, denominator = text.removesuffix("s").partition("/")
+    try:
+        return float(numerator) / float(denominator or 1)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
+
+
+def _command() -> str:
+    return shlex.join(["ae-env", *sys.argv[1:]])
+
+
+def _escape(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)

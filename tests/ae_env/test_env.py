@@ -1,0 +1,355 @@
+"""The environment contract: spaces, info, seeding, specs, and what the consumers' checkers say."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+import ae_env
+
+ID = "ae_env/AutoExposure-v0"
+ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
+INFO_KEYS = {
+    *("scene_id", "state", "iso", "exposure_time", "f_number", "ev100"),
+    *("clipped_high", "clipped_low", "excess_noise", "modules", "rewards"),
+}
+
+
+def _make(**arguments: Any) -> gym.Env:
+    return gym.make(ID, **{**ARGUMENTS, **arguments})
+
+
+class MeanSignal:
+    domain = "raw"
+
+    def __call__(self, images: torch.Tensor, captures: Any) -> torch.Tensor:
+        return images.mean(dim=(1, 2, 3))
+
+
+@pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
+@pytest.mark.parametrize("extra", [{}, {"with_oracle": True, "sensors": False}])
+def test_gymnasium_checker_has_nothing_to_say(kind: str, extra: dict[str, Any]) -> None:
+    env = _make(observation=kind, render_mode="rgb_array", **extra)
+    check_env(env.unwrapped)  # warnings are errors
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype"), [("uint8", None), ("linear", "float32"), ("dn", "uint16")]
+)
+def test_sb3_checker_warns_of_exactly_the_image(kind: str, dtype: str | None) -> None:
+    from stable_baselines3.common.env_checker import check_env as check_sb3
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_sb3(_make(observation=kind).unwrapped)
+    messages = [str(w.message) for w in caught]
+    if dtype is None:
+        assert messages == []
+    else:
+        assert len(messages) == 2
+        assert f"raw is an image but its `dtype` is ({dtype})" in messages[0]
+        assert "raw is an image but the upper and lower bounds are not in [0, 255]" in messages[1]
+
+
+@pytest.mark.parametrize(("kind", "convolves"), [("uint8", True), ("linear", False)])
+def test_sb3_default_policy_sees_the_raw_through_a_cnn(kind: str, convolves: bool) -> None:
+    from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
+
+    extractor = CombinedExtractor(_make(observation=kind).observation_space)
+    assert isinstance(extractor.extractors["raw"], NatureCNN) == convolves
+    if convolves:
+        first = extractor.extractors["raw"].cnn[0]
+        assert (first.in_channels, first.kernel_size, first.stride) == (4, (8, 8), (4, 4))
+
+
+def test_spaces_are_as_documented() -> None:
+    space = _make(resolution=40).observation_space
+    assert list(space) == ["raw", "sensors", "settings"]
+    assert space["raw"] == gym.spaces.Box(0, 255, (4, 40, 40), np.uint8)
+    assert space["settings"] == gym.spaces.Box(-1, 1, (3,), np.float32)
+    assert space["sensors"] == gym.spaces.Box(-1, 1, (2,), np.float32)
+    assert "sensors" not in _make(sensors=False).observation_space.spaces
+    assert _make(observation="linear").observation_space["raw"].dtype == np.float32
+    dn = _make(observation="dn").observation_space["raw"]
+    assert dn.dtype == np.uint16
+    assert dn.high.max() == _make().unwrapped.camera.white_level
+    env = _make()
+    assert env.action_space == gym.spaces.Discrete(64)
+    assert env.get_wrapper_attr("action_masks")().tolist() == [True] * 64
+
+
+def test_info_has_the_same_keys_and_plain_numbers() -> None:
+    env = _make(with_oracle=True)
+    _, first = env.reset(seed=0)
+    _, reward, terminated, truncated, second = env.step(5)
+    assert set(first) == set(second) == INFO_KEYS | {"oracle_state", "regret"}
+    parts = {"brightness", "highlights", "shadows", "noise", "sharpness", "score"}
+    assert set(first["rewards"]) == set(second["rewards"]) == parts
+    for info in (first, second):
+        assert all(isinstance(v, int | float | str | dict) for v in info.values())
+    assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+    assert second["state"] == 5
+    assert (second["iso"], second["f_number"]) == (100.0, 5.6)
+    assert second["ev100"] == pytest.approx(np.log2(5.6**2 / second["exposure_time"]))
+    assert second["modules"].startswith("exposure")
+
+
+def test_episode_is_truncated_after_eight_steps_and_never_terminates() -> None:
+    env = _make()
+    env.reset(seed=0)
+    flags = [env.step(3)[2:4] for _ in range(8)]
+    assert flags == [(False, False)] * 7 + [(False, True)]
+
+
+def test_reset_options_choose_scene_state_and_frame() -> None:
+    env = _make(lighting={"kind": "step", "stops": -3, "at": 5})
+    scene = env.unwrapped.scenes[3]
+    _, info = env.reset(seed=0, options={"scene": scene.scene_id, "state": 17})
+    assert (info["scene_id"], info["state"]) == (scene.scene_id, 17)
+    assert env.reset(options={"scene": 3})[1]["scene_id"] == scene.scene_id
+    options = {"scene": 3, "state": 17}
+    bright, _ = env.reset(seed=1, options=options)
+    first = env.unwrapped.core.episode(0)
+    dark, _ = env.reset(seed=1, options={**options, "frame": 5})
+    second = env.unwrapped.core.episode(0)
+    assert dark["raw"].mean() < bright["raw"].mean()
+    # The draws do not depend on the options: the episode is the same otherwise.
+    assert (first.speed, first.defocus) == (second.speed, second.defocus)
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"scene": "no such scene"}, "scene"),
+        ({"scene": 10**6}, "scene"),
+        ({"state": 64}, "state"),
+        ({"state": "best"}, "state"),
+        ({"frame": -1}, "frame"),
+        ({"sceen": 1}, "sceen"),
+    ],
+)
+def test_bad_reset_options_are_refused(options: dict[str, Any], name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        _make().reset(seed=0, options=options)
+
+
+def test_bad_actions_are_refused() -> None:
+    env = _make().unwrapped
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(0)
+    env.reset(seed=0)
+    for action in (64, -1, 2.5, "3", [1, 2]):
+        with pytest.raises(ValueError, match="`action`"):
+            env.step(action)
+
+
+def _rollout(seed: int, **arguments: Any) -> list[Any]:
+    env = _make(**arguments)
+    frames = [env.reset(seed=seed)]
+    frames += [env.step(int(a)) for a in np.random.default_rng(0).integers(64, size=8)]
+    frames += [env.reset()]
+    return frames
+
+
+def _assert_equal(first: Any, second: Any) -> None:
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert list(first) == list(second)
+        for key in first:
+            _assert_equal(first[key], second[key])
+    elif isinstance(first, tuple | list):
+        for a, b in zip(first, second, strict=True):
+            _assert_equal(a, b)
+    else:
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
+def test_same_seed_same_rollout(kind: str) -> None:
+    _assert_equal(_rollout(7, observation=kind), _rollout(7, observation=kind))
+    assert (_rollout(7)[0][0]["raw"] != _rollout(8)[0][0]["raw"]).any()
+
+
+def test_noise_depends_on_the_frame_and_on_nothing_else() -> None:
+    env = _make()
+    first, _ = env.reset(seed=2, options={"state": 20})
+    second, *_ = env.step(20)
+    assert (first["raw"] != second["raw"]).any()  # the same state again, other noise
+    env.reset(seed=2, options={"state": 40})
+    np.testing.assert_array_equal(env.step(20)[0]["raw"], second["raw"])
+
+
+def test_global_random_state_is_left_alone() -> None:
+    torch.manual_seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    expected = (torch.rand(1), np.random.rand())  # noqa: NPY002
+    torch.manual_seed(0)
+    np.random.seed(0)  # noqa: NPY002
+    _rollout(1)
+    assert (torch.rand(1), np.random.rand()) == expected  # noqa: NPY002
+
+
+def test_returned_arrays_are_never_reused() -> None:
+    env = _make(with_oracle=True)
+    frames = [env.reset(seed=0)]
+    frames += [env.step(9)[::4] for _ in range(5)]
+    arrays = [array for observation, _ in frames for array in observation.values()]
+    copies = [array.copy() for array in arrays]
+    env.step(60)
+    env.reset()
+    for i, (array, copy) in enumerate(zip(arrays, copies, strict=True)):
+        np.testing.assert_array_equal(array, copy)
+        assert not any(np.shares_memory(array, other) for other in arrays[i + 1 :])
+    assert len({id(info) for _, info in frames}) == len(frames)
+
+
+def test_action_delay_counts_frames() -> None:
+    env = _make(delay=2)
+    env.reset(seed=0, options={"state": 7})
+    states = [env.step(action)[4]["state"] for action in (10, 20, 30, 40)]
+    assert states == [7, 7, 10, 20]
+
+
+def test_costs_are_subtracted_and_shown() -> None:
+    costs = {"flicker": 0.5, "switch": 0.25}
+    env, free = _make(costs=costs), _make()
+    _, info = env.reset(seed=0, options={"state": 0})
+    free.reset(seed=0, options={"state": 0})
+    assert (info["rewards"]["flicker"], info["rewards"]["switch"]) == (0.0, 0.0)
+    before = env.reset(seed=0, options={"state": 0})[0]["raw"].mean() / 255.0
+    for state, changed in ((0, 0.0), (1, 1 / 3), (63, 1.0)):  # state 1 to 63: all but none alike
+        observation, reward, _, _, info = env.step(state)
+        score = free.step(state)[1]
+        mean = observation["raw"].mean() / 255.0
+        assert info["rewards"]["switch"] == pytest.approx(changed)
+        assert info["rewards"]["flicker"] == pytest.approx(abs(mean - before), abs=1e-6)
+        expected = score - 0.5 * abs(mean - before) - 0.25 * changed
+        assert reward == pytest.approx(expected, abs=1e-6)
+        assert info["rewards"]["score"] == pytest.approx(score)
+        before = mean
+
+
+def test_expected_reward_is_the_table_entry() -> None:
+    env = _make(reward="expected")
+    env.reset(seed=4)
+    for state in (0, 21, 63):
+        _, reward, *_ = env.step(state)
+        assert reward == env.unwrapped.expected_scores()[state]
+
+
+def test_oracle_and_regret_agree_with_the_expected_scores() -> None:
+    env = _make(with_oracle=True)
+    for seed in range(3):
+        env.reset(seed=seed)
+        _, _, _, _, info = env.step(30)
+        scores = env.unwrapped.expected_scores()
+        assert scores[info["oracle_state"]] == pytest.approx(scores.max(), abs=1e-7)
+        assert info["regret"] == pytest.approx(scores.max() - scores[30])
+        assert info["regret"] >= 0
+
+
+def test_clipped_fractions_are_those_of_the_frame() -> None:
+    env = _make(observation="linear")
+    for state in (0, 63):  # the darkest but for ISO and aperture, and the brightest
+        raw = env.reset(seed=0, options={"state": state})[0]["raw"]
+        info = env.reset(seed=0, options={"state": state})[1]
+        assert info["clipped_high"] == pytest.approx((raw >= 1 - 1e-6).mean(), abs=1e-6)
+        assert info["clipped_low"] == pytest.approx((raw <= 2.0**-10).mean(), abs=1e-6)
+
+
+def test_motion_and_depth_can_be_switched_off() -> None:
+    env = _make(motion="none", depth="far", noise=False)
+    for seed in range(4):
+        observation, info = env.reset(seed=seed)
+        assert info["modules"] == "exposure"
+        assert observation["sensors"][0] == -1.0
+        assert info["rewards"]["sharpness"] == 1.0
+    assert _make(motion=0.5, depth=2.0).reset(seed=0)[1]["modules"] == (
+        "exposure+defocus+motion_blur+noise"
+    )
+
+
+def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> None:
+    env = _make(resolution=36).unwrapped
+    speeds, defocus = [], []
+    for seed in range(400):
+        env.core.start(0, np.random.default_rng(seed), {})
+        speeds.append(env.core.episode(0).speed)
+        defocus.append(env.core.episode(0).defocus)
+    assert np.mean(np.array(speeds) == 0) == pytest.approx(1 / 3, abs=0.08)  # 3.4 sigma
+    assert min(defocus) >= 0.1
+    assert max(defocus) <= 8.0
+    assert np.median(defocus) == pytest.approx(1.0, rel=0.25)
+
+
+def test_spec_round_trips_through_json_and_pickle() -> None:
+    env = _make(observation="linear", costs={"switch": 0.1}, lighting={"kind": "ramp"})
+    env.reset(seed=3)
+    expected = env.step(11)
+    for spec in (EnvSpec.from_json(env.spec.to_json()), pickle.loads(pickle.dumps(env.spec))):
+        assert spec == env.spec
+        again = gym.make(spec)
+        again.reset(seed=3)
+        _assert_equal(again.step(11), expected)
+
+
+def test_in_process_arguments_say_so_when_json_is_asked_for() -> None:
+    env = _make(scorer=MeanSignal())
+    env.reset(seed=0)
+    assert 0.0 <= env.step(0)[1] <= 1.0
+    with pytest.raises(ValueError, match=r"`scorer`.*this process only.*package\.module"):
+        env.spec.to_json()
+    env = gym.make(ID, scenes=_make().unwrapped.scenes[:2], resolution=36)
+    with pytest.raises(ValueError, match="`scenes`"):
+        env.spec.to_json()
+
+
+def test_scorer_named_by_module_serialises() -> None:
+    env = _make(scorer="ae_env.scorers.terms:Brightness")
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    env.reset(seed=0)
+    again.reset(seed=0)
+    assert env.step(1)[1] == again.step(1)[1]
+
+
+def test_import_is_light_and_registers_once() -> None:
+    code = (
+        "import sys, gymnasium, ae_env, ae_env.registration as r; r.register_envs();"
+        f"assert {ID!r} in gymnasium.registry; assert 'torch' not in sys.modules; "
+        "assert 'matplotlib' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True)
+
+
+def test_public_names_resolve() -> None:
+    assert set(ae_env.__all__) <= set(dir(ae_env))
+    for name in ae_env.__all__:
+        assert getattr(ae_env, name).__doc__
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        _ = ae_env.nonsense
+
+
+def test_module_prefix_makes_the_environment_known() -> None:
+    assert gym.make(f"ae_env:{ID}", **ARGUMENTS).unwrapped.spec.id == ID
+
+
+@pytest.mark.slow
+def test_bundled_oracle_is_spread_over_every_control() -> None:
+    """No single value of a control may be the oracle's in more than 60 % of the scenes."""
+    env = gym.make(ID, scenes="bundled", split="test", resolution=64).unwrapped
+    states = []
+    for i in range(len(env.scenes)):
+        env.core.start(0, np.random.default_rng(i), {"scene": i})
+        states.append(env.core.expected_scores(0).oracle)
+    for control in env.grid.controls(np.array(states)).T:
+        assert np.bincount(control).max() <= 0.6 * len(states)

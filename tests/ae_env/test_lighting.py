@@ -1,0 +1,69 @@
+"""How the light changes over an episode."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from ae_env.lighting import KINDS, Lighting, make_lighting
+
+
+def _gains(spec: object, frames: int = 14, phase: float = 0.0) -> list[float]:
+    lighting = make_lighting(spec)  # type: ignore[arg-type]
+    return [lighting.gain(frame, 0.01, phase) for frame in range(frames)]
+
+
+def test_static_light_stays() -> None:
+    assert _gains("static") == [1.0] * 14
+
+
+def test_step() -> None:
+    assert _gains({"kind": "step", "stops": 3, "at": 2}, 4) == [1.0, 1.0, 8.0, 8.0]
+
+
+def test_ramp_stops_at_its_end() -> None:
+    stops = [math.log2(g) for g in _gains({"kind": "ramp", "stops": -2, "stops_per_frame": 0.5}, 7)]
+    assert stops == pytest.approx([0, -0.5, -1, -1.5, -2, -2, -2])
+
+
+def test_sine_has_its_period_amplitude_and_phase() -> None:
+    spec = {"kind": "sine", "stops": 2, "period": 8}
+    stops = [math.log2(g) for g in _gains(spec, 9)]
+    assert stops[::2] == pytest.approx([0, 2, 0, -2, 0], abs=1e-9)
+    shifted = [math.log2(g) for g in _gains(spec, 7, phase=0.25)]
+    assert shifted == pytest.approx(stops[2:9])
+
+
+def test_tunnel_goes_in_and_out() -> None:
+    spec = {"kind": "tunnel", "stops": -6, "enter": 2, "leave": 6, "edge": 2}
+    stops = [math.log2(g) for g in _gains(spec, 10)]
+    assert stops == pytest.approx([0, 0, 0, -3, -6, -6, -6, -3, 0, 0])
+
+
+def test_lens_cap_goes_on_and_off() -> None:
+    gains = _gains({"kind": "lens_cap", "on": 1, "off": 3}, 4)
+    assert gains == [1.0, 2.0**-20, 2.0**-20, 1.0]
+
+
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_every_kind_is_made_from_its_name_with_positive_gains(name: str) -> None:
+    lighting = make_lighting(name)
+    assert isinstance(lighting, Lighting)
+    assert lighting.name == name
+    assert make_lighting(lighting) is lighting
+    assert all(0 < gain < math.inf for gain in _gains(name, 40, phase=0.3))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("stepp", "did you mean 'step'"),
+        ({"stops": 3}, "must be one of"),
+        ({"kind": "step", "stop": 3}, "not 'stop'"),
+        ({"kind": "step", "stops": math.nan}, "finite"),
+    ],
+)
+def test_bad_lightings_are_refused(spec: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_lighting(spec)  # type: ignore[arg-type]

@@ -1,0 +1,83 @@
+"""The environment's arguments: every mistake is named before any work is done."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.options import EnvOptions
+from simulator import get_camera
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scorrer": "noise"}, "did you mean `scorer`"),
+        ({"split": "tset"}, "did you mean 'test'"),
+        ({"observation": "float"}, "`observation`"),
+        ({"crop": "centre"}, "`crop`"),
+        ({"reward": "score"}, "`reward`"),
+        ({"resolution": 35}, r"\[36, 4096\]"),
+        ({"resolution": 64.0}, "integer"),
+        ({"resolution": True}, "integer"),
+        ({"motion": "far"}, "`motion`"),
+        ({"motion": -0.5}, "`motion`"),
+        ({"motion": float("nan")}, "`motion`"),
+        ({"depth": "none"}, "did you mean|must be one of"),
+        ({"delay": -1}, "`delay`"),
+        ({"delay": 17}, "`delay`"),
+        ({"costs": {"flicer": 1.0}}, "did you mean 'flicker'"),
+        ({"costs": {"switch": -1.0}}, "costs"),
+    ],
+)
+def test_mistakes_are_named(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        EnvOptions.from_kwargs(arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scenes": "bundeld"}, "`scenes`"),
+        ({"camera": "nikon_z7"}, "did you mean 'nikon_z6'"),
+        ({"scorer": "balanc"}, "did you mean 'balanced'"),
+        ({"grid": "third"}, "`grid`"),
+        ({"lighting": "tunel"}, "did you mean 'tunnel'"),
+    ],
+)
+def test_unknown_names_are_refused_by_make(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        gym.make("ae_env/AutoExposure-v0", **{"scenes": "bundled:small", **arguments})
+
+
+def test_defaults_are_the_documented_ones() -> None:
+    options = EnvOptions()
+    assert (options.scenes, options.split, options.scorer) == ("bundled", "train", "balanced")
+    assert (options.observation, options.resolution, options.reward) == ("uint8", 64, "capture")
+    assert (options.sensors, options.noise, options.with_oracle, options.delay) == (
+        *(True, True, False),
+        0,
+    )
+    assert len(options.make_grid()) == 64
+    assert options.make_camera() == get_camera("nikon_z6")
+
+
+def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
+    options = {"scenes": "bundled:small", "resolution": 36}
+    train = EnvOptions(**options).load_scenes()
+    assert EnvOptions(**options).load_scenes() is train
+    test = EnvOptions(split="test", **options).load_scenes()
+    assert {s.group for s in train}.isdisjoint({s.group for s in test})
+    both = EnvOptions(split="all", **options).load_scenes()
+    assert [s.scene_id for s in both] == [s.scene_id for s in train + test]
+
+
+def test_scenes_of_ones_own_and_another_camera() -> None:
+    scenes = EnvOptions(scenes="bundled:small", resolution=64).load_scenes()[:2]
+    env = gym.make("ae_env/AutoExposure-v0", scenes=scenes, resolution=64, camera="canon_70d")
+    env.reset(seed=0)
+    assert env.unwrapped.camera.name == "canon_70d"
+    assert len(env.unwrapped.scenes) == 2

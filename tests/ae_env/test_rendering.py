@@ -1,0 +1,187 @@
+"""Pictures: what a frame shows, and where the contact sheet puts what."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from matplotlib import colormaps
+from PIL import Image
+
+from ae_env import contact_sheet
+from ae_env.grid import ExposureGrid
+from ae_env.observation import decode_observation
+from ae_env.rendering import _averaged, _Sheet, _visits
+from ae_env.scenes import Scene, reference_settings
+from ae_env.score_table import ScoreTable, ScoreTables
+from ae_env.scorers import make_scorer
+from simulator import NoiseLevelFunction, develop, get_camera
+
+CAMERA = get_camera("nikon_z6")
+SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
+
+
+def _env(**arguments: Any) -> gym.Env:
+    arguments = {"scenes": "bundled:small", "resolution": 64, **arguments}
+    return gym.make("ae_env/AutoExposure-v0", render_mode="rgb_array", **arguments)
+
+
+def _scene(height: int = 64, width: int = 64, **fields: Any) -> Scene:
+    light = torch.rand(4, height, width, generator=torch.Generator().manual_seed(0))
+    return Scene.from_array(
+        light, reference_settings(10.0), CAMERA, scene_id="test", illuminance=2560.0, **fields
+    )
+
+
+@pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
+def test_frame_is_the_developed_capture_enlarged(kind: str) -> None:
+    env = _env(observation=kind)
+    observation, _ = env.reset(seed=1, options={"state": 21})
+    picture = env.render()
+    assert picture.dtype == np.uint8
+    assert picture.shape == (256, 256, 3)
+    inner = env.unwrapped
+    scene = inner.scenes[inner.core.episode(0).scene]
+    raw = observation["raw"]
+    if kind == "uint8":
+        raw = decode_observation(raw)
+    elif kind == "dn":
+        black = np.array(CAMERA.black_level)[:, None, None]
+        raw = (raw - black) / (CAMERA.white_level - black)
+    signal = torch.from_numpy(raw.astype(np.float32))[None]
+    expected = develop(signal, scene.white_balance, CAMERA.colour_matrix)[0]
+    expected = (expected.permute(1, 2, 0).numpy() * 255).round()
+    above_the_caption = slice(2, 200, 4)
+    difference = picture[above_the_caption, 2::4].astype(int) - expected[: 200 // 4]
+    assert np.abs(difference).max() <= 1
+
+
+def test_frame_is_at_least_256_pixels_and_captioned() -> None:
+    env = _env(resolution=40)
+    env.reset(seed=1, options={"state": 0})
+    first = env.render()
+    assert first.shape == (280, 280, 3)  # seven times 40
+    env.reset(seed=1, options={"state": 3})
+    band = slice(-20, None)
+    assert (first[band] != env.render()[band]).any()
+    assert first[band].max() > 200  # the ink
+    first[:] = 0  # the caller's own
+    assert env.render().max() > 0
+
+
+def test_sheet_of_the_default_grid_is_a_readable_picture() -> None:
+    sheet = contact_sheet(_scene(), speed=0.1, defocus=1.0, path=[0, 21, 21, 37])
+    assert isinstance(sheet, Image.Image)
+    assert sheet.mode == "RGB"
+    assert 800 < sheet.width < 1600
+    assert 800 < sheet.height < 1600
+
+
+def _layout(grid: ExposureGrid, paths: dict[str, list[int]] | None = None) -> _Sheet:
+    scores = np.linspace(0, 1, len(grid))
+    table = ScoreTable(scores, np.zeros(len(grid)), {})
+    return _Sheet(grid, table, [Image.new("RGB", (64, 64))] * len(grid), paths or {})
+
+
+def test_time_grows_to_the_right_and_f_number_downwards_in_a_panel_per_iso() -> None:
+    grid = ExposureGrid.default()
+    sheet = _layout(grid)
+    width, height = sheet.thumb
+    for state in range(64):
+        iso, time, aperture = grid.controls(state)
+        x, y = sheet.corner(state)
+        left, top = sheet.panel_corner(*divmod(int(iso), 2))
+        assert (x - left, y - top) == (int(time) * (width + 4), int(aperture) * (height + 4))
+    corners = np.array([sheet.corner(s) for s in range(64)])
+    apart = np.abs(corners[:, None] - corners[None]).max(-1) >= min(width, height)
+    assert (apart | np.eye(64, dtype=bool)).all()  # no picture covers another
+
+
+def test_border_has_the_colour_of_the_score() -> None:
+    scene = _scene()
+    sheet = np.asarray(contact_sheet(scene, grid=SMALL))
+    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced"), use_cache=False).table(scene)
+    layout = _layout(SMALL)
+    for state in range(8):
+        if state == table.oracle:
+            continue
+        x, y = layout.corner(state)
+        expected = colormaps["viridis"](table.mean[state] / table.mean.max(), bytes=True)[:3]
+        assert sheet[y + 2, x + 40].tolist() == [int(v) for v in expected]
+
+
+def test_oracle_is_framed_in_white() -> None:
+    scene = _scene()
+    sheet = np.asarray(contact_sheet(scene, grid=SMALL))
+    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced"), use_cache=False).table(scene)
+    layout = _layout(SMALL)
+    framed = [
+        sheet[layout.corner(s)[1] - 1, layout.corner(s)[0] + 40].min() > 200 for s in range(8)
+    ]
+    assert framed == [state == table.oracle for state in range(8)]
+
+
+def test_paths_are_drawn_in_their_own_colours() -> None:
+    plain = np.asarray(contact_sheet(_scene(), grid=SMALL))
+    drawn = contact_sheet(_scene(), grid=SMALL, path={"first": [0, 7], "second": [3, 3, 4]})
+    colours = {(0xE6, 0x9F, 0x00), (0x56, 0xB4, 0xE9)}
+    found = {tuple(c) for c in np.asarray(drawn).reshape(-1, 3).tolist()}
+    assert colours <= found
+    assert not colours & {tuple(c) for c in plain.reshape(-1, 3).tolist()}
+
+
+def test_frames_of_a_state_are_numbered_in_runs() -> None:
+    assert _visits([5, 9, 9, 9, 5, 5]) == {5: "0,4-5", 9: "1-3"}
+    assert _visits([2]) == {2: "0"}
+
+
+def test_same_seed_same_sheet() -> None:
+    first, second = (np.asarray(contact_sheet(_scene(), grid=SMALL, seed=3)) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    assert (first != np.asarray(contact_sheet(_scene(), grid=SMALL, seed=4))).any()
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        ExposureGrid((100,), (0.01,), (4,)),
+        ExposureGrid((100, 200, 400), (1 / 60,), (2, 4, 8)),
+        ExposureGrid((100,), tuple(2.0**-i for i in range(8, 0, -1)), (4, 8)),
+    ],
+)
+def test_other_grids_and_shapes(grid: ExposureGrid) -> None:
+    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
+    wide = _scene(60, 90, nlf=nlf)
+    sheet = contact_sheet(replace(wide, illuminance=None), grid=grid, path=[0], camera=CAMERA)
+    assert min(sheet.size) > 100
+
+
+def test_large_scenes_are_averaged_as_a_whole() -> None:
+    nlf = NoiseLevelFunction((9e-4,) * 4, (9e-6,) * 4)
+    scene = _scene(600, 800, nlf=nlf)
+    small = _averaged(scene, 192)
+    assert small.light.shape == (4, 200, 266)
+    assert small.box_factor == 3
+    np.testing.assert_allclose(small.nlf.shot, 1e-4)
+    mean = scene.light[2, 3:6, 6:9].double().mean()
+    assert float(small.light[2, 1, 2]) == pytest.approx(float(mean), rel=1e-6)
+    assert _averaged(_scene(), 192) is not None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"grid": ExposureGrid.third_stop()}, "at most 256"),
+        ({"path": [0, 64]}, r"in \[0, 64\)"),
+        ({"path": []}, "list of states"),
+        ({"path": {"mine": [1.5]}}, "'mine'"),
+        ({"scorer": "balancd"}, "did you mean"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        contact_sheet(_scene(), **arguments)

@@ -1,0 +1,224 @@
+"""Score tables: expectations over noise, their standard errors, the oracle, the cache."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, reference_settings
+from ae_env.score_table import ScoreTables, scene_latent
+from ae_env.scorers import CompositeScorer, make_scorer
+from ae_env.scorers.protocol import Captures
+from ae_env.scorers.terms import Highlights
+from simulator import get_camera
+
+CAMERA = get_camera("nikon_z6")
+SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
+
+
+def _scene(seed: int = 0, **fields: Any) -> Scene:
+    rng = np.random.default_rng(seed)
+    light = 0.12 * np.exp(rng.normal(0.0, 1.0, (4, 40, 40)))
+    return Scene.from_array(
+        torch.from_numpy(light.astype(np.float32)),
+        reference_settings(8.0),
+        CAMERA,
+        scene_id="test",
+        illuminance=640.0,
+        **fields,
+    )
+
+
+def _tables(scorer: Any = "balanced", **options: Any) -> ScoreTables:
+    return ScoreTables(options.pop("grid", SMALL), CAMERA, make_scorer(scorer), **options)
+
+
+class FirstPixel:
+    """Reads one pixel in the middle of the range: its noise is that of the sensor."""
+
+    domain = "raw"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        return images[:, 1, 0, 0]
+
+
+class MeanSignal:
+    domain = "raw"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        return images.mean(dim=(1, 2, 3))
+
+
+def test_closed_form_has_no_error() -> None:
+    table = _tables().table(_scene(), speed=0.2, defocus=1.0)
+    np.testing.assert_array_equal(table.standard_error, 0.0)
+    assert table.mean.shape == (8,)
+    assert table.mean.dtype == np.float64
+    assert set(table.parts) == {"brightness", "highlights", "shadows", "noise", "sharpness"}
+
+
+def test_average_over_noise_is_the_noise_free_signal() -> None:
+    """Mid-range flat light: noise is symmetric there, so a mean of pixels must come out exact."""
+    scene = replace(_scene(), light=torch.full((4, 40, 40), 0.2))
+    grid = ExposureGrid((100, 200), (1 / 500,), (4, 5.6))
+    table = _tables(MeanSignal(), grid=grid, noise_seeds=64).table(scene)
+    latent = scene_latent(scene, CAMERA)
+    for state, mean, error in zip(grid, table.mean, table.standard_error, strict=True):
+        light = 0.2 * 2.0 ** (state.log2_exposure - scene.reference.log2_exposure)
+        assert float(latent.expected(state).mean()) == pytest.approx(light, rel=1e-6)
+        assert abs(mean - light) < 5 * error + 1 / 15_520  # quantised to digital numbers
+
+
+def test_standard_error_is_that_of_the_sensor_noise() -> None:
+    scene = replace(_scene(), light=torch.full((4, 40, 40), 0.3))
+    grid = ExposureGrid((100,), (1 / 1000, 1 / 250), (4,))
+    seeds = 400
+    table = _tables(FirstPixel(), grid=grid, noise_seeds=seeds).table(scene)
+    nlf = CAMERA.nlf(100)
+    for state, error in zip(grid, table.standard_error, strict=True):
+        light = 0.3 * 2.0 ** (state.log2_exposure - scene.reference.log2_exposure)
+        sigma = np.sqrt(nlf.read[1] + nlf.shot[1] * light)
+        # The spread of 400 normals is known to 1 / sqrt(2 * 399) = 3.5 %; quantisation adds a bit.
+        assert error == pytest.approx(sigma / np.sqrt(seeds), rel=0.13)
+
+
+def test_common_noise_makes_one_seed_repeatable_and_its_error_unknown() -> None:
+    first = _tables(MeanSignal(), noise_seeds=1).table(_scene())
+    second = _tables(MeanSignal(), noise_seeds=1).table(_scene())
+    np.testing.assert_array_equal(first.mean, second.mean)
+    assert np.isnan(first.standard_error).all()
+
+
+def test_mixed_scorer_averages_only_what_is_noisy() -> None:
+    scorer = CompositeScorer({"mean": MeanSignal(), "noise": make_scorer("noise").parts["noise"]})
+    table = _tables(scorer, noise_seeds=4).table(_scene())
+    assert (table.standard_error > 0).all()
+    np.testing.assert_array_equal(
+        table.parts["noise"], _tables("noise").table(_scene()).parts["noise"]
+    )
+    np.testing.assert_allclose(table.mean, 0.5 * (table.parts["mean"] + table.parts["noise"]))
+
+
+def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
+    table = _tables().table(_scene())
+    assert table.mean[table.oracle] == table.mean.max()
+    # Under `brightness` alone all states of one EV are alike: ISO 100 at 1/25 s equals ISO 400
+    # at 1/100 s and ISO 1600 at 1/400 s; times that are no powers of two round differently.
+    grid = ExposureGrid((100, 400, 1600), (1 / 400, 1 / 100, 1 / 25), (4, 8))
+    for ev100 in np.arange(2.0, 16.0, 0.37):
+        scene = replace(_scene(), illuminance=2.5 * 2.0**ev100)
+        best = _tables("brightness", grid=grid, use_cache=False).table(scene)
+        alike = np.flatnonzero(best.mean > best.mean.max() - 1e-7)
+        assert best.oracle == alike[0]
+
+
+def test_more_light_is_like_a_longer_exposure() -> None:
+    """Twice the light at 1/500 s is that of 1/250 s, to a score that sees only light."""
+    scene = _scene()
+    grid = ExposureGrid((100,), (1 / 500, 1 / 250), (4,))
+    plain = _tables(grid=grid).table(scene)
+    brighter = _tables(grid=grid).table(scene, gain=2.0)
+    assert brighter.mean[0] == pytest.approx(plain.mean[1], rel=1e-6)
+
+
+def _files(cache: Path) -> list[Path]:
+    return sorted((cache / "score_tables").glob("*"))
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    return tmp_path
+
+
+def test_second_time_comes_from_the_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = _scene()
+    first = _tables().table(scene, speed=0.2, defocus=1.5)
+    assert len(_files(cache)) == 1
+    monkeypatch.setattr(Highlights, "__call__", None)  # would fail if it were called again
+    second = _tables().table(scene, speed=0.2, defocus=1.5)
+    np.testing.assert_array_equal(first.mean, second.mean)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"not a table"])
+def test_a_damaged_file_is_made_anew(
+    cache: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = _scene()
+    expected = _tables().table(scene).mean
+    (path,) = _files(cache)
+    path.write_bytes(content)
+    with caplog.at_level(logging.WARNING):
+        np.testing.assert_array_equal(_tables().table(scene).mean, expected)
+    assert "made anew" in caplog.text
+    np.testing.assert_array_equal(_tables().table(scene).mean, expected)
+    assert len(_files(cache)) == 1
+
+
+def test_a_truncated_file_is_made_anew(cache: Path) -> None:
+    scene = _scene()
+    expected = _tables().table(scene).mean
+    (path,) = _files(cache)
+    path.write_bytes(path.read_bytes()[:-40])
+    np.testing.assert_array_equal(_tables().table(scene).mean, expected)
+
+
+def test_key_changes_with_everything_that_changes_the_scores(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = _scene()
+    counts = []
+
+    def use(tables: ScoreTables, scene: Scene = scene) -> None:
+        tables.table(scene)
+        counts.append(len(_files(cache)))
+
+    use(_tables())
+    use(_tables())  # nothing changed
+    use(_tables(grid=ExposureGrid((100,), (1 / 500,), (4,))))
+    use(ScoreTables(SMALL, get_camera("canon_70d"), make_scorer("balanced")))
+    scaled = CAMERA.with_nlf(100, CAMERA.nlf(100).scaled(2.0))
+    use(ScoreTables(SMALL, scaled, make_scorer("balanced")))  # the same name, other noise
+    use(_tables({"highlights": 1.0, "noise": 1.0}))
+    use(_tables(), replace(scene, light=scene.light * 1.5))
+    use(_tables(), replace(scene, reference=reference_settings(9.0)))
+    use(_tables(), replace(scene, illuminance=None))
+    other = make_scorer("highlights")
+    use(ScoreTables(SMALL, CAMERA, other))
+    strict = Highlights()
+    strict.scale = 0.05
+    use(ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": strict})))
+    assert counts == [1, 1, *range(2, 11)]
+
+
+def test_class_constants_enter_the_key(cache: Path) -> None:
+    """A subclass that only changes a constant is another scorer."""
+
+    class Strict(Highlights):
+        scale = 0.05
+
+    scene = _scene()
+    mild = ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": Highlights()})).table(scene)
+    strict = ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": Strict()})).table(scene)
+    assert (strict.mean < mild.mean).any()
+    assert len(_files(cache)) == 2
+
+
+def test_scorers_with_state_that_cannot_be_keyed_are_not_cached(cache: Path) -> None:
+    scorer = Highlights()
+    scorer.network = torch.nn.Linear(2, 2)  # type: ignore[attr-defined]
+    table = ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": scorer})).table(_scene())
+    assert np.isfinite(table.mean).all()
+    assert _files(cache) == []
+
+
+def test_noise_seeds_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="`noise_seeds`"):
+        _tables(noise_seeds=0)

@@ -1,0 +1,299 @@
+"""The native vector environment against SyncVectorEnv of single ones, and in other processes."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+import ae_env  # noqa: F401  (registers the environment)
+
+ID = "ae_env/AutoExposure-v0"
+ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
+NUM_ENVS = 3
+
+
+def _native(num_envs: int = NUM_ENVS, **arguments: Any) -> gym.vector.VectorEnv:
+    return gym.make_vec(ID, num_envs=num_envs, **{**ARGUMENTS, **arguments})
+
+
+def _make_single(**arguments: Any) -> gym.Env:
+    torch.set_num_threads(1)  # a worker process of its own crawls with one thread per core
+    return gym.make(f"ae_env:{ID}", **{**ARGUMENTS, **arguments})
+
+
+def _reference(mode: AutoresetMode, lengths: list[int], **arguments: Any) -> SyncVectorEnv:
+    make: list[Callable[[], gym.Env]] = [
+        functools.partial(_make_single, max_episode_steps=n, **arguments) for n in lengths
+    ]
+    return SyncVectorEnv(make, autoreset_mode=mode, copy=True)
+
+
+def _assert_same(first: Any, second: Any, where: str = "") -> None:
+    """Equal values in equal shapes, whatever the order of the keys.
+
+    Scores (float64) may differ in the last digits: an exponential is rounded differently in the
+    vector unit than in the few elements left over at the end of a batch.
+    """
+    if isinstance(first, dict):
+        assert isinstance(second, dict), where
+        assert set(first) == set(second), f"{where}: {set(first) ^ set(second)}"
+        for key in first:
+            _assert_same(first[key], second[key], f"{where}.{key}")
+    elif isinstance(first, tuple):
+        for i, (a, b) in enumerate(zip(first, second, strict=True)):
+            _assert_same(a, b, f"{where}({i})")
+    elif isinstance(first, np.ndarray) and first.dtype == object:
+        assert second.dtype == object, where
+        assert first.shape == second.shape, where
+        for i, (a, b) in enumerate(zip(first, second, strict=True)):
+            _assert_same(a, b, f"{where}[{i}]")
+    elif isinstance(first, np.ndarray):
+        assert first.dtype == second.dtype, f"{where}: {first.dtype} {second.dtype}"
+        if first.dtype == np.float64:
+            np.testing.assert_allclose(first, second, rtol=1e-10, atol=1e-12, err_msg=where)
+        else:
+            np.testing.assert_array_equal(first, second, err_msg=where)
+    else:
+        assert first == second, where
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {},
+        {
+            "with_oracle": True,
+            "observation": "linear",
+            "costs": {"flicker": 0.1, "switch": 0.1},
+            "lighting": "sine",
+            "delay": 1,
+        },
+    ],
+)
+def test_parity_with_sync_vector_env(mode: AutoresetMode, extra: dict[str, Any]) -> None:
+    envs = _native(autoreset_mode=mode.name, max_episode_steps=3, **extra)
+    reference = _reference(mode, [3] * NUM_ENVS, **extra)
+    assert envs.metadata["autoreset_mode"] == mode
+    _assert_same(envs.reset(seed=11), reference.reset(seed=11), "reset")
+    rng = np.random.default_rng(0)
+    finished = np.zeros(NUM_ENVS, dtype=bool)
+    for step in range(9):
+        actions = rng.integers(64, size=NUM_ENVS)
+        if mode == AutoresetMode.DISABLED and finished.any():
+            options = {"reset_mask": finished}
+            _assert_same(
+                envs.reset(options=options), reference.reset(options=dict(options)), "again"
+            )
+        mine, theirs = envs.step(actions), reference.step(actions)
+        _assert_same(mine, theirs, f"step {step}")
+        finished = mine[3]
+
+
+def test_parity_when_episodes_end_one_by_one() -> None:
+    """Episodes get out of step through masked resets; the shown frames of the others stay."""
+    envs = _native(autoreset_mode="DISABLED", max_episode_steps=2)
+    reference = _reference(AutoresetMode.DISABLED, [2] * NUM_ENVS)
+    envs.reset(seed=3)
+    reference.reset(seed=3)
+    masks = ([True, False, False], [False, True, True], [True, False, True])
+    for mask in masks:
+        _assert_same(envs.step(np.array([1, 2, 3])), reference.step(np.array([1, 2, 3])))
+        options = {"reset_mask": np.array(mask), "state": 5}
+        mine = envs.reset(options=dict(options))
+        theirs = reference.reset(options=dict(options))
+        _assert_same(mine, theirs, "masked reset")
+        both = np.array([True] * NUM_ENVS)
+        envs.reset(options={"reset_mask": both})
+        reference.reset(options={"reset_mask": both})
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+def test_staggered_episodes_agree_with_single_ones(mode: str) -> None:
+    """After a masked reset the episodes end at different steps, in the autoreset modes as well."""
+    envs = _native(autoreset_mode=mode, max_episode_steps=3)
+    singles = [_make_single(max_episode_steps=3) for _ in range(NUM_ENVS)]
+    envs.reset(seed=20)
+    for i, env in enumerate(singles):
+        env.reset(seed=20 + i)
+    envs.step(np.array([1, 1, 1]))
+    for env in singles:
+        env.step(1)
+    envs.reset(options={"reset_mask": np.array([False, True, False])})
+    singles[1].reset()
+    done = [False] * NUM_ENVS
+    for action in range(2, 9):
+        observation, reward, _, truncated, info = envs.step(np.full(NUM_ENVS, action))
+        for i, env in enumerate(singles):
+            if done[i]:
+                one, single_info = env.reset()
+                expected, score, done[i] = one, 0.0, False
+            else:
+                expected, score, _, done[i], single_info = env.step(action)
+                if mode == "SAME_STEP" and done[i]:
+                    np.testing.assert_array_equal(info["final_obs"][i]["raw"], expected["raw"])
+                    expected, single_info = env.reset()
+            np.testing.assert_array_equal(observation["raw"][i], expected["raw"])
+            assert info["scene_id"][i] == single_info["scene_id"]
+            assert reward[i] == score
+            assert truncated[i] == done[i]
+            done[i] = done[i] and mode == "NEXT_STEP"
+
+
+def test_a_finished_episode_needs_a_reset_when_autoreset_is_off() -> None:
+    envs = _native(autoreset_mode="DISABLED", max_episode_steps=1)
+    envs.reset(seed=0)
+    envs.step(np.zeros(NUM_ENVS, np.int64))
+    with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
+        envs.step(np.zeros(NUM_ENVS, np.int64))
+
+
+def test_an_episode_is_bit_equal_alone_or_in_a_batch() -> None:
+    many, alone = _native(20), _native(1)
+    many.reset(seed=0)
+    alone.reset(seed=13)
+    for action in (0, 21, 63, 40):
+        batch = many.step(np.full(20, action))[0]
+        one = alone.step(np.array([action]))[0]
+        np.testing.assert_array_equal(batch["raw"][13], one["raw"][0])
+
+
+def test_returned_arrays_are_never_reused() -> None:
+    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=2)
+    shown = [envs.reset(seed=0)[0]]
+    shown += [envs.step(np.full(NUM_ENVS, i))[0] for i in range(5)]
+    arrays = [array for observation in shown for array in observation.values()]
+    for i, array in enumerate(arrays):
+        assert not any(np.shares_memory(array, other) for other in arrays[i + 1 :])
+
+
+def test_final_info_describes_the_last_frame() -> None:
+    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=1)
+    envs.reset(seed=0)
+    _, _, _, truncated, info = envs.step(np.array([4, 5, 6]))
+    assert truncated.all()
+    np.testing.assert_array_equal(info["final_info"]["state"], [4, 5, 6])
+    assert set(info["final_info"]["rewards"]) == set(info["rewards"])
+
+
+def test_reset_options_per_environment() -> None:
+    envs = _native()
+    ids = [envs.unwrapped.scenes[i].scene_id for i in (0, 2, 4)]
+    _, info = envs.reset(seed=0, options={"scene": ids, "state": [1, 2, 3]})
+    assert info["scene_id"].tolist() == ids
+    np.testing.assert_array_equal(envs.unwrapped.states, [1, 2, 3])
+    _, info = envs.reset(options={"scene": ids[1], "state": 9})
+    assert info["scene_id"].tolist() == [ids[1]] * 3
+    assert info["state"].tolist() == [9, 9, 9]
+
+
+def test_scores_masks_and_pictures_of_every_environment() -> None:
+    envs = _native(render_mode="rgb_array", with_oracle=True)
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.render()
+    _, info = envs.reset(seed=0)
+    scores = envs.unwrapped.expected_scores()
+    assert scores.shape == (NUM_ENVS, 64)
+    best = scores[np.arange(NUM_ENVS), info["oracle_state"]]
+    np.testing.assert_allclose(best, scores.max(1), atol=1e-7)
+    assert envs.unwrapped.action_masks().shape == (NUM_ENVS, 64)
+    pictures = envs.render()
+    assert len(pictures) == NUM_ENVS
+    assert all(p.dtype == np.uint8 and p.shape[2] == 3 and p.shape[0] >= 256 for p in pictures)
+    assert _native().render() is None
+
+
+def test_rendering_follows_a_masked_reset() -> None:
+    envs = _native(render_mode="rgb_array", autoreset_mode="DISABLED")
+    envs.reset(seed=0, options={"scene": 0, "state": 0})
+    before = envs.render()
+    mask = np.array([False, True, False])
+    envs.reset(options={"reset_mask": mask, "scene": 1, "state": 30})
+    after = envs.render()
+    assert [(a != b).any() for a, b in zip(after, before, strict=True)] == mask.tolist()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"num_envs": 0}, "num_envs"),
+        ({"max_episode_steps": 0}, "max_episode_steps"),
+        ({"autoreset_mode": "LATER"}, "autoreset_mode"),
+        ({"render_mode": "human"}, "render_mode"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments: dict[str, Any], name: str) -> None:
+    from ae_env import AutoExposureVectorEnv
+
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        AutoExposureVectorEnv(**{**ARGUMENTS, **arguments})
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [np.array([0, 1]), np.zeros(3), np.array([0, 1, 64]), np.array([-1, 0, 0])],
+)
+def test_bad_actions_are_refused(actions: np.ndarray) -> None:
+    envs = _native()
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"`actions?`"):
+        envs.step(actions)
+
+
+def test_bad_resets_are_refused() -> None:
+    envs = _native()
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step(np.zeros(3, np.int64))
+    for options in ({"reset_mask": [True] * 3}, {"reset_mask": np.zeros(3, bool)}, {"states": 1}):
+        with pytest.raises(ValueError, match="options"):
+            envs.reset(options=options)
+    with pytest.raises(ValueError, match="must have 3 entries"):
+        envs.reset(options={"state": [1, 2]})
+    with pytest.raises(ValueError, match="`seed`"):
+        envs.reset(seed=[1, 2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("context", ["spawn", "forkserver"])
+def test_construction_in_other_processes(context: str) -> None:
+    make = functools.partial(_make_single)
+    envs = AsyncVectorEnv([make] * 2, context=context)
+    try:
+        observation, _ = envs.reset(seed=5)
+        native = _native(2)
+        expected, _ = native.reset(seed=5)
+        for action in (8, 33):
+            np.testing.assert_array_equal(observation["raw"], expected["raw"])
+            observation = envs.step(np.full(2, action))[0]
+            expected = native.step(np.full(2, action))[0]
+        np.testing.assert_array_equal(observation["raw"], expected["raw"])
+    finally:
+        envs.close()
+
+
+def _resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * 4096
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
+def test_memory_stays_flat_over_100_000_steps() -> None:
+    """Static light, and light that never repeats: neither may let a cache grow."""
+    num_envs, steps = 64, 1600  # 102,400 environment steps
+    envs = _native(num_envs, autoreset_mode="SAME_STEP")
+    envs.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for step in range(steps):
+        envs.step(rng.integers(64, size=num_envs))
+        if step == steps // 4:
+            before = _resident_bytes()
+    assert _resident_bytes() - before < 16 * 2**20

@@ -1,0 +1,59 @@
+"""A camera, a grid and synthetic frames for the policies' tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from ae_env.grid import ExposureGrid
+from ae_env.observation import encode_observation, encode_sensors, encode_settings
+from agents.policy import PolicyContext
+from simulator.camera import get_camera
+
+SIZE = 64
+
+
+@pytest.fixture(scope="session")
+def context() -> PolicyContext:
+    space = gym.spaces.Dict(
+        {
+            "raw": gym.spaces.Box(0, 255, (4, SIZE, SIZE), np.uint8),
+            "settings": gym.spaces.Box(-1, 1, (3,), np.float32),
+            "sensors": gym.spaces.Box(-1, 1, (2,), np.float32),
+        }
+    )
+    return PolicyContext(ExposureGrid.default(), get_camera("nikon_z6"), space)
+
+
+@pytest.fixture(scope="session")
+def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
+    """Frames of scenes (light relative to a grey card at its own EV) taken at grid states."""
+
+    def take(
+        light: np.ndarray, scene_ev: float, states: Any, speed: float = 0.0, defocus: float = 0.1
+    ) -> dict[str, np.ndarray]:
+        states = np.atleast_1d(states)
+        # Independent of the code under test: x = 0.12 * light * 2^(scene EV - state EV).
+        gain = 2.0 ** (scene_ev - context.grid.ev100[states])
+        signal = 0.12 * gain[:, None, None, None] * np.broadcast_to(light, (4, SIZE, SIZE))
+        apex = np.array(
+            [
+                (s.aperture_value, s.time_value, s.speed_value)
+                for s in (context.grid[int(i)] for i in states)
+            ]
+        )
+        count = len(states)
+        return {
+            "raw": encode_observation(torch.from_numpy(signal.astype(np.float32))).numpy(),
+            "settings": encode_settings(apex),
+            "sensors": encode_sensors(
+                np.full(count, speed), np.full(count, defocus), np.zeros((count, 2))
+            ),
+        }
+
+    return take
