@@ -7,6 +7,7 @@ import importlib
 import logging
 import shlex
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +32,8 @@ app = typer.Typer(
 )
 console = Console()
 BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "throughput")
+#: Exit status after Ctrl-C.
+_INTERRUPTED = 130
 
 Seed = Annotated[int, typer.Option(help="Seed of everything that is random.", min=0)]
 Scenes = Annotated[
@@ -47,15 +50,17 @@ def main() -> None:
         handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
     )
     try:
-        app()
-    except (ValueError, FileNotFoundError, ImportError) as error:
+        app(prog_name="ae-env")
+    except (ValueError, OSError, ImportError, SyntaxError) as error:
         if "--debug" in sys.argv:
             raise
-        Console(stderr=True).print(f"[bold red]error[/] {_escape(str(error))}", soft_wrap=True)
+        text = " ".join(str(error).split())
+        Console(stderr=True).print(f"[bold red]error[/] {_escape(text)}", soft_wrap=True)
         raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        Console(stderr=True).print("\nstopped; the same command goes on where it was")
-        raise SystemExit(130) from None
+    except SystemExit as stop:
+        if stop.code == _INTERRUPTED:  # what Typer makes of Ctrl-C
+            Console(stderr=True).print("\nstopped; the same command goes on where it was")
+        raise
 
 
 @app.callback()
@@ -77,15 +82,17 @@ def quickstart(
     """
     from agents.quickstart import next_commands, run_quickstart
 
+    _make_folder(out)
     with _bars() as progress:
         done = run_quickstart(scenes, out, seed=seed, progress=progress, command=_command())
     if done.zero_shot:
-        console.print(f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes")
+        text = f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes"
+        console.print(text, soft_wrap=True, markup=False)
     _print_scores(done.result)
     _print_files(done.files)
     console.print("\nTry next:")
     for line in next_commands(scenes, out, done.agents):
-        console.print(f"  {line}", soft_wrap=True, highlight=False)
+        console.print(f"  {line}", soft_wrap=True, highlight=False, markup=False)
 
 
 @app.command()
@@ -108,7 +115,10 @@ def simulate(
     settings = CameraSettings(iso, _seconds(shutter), aperture)
     if out.suffix.lower() != ".dng":
         raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
+    device = _device(device)
     source = read_raw(raw)
+    for path in (out, png or out):
+        _make_folder(path.parent)
     simulator = CameraSimulator(device=device)
     latent = simulator.prepare(source)
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
@@ -138,9 +148,11 @@ def sweep(
     from ae_env.scenes import Scene
     from simulator import CameraSimulator, read_raw, write_dng
 
+    device = _device(device)
     source = read_raw(raw)
-    scene = Scene.from_raw(source, scene_id=raw.stem).resized(128)
-    out.mkdir(parents=True, exist_ok=True)
+    _make_folder(out)
+    scene = Scene.from_raw(source, scene_id=raw.stem)
+    scene = scene.resized(min(128, *scene.light.shape[1:]))
     sheet = out / "contact_sheet.png"
     _save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
     files = {"contact sheet": sheet}
@@ -169,23 +181,24 @@ def train(
 
     Example: `ae-env train configs/ppo.yaml --out runs/ppo`
     """
-    import torch
-
     from agents.training import load_config, train_agent
+    from agents.weights import sibling
 
     agent = load_config(config)
+    _make_folder(sibling(out, ".json").parent)
     if seed is not None:
         agent = agent.with_seed(seed)
-    if device == "auto":
-        device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = _device(device)
     with _bars() as progress, progress(f"training {agent.agent}") as task:
 
         def report(done: int, total: int, values: dict[str, float]) -> None:
             task(done, total, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
 
         train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
-    console.print(f"wrote {out}.safetensors and {out}.json")
-    console.print(f"next: ae-env evaluate --policy {agent.agent}:{out}", highlight=False)
+    files = (sibling(out, ".safetensors"), sibling(out, ".json"))
+    _print_files({"weights": files[0], "description": files[1]})
+    command = shlex.join(["ae-env", "evaluate", "--policy", f"{agent.agent}:{out}"])
+    console.print(f"next: {command}", highlight=False, soft_wrap=True, markup=False)
 
 
 @app.command()
@@ -197,6 +210,7 @@ def evaluate(
     lighting: Annotated[str, typer.Option(help="static, step, ramp, sine, tunnel...")] = "static",
     delay: Annotated[int, typer.Option(help="Frames from a decision to its frame.", min=0)] = 0,
     sensors: Annotated[bool, typer.Option(help="Whether speed and defocus are observed.")] = True,
+    resolution: Annotated[int, typer.Option(help="Packed pixels a side.")] = 64,
     episodes: Annotated[int, typer.Option(help="Episodes per scene.", min=1)] = 2,
     frames: Annotated[int, typer.Option(help="Frames per episode.", min=1)] = 8,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("evaluation"),
@@ -218,14 +232,17 @@ def evaluate(
         "lighting": lighting,
         "delay": delay,
         "sensors": sensors,
+        "resolution": resolution,
     }
     envs = make_envs(options, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
     policies = {name: make_policy(name, context) for name in policy}
+    _make_folder(out)
     training = {**options, "scenes": training_scenes(scenes)[0], "lighting": "static", "delay": 0}
     with _bars() as progress:
         with progress("fitting on training scenes") as task:
             fit_policies(policies, training, seed=seed, progress=task)
+            task(1, 1)
         with progress("evaluation") as task:
             result = run(
                 policies,
@@ -265,6 +282,7 @@ def bench(
             "the benchmarks are not part of the installed package: run this in a clone of the "
             "repository"
         ) from None
+    _make_folder(out)
     module.run(out, seed=seed, quick=quick)
 
 
@@ -329,7 +347,7 @@ def _print_scores(result: EvaluationResult) -> None:
 
 def _print_files(files: Mapping[str, Path]) -> None:
     for name, path in files.items():
-        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True)
+        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True, markup=False)
 
 
 def _write_png(path: Path, raw: RawImage) -> Path:
@@ -358,6 +376,31 @@ def _seconds(text: str) -> float:
         return float(numerator) / float(denominator or 1)
     except (ValueError, ZeroDivisionError):
         raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
+
+
+def _make_folder(path: Path) -> None:
+    """Makes a folder for results before any time is spent on them."""
+    existing = next(p for p in (path, *path.parents) if p.exists())
+    if not existing.is_dir():
+        raise ValueError(f"`out` (={str(path)!r}) must be a folder, but {existing} is a file")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise ValueError(f"`out` (={str(path)!r}) cannot be written: {error.strerror}") from error
+
+
+def _device(name: str) -> str:
+    """The torch device called `name`, checked before any work is done."""
+    import torch
+
+    cuda = torch.cuda.is_available()
+    if name == "auto":
+        return "cuda" if cuda else "cpu"
+    if name != "cpu" and not (cuda and name.partition(":")[0] == "cuda"):
+        raise ValueError(f"`device` (={name!r}) must be auto, cpu{', cuda' if cuda else ''} here")
+    return name
 
 
 def _command() -> str:

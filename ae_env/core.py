@@ -19,7 +19,15 @@ from ae_env.observation import PEDESTAL, encode_observation, encode_sensors, enc
 from ae_env.options import COSTS, EnvOptions
 from ae_env.score_table import ScoreTable, ScoreTables, describe_captures, scene_latent
 from ae_env.scorers.protocol import DependsOn
-from simulator.capture import add_noise, clip_and_quantise, sensor_light
+from simulator.blur import motion_blur
+from simulator.camera_simulator import Latent
+from simulator.capture import (
+    SIGNAL_LIMIT,
+    Exposure,
+    add_noise,
+    clip_and_quantise,
+    defocused_light,
+)
 from simulator.noise import noise_generator
 
 #: Share of the episodes in which nothing moves.
@@ -30,8 +38,11 @@ SPEED_SIGMA = 1.3
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
 #: A sample below this signal is counted as clipped low: ten stops below white.
 LOW_CLIP = 2.0**-10
-#: Frames that are processed together: a chunk this small stays in the processor's cache.
-CHUNK_PIXELS = 4 * 64 * 64 * 8
+#: Samples that are processed together: a chunk this small stays in the processor's cache.
+CHUNK_SAMPLES = 4 * 64 * 64 * 8
+#: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
+OPTICS_BYTES = 256 * 2**20
+_RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
 
 
 @dataclass
@@ -49,6 +60,9 @@ class Episode:
     image_mean: float = float("nan")
     table: tuple[float, ScoreTable] | None = None
     closed_parts: dict[str, np.ndarray] | None = None
+    latent: tuple[float, Latent] | None = None  # by gain
+    defocused: dict[float, torch.Tensor] = field(default_factory=dict)  # by blur diameter
+    blurred: tuple[tuple[float, float], torch.Tensor] | None = None  # by defocus and motion
 
 
 @dataclass
@@ -86,8 +100,10 @@ class EpisodeCore:
         self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
         states = self.grid.states
         self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
-        self._nlf = [self.camera.nlf(s.iso) for s in states]
         self._bounds = np.array([[s.iso, s.exposure_time, s.f_number, s.ev100] for s in states])
+        frame_bytes = 16 * options.resolution**2
+        kept = num_envs * (len(self.grid.f_numbers) + 1) * frame_bytes
+        self._keep_defocused = kept <= OPTICS_BYTES
 
     # -- spaces -------------------------------------------------------------------------------
 
@@ -213,29 +229,21 @@ class EpisodeCore:
             indices: Episodes.
             previous: State of each before this step, for the costs; None after a reset.
         """
-        size = self.options.resolution
-        per_chunk = max(1, CHUNK_PIXELS // (4 * size * size))
-        chunks = [
-            self._capture(indices[i : i + per_chunk]) for i in range(0, len(indices), per_chunk)
-        ]
-        raw = np.concatenate([c[0] for c in chunks]) if len(chunks) > 1 else chunks[0][0]
-        columns = {
-            name: np.concatenate([np.atleast_1d(c[1][name]) for c in chunks])
-            for name in chunks[0][1]
-        }
+        raw, columns = self._capture_all(indices)
         episodes = [self.episode(i) for i in indices]
         rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
         rewards["score"] = self._scores(rewards, indices)
-        costs = self._costs(episodes, columns.pop("image_mean"), previous)
+        costs = self._costs(episodes, columns.pop("image_mean", None), previous)
         reward = rewards["score"].copy()
         for name, cost in costs.items():
             rewards[name] = cost
             reward -= self.options.costs[name] * cost
-        apex = self._apex[[e.state for e in episodes]]
-        observation = {"raw": raw, "settings": encode_settings(apex)}
+        settings = encode_settings(self._apex[[e.state for e in episodes]])
+        observation = {"raw": raw, "settings": settings}
         if self.options.sensors:
-            observation["sensors"] = self._sensors(episodes)
-        info = self._info(indices, episodes) | columns | {"rewards": rewards}
+            speed, defocus = np.array([(e.speed, e.defocus) for e in episodes]).T
+            observation["sensors"] = encode_sensors(speed, defocus, columns.pop("sensor_noise"))
+        info = self._info(episodes) | columns | {"rewards": rewards}
         if self.options.with_oracle:
             tables = [self.expected_scores(i) for i in indices]
             best = np.array([t.mean[t.oracle] for t in tables])
@@ -248,47 +256,92 @@ class EpisodeCore:
             return np.array([self.expected_scores(i).mean[self.episode(i).state] for i in indices])
         return np.asarray(self.scorer.combine(parts), dtype=np.float64)
 
-    def _capture(self, indices: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def _capture_all(self, indices: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Observations of `raw` and the info columns, worked out chunk by chunk."""
+        shape = (len(indices), 4, self.options.resolution, self.options.resolution)
+        raw = np.empty(shape, _RAW_DTYPES[self.options.observation])
+        size = max(1, CHUNK_SAMPLES // (4 * self.options.resolution**2))
+        chunks = []
+        for start in range(0, len(indices), size):
+            part = slice(start, start + size)
+            chunks.append(self._capture(indices[part], raw[part]))
+        columns = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
+        return raw, columns
+
+    def _capture(self, indices: Sequence[int], raw: np.ndarray) -> dict[str, np.ndarray]:
+        """Info columns of the episodes `indices`; their observations are written to `raw`."""
         episodes = [self.episode(i) for i in indices]
-        settings = [self.grid[e.state] for e in episodes]
-        gains = [self.gain(e, s.exposure_time) for e, s in zip(episodes, settings, strict=True)]
-        exposures, lights = [], []
-        for episode, state, gain in zip(episodes, settings, gains, strict=True):
-            latent = scene_latent(
-                self.scenes[episode.scene],
-                self.camera,
-                speed=episode.speed,
-                defocus=episode.defocus,
-                gain=gain,
-            )
-            exposures.append(latent.exposure(state))
-            lights.append(sensor_light(latent.light, exposures[-1]))
-        light = torch.stack(lights)
+        light, exposures, gains = self._sensor_light(episodes)
         excess = np.zeros(len(episodes))
+        generators = [noise_generator(e.noise_seed, e.frame) for e in episodes]
         if self.options.noise:
-            generators = [noise_generator(e.noise_seed, e.frame) for e in episodes]
             light, excess = add_noise(light, exposures, generators)
         frames = clip_and_quantise(light, self.camera)
-
         columns: dict[str, np.ndarray] = {
-            "clipped_high": (frames >= 1.0 - 1e-6).float().mean(dim=(1, 2, 3)).double().numpy(),
-            "clipped_low": (frames <= LOW_CLIP).float().mean(dim=(1, 2, 3)).double().numpy(),
+            "clipped_high": _share(frames.numpy() >= 1.0 - 1e-6),
+            "clipped_low": _share(frames.numpy() <= LOW_CLIP),
             "excess_noise": excess,
             "modules": np.array([_modules(e, self.options.noise) for e in exposures], object),
         }
+        if self.options.sensors:  # drawn last: the frame is the same with and without them
+            columns["sensor_noise"] = np.stack([_normals(g) for g in generators])
         columns |= self._part_scores(indices, frames, gains)
-        codes = encode_observation(frames)
-        columns["image_mean"] = codes.float().mean(dim=(1, 2, 3)).double().numpy() / 255.0
-        return self._encode(frames, codes), columns
-
-    def _encode(self, frames: torch.Tensor, codes: torch.Tensor) -> np.ndarray:
+        codes: torch.Tensor | None = None
         if self.options.observation == "uint8":
-            return codes.numpy()
+            codes = torch.from_numpy(raw)
+            encode_observation(frames, out=codes)
+        else:
+            raw[...] = self._encode(frames)
+        if "flicker" in self.options.costs:
+            codes = encode_observation(frames) if codes is None else codes
+            columns["image_mean"] = codes.sum(dim=(1, 2, 3)).numpy() / (255.0 * codes[0].numel())
+        return columns
+
+    def _sensor_light(
+        self, episodes: Sequence[Episode]
+    ) -> tuple[torch.Tensor, list[Exposure], list[float]]:
+        """Light on the sensor (B, 4, H, W) of each episode in its current state."""
+        size = self.options.resolution
+        light = torch.empty(len(episodes), 4, size, size)
+        exposures, gains = [], []
+        for i, episode in enumerate(episodes):
+            state = self.grid[episode.state]
+            gain = self.gain(episode, state.exposure_time)
+            latent = self._latent(episode, gain)
+            exposure = latent.exposure(state)
+            torch.mul(self._blurred(episode, latent, exposure), exposure.ratio, out=light[i])
+            exposures.append(exposure)
+            gains.append(gain)
+        return light.clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT), exposures, gains
+
+    def _latent(self, episode: Episode, gain: float) -> Latent:
+        if episode.latent is None or episode.latent[0] != gain:
+            scene = self.scenes[episode.scene]
+            latent = scene_latent(
+                scene, self.camera, speed=episode.speed, defocus=episode.defocus, gain=gain
+            )
+            episode.latent = (gain, latent)
+        return episode.latent[1]
+
+    def _blurred(self, episode: Episode, latent: Latent, exposure: Exposure) -> torch.Tensor:
+        """The blurred light before exposure; kept, because an agent that has settled repeats it."""
+        key = (exposure.defocus_px, exposure.motion_px)
+        if episode.blurred is not None and episode.blurred[0] == key:
+            return episode.blurred[1]
+        defocused = episode.defocused.get(exposure.defocus_px)
+        if defocused is None:
+            defocused = defocused_light(latent.light, exposure.defocus_px)
+            if self._keep_defocused:
+                episode.defocused[exposure.defocus_px] = defocused
+        episode.blurred = (key, motion_blur(defocused, exposure.motion_px))
+        return episode.blurred[1]
+
+    def _encode(self, frames: torch.Tensor) -> np.ndarray:
         if self.options.observation == "linear":
             return frames.clamp(-PEDESTAL, 1.0).numpy()
         span = np.array(self.camera.span)[:, None, None]
         black = np.array(self.camera.black_level)[:, None, None]
-        return np.rint(frames.numpy() * span + black).astype(np.uint16)
+        return np.rint(frames.numpy() * span + black)
 
     def _part_scores(
         self, indices: Sequence[int], frames: torch.Tensor, gains: Sequence[float]
@@ -317,27 +370,23 @@ class EpisodeCore:
                 scores[f"score:{name}"] = values.numpy()
         return scores
 
-    def _sensors(self, episodes: list[Episode]) -> np.ndarray:
-        seeds = ((e.noise_seed, 1, e.frame) for e in episodes)
-        noise = np.stack([np.random.default_rng(seed).standard_normal(2) for seed in seeds])
-        speed = np.array([e.speed for e in episodes])
-        return encode_sensors(speed, np.array([e.defocus for e in episodes]), noise)
-
     def _costs(
-        self, episodes: list[Episode], means: np.ndarray, previous: Sequence[int] | None
+        self, episodes: list[Episode], means: np.ndarray | None, previous: Sequence[int] | None
     ) -> dict[str, np.ndarray]:
         costs = {name: np.zeros(len(episodes)) for name in COSTS if name in self.options.costs}
-        for i, (episode, mean) in enumerate(zip(episodes, means, strict=True)):
+        if means is not None:
+            before = np.array([e.image_mean for e in episodes])
+            for episode, mean in zip(episodes, means, strict=True):
+                episode.image_mean = float(mean)
             if previous is not None:
-                if "flicker" in costs:
-                    costs["flicker"][i] = abs(mean - episode.image_mean)
-                if "switch" in costs:
-                    before, after = self.grid.controls(np.array([previous[i], episode.state]))
-                    costs["switch"][i] = np.mean(before != after)
-            episode.image_mean = float(mean)
+                costs["flicker"] = np.abs(means - before)
+        if "switch" in costs and previous is not None:
+            now = np.array([e.state for e in episodes])
+            changed = self.grid.controls(np.array(previous)) != self.grid.controls(now)
+            costs["switch"] = changed.mean(axis=-1)
         return costs
 
-    def _info(self, indices: Sequence[int], episodes: list[Episode]) -> dict[str, Any]:
+    def _info(self, episodes: list[Episode]) -> dict[str, Any]:
         states = np.array([e.state for e in episodes])
         bounds = self._bounds[states]
         return {
@@ -350,13 +399,23 @@ class EpisodeCore:
         }
 
 
+def _normals(generator: torch.Generator) -> np.ndarray:
+    """Two standard normals."""
+    return torch.empty(2, dtype=torch.float64).normal_(generator=generator).numpy()
+
+
+def _share(mask: np.ndarray) -> np.ndarray:
+    """(B,) float64 share of True in each image of a mask (B, 4, H, W)."""
+    return np.array([np.count_nonzero(image) for image in mask]) / mask[0].size
+
+
 def _fixed_or_drawn(option: str | float, off: str, drawn: float) -> float:
     if option == "random":
         return drawn
     return 0.0 if option == off else float(option)
 
 
-def _modules(exposure: Any, noise: bool) -> str:
+def _modules(exposure: Exposure, noise: bool) -> str:
     names = ["exposure"]
     names += ["defocus"] * (exposure.defocus_px > 0) + ["motion_blur"] * (exposure.motion_px > 0)
     return "+".join(names + ["noise"] * noise)

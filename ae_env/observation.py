@@ -25,24 +25,26 @@ SENSOR_NOISE = 0.15
 DEFOCUS_FRAME = 64
 
 
-def encode_observation(signal: torch.Tensor) -> torch.Tensor:
+def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
     """Signal on the scale where white is 1 to 8-bit codes.
 
     Args:
         signal: Float tensor of any shape.
+        out: uint8 tensor of this shape to write to, instead of a new one.
 
     Returns:
         uint8: ``round(255 sqrt((x + p) / (1 + p)))``, x clipped to [-p, 1], p = 1/1024.
     """
     codes = signal.clamp(-PEDESTAL, 1.0).add_(PEDESTAL).div_(1.0 + PEDESTAL)
-    return codes.sqrt_().mul_(255.0).round_().byte()
+    codes = codes.sqrt_().mul_(255.0).round_()
+    return codes.byte() if out is None else out.copy_(codes)
 
 
 def decode_observation(raw: np.ndarray) -> np.ndarray:
     """8-bit codes back to the signal, float32 in [-1/1024, 1]; inverts `encode_observation`.
 
-    >>> decode_observation(np.array([0, 255], np.uint8))
-    array([-0.00097656,  1.        ], dtype=float32)
+    >>> decode_observation(np.array([0, 255], np.uint8)).tolist()
+    [-0.0009765625, 1.0]
     """
     table = (1.0 + PEDESTAL) * (np.arange(256) / 255.0) ** 2 - PEDESTAL
     return table.astype(np.float32)[raw]

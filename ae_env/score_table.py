@@ -12,7 +12,7 @@ import io
 import json
 import logging
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +31,10 @@ from simulator.settings import CameraSettings, exposure_ratio
 _LOGGER = logging.getLogger(__name__)
 #: Bumped when the way that scores are computed changes.
 TABLE_VERSION = 1
-#: States evaluated at once: more only spends time in memory paging.
+#: States evaluated at once: more only spends time in memory paging. Where only the blur matters,
+#: which seldom looks at pixels, as many as this number of samples allows.
 _CHUNK = 16
+_BLUR_SAMPLES = 2**22
 #: Scores closer than this are equal: rounding moves them by 1e-8, noise seeds by 1e-5.
 TIE = 1e-7
 
@@ -78,12 +80,9 @@ def scene_latent(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
         gain: Light relative to the scene's own.
     """
-    reference = scene.reference
-    if gain != 1.0:  # more light is the same as a reference of a shorter exposure
-        reference = replace(reference, exposure_time=reference.exposure_time / gain)
     return Latent(
         light=scene.light,
-        reference=reference,
+        reference=scene.reference,
         camera=camera,
         nlf=scene.nlf,
         saturated=scene.saturated,
@@ -91,6 +90,7 @@ def scene_latent(
         box_factor=scene.box_factor,
         image_speed=speed,
         defocus=defocus * scene.light.shape[-2] / 64.0,
+        gain=gain,
     )
 
 
@@ -209,7 +209,8 @@ class ScoreTables:
         if not self.scorer.names(*kinds):
             return {}
         chunks = []
-        for states in _chunks(list(self.grid.states)):
+        size = max(_CHUNK, _BLUR_SAMPLES // scene.light.numel()) if kinds == ("blur",) else _CHUNK
+        for states in _chunks(list(self.grid.states), size):
             captures = self._captures(scene, states, speed, defocus, gain)
             scores = self.scorer.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
@@ -274,8 +275,8 @@ class ScoreTables:
         return cache_dir() / "score_tables" / f"{digest.hexdigest()[:32]}.npz"
 
 
-def _chunks(states: list[CameraSettings]) -> list[list[CameraSettings]]:
-    return [states[i : i + _CHUNK] for i in range(0, len(states), _CHUNK)]
+def _chunks(states: list[CameraSettings], size: int = _CHUNK) -> list[list[CameraSettings]]:
+    return [states[i : i + size] for i in range(0, len(states), size)]
 
 
 def _load_parts(path: Path) -> dict[str, np.ndarray] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import time
@@ -16,6 +17,8 @@ from safetensors.torch import save
 from simulator.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
+#: What reading a damaged file, or one of something else, ends in.
+_UNFIT = (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError)
 
 
 class HasState(Protocol):
@@ -35,30 +38,43 @@ class Checkpoint:
         path: The file; None keeps nothing.
         parts: Modules, optimisers, schedules by name.
         interval: Least time between two saves [s].
+        identity: JSON value that says what is trained and how; the state of another training is
+            not taken over.
     """
 
     def __init__(
-        self, path: Path | None, parts: Mapping[str, HasState], interval: float = 20.0
+        self,
+        path: Path | None,
+        parts: Mapping[str, HasState],
+        interval: float = 20.0,
+        identity: Any = None,
     ) -> None:
         self.path, self.parts, self.interval = path, dict(parts), interval
+        self._identity = json.loads(json.dumps(identity))
         self._saved = time.monotonic()
 
     def restore(self) -> int:
         """Takes over the state on disk; returns the steps done so far, 0 where there is none."""
         if self.path is None or not self.path.exists():
             return 0
+        before = {name: copy.deepcopy(part.state_dict()) for name, part in self.parts.items()}
         try:
             with safe_open(self.path, framework="pt") as stored:
                 tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-                structure = json.loads(stored.metadata()["structure"])
+                structure = json.loads((stored.metadata() or {})["structure"])
+            step = int(structure["step"])
+            if structure["identity"] != self._identity:
+                raise ValueError("it belongs to a training with other settings")
             for name, part in self.parts.items():
                 part.load_state_dict(_unflatten(structure["parts"][name], tensors))
-        except (SafetensorError, json.JSONDecodeError, KeyError, ValueError, RuntimeError) as error:
+        except _UNFIT as error:
+            for name, part in self.parts.items():  # nothing of a half-restored state stays
+                part.load_state_dict(before[name])
             _LOGGER.warning(
                 "checkpoint %s does not fit, training begins anew: %s", self.path, error
             )
             return 0
-        return int(structure["step"])
+        return step
 
     def save(self, step: int, *, force: bool = False) -> None:
         """Writes the state after `step` steps, unless the last save is too recent."""
@@ -66,14 +82,9 @@ class Checkpoint:
             return
         tensors: dict[str, torch.Tensor] = {}
         parts = {name: _flatten(part.state_dict(), tensors) for name, part in self.parts.items()}
-        structure = json.dumps({"step": step, "parts": parts})
+        structure = json.dumps({"step": step, "identity": self._identity, "parts": parts})
         write_atomically(self.path, save(tensors, metadata={"structure": structure}))
         self._saved = time.monotonic()
-
-    def remove(self) -> None:
-        """Deletes the file: the training is complete."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
 
 
 def _flatten(value: Any, tensors: dict[str, torch.Tensor]) -> Any:

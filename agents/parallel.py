@@ -5,8 +5,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import queue
-from collections.abc import Callable, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +18,8 @@ from agents.training import AgentConfig, is_trained, train_agent
 
 #: Seconds between two looks at the queue.
 _PATIENCE = 0.2
+#: In a worker: set when it is to end.
+_stop: Any = None
 
 
 @dataclass(frozen=True)
@@ -57,14 +62,18 @@ def train_in_parallel(
     workers = min(workers or cores, len(waiting))
     threads = max(1, cores // workers)
     context = multiprocessing.get_context("spawn")
+    stop = context.Event()
     with (
         context.Manager() as manager,
-        ProcessPoolExecutor(workers, mp_context=context) as executor,
+        ProcessPoolExecutor(
+            workers, mp_context=context, initializer=_obey, initargs=(stop,)
+        ) as executor,
     ):
         messages = manager.Queue()
-        running: set[Future[None]] = {
-            executor.submit(_train, job, threads, messages) for job in waiting
-        }
+        with _interrupts_ignored():
+            running: set[Future[None]] = {
+                executor.submit(_train, job, threads, messages) for job in waiting
+            }
         try:
             while running:
                 done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
@@ -72,8 +81,28 @@ def train_in_parallel(
                 for future in done:
                     future.result()
         except BaseException:
+            stop.set()
             executor.shutdown(wait=True, cancel_futures=True)
             raise
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Processes started within leave Ctrl-C to this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _obey(stop: Any) -> None:
+    """Begins a worker, which ends its training when `stop` is set."""
+    global _stop
+    _stop = stop
 
 
 def _deliver(messages: Any, progress: Callable[..., None] | None) -> None:
@@ -94,8 +123,11 @@ def _train(job: TrainingJob, threads: int, messages: Any) -> None:
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
         nonlocal last
+        if _stop is not None and _stop.is_set():
+            raise KeyboardInterrupt
         if done == total or done - last >= total // 200:
             last = done
             messages.put((job.name, done, total, values))
 
-    train_agent(job.config, job.out, progress=report)
+    if _stop is None or not _stop.is_set():
+        train_agent(job.config, job.out, progress=report)

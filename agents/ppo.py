@@ -7,7 +7,7 @@ contextual bandit: the default discount is 0.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,25 +19,90 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 
+from ae_env.grid import ExposureGrid
 from agents.checkpoint import Checkpoint
-from agents.networks import ExposureFeatures
+from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.ranges import check_ranges
 from agents.sb3_adapter import SB3VectorAdapter
-from agents.weights import check_context, describe_context, load_agent, save_agent
+from agents.weights import check_context, describe_context, load_agent, load_into, save_agent
 
 
 class ExposureExtractor(BaseFeaturesExtractor):
-    """`ExposureFeatures` as SB3 wants it; SB3 has divided the raw by 255 already."""
+    """`ExposureFeatures` as SB3 wants it, with the sensors kept beside for the `StateHead`.
 
-    def __init__(self, observation_space: gym.spaces.Dict, features_dim: int = 256) -> None:
-        super().__init__(observation_space, features_dim)
-        self.features = ExposureFeatures(observation_space, features_dim)
+    SB3 has divided the raw by 255 already.
+    """
+
+    def __init__(self, observation_space: gym.spaces.Dict, width: int = 256) -> None:
+        sensors = 2 if "sensors" in observation_space.spaces else 0
+        super().__init__(observation_space, width + sensors)
+        self.features = ExposureFeatures(observation_space, width)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Features (B, features_dim)."""
         sensors = observations.get("sensors")
-        return self.features(observations["raw"], observations["settings"], sensors)
+        features = self.features(observations["raw"], observations["settings"], sensors)
+        return features if sensors is None else torch.cat([features, sensors], dim=1)
+
+
+class _StateLogits(nn.Module):
+    """Logit of each state from what `ExposureExtractor` gives."""
+
+    def __init__(self, grid: ExposureGrid, width: int, has_sensors: bool) -> None:
+        super().__init__()
+        self.width = width
+        self.head = StateHead(grid, width, has_sensors)
+        nn.init.orthogonal_(self.head.values.weight, 0.01)  # begin with all states alike
+        nn.init.zeros_(self.head.values.bias)
+
+    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        features, sensors = latent[:, : self.width], latent[:, self.width :]
+        return self.head(features, sensors if sensors.shape[1] else None)[..., 0]
+
+
+class ExposureActorCritic(MultiInputActorCriticPolicy):
+    """SB3's actor and critic on the exposure features, with a `StateHead` for the logits.
+
+    Args:
+        observation_space: Observation of a single environment.
+        action_space: `Discrete`, one per state.
+        lr_schedule: As SB3 calls it.
+        grid: The exposure states.
+        width: Features that describe a frame.
+        kwargs: Further arguments of SB3's policy.
+    """
+
+    def __init__(
+        self,
+        observation_space: gym.spaces.Dict,
+        action_space: gym.Space,
+        lr_schedule: Any,
+        *,
+        grid: ExposureGrid,
+        width: int = 256,
+        **kwargs: Any,
+    ) -> None:
+        self.grid, self.width = grid, width
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            features_extractor_class=ExposureExtractor,
+            features_extractor_kwargs={"width": width},
+            net_arch={"pi": [], "vf": [128]},
+            activation_fn=nn.ReLU,
+            **kwargs,
+        )
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        has_sensors = self.features_dim > self.width
+        self.action_net = _StateLogits(self.grid, self.width, has_sensors)
+        rate = lr_schedule(1)
+        self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
 
 @dataclass(frozen=True)
@@ -74,23 +139,40 @@ class PPOTraining:
     width: int = 256
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            total_timesteps=(1, 1e12),
+            n_steps=(1, 1e6),
+            batch_size=(2, 1e9),
+            n_epochs=(1, 1e4),
+            learning_rate=(1e-9, 1.0),
+            gamma=(0.0, 1.0),
+            gae_lambda=(0.0, 1.0),
+            clip_range=(1e-6, 1e6),
+            ent_coef=(0.0, 1e6),
+            vf_coef=(0.0, 1e6),
+            max_grad_norm=(1e-9, 1e9),
+            width=(1, 65536),
+            seed=(0, 2**32 - 1),
+        )
 
-def make_policy_network(
-    observation_space: gym.spaces.Dict, action_space: gym.Space, width: int
-) -> MultiInputActorCriticPolicy:
-    """SB3's policy with the exposure features, on its own, to load weights into."""
-    return MultiInputActorCriticPolicy(
-        observation_space, action_space, lambda _: 0.0, **_policy_kwargs(width)
+    def check_batch(self, num_envs: int) -> None:
+        """Raises a `ValueError` unless `num_envs` rollouts divide into gradient steps."""
+        frames = self.n_steps * num_envs
+        if frames % self.batch_size:
+            raise ValueError(
+                f"`batch_size` (={self.batch_size}) must divide the frames of a rollout, n_steps * "
+                f"num_envs (={self.n_steps} * {num_envs} = {frames})"
+            )
+
+
+def make_policy_network(context: PolicyContext, width: int) -> ExposureActorCritic:
+    """The actor and critic on their own, to load weights into."""
+    actions = gym.spaces.Discrete(len(context.grid))
+    return ExposureActorCritic(
+        context.observation_space, actions, lambda _: 0.0, grid=context.grid, width=width
     )
-
-
-def _policy_kwargs(width: int) -> dict[str, Any]:
-    return {
-        "features_extractor_class": ExposureExtractor,
-        "features_extractor_kwargs": {"features_dim": width},
-        "net_arch": {"pi": [128], "vf": [128]},
-        "activation_fn": torch.nn.ReLU,
-    }
 
 
 class PPOPolicy(Policy):
@@ -109,7 +191,7 @@ class PPOPolicy(Policy):
         self,
         context: PolicyContext,
         weights: str | Path | None = None,
-        network: MultiInputActorCriticPolicy | None = None,
+        network: ExposureActorCritic | None = None,
     ) -> None:
         super().__init__(context)
         if (weights is None) == (network is None):
@@ -117,9 +199,8 @@ class PPOPolicy(Policy):
         if network is None:
             tensors, card = load_agent(str(weights), "ppo")
             check_context(card, context)
-            actions = gym.spaces.Discrete(len(context.grid))
-            network = make_policy_network(context.observation_space, actions, card["width"])
-            network.load_state_dict(tensors)
+            network = make_policy_network(context, card["width"])
+            load_into(network, tensors, str(weights))
         network.set_training_mode(False)
         self.network = network
 
@@ -166,7 +247,8 @@ def train_ppo(
     checkpoint: Path | None = None,
     progress: Callable[[int, int, dict[str, float]], None] | None = None,
     device: str = "cpu",
-) -> MultiInputActorCriticPolicy:
+    identity: Any = None,
+) -> ExposureActorCritic:
     """Trains PPO on the scenes of `envs` (autoreset mode SAME_STEP).
 
     Args:
@@ -175,12 +257,16 @@ def train_ppo(
         checkpoint: Where to keep the state of the training; a second run resumes there.
         progress: Called with frames done, frames in all, and the mean reward.
         device: Torch device of the network.
+        identity: JSON value; the checkpoint of a training with another one is not resumed. By
+            default the hyperparameters.
 
     Returns:
         The trained policy network.
     """
+    training.check_batch(envs.num_envs)
+    context = PolicyContext.from_envs(envs)
     model = PPO(
-        MultiInputActorCriticPolicy,
+        ExposureActorCritic,
         SB3VectorAdapter(envs),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
         n_steps=training.n_steps,
@@ -192,11 +278,15 @@ def train_ppo(
         ent_coef=training.ent_coef,
         vf_coef=training.vf_coef,
         max_grad_norm=training.max_grad_norm,
-        policy_kwargs=_policy_kwargs(training.width),
+        policy_kwargs={"grid": context.grid, "width": training.width},
         seed=training.seed,
         device=device,
     )
-    store = Checkpoint(checkpoint, {"policy": model.policy, "optimiser": model.policy.optimizer})
+    store = Checkpoint(
+        checkpoint,
+        {"policy": model.policy, "optimiser": model.policy.optimizer},
+        identity=identity or asdict(training),
+    )
     done = store.restore()
     model.num_timesteps = done
     if done:  # a resumed run sees other episodes than the first
@@ -205,19 +295,19 @@ def train_ppo(
     if remaining > 0:
         callback = _TrainingCallback(training, store, progress)
         model.learn(remaining, callback=callback, reset_num_timesteps=done == 0)
-    store.remove()
+    store.save(model.num_timesteps, force=True)
     return model.policy  # type: ignore[return-value]
 
 
 def save_ppo(
     path: Path,
-    network: MultiInputActorCriticPolicy,
+    network: ExposureActorCritic,
     context: PolicyContext,
     training: dict[str, Any],
 ) -> None:
     """Writes the agent as ``path.safetensors`` and ``path.json``."""
     description = {
-        "width": network.features_dim,
+        "width": network.width,
         "context": describe_context(context),
         "training": training,
     }

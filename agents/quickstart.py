@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -104,8 +105,9 @@ def run_quickstart(
 def training_scenes(scenes: str) -> tuple[str, bool]:
     """Where agents for `scenes` are trained: there, or on the bundled ones if they are too few."""
     from ae_env.options import EnvOptions
+    from ae_env.scenes.loading import BUNDLED
 
-    if not scenes.startswith("bundled"):
+    if scenes not in BUNDLED:
         groups = {s.group for s in EnvOptions(scenes=scenes, split="all").load_scenes()}
         if len(groups) < 15:
             return "bundled", True
@@ -199,10 +201,11 @@ def _contact_sheet(
 
 def next_commands(scenes: str, out: Path, agents: Mapping[str, Path]) -> Sequence[str]:
     """Command lines to try after a quickstart."""
-    own = "" if scenes == "bundled" else f" --scenes {scenes}"
-    ppo = agents["ppo"]
+    own = [] if scenes == "bundled" else ["--scenes", scenes]
+    evaluation = ["ae-env", "evaluate", "--policy", f"ppo:{agents['ppo']}"]
+    evaluation += ["--policy", "matrix:tuned", *own, "--out", f"{out}/meters"]
     return (
-        f"ae-env evaluate --policy ppo:{ppo} --policy matrix:tuned{own} --out {out}/meters",
+        shlex.join(evaluation),
         "ae-env evaluate --policy my_policy.py:MyPolicy",
         "ae-env quickstart --scenes path/to/your/raws --out my_scenes",
         "ae-env train configs/regression.yaml --out runs/regression",

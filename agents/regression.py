@@ -8,7 +8,7 @@ each weighted by the network's own confidence.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,11 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from agents.networks import ExposureFeatures
+from ae_env.grid import ExposureGrid
+from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
-from agents.weights import check_context, describe_context, load_agent, save_agent
+from agents.ranges import check_ranges
+from agents.weights import check_context, describe_context, load_agent, load_into, save_agent
 
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
@@ -31,25 +33,25 @@ class ScoreRegressor(nn.Module):
 
     Args:
         observation_space: Observation of a single environment.
-        num_states: States of the grid.
-        width: Hidden features.
+        grid: The exposure states.
+        width: Features that describe a frame.
     """
 
     def __init__(
-        self, observation_space: gym.spaces.Dict, num_states: int, width: int = 256
+        self, observation_space: gym.spaces.Dict, grid: ExposureGrid, width: int = 256
     ) -> None:
         super().__init__()
+        self.width = width
         self.features = ExposureFeatures(observation_space, width)
-        self.scores = nn.Linear(width, num_states)
-        self.log_variance = nn.Linear(width, num_states)
+        self.states = StateHead(grid, width, "sensors" in observation_space.spaces, outputs=2)
 
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Expected score and log variance of the prediction, both (B, S)."""
-        features = self.features(codes, settings, sensors)
-        log_variance = self.log_variance(features).clamp(*_LOG_VARIANCE)
-        return torch.sigmoid(self.scores(features)), log_variance
+        values = self.states(self.features(codes, settings, sensors), sensors)
+        scores, log_variance = values.unbind(dim=2)
+        return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE)
 
 
 def observation_tensors(
@@ -86,8 +88,8 @@ class RegressionPolicy(Policy):
         if network is None:
             tensors, card = load_agent(str(weights), "regression")
             check_context(card, context)
-            network = ScoreRegressor(context.observation_space, len(context.grid), card["width"])
-            network.load_state_dict(tensors)
+            network = ScoreRegressor(context.observation_space, context.grid, card["width"])
+            load_into(network, tensors, str(weights))
         self.network = network.eval()
         self._weighted = np.zeros((0, len(context.grid)))
         self._precision = np.zeros((0, len(context.grid)))
@@ -133,13 +135,29 @@ class RegressionTraining:
     """
 
     frames: int = 100_000
-    learning_rate: float = 2e-3
+    learning_rate: float = 5e-3
     weight_decay: float = 1e-3
     replay: int = 2
     memory: int = 8192
     explore: float = 0.5
     width: int = 256
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            frames=(1, 1e12),
+            learning_rate=(1e-9, 1.0),
+            weight_decay=(0.0, 1.0),
+            replay=(0, 64),
+            memory=(1, 1e9),
+            explore=(0.0, 1.0),
+            width=(1, 65536),
+            seed=(0, 2**63),
+        )
+
+    def check_batch(self, num_envs: int) -> None:
+        """Any number of environments will do."""
 
 
 def train_regression(
@@ -149,6 +167,7 @@ def train_regression(
     checkpoint: Path | None = None,
     progress: Callable[[int, int, dict[str, float]], None] | None = None,
     device: str = "cpu",
+    identity: Any = None,
 ) -> ScoreRegressor:
     """Trains a regression agent on the training scenes of `envs` (autoreset mode SAME_STEP).
 
@@ -159,6 +178,8 @@ def train_regression(
             resumes there.
         progress: Called with frames done, frames in all, and losses.
         device: Torch device of the network.
+        identity: JSON value; the checkpoint of a training with another one is not resumed. By
+            default the hyperparameters.
 
     Returns:
         The trained network.
@@ -168,7 +189,7 @@ def train_regression(
     context = PolicyContext.from_envs(envs)
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(training.seed)
-        network = ScoreRegressor(context.observation_space, len(context.grid), training.width)
+        network = ScoreRegressor(context.observation_space, context.grid, training.width)
     network.to(device)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
@@ -178,7 +199,9 @@ def train_regression(
         optimiser, max_lr=training.learning_rate, total_steps=steps + 1, pct_start=0.1
     )
     store = Checkpoint(
-        checkpoint, {"network": network, "optimiser": optimiser, "schedule": schedule}
+        checkpoint,
+        {"network": network, "optimiser": optimiser, "schedule": schedule},
+        identity=identity or asdict(training),
     )
     first = store.restore()
     frames = _rollout(envs, RegressionPolicy(context, network=network), training, first)
@@ -202,7 +225,7 @@ def train_regression(
                 (step + 1) * envs.num_envs, steps * envs.num_envs, {"mse": error.mean().item()}
             )
         store.save(step + 1)
-    store.remove()
+    store.save(steps, force=True)
     return network
 
 
@@ -229,7 +252,7 @@ class _Replay:
             if self.rng.random() < 0.5:
                 mixed["raw"] = mixed["raw"][..., ::-1]
             parts.append(mixed)
-        self.memory = [*self.memory[-count + 1 :], new]
+        self.memory = [*self.memory, new][-count:]
         merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
         return merged, merged.pop("target")
 
@@ -258,7 +281,7 @@ def save_regression(
 ) -> None:
     """Writes the agent as ``path.safetensors`` and ``path.json``."""
     description = {
-        "width": network.scores.in_features,
+        "width": network.width,
         "context": describe_context(context),
         "training": training,
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -36,11 +36,14 @@ class SB3VectorAdapter(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Begins episodes everywhere, with the seeds of the last `seed`."""
+        """Begins episodes everywhere, with what `seed` and `set_options` have set."""
         seeds: Any = None if all(s is None for s in self._seeds) else self._seeds
-        observations, infos = self.envs.reset(seed=seeds)
+        names = {name for own in self._options for name in own}
+        options = {name: [own.get(name) for own in self._options] for name in names}
+        observations, infos = self.envs.reset(seed=seeds, options=options)
         self.reset_infos = [self._info(infos, i) for i in range(self.num_envs)]
         self._reset_seeds()
+        self._reset_options()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -75,6 +78,11 @@ class SB3VectorAdapter(VecEnv):
     def close(self) -> None:
         """Closes the vector environment."""
         self.envs.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """One picture per environment, for `render` and SB3's video recorder."""
+        pictures: Any = self.envs.render()
+        return [None] * self.num_envs if pictures is None else list(pictures)
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The attribute, once per environment: all share one object."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+import difflib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +14,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from agents.regression import RegressionTraining
-from agents.weights import load_agent
+from agents.weights import load_agent, sibling
 
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -38,8 +41,23 @@ class AgentConfig(BaseModel):
     def _check(self) -> AgentConfig:
         from ae_env.options import EnvOptions
 
-        self.hyperparameters()
-        EnvOptions.from_kwargs(self.environment)
+        hyperparameters = self.hyperparameters()
+        try:
+            options = EnvOptions.from_kwargs(self.environment)
+            for make in (options.make_grid, options.make_camera, options.make_scorer):
+                make()
+        except (TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"environment: {error}") from error
+        if options.observation != "uint8":
+            raise ValueError(
+                f"environment: `observation` (={options.observation!r}) must be 'uint8', which is "
+                "what the agents' networks take"
+            )
+        hyperparameters.check_batch(self.num_envs)
+        try:
+            json.dumps(self.card())
+        except TypeError as error:  # found out before the training, not when it is saved
+            raise ValueError(f"every entry must be a JSON value: {error}") from error
         return self
 
     def hyperparameters(self) -> Any:
@@ -48,7 +66,16 @@ class AgentConfig(BaseModel):
             kind: Any = RegressionTraining
         else:
             from agents.ppo import PPOTraining as kind
-        return TypeAdapter(kind, config=ConfigDict(extra="forbid")).validate_python(self.training)
+        known = [field.name for field in fields(kind)]
+        for name in self.training:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                raise ValueError(f"training.{name} is unknown: the entries are {known}{hint}")
+        try:
+            return TypeAdapter(kind).validate_python(self.training)
+        except ValidationError as error:
+            raise ValueError(_one_line(error, "training.")) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
         """The same training with another seed."""
@@ -71,8 +98,22 @@ def load_config(path: str | Path) -> AgentConfig:
         raise ValueError(f"`config` (={str(path)!r}): there is no such file")
     try:
         return AgentConfig.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
-    except (yaml.YAMLError, ValidationError) as error:
-        raise ValueError(f"`config` (={str(path)!r}) is not a training: {error}") from error
+    except ValidationError as error:
+        raise ValueError(f"`config` (={str(path)!r}): {_one_line(error)}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"`config` (={str(path)!r}) is not YAML: {text}") from error
+
+
+def _one_line(error: ValidationError, prefix: str = "") -> str:
+    """Every complaint of pydantic's, with the entry that it is about."""
+    parts = []
+    for item in error.errors():
+        entry = ".".join(str(key) for key in item["loc"])
+        message = item["msg"].removeprefix("Value error, ")
+        given = f" (={item['input']!r})" if entry and item["type"] != "missing" else ""
+        parts.append(f"{prefix}{entry}{given}: {message}" if entry else message)
+    return "; ".join(parts)
 
 
 def is_trained(config: AgentConfig, out: Path) -> bool:
@@ -81,7 +122,8 @@ def is_trained(config: AgentConfig, out: Path) -> bool:
         _, card = load_agent(out, config.agent)
     except (FileNotFoundError, ValueError):
         return False
-    return card["training"] == config.card()
+    # Through JSON, as the card was: a tuple comes back as a list.
+    return bool(card["training"] == json.loads(json.dumps(config.card())))
 
 
 def train_agent(
@@ -120,27 +162,31 @@ def train_agent(
         autoreset_mode="SAME_STEP",
         **config.environment,
     )
-    arguments: dict[str, Any] = {"checkpoint": out.with_suffix(".checkpoint"), "device": device}
-    callback = _logged(progress, tensorboard)
+    arguments: dict[str, Any] = {"checkpoint": sibling(out, ".checkpoint"), "device": device}
     network: Any
-    if config.agent == "regression":
-        from agents.regression import save_regression, train_regression
+    with closing(envs), _logged(progress, tensorboard) as callback:
+        arguments |= {"progress": callback, "identity": config.card()}
+        context = PolicyContext.from_envs(envs)
+        if config.agent == "regression":
+            from agents.regression import save_regression, train_regression
 
-        network = train_regression(envs, config.hyperparameters(), progress=callback, **arguments)
-        save_regression(out, network, PolicyContext.from_envs(envs), config.card())
-    else:
-        from agents.ppo import save_ppo, train_ppo
+            network = train_regression(envs, config.hyperparameters(), **arguments)
+            save_regression(out, network, context, config.card())
+        else:
+            from agents.ppo import save_ppo, train_ppo
 
-        network = train_ppo(envs, config.hyperparameters(), progress=callback, **arguments)
-        save_ppo(out, network, PolicyContext.from_envs(envs), config.card())
-    envs.close()
+            network = train_ppo(envs, config.hyperparameters(), **arguments)
+            save_ppo(out, network, context, config.card())
+    sibling(out, ".checkpoint").unlink(missing_ok=True)
     return out
 
 
-def _logged(progress: Progress | None, folder: Path | None) -> Progress | None:
+@contextmanager
+def _logged(progress: Progress | None, folder: Path | None) -> Iterator[Progress | None]:
     """`progress` that also writes each value to TensorBoard."""
     if folder is None:
-        return progress
+        yield progress
+        return
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
@@ -153,4 +199,5 @@ def _logged(progress: Progress | None, folder: Path | None) -> Progress | None:
         if progress is not None:
             progress(done, total, values)
 
-    return report
+    with writer:
+        yield report

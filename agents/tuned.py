@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from simulator.files import write_atomically
 EV_BANDWIDTHS = (0.35, 0.6, 1.0)
 SENSOR_BANDWIDTHS = (1.0, 1.5, 2.2)
 FOLDS = 8
+#: Bandwidths whose criterion [score] is this near to the best are as good.
+INDIFFERENCE = 0.001
 #: Weight of the prior that the local fit shrinks to: the fit with all bandwidths widened.
 SHRINKAGE = 1.0
 WIDER = 3.0
@@ -47,7 +50,9 @@ class ScoreRegression:
         """Choose the bandwidths by cross-validation over source groups.
 
         The criterion is the mean score of the state that the regression picks for the groups left
-        out (8 folds); the bandwidth of the EV is chosen first, then that of the sensors.
+        out (8 folds); the bandwidth of the EV is chosen first, then that of the sensors. Of those
+        within 0.001 of the best the widest is taken: the criterion is flat, narrow kernels are not
+        safe where few scenes are near.
 
         Args:
             features: ``(n, d)``, the metered EV first.
@@ -64,13 +69,19 @@ class ScoreRegression:
             return _left_out_score(features, scores, folds, candidate)
 
         sensors = SENSOR_BANDWIDTHS[1]
-        ev = max(EV_BANDWIDTHS, key=lambda b: criterion(bandwidths(b, sensors)))
+        ev = _widest_good(EV_BANDWIDTHS, [criterion(bandwidths(b, sensors)) for b in EV_BANDWIDTHS])
         if dimensions > 1:
-            sensors = max(SENSOR_BANDWIDTHS, key=lambda b: criterion(bandwidths(ev, b)))
+            found = [criterion(bandwidths(ev, b)) for b in SENSOR_BANDWIDTHS]
+            sensors = _widest_good(SENSOR_BANDWIDTHS, found)
         return cls(features, scores, bandwidths(ev, sensors))
 
     def predict(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Expected scores of all states at these readings, ``(N, S)``."""
+        """Expected scores of all states at these readings, ``(N, S)``.
+
+        Readings outside the range of the training ones (an overexposed frame may read any EV) are
+        taken to be at its end: a local fit must not extrapolate.
+        """
+        features = np.clip(features, self.features.min(axis=0), self.features.max(axis=0))
         mean = self.scores.mean(axis=0)
         prior = np.broadcast_to(mean, (len(features), self.scores.shape[1]))
         for widen in (WIDER, 1.0):
@@ -134,6 +145,11 @@ class ScoreRegression:
         if set(arrays) != {"features", "scores", "bandwidths"}:
             raise ValueError(f"`path` (={str(path)!r}) holds no tuned program: {sorted(arrays)}")
         return cls(**arrays)
+
+
+def _widest_good(bandwidths: Sequence[float], criteria: Sequence[float]) -> float:
+    best = max(criteria)
+    return max(b for b, c in zip(bandwidths, criteria, strict=True) if c >= best - INDIFFERENCE)
 
 
 def _left_out_score(

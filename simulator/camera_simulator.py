@@ -7,6 +7,7 @@ steps.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -14,7 +15,13 @@ from typing import Any, Protocol
 import torch
 
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture import Exposure, add_noise, clip_and_quantise, sensor_light
+from simulator.capture import (
+    SIGNAL_LIMIT,
+    Exposure,
+    add_noise,
+    clip_and_quantise,
+    sensor_light,
+)
 from simulator.noise import noise_generator, noise_variance, top_up_variance
 from simulator.raw_image import RawImage, check_packed
 from simulator.settings import CameraSettings, exposure_ratio
@@ -95,6 +102,7 @@ class Latent:
         image_speed: Speed of the image along the rows [frame heights per second].
         defocus: Diameter of the defocus disc at f/4 [pixel of `light`]; 0 for a scene that is far
             or in focus throughout.
+        gain: Light relative to `light`, where it changes over time.
     """
 
     light: torch.Tensor
@@ -106,6 +114,7 @@ class Latent:
     box_factor: int = 1
     image_speed: float = 0.0
     defocus: float = 0.0
+    gain: float = 1.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "light", check_packed("light", self.light))
@@ -116,19 +125,21 @@ class Latent:
 
     def exposure(self, settings: CameraSettings) -> Exposure:
         """What a capture at `settings` does to this light."""
+        motion_px = self.image_speed * settings.exposure_time * self.light.shape[-2]
+        defocus_px = self.defocus * 4.0 / settings.effective_f_number
         return Exposure(
-            ratio=exposure_ratio(self.reference, settings),
+            ratio=self.gain * exposure_ratio(self.reference, settings),
             source=self.nlf,
-            target=self.camera.nlf(settings.iso).scaled(1.0 / self.box_factor**2),
-            motion_px=self.image_speed * settings.exposure_time * self.light.shape[-2],
-            defocus_px=self.defocus * 4.0 / settings.effective_f_number,
+            target=_averaged_nlf(self.camera, settings.iso, self.box_factor),
+            motion_px=motion_px if motion_px > NEGLIGIBLE_BLUR else 0.0,
+            defocus_px=defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0,
         )
 
     def plan(self, settings: CameraSettings) -> SimulationPlan:
         """Steps, reasons, predicted error and cost of a capture at `settings`."""
         exposure = self.exposure(settings)
         pixels = self.light.numel()
-        signal = self.light * exposure.ratio
+        signal = (self.light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
         missing, excess = top_up_variance(signal, exposure.source_noise, exposure.target)
         wanted = noise_variance(signal, exposure.target).clamp_(min=torch.finfo(torch.float32).tiny)
         relative_excess = float((excess / wanted).mean(dtype=torch.float64))
@@ -136,16 +147,20 @@ class Latent:
         steps = {"exposure": (_EXPOSE_OPERATIONS * pixels, "")}
         taps = 1 + int(exposure.defocus_px) ** 2
         steps["defocus"] = (
-            taps * 2 * pixels * (exposure.defocus_px > NEGLIGIBLE_BLUR),
-            "the scene is taken as far or in focus throughout",
+            taps * 2 * pixels * (exposure.defocus_px > 0),
+            "the scene is taken as far or in focus throughout"
+            if self.defocus == 0
+            else f"the defocus disc is below {NEGLIGIBLE_BLUR} pixel",
         )
         steps["motion_blur"] = (
-            _STREAK_OPERATIONS * pixels * (exposure.motion_px > NEGLIGIBLE_BLUR),
-            "the image does not move during the exposure",
+            _STREAK_OPERATIONS * pixels * (exposure.motion_px > 0),
+            "the image does not move"
+            if self.image_speed == 0
+            else f"the image moves less than {NEGLIGIBLE_BLUR} pixel during the exposure",
         )
         steps["noise"] = (
             _NOISE_OPERATIONS * pixels * bool((missing > 0).any()),
-            "the source is noisier than the target at every pixel",
+            "no pixel lacks noise: the source has the target's already, or more",
         )
         steps["clip_and_quantise"] = (_CLIP_OPERATIONS * pixels, "")
         return SimulationPlan(
@@ -191,6 +206,12 @@ class Latent:
             yield self.capture(settings, seed)[0]
 
 
+@functools.lru_cache(maxsize=4096)
+def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
+    """Noise of `box_factor` squared sensor pixels averaged."""
+    return camera.nlf(iso).scaled(1.0 / box_factor**2)
+
+
 class CameraSimulator:
     """Simulates what a camera would have recorded at other settings.
 
@@ -218,16 +239,17 @@ class CameraSimulator:
         self,
         source: RawImage | Latent | HasLatent,
         *,
-        image_speed: float = 0.0,
-        defocus: float = 0.0,
+        image_speed: float | None = None,
+        defocus: float | None = None,
     ) -> Latent:
         """Everything that does not depend on the target settings, done once.
 
         Args:
             source: A raw, a latent, or a scene.
-            image_speed: Speed of the image along the rows [frame heights per second].
-            defocus: Diameter of the defocus disc at f/4 [pixel]. 0 takes the scene as far or in
-                focus throughout, where every aperture is exact.
+            image_speed: Speed of the image along the rows [frame heights per second]; by default
+                the source's own, 0 for a raw.
+            defocus: Diameter of the defocus disc at f/4 [pixel]; by default the source's own. 0
+                takes the scene as far or in focus throughout, where every aperture is exact.
 
         Raises:
             ValueError: If an argument is out of range.
@@ -254,8 +276,10 @@ class CameraSimulator:
             raise ValueError(
                 f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene"
             )
-        if image_speed or defocus:
-            latent = replace(latent, image_speed=image_speed, defocus=defocus)
+        if image_speed is not None:
+            latent = replace(latent, image_speed=image_speed)
+        if defocus is not None:
+            latent = replace(latent, defocus=defocus)
         return latent
 
     def plan(

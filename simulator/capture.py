@@ -2,6 +2,7 @@
 
 The order is physical, and it matters: exposed light, not clipped -> motion and defocus blur of
 that unclipped light -> noise of the blurred signal -> clip -> quantise, each of the last two once.
+(Exposure and blur are linear and change places here: one blur then serves many exposures.)
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from simulator.noise import noise_variance
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
 SIGNAL_LIMIT = 1e6
+#: Light beyond this many times the reference's white is clipped before it is blurred: it is white
+#: at every exposure, and sums of larger numbers would no longer resolve the shadows.
+LATENT_LIMIT = 1e9
 
 
 @dataclass(frozen=True)
@@ -42,16 +46,28 @@ class Exposure:
     @property
     def source_noise(self) -> NoiseLevelFunction:
         """Noise that reaches the sensor from the latent: exposed, and averaged by the blur."""
-        exposed = self.source.exposed(self.ratio)
-        if exposed.is_zero:
-            return exposed
-        return exposed.scaled(kernel_energy(self.motion_px, self.defocus_px))
+        if self.source.is_zero:
+            return self.source
+        return self.source.exposed(self.ratio).scaled(
+            kernel_energy(self.motion_px, self.defocus_px)
+        )
 
 
 def sensor_light(latent: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     """Light on the sensor, (4, H, W): exposed and blurred, neither noisy nor clipped."""
-    light = (latent * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
-    return motion_blur(disc_blur(light, exposure.defocus_px), exposure.motion_px)
+    light = latent
+    if exposure.defocus_px or exposure.motion_px:  # else even the brightest light stays exact
+        light = motion_blur(defocused_light(latent, exposure.defocus_px), exposure.motion_px)
+    return (light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
+
+
+def defocused_light(latent: torch.Tensor, defocus_px: float) -> torch.Tensor:
+    """Light (4, H, W) of a scene behind an aperture, still at the latent's exposure.
+
+    Blur and exposure are linear, so the blur may come first: it then serves every exposure time
+    and ISO.
+    """
+    return disc_blur(latent.clamp(-LATENT_LIMIT, LATENT_LIMIT), defocus_px)
 
 
 def add_noise(
@@ -80,8 +96,9 @@ def add_noise(
     normals = torch.empty(light.shape, dtype=torch.float32)
     for normal, generator in zip(normals, generators, strict=True):
         normal.normal_(generator=generator)
-    deviation = missing.clamp_(min=0.0).sqrt_()
-    return deviation.mul_(normals.to(light.device)).add_(light), excess_noise
+    if not all(source.is_zero for source in sources):
+        missing.clamp_(min=0.0)
+    return missing.sqrt_().mul_(normals.to(light.device)).add_(light), excess_noise
 
 
 def _planes(values: list[tuple[float, float, float, float]]) -> torch.Tensor:

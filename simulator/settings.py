@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 #: Calibration constant of reflected-light meters in the saturation-based ISO 12232 relation used
 #: throughout: a surface of luminance L gives ``x = L * t * ISO / (120 * N**2)`` of sensor white.
@@ -33,12 +34,14 @@ class CameraSettings:
     """The three settings that decide an exposure.
 
     Args:
-        iso: ISO speed, in (0, 1e8].
-        exposure_time: Time the shutter is open, in seconds, in (0, 1e5].
+        iso: ISO speed, in [0.001, 1e8].
+        exposure_time: Time the shutter is open, in seconds, in [1e-9, 1e5].
         f_number: Aperture f-number as marked on the lens, in [0.5, 1024].
 
+    The ranges keep every exposure ratio between two settings below 2**106, a finite float32.
+
     Raises:
-        ValueError: If a value is not a finite number in its range.
+        ValueError: If a value is not a number in its range.
 
     >>> CameraSettings(iso=100, exposure_time=1 / 125, f_number=16).ev100
     14.965784284662087
@@ -50,18 +53,17 @@ class CameraSettings:
 
     def __post_init__(self) -> None:
         for name, low, high in (
-            ("iso", 0.0, 1e8),
-            ("exposure_time", 0.0, 1e5),
+            ("iso", 1e-3, 1e8),
+            ("exposure_time", 1e-9, 1e5),
             ("f_number", 0.5, 1024.0),
         ):
             value = getattr(self, name)
             try:
-                number = float(value)
+                number = math.nan if isinstance(value, str | bytes) else float(value)
             except (TypeError, ValueError):
-                raise ValueError(f"`{name}` (={value!r}) must be a number") from None
-            if not math.isfinite(number) or number > high or number < low or number == 0.0:
-                bracket = "(" if low == 0.0 else "["
-                raise ValueError(f"`{name}` (={value!r}) must be in {bracket}{low:g}, {high:g}]")
+                number = math.nan
+            if not low <= number <= high:
+                raise ValueError(f"`{name}` (={value!r}) must be a number in [{low:g}, {high:g}]")
             object.__setattr__(self, name, number)
 
     @classmethod
@@ -74,17 +76,17 @@ class CameraSettings:
         settings = cls(iso, exposure_time, f_number)
         return cls(settings.iso, snap_exposure_time(settings.exposure_time), settings.f_number)
 
-    @property
+    @cached_property
     def aperture_stop(self) -> int:
         """Aperture in sixths of the f-number's octave (thirds of a stop): ``round(6 log2 N)``."""
         return round(6.0 * math.log2(self.f_number))
 
-    @property
+    @cached_property
     def effective_f_number(self) -> float:
         """The f-number that the marked one stands for, 2.8 for sqrt(2)**3 (paper, section 3.1)."""
         return 2.0 ** (self.aperture_stop / 6.0)
 
-    @property
+    @cached_property
     def log2_exposure(self) -> float:
         """log2 of the exposure relative to ISO 100, 1 s, f/1, with the effective f-number."""
         return (

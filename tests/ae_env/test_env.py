@@ -353,3 +353,42 @@ def test_bundled_oracle_is_spread_over_every_control() -> None:
         states.append(env.core.expected_scores(0).oracle)
     for control in env.grid.controls(np.array(states)).T:
         assert np.bincount(control).max() <= 0.6 * len(states)
+
+
+@pytest.mark.parametrize("lighting", ["ramp", "sine", "tunnel", "lens_cap"])
+def test_every_lighting_works_on_every_scene(lighting: str) -> None:
+    env = _make(lighting=lighting, split="all", with_oracle=True).unwrapped
+    for i in range(len(env.scenes)):
+        observation, info = env.reset(seed=i, options={"scene": i, "frame": 3})
+        assert np.isfinite(info["rewards"]["score"])
+        assert env.observation_space.contains(observation)
+
+
+def test_kept_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blurred light is kept where memory allows; frames must not depend on it."""
+    kept = _rollout(5, depth=3.0, motion=0.5)
+    monkeypatch.setattr("ae_env.core.OPTICS_BYTES", 0)
+    _assert_equal(_rollout(5, depth=3.0, motion=0.5), kept)
+
+
+def test_frames_are_the_simulators_own() -> None:
+    """The batched path and `CameraSimulator` give the same digital numbers for the same light."""
+    from ae_env.score_table import scene_latent
+
+    env = _make(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
+    for state in (0, 21, 42, 63):
+        observation, _ = env.reset(seed=1, options={"state": state})
+        episode = env.core.episode(0)
+        scene = env.scenes[episode.scene]
+        latent = scene_latent(scene, env.camera, speed=episode.speed, defocus=episode.defocus)
+        light = latent.expected(env.grid[state]).numpy().astype(np.float64)
+        span, black = env.camera.span[0], env.camera.black_level[0]
+        numbers = np.clip(np.rint(light * span + black), 0, env.camera.white_level)
+        assert np.abs(observation["raw"] - numbers).max() <= 1  # float32 against float64
+        assert (observation["raw"] != numbers).mean() < 1e-3
+
+
+def test_frame_is_the_same_with_and_without_sensors() -> None:
+    first, _ = _make(sensors=True).reset(seed=6)
+    second, _ = _make(sensors=False).reset(seed=6)
+    np.testing.assert_array_equal(first["raw"], second["raw"])

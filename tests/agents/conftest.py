@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import ae_env  # noqa: F401  (registers the environment)
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation, encode_sensors, encode_settings
 from agents.policy import PolicyContext
@@ -57,3 +58,22 @@ def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
         }
 
     return take
+
+
+#: Few small scenes and frames: what the trainings of the tests run on.
+TINY = {"scenes": "bundled:small", "resolution": 36}
+
+
+@pytest.fixture
+def make_tiny_envs() -> Iterator[Callable[..., gym.vector.VectorEnv]]:
+    """Makes small native vector environments, and closes them after the test."""
+    made: list[gym.vector.VectorEnv] = []
+
+    def make(num_envs: int = 4, mode: str = "SAME_STEP", **arguments: Any) -> gym.vector.VectorEnv:
+        options = {**TINY, "num_envs": num_envs, "autoreset_mode": mode, **arguments}
+        made.append(gym.make_vec("ae_env/AutoExposure-v0", **options))
+        return made[-1]
+
+    yield make
+    for envs in made:
+        envs.close()

@@ -24,12 +24,21 @@ def test_a_linear_surface_is_reproduced_away_from_the_data_edge():
     np.testing.assert_allclose(model.predict(query), expected, atol=0.01)
 
 
-def test_far_from_all_samples_it_falls_back_to_the_mean():
+def test_outside_the_training_range_it_does_not_extrapolate():
     features, scores, _ = _samples()
     model = ScoreRegression(features, scores, np.array([0.3, 0.3]))
-    far = model.predict(np.array([[500.0, -500.0]]))
-    np.testing.assert_allclose(far[0], scores.mean(axis=0), atol=1e-9)
-    assert np.isfinite(model.predict(np.array([[1e6, 0.0], [0.0, 0.0]]))).all()
+    far = model.predict(np.array([[500.0, -500.0], [1e9, 0.0]]))
+    edge = model.predict(np.array([[features[:, 0].max(), features[:, 1].min()]]))
+    np.testing.assert_allclose(far[0], edge[0])
+    assert ((far > -0.2) & (far < 1.2)).all()
+
+
+def test_in_a_gap_between_samples_it_falls_back_to_the_mean():
+    rng = np.random.default_rng(0)
+    features = np.concatenate([rng.uniform(-9, -8, (300, 1)), rng.uniform(8, 9, (300, 1))])
+    scores = np.repeat(np.eye(2), 300, axis=0)
+    found = ScoreRegression(features, scores, np.array([0.5])).predict(np.zeros((1, 1)))
+    np.testing.assert_allclose(found, [[0.5, 0.5]], atol=1e-3)
 
 
 def test_fit_picks_nearly_the_best_state_of_unseen_samples():

@@ -1,0 +1,137 @@
+"""Agents on disk: safetensors and JSON, and clear words when they do not fit."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save
+from torch import nn
+
+from ae_env.grid import ExposureGrid
+from agents.policy import PolicyContext, make_policy
+from agents.regression import ScoreRegressor, save_regression
+from agents.weights import describe_context, load_agent, load_into, save_agent, sibling
+
+
+@pytest.fixture
+def agent(context: PolicyContext, tmp_path: Path) -> Path:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = ScoreRegressor(context.observation_space, len(context.grid), width=8)
+    path = tmp_path / "regression-0.5"
+    save_regression(path, network, context, {"agent": "regression"})
+    return path
+
+
+def test_round_trip(agent: Path, context: PolicyContext) -> None:
+    assert sorted(p.name for p in agent.parent.iterdir()) == [
+        "regression-0.5.json",
+        "regression-0.5.safetensors",
+    ]
+    tensors, card = load_agent(agent, "regression")
+    on_disk = load_file(sibling(agent, ".safetensors"))
+    assert set(tensors) == set(on_disk)
+    assert all(torch.equal(tensors[name], on_disk[name]) for name in on_disk)
+    assert card["width"] == 8
+    assert card["training"] == {"agent": "regression"}
+    assert card["context"] == describe_context(context)
+    network = ScoreRegressor(context.observation_space, len(context.grid), width=8)
+    load_into(network, tensors, agent)
+    assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("ending", ["", ".safetensors", ".json"])
+def test_any_of_the_two_files_names_the_agent(agent: Path, ending: str) -> None:
+    tensors, _ = load_agent(f"{agent}{ending}", "regression")
+    assert "scores.weight" in tensors
+
+
+def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
+    module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
+    module["again"] = module["a"]
+    save_agent(tmp_path / "m", "ppo", module, {"width": 2, "context": {}, "training": {}})
+    assert len(load_file(tmp_path / "m.safetensors")) == 4
+    tensors, _ = load_agent(tmp_path / "m", "ppo")
+    assert set(tensors) == set(module.state_dict())
+    assert torch.equal(tensors["again.weight"], module["a"].weight)
+
+
+def test_no_pickle(agent: Path) -> None:
+    content = sibling(agent, ".safetensors").read_bytes()
+    header = int.from_bytes(content[:8], "little")
+    assert json.loads(content[8 : 8 + header])["scores.weight"]["dtype"] == "F32"
+    sources = Path(__file__).parents[2] / "agents"
+    for file in sources.glob("*.py"):
+        assert not re.search(r"import pickle|torch\.load\(|torch\.save\(", file.read_text())
+
+
+@pytest.mark.parametrize("suffix", [".json", ".safetensors"])
+def test_missing_file(agent: Path, suffix: str) -> None:
+    sibling(agent, suffix).unlink()
+    with pytest.raises(FileNotFoundError, match=rf"there is no regression-0.5{suffix}.*ae-env"):
+        load_agent(agent, "regression")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "message"),
+    [
+        (".safetensors", b"\x10", "cannot be read"),
+        (".safetensors", b"{}" * 40, "cannot be read"),
+        (".json", b"{", "cannot be read"),
+        (".json", b"\xff\xfe", "cannot be read"),
+        (".json", b"[1]", "must hold a JSON object"),
+        (".json", b"{}", "must be a regression agent of format 1, got None"),
+        (".json", b'{"kind": "regression", "format": 1}', r"lacks \['width', 'context'"),
+        (".json", b'{"kind": "regression", "format": 2}', "format 1, got 'regression' of format 2"),
+    ],
+)
+def test_damaged_file(agent: Path, suffix: str, content: bytes, message: str) -> None:
+    sibling(agent, suffix).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        load_agent(agent, "regression")
+
+
+def test_file_cut_short(agent: Path) -> None:
+    file = sibling(agent, ".safetensors")
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="cannot be read"):
+        load_agent(agent, "regression")
+
+
+def test_wrong_kind(agent: Path) -> None:
+    with pytest.raises(ValueError, match="must be a ppo agent of format 1, got 'regression'"):
+        load_agent(agent, "ppo")
+
+
+def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None:
+    file = sibling(agent, ".safetensors")
+    tensors = load_file(file)
+    tensors["scores.weight"] = torch.zeros(63, 8)
+    file.write_bytes(save(tensors))
+    with pytest.raises(ValueError, match=r"do not fit the network: .*scores\.weight") as caught:
+        make_policy(f"regression:{agent}", context)
+    assert "\n" not in str(caught.value)
+
+
+def test_other_grid(agent: Path, context: PolicyContext) -> None:
+    grid = ExposureGrid((100, 200), (0.01, 0.1), (4.0, 8.0))
+    with pytest.raises(ValueError, match=r"trained with isos = \[100\.0, 400\.0.*has \[100"):
+        make_policy(f"regression:{agent}", replace(context, grid=grid))
+
+
+def test_other_observation(agent: Path, context: PolicyContext) -> None:
+    space = dict(context.observation_space.spaces)
+    del space["sensors"]
+    blind = replace(context, observation_space=type(context.observation_space)(space))
+    with pytest.raises(ValueError, match="trained with sensors = True, the environment has False"):
+        make_policy(f"regression:{agent}", blind)
+
+
+def test_an_agent_needs_a_name() -> None:
+    with pytest.raises(ValueError, match="must have a name"):
+        sibling("runs/.safetensors", ".json")

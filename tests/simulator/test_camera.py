@@ -1,0 +1,216 @@
+"""Camera profiles: calibration numbers, interpolation over ISO, and the colour filter array."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from simulator.camera import (
+    BayerPattern,
+    CameraProfile,
+    NoiseLevelFunction,
+    get_camera,
+    list_cameras,
+)
+
+# Retyped from the published table (shot and read of R, G, B): the Z6's DNG NoiseProfile tags.
+Z6 = {
+    100: (
+        (7.88891432059205e-06, 7.47234302281224e-06, 7.31670099946593e-06),
+        (5.71150998895191e-09, 5.73712214136873e-09, 5.59509111432998e-09),
+    ),
+    400: (
+        (3.25795376516365e-05, 3.09620813305867e-05, 2.95490959029526e-05),
+        (5.23908219573611e-08, 5.22487909303224e-08, 4.85513274723299e-08),
+    ),
+    800: (
+        (6.47394522011139e-05, 6.19623102159152e-05, 5.78805218585489e-05),
+        (2.34025221765005e-08, 2.22569604502207e-08, 1.94326385518926e-08),
+    ),
+    6400: (
+        (0.000536276798657206, 0.000529454489967193, 0.000460526436255436),
+        (6.94797157253651e-07, 7.25184811907467e-07, 7.1397833103636e-07),
+    ),
+}
+
+
+def planes(red_green_blue: tuple[float, float, float]) -> tuple[float, ...]:
+    red, green, blue = red_green_blue
+    return (red, green, green, blue)
+
+
+@pytest.mark.parametrize("iso", sorted(Z6))
+def test_z6_calibrated_isos_are_the_table(iso: int) -> None:
+    nlf = get_camera("nikon_z6").nlf(iso)
+    assert nlf.shot == pytest.approx(planes(Z6[iso][0]), rel=1e-12)
+    assert nlf.read == pytest.approx(planes(Z6[iso][1]), rel=1e-12)
+    assert not nlf.extrapolated
+
+
+@pytest.mark.parametrize("iso", [100, 200, 400, 800, 1600, 3200, 6400])
+def test_70d_is_the_eld_calibration(iso: int) -> None:
+    """K = 0.4075 ISO / 100 DN per electron, ln sigma = 0.5681 ln K + 1.9983 DN, to their digits."""
+    gain = 0.4075 * iso / 100
+    sigma = math.exp(0.5681 * math.log(gain) + 1.9983)
+    nlf = get_camera("canon_70d").nlf(iso)
+    assert nlf.shot == pytest.approx((gain / 15583,) * 4, rel=1e-4)
+    assert nlf.read == pytest.approx(((sigma / 15583) ** 2,) * 4, rel=5e-4)
+
+
+def test_interpolation_is_log_log_inside_a_segment() -> None:
+    # ISO 200 is the geometric mean of 100 and 400, but is calibrated itself; 282.84 lies half-way
+    # between 200 and 400, so every value is the geometric mean. Green, by hand:
+    nlf = get_camera("nikon_z6").nlf(200 * math.sqrt(2))
+    assert nlf.shot[1] == pytest.approx(2.1815e-05, rel=1e-4)  # sqrt(1.53704e-5 * 3.09621e-5)
+    assert nlf.read[1] == pytest.approx(3.4856e-08, rel=1e-4)  # sqrt(2.32535e-8 * 5.22488e-8)
+    assert not nlf.extrapolated
+    # two thirds of the way from 800 to 1000 in log ISO: 800^(1/3) * 1000^(2/3)
+    nlf = get_camera("nikon_z6").nlf(800 ** (1 / 3) * 1000 ** (2 / 3))
+    red = 6.47394522011139e-05 ** (1 / 3) * 8.31208514534218e-05 ** (2 / 3)
+    assert nlf.shot[0] == pytest.approx(red, rel=1e-9)
+
+
+def test_interpolation_never_crosses_the_conversion_gain_step() -> None:
+    # The Z6 switches gain at ISO 800, where read noise falls. 600 is 1.5 times 400: shot noise
+    # scales with the ratio, read noise with its square.
+    nlf = get_camera("nikon_z6").nlf(600)
+    assert nlf.shot == pytest.approx([1.5 * v for v in planes(Z6[400][0])], rel=1e-12)
+    assert nlf.read == pytest.approx([2.25 * v for v in planes(Z6[400][1])], rel=1e-12)
+    assert not nlf.extrapolated  # inside the table's range
+    just_below = get_camera("nikon_z6").nlf(799.99)
+    assert just_below.read[1] == pytest.approx(4 * 5.22487909303224e-08, rel=1e-4)
+    assert get_camera("nikon_z6").nlf(800).read[1] == pytest.approx(2.22569604502207e-08)
+
+
+def test_a_segment_begins_at_its_iso_not_at_its_first_calibration() -> None:
+    camera = replace(get_camera("nikon_z6"), segments=(700.0,))
+    assert camera.nlf(699).read[1] == pytest.approx((699 / 400) ** 2 * 5.22487909303224e-08)
+    assert camera.nlf(750).read[1] == pytest.approx((750 / 800) ** 2 * 2.22569604502207e-08)
+    assert camera.nlf(750).shot[1] == pytest.approx(750 / 800 * 6.19623102159152e-05)
+
+
+@pytest.mark.parametrize(
+    ("iso", "base", "factor"),
+    [(25, 100, 0.25), (50, 100, 0.5), (12800, 6400, 2), (409600, 6400, 64)],
+)
+def test_extrapolation_is_flagged(iso: float, base: int, factor: float) -> None:
+    nlf = get_camera("nikon_z6").nlf(iso)
+    assert nlf.extrapolated
+    assert nlf.shot == pytest.approx([factor * v for v in planes(Z6[base][0])], rel=1e-12)
+    assert nlf.read == pytest.approx([factor**2 * v for v in planes(Z6[base][1])], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["nikon_z6", "canon_70d"])
+def test_shot_noise_grows_with_iso(name: str) -> None:
+    camera = get_camera(name)
+    shots = [camera.nlf(100 * 2 ** (i / 6)).shot[1] for i in range(-12, 60)]
+    assert shots == sorted(shots)
+
+
+def test_one_measurement_calibrates_a_camera() -> None:
+    measured = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
+    camera = get_camera("nikon_z6").with_nlf(200, measured)
+    assert camera.nlf(200) == measured
+    assert camera.nlf(800).read == pytest.approx((16e-6,) * 4)
+    assert camera.nlf(800).extrapolated
+
+
+def test_noise_level_function_arithmetic() -> None:
+    nlf = NoiseLevelFunction((4e-5, 3e-5, 3e-5, 2e-5), (4e-8, 3e-8, 3e-8, 2e-8))
+    assert nlf.exposed(8).shot == pytest.approx((32e-5, 24e-5, 24e-5, 16e-5))
+    assert nlf.exposed(8).read == pytest.approx((256e-8, 192e-8, 192e-8, 128e-8))
+    assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
+    assert NoiseLevelFunction.zero().is_zero
+    assert not nlf.is_zero
+    assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
+
+
+@pytest.mark.parametrize("value", [(1e-5,) * 3, (-1e-9,) * 4, (math.nan,) * 4, (math.inf,) * 4])
+@pytest.mark.parametrize("name", ["shot", "read"])
+def test_bad_noise_level_function(name: str, value: tuple[float, ...]) -> None:
+    arguments = {"shot": (1e-5,) * 4, "read": (1e-8,) * 4, name: value}
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        NoiseLevelFunction(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "offsets"),
+    [
+        ("RGGB", ((0, 0), (0, 1), (1, 0), (1, 1))),
+        ("BGGR", ((1, 1), (1, 0), (0, 1), (0, 0))),
+        ("GRBG", ((0, 1), (0, 0), (1, 1), (1, 0))),
+        ("GBRG", ((1, 0), (1, 1), (0, 0), (0, 1))),
+    ],
+)
+def test_cfa_offsets(pattern: str, offsets: tuple[tuple[int, int], ...]) -> None:
+    """R, G1 on red's row, G2 on blue's row, B."""
+    assert BayerPattern(pattern).offsets == offsets
+
+
+def profile(**fields: object) -> CameraProfile:
+    defaults = {"name": "bench", "cfa": "RGGB", "black_level": 64, "white_level": 1023}
+    return CameraProfile(**(defaults | {"bit_depth": 10} | fields))  # type: ignore[arg-type]
+
+
+def test_levels() -> None:
+    camera = profile(black_level=(64, 60.5, 60, 63))
+    assert camera.span == (959, 962.5, 963, 960)
+    assert camera.pedestal == pytest.approx((64 / 959, 60.5 / 962.5, 60 / 963, 63 / 960))
+    assert profile().black_level == (64.0,) * 4
+    assert profile().cfa is BayerPattern.RGGB
+    z6 = get_camera("nikon_z6")
+    assert z6.span == (15520 - 1008,) * 4
+    assert z6.pedestal == pytest.approx((1008 / 14512,) * 4)
+
+
+def test_full_well() -> None:
+    assert get_camera("nikon_z6").full_well == pytest.approx(133_827, abs=1)  # 1 / 7.472343e-6
+    assert get_camera("canon_70d").full_well == pytest.approx(15583 / 0.4075, rel=1e-4)
+    assert profile().full_well is None
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"cfa": "XTRANS"}, r"`cfa` \(='XTRANS'\) must be one of RGGB, BGGR, GRBG, GBRG"),
+        ({"black_level": (1, 2, 3)}, "`black_level`"),
+        ({"black_level": -1}, "`white_level`"),
+        ({"black_level": (0, 0, 0, 1023)}, "`white_level`"),
+        ({"white_level": 70_000, "bit_depth": 16}, "must fit in 16 bits"),
+        ({"white_level": math.nan}, "`white_level`"),
+        ({"black_level": math.nan}, "`white_level`"),
+        ({"bit_depth": 0}, "`bit_depth`"),
+        ({"bit_depth": 24}, "`bit_depth`"),
+    ],
+)
+def test_bad_profiles_are_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        profile(**fields)
+
+
+@pytest.mark.parametrize("iso", [0, -100, math.nan, math.inf])
+def test_bad_iso(iso: float) -> None:
+    with pytest.raises(ValueError, match="`iso`"):
+        get_camera("nikon_z6").nlf(iso)
+
+
+def test_a_camera_without_calibration_says_what_to_do() -> None:
+    with pytest.raises(ValueError, match=r"'bench' has no noise calibration.*estimate_nlf"):
+        profile().nlf(100)
+
+
+def test_unknown_names_propose_the_nearest() -> None:
+    assert list_cameras() == ["canon_70d", "nikon_z6"]
+    with pytest.raises(ValueError, match="did you mean 'nikon_z6'"):
+        get_camera("nikon_z7")
+    with pytest.raises(ValueError, match=r"must be one of \['canon_70d', 'nikon_z6'\]$"):
+        get_camera("qqqq")
+
+
+def test_profiles_are_hashable_values() -> None:
+    camera = get_camera("nikon_z6")
+    assert hash(camera) == hash(replace(camera))
+    assert camera == replace(camera)
+    assert camera != replace(camera, white_level=16383)

@@ -1,0 +1,169 @@
+"""Photographic arithmetic against APEX, ISO 12232 and the tables printed on cameras."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from simulator.settings import (
+    CameraSettings,
+    exposure_ratio,
+    format_exposure_time,
+    incident_ev100,
+    sensor_signal,
+    snap_exposure_time,
+)
+
+
+@pytest.mark.parametrize(
+    ("iso", "exposure_time", "f_number", "ev100"),
+    [
+        (100, 1.0, 1.0, 0.0),  # the definition
+        (100, 1 / 128, 16.0, 15.0),  # the sunny-16 rule
+        (3200, 1 / 32, 2.0, 2.0),
+        (400, 1 / 125, 5.6, 9.93664),  # log2(5.6^2 * 125) - 2, with the marked f-number
+    ],
+)
+def test_ev100(iso: float, exposure_time: float, f_number: float, ev100: float) -> None:
+    assert CameraSettings(iso, exposure_time, f_number).ev100 == pytest.approx(ev100, abs=1e-4)
+
+
+def test_apex_values_add_up() -> None:
+    settings = CameraSettings(iso=800, exposure_time=1 / 250, f_number=4.0)
+    assert settings.aperture_value == 4.0
+    assert settings.time_value == pytest.approx(7.965784, abs=1e-6)
+    assert settings.speed_value == 8.0  # APEX: Sv 5 is ISO 100
+    # APEX: Ev = Av + Tv, and Ev at ISO 100 is that minus the gain
+    assert settings.ev100 == pytest.approx(4.0 + 7.965784 - 3.0, abs=1e-6)
+    assert CameraSettings(100, 1.0, 1.0).speed_value == 5.0
+
+
+@pytest.mark.parametrize(
+    ("marked", "exact"),
+    [
+        *[(1.4, 2**0.5), (2.0, 2.0), (2.8, 2**1.5), (4.0, 4.0), (5.6, 2**2.5), (8.0, 8.0)],
+        *[(11.0, 2**3.5), (16.0, 16.0), (22.0, 2**4.5), (1.8, 2 ** (5 / 6)), (3.5, 2 ** (11 / 6))],
+    ],
+)
+def test_marked_f_numbers_stand_for_powers_of_the_sixth_root_of_two(
+    marked: float, exact: float
+) -> None:
+    assert CameraSettings(100, 1.0, marked).effective_f_number == pytest.approx(exact, rel=1e-12)
+
+
+def test_f_2_8_is_the_third_power_of_the_root_of_two() -> None:
+    assert CameraSettings(100, 1.0, 2.8).aperture_stop == 9
+    assert CameraSettings(100, 1.0, 2.8).effective_f_number == pytest.approx(math.sqrt(2) ** 3)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "exact"),
+    [
+        *[(1 / 60, 1 / 64), (1 / 30, 1 / 32), (1 / 15, 1 / 16), (1 / 125, 1 / 128)],
+        *[(1 / 250, 1 / 256), (1 / 500, 1 / 512), (1 / 1000, 1 / 1024), (1 / 8000, 1 / 8192)],
+        *[(0.5, 0.5), (1.0, 1.0), (4.0, 4.0), (15.0, 16.0), (30.0, 32.0), (8.0, 8.0)],
+        *[(1 / 100, 2 ** (-20 / 3)), (1 / 80, 2 ** (-19 / 3)), (0.3, 2 ** (-5 / 3))],
+        *[
+            (1 / 13, 2 ** (-11 / 3)),
+            (1.3, 2 ** (1 / 3)),
+            (1.6, 2 ** (2 / 3)),
+            (20.0, 2 ** (13 / 3)),
+        ],
+        (0.01667, 1 / 64),  # as some files round it
+    ],
+)
+def test_recorded_shutter_speeds_snap_to_the_exact_stop(nominal: float, exact: float) -> None:
+    assert CameraSettings.from_exif(100, nominal, 4).exposure_time == pytest.approx(
+        exact, rel=1e-12
+    )
+    assert snap_exposure_time(nominal) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("exposure_time", [1 / 90, 1 / 45, 1 / 55, 0.0002 / 3, 45.0, 120.0])
+def test_speeds_far_from_a_nominal_stop_are_kept(exposure_time: float) -> None:
+    assert CameraSettings.from_exif(100, exposure_time, 4).exposure_time == exposure_time
+
+
+def test_direct_settings_are_taken_as_they_are() -> None:
+    assert CameraSettings(100, 1 / 60, 4).exposure_time == 1 / 60
+    assert CameraSettings(100, 1 / 60, 4) != CameraSettings.from_exif(100, 1 / 60, 4)
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "ratio"),
+    [
+        ((100, 1 / 64, 4), (100, 1 / 64, 4), 1.0),
+        ((100, 1 / 64, 4), (100, 1 / 32, 4), 2.0),
+        ((100, 1 / 64, 4), (1600, 1 / 64, 4), 16.0),
+        ((100, 1 / 64, 4), (100, 1 / 64, 5.6), 0.5),  # not (4 / 5.6)^2 = 0.5102
+        ((100, 1 / 64, 2.8), (100, 1 / 64, 11), 2.0**-4),
+        ((100, 1 / 1000, 11), (6400, 1 / 2, 4), 500 * 64 * 8),
+        ((320, 1 / 50, 3.5), (250, 1 / 30, 6.3), (5 / 3) * (25 / 32) * 2.0 ** ((11 - 16) / 3)),
+    ],
+)
+def test_exposure_ratio_closed_form(
+    source: tuple[float, float, float], target: tuple[float, float, float], ratio: float
+) -> None:
+    first, second = CameraSettings(*source), CameraSettings(*target)
+    assert exposure_ratio(first, second) == pytest.approx(ratio, rel=1e-12)
+    assert exposure_ratio(second, first) == pytest.approx(1 / ratio, rel=1e-12)
+
+
+def test_exposure_ratio_of_the_widest_settings_is_a_finite_float32() -> None:
+    dark, bright = CameraSettings(1e-3, 1e-9, 1024), CameraSettings(1e8, 1e5, 0.5)
+    # 1e11 of gain, 1e14 of time, 2048^2 of aperture
+    assert exposure_ratio(dark, bright) == pytest.approx(1e25 * 2.0**22, rel=1e-9)
+    assert exposure_ratio(dark, bright) < 2.0**127
+
+
+def test_incident_meter() -> None:
+    assert incident_ev100(2.5) == 0.0
+    assert incident_ev100(1.0) == pytest.approx(-1.3219, abs=1e-4)
+    assert incident_ev100(2.5 * 2**15) == 15.0  # full sun
+
+
+@pytest.mark.parametrize("illuminance", [1.0, 320.0, 100_000.0])
+def test_a_grey_card_under_incident_metering_is_at_0119_of_white(illuminance: float) -> None:
+    ev = math.log2(illuminance / 2.5)
+    settings = CameraSettings(iso=100, exposure_time=2.0 ** (6 - ev), f_number=8.0)
+    luminance = 0.18 * illuminance / math.pi  # a Lambertian card
+    # ISO 12232: 0.65 L t / N^2 over 78 / ISO
+    expected = 0.65 * luminance * settings.exposure_time / 64 * 100 / 78
+    assert sensor_signal(luminance, settings) == pytest.approx(expected, rel=1e-9)
+    assert sensor_signal(luminance, settings) == pytest.approx(0.1194, abs=5e-5)
+
+
+@pytest.mark.parametrize("name", ["iso", "exposure_time", "f_number"])
+@pytest.mark.parametrize(
+    "value",
+    [0, -1, -0.0, math.nan, math.inf, -math.inf, "fast", "100", b"1", None, [], 1e99, 1e-99],
+)
+def test_bad_values_are_named(name: str, value: object) -> None:
+    arguments = {"iso": 100, "exposure_time": 0.01, "f_number": 4.0, name: value}
+    with pytest.raises(ValueError, match=rf"^`{name}` \(={'.*'}\) must be a number in \["):
+        CameraSettings(**arguments)
+
+
+@pytest.mark.parametrize("illuminance", [0.0, -1.0, math.nan, math.inf])
+def test_bad_illuminance(illuminance: float) -> None:
+    with pytest.raises(ValueError, match="`illuminance`"):
+        incident_ev100(illuminance)
+
+
+def test_settings_are_values() -> None:
+    first = CameraSettings(100, 1, 4)
+    assert first == CameraSettings(100.0, 1.0, 4.0)
+    assert hash(first) == hash(CameraSettings(100.0, 1.0, 4.0))
+    assert isinstance(first.iso, float)
+    with pytest.raises(AttributeError):
+        first.iso = 200  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("exposure_time", "text"),
+    [(1 / 1000, "1/1000 s"), (1 / 64, "1/64 s"), (0.5, "1/2 s"), (1.3, "1.3 s"), (30.0, "30 s")],
+)
+def test_format(exposure_time: float, text: str) -> None:
+    assert format_exposure_time(exposure_time) == text
+    assert str(CameraSettings(400, exposure_time, 5.6)) == f"ISO 400, {text}, f/5.6"
