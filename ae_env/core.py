@@ -7,26 +7,24 @@ happens here, so that the two cannot differ.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 
+from ae_env.episode import Episode
 from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import PEDESTAL, encode_observation, encode_sensors, encode_settings
 from ae_env.options import COSTS, EnvOptions
-from ae_env.score_table import ScoreTable, ScoreTables, describe_captures, scene_latent
+from ae_env.score_table import ScoreTable, ScoreTables, describe_captures
 from ae_env.scorers.protocol import DependsOn
-from simulator.blur import motion_blur
-from simulator.camera_simulator import Latent
 from simulator.capture import (
     SIGNAL_LIMIT,
     Exposure,
     add_noise,
     clip_and_quantise,
-    defocused_light,
 )
 from simulator.noise import noise_generator
 
@@ -43,26 +41,6 @@ CHUNK_SAMPLES = 4 * 64 * 64 * 8
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
 OPTICS_BYTES = 256 * 2**20
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
-
-
-@dataclass
-class Episode:
-    """One scene being photographed."""
-
-    scene: int
-    state: int
-    speed: float
-    defocus: float
-    phase: float
-    noise_seed: int
-    frame: int = 0
-    pending: list[int] = field(default_factory=list)
-    image_mean: float = float("nan")
-    table: tuple[float, ScoreTable] | None = None
-    closed_parts: dict[str, np.ndarray] | None = None
-    latent: tuple[float, Latent] | None = None  # by gain
-    defocused: dict[float, torch.Tensor] = field(default_factory=dict)  # by blur diameter
-    blurred: tuple[tuple[float, float], torch.Tensor] | None = None  # by defocus and motion
 
 
 @dataclass
@@ -307,34 +285,13 @@ class EpisodeCore:
         for i, episode in enumerate(episodes):
             state = self.grid[episode.state]
             gain = self.gain(episode, state.exposure_time)
-            latent = self._latent(episode, gain)
+            latent = episode.latent(self.scenes[episode.scene], self.camera, gain)
             exposure = latent.exposure(state)
-            torch.mul(self._blurred(episode, latent, exposure), exposure.ratio, out=light[i])
+            blurred = episode.blurred_light(latent.light, exposure, self._keep_defocused)
+            torch.mul(blurred, exposure.ratio, out=light[i])
             exposures.append(exposure)
             gains.append(gain)
         return light.clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT), exposures, gains
-
-    def _latent(self, episode: Episode, gain: float) -> Latent:
-        if episode.latent is None or episode.latent[0] != gain:
-            scene = self.scenes[episode.scene]
-            latent = scene_latent(
-                scene, self.camera, speed=episode.speed, defocus=episode.defocus, gain=gain
-            )
-            episode.latent = (gain, latent)
-        return episode.latent[1]
-
-    def _blurred(self, episode: Episode, latent: Latent, exposure: Exposure) -> torch.Tensor:
-        """The blurred light before exposure; kept, because an agent that has settled repeats it."""
-        key = (exposure.defocus_px, exposure.motion_px)
-        if episode.blurred is not None and episode.blurred[0] == key:
-            return episode.blurred[1]
-        defocused = episode.defocused.get(exposure.defocus_px)
-        if defocused is None:
-            defocused = defocused_light(latent.light, exposure.defocus_px)
-            if self._keep_defocused:
-                episode.defocused[exposure.defocus_px] = defocused
-        episode.blurred = (key, motion_blur(defocused, exposure.motion_px))
-        return episode.blurred[1]
 
     def _encode(self, frames: torch.Tensor) -> np.ndarray:
         if self.options.observation == "linear":

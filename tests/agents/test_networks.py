@@ -8,7 +8,9 @@ import pytest
 import torch
 from torch import nn
 
-from agents.networks import ExposureFeatures
+from ae_env.grid import ExposureGrid
+from ae_env.observation import encode_sensors
+from agents.networks import ExposureFeatures, StateHead
 from agents.regression import observation_tensors
 
 
@@ -36,11 +38,12 @@ def test_shapes(size: int, sensors: bool) -> None:
 
 def test_features_are_convolutional() -> None:
     features = ExposureFeatures(space(64))
-    layers = [type(layer) for layer in features.cnn]
-    assert layers.count(nn.Conv2d) == 3
-    assert features.cnn[0].in_channels == 6  # 4 planes, mean and maximum of the luminance
-    # The raw reaches the dense layer as 48 planes of 4 x 4 at 16 pixels a side, not pixel by pixel.
-    assert 48 * 4 * 4 < features.head[0].in_features < 4 * 64 * 64 // 8
+    layers = [layer for layer in features.cnn if isinstance(layer, nn.Conv2d)]
+    assert len(layers) >= 3
+    assert layers[0].in_channels == 6  # 4 planes, mean and maximum of the luminance
+    assert all(layer.kernel_size == (3, 3) for layer in layers)
+    # The raw reaches the dense layer as coarse features, not pixel by pixel.
+    assert features.head[0].in_features < 4 * 64 * 64 // 8
 
 
 def test_black_and_white_frames_are_finite() -> None:
@@ -84,6 +87,43 @@ def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> N
     assert spread.mean() * 8.0 < 0.15  # stops: quantisation and marked f-numbers remain
     # It is log2 x + EV100 as the decoded signal says: 18 % grey at 0.119 of white.
     light = torch.log2(scene.light[1:3].mean(dim=0)) - scene.reference.log2_exposure
-    expected = nn.functional.avg_pool2d(light[None], 2)[0][usable]
+    block = light.shape[-1] // luminance.shape[-1]
+    expected = nn.functional.avg_pool2d(light[None], block)[0][usable]
     error = luminance[:, usable].mean(dim=0) * 8.0 + 3.0 - expected
     assert error.abs().median() < 0.15
+
+
+@pytest.mark.parametrize("grid", [ExposureGrid.default(), ExposureGrid((100, 3200), (0.01,), (4,))])
+@pytest.mark.parametrize("sensors", [True, False])
+def test_state_head_values_every_state(grid: ExposureGrid, sensors: bool) -> None:
+    head = StateHead(grid, 6, sensors, outputs=2, width=5)
+    speed = torch.zeros(3, 2) if sensors else None
+    values = head(torch.randn(3, 6), speed)
+    assert values.shape == (3, len(grid), 2)
+    assert torch.isfinite(values).all()
+
+
+def test_state_head_needs_the_sensors_it_was_made_for() -> None:
+    with pytest.raises(ValueError, match="`sensors` must be given"):
+        StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
+
+
+def test_state_head_tells_states_of_equal_exposure_apart() -> None:
+    grid = ExposureGrid((100, 400), (1 / 64, 1 / 16), (4.0,))
+    assert grid.ev100[1] == pytest.approx(grid.ev100[2])  # ISO 100, 1/16 s and ISO 400, 1/64 s
+    values = StateHead(grid, 6, False)(torch.randn(1, 6), None)[0, :, 0]
+    assert values[1] != values[2]
+
+
+def test_foretold_blur_is_that_of_the_scorer() -> None:
+    grid = ExposureGrid.default()
+    head = StateHead(grid, 6, True)
+    speed, defocus = np.array([0.125, 2.0]), np.array([1.0, 0.5])
+    sensors = torch.from_numpy(encode_sensors(speed, defocus, np.zeros((2, 2))))
+    foretold = head._blur(sensors.float())
+    times = np.array([s.exposure_time for s in grid])
+    openings = np.array([4.0 / s.effective_f_number for s in grid])
+    # Blur of the `sharpness` term in 64 pixels: sqrt((v t)^2 + (4 D / N)^2); marked N here.
+    blur = np.hypot(64.0 * speed[:, None] * times, defocus[:, None] * openings)
+    np.testing.assert_allclose(foretold[..., 0].numpy() * 4.0, np.log2(blur), atol=0.05)
+    np.testing.assert_allclose(foretold[..., 1].numpy() * 2.0, np.log1p(blur**2), atol=0.05)

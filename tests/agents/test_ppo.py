@@ -40,7 +40,7 @@ def test_progress_and_determinism(make_tiny_envs) -> None:
     assert all(torch.equal(first[name], again[name]) for name in first)
     other = PPOTraining(**{**TRAINING.__dict__, "seed": 4})
     weights = train_ppo(make_tiny_envs(), other).state_dict()
-    assert not torch.equal(first["action_net.weight"], weights["action_net.weight"])
+    assert any(not torch.equal(first[name], weights[name]) for name in first)
 
 
 @pytest.mark.slow
@@ -78,8 +78,7 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path) -> None:
         assert chosen.dtype == np.int64
         assert np.array_equal(chosen, loaded.act(observations))
         # SB3's own deterministic prediction is the same.
-        controls = network.predict(observations, deterministic=True)[0]
-        assert np.array_equal(chosen, np.ravel_multi_index(controls.T, (4, 4, 4)))
+        assert np.array_equal(chosen, network.predict(observations, deterministic=True)[0])
         masks = rng.random((6, 64)) < 0.3
         masks[:, 5] = True
         allowed = loaded.act(observations, masks)
@@ -93,7 +92,7 @@ def test_features_are_convolutional(make_tiny_envs) -> None:
     extractor = network.features_extractor
     assert isinstance(extractor, ExposureExtractor)
     convolutions = [m for m in extractor.modules() if isinstance(m, nn.Conv2d)]
-    assert len(convolutions) == 3
+    assert len(convolutions) >= 3
     assert not any(isinstance(m, nn.Flatten) for m in list(extractor.children()))
     widest = max(m.in_features for m in network.modules() if isinstance(m, nn.Linear))
     assert widest < 4 * 64 * 64 // 8  # no layer takes the raw pixel by pixel

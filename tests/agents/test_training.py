@@ -142,7 +142,7 @@ def test_seed_and_tensorboard(tmp_path: Path) -> None:
     for name, seed in (("a", 0), ("b", 1)):
         train_agent(tiny().with_seed(seed), tmp_path / name, tensorboard=tmp_path / "log")
     first, second = (load_file(tmp_path / f"{name}.safetensors") for name in "ab")
-    assert not torch.equal(first["scores.weight"], second["scores.weight"])
+    assert any(not torch.equal(first[name], second[name]) for name in first)
     assert json.loads((tmp_path / "b.json").read_text())["training"]["training"]["seed"] == 1
     events = list((tmp_path / "log").glob("events*"))
     assert events
