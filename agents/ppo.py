@@ -133,7 +133,7 @@ class PPOTraining:
     gamma: float = 0.0
     gae_lambda: float = 1.0
     clip_range: float = 0.2
-    ent_coef: float = 0.01
+    ent_coef: float = 0.02
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
     width: int = 256

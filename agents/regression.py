@@ -35,21 +35,28 @@ class ScoreRegressor(nn.Module):
         observation_space: Observation of a single environment.
         grid: The exposure states.
         width: Features that describe a frame.
+        dropout: Share of the features that a training step leaves out.
     """
 
     def __init__(
-        self, observation_space: gym.spaces.Dict, grid: ExposureGrid, width: int = 256
+        self,
+        observation_space: gym.spaces.Dict,
+        grid: ExposureGrid,
+        width: int = 256,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.width = width
         self.features = ExposureFeatures(observation_space, width)
+        self.dropout = nn.Dropout(dropout)
         self.states = StateHead(grid, width, "sensors" in observation_space.spaces, outputs=2)
 
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Expected score and log variance of the prediction, both (B, S)."""
-        values = self.states(self.features(codes, settings, sensors), sensors)
+        features = self.dropout(self.features(codes, settings, sensors))
+        values = self.states(features, sensors)
         scores, log_variance = values.unbind(dim=2)
         return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE)
 
@@ -131,6 +138,7 @@ class RegressionTraining:
         explore: Share of random actions; the others are the agent's own, so that it learns from
             the frames it will meet.
         width: Hidden features of the network.
+        dropout: Share of the features that an optimiser step leaves out.
         seed: Of scenes, noise and weights.
     """
 
@@ -141,6 +149,7 @@ class RegressionTraining:
     memory: int = 8192
     explore: float = 0.5
     width: int = 256
+    dropout: float = 0.1
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -189,7 +198,9 @@ def train_regression(
     context = PolicyContext.from_envs(envs)
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(training.seed)
-        network = ScoreRegressor(context.observation_space, context.grid, training.width)
+        network = ScoreRegressor(
+            context.observation_space, context.grid, training.width, training.dropout
+        )
     network.to(device)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay

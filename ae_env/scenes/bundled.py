@@ -45,6 +45,9 @@ GROUPS_PER_KIND = {
 FIRST_TEST_INDEX = 1000
 #: Groups of each kind and split in "bundled:small"; the same scenes as the first of "bundled".
 SMALL_GROUPS = 2
+#: How many times the training groups of "bundled" there are in "bundled:large"; same test groups.
+LARGE_FACTOR = 4
+Size = Literal["small", "normal", "large"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ def bundled_scenes(
     resolution: int | None = 64,
     crop: Crop = "box",
     *,
-    small: bool = False,
+    size: Size = "normal",
 ) -> list[Scene]:
     """The bundled scenes of `split`, from the cache where they have been made before.
 
@@ -69,36 +72,41 @@ def bundled_scenes(
         camera: Whose colours the light is taken to.
         resolution: Packed pixels a side; None keeps 256.
         crop: See `Scene.resized`.
-        small: Only `SMALL_GROUPS` groups of each kind and split.
+        size: ``"small"``: only `SMALL_GROUPS` groups of each kind and split; ``"large"``:
+            `LARGE_FACTOR` times the procedural training groups, and the same test groups.
     """
     parts = ["train", "test"] if split == "all" else [split]
     scenes: list[Scene] = []
     for part in parts:
-        path = _cache_path(part, camera, resolution, crop, small)
+        path = _cache_path(part, camera, resolution, crop, size)
         loaded = _read_cache(path, camera)
         if loaded is None:
-            loaded = [_rounded(s) for s in _make(part, camera, resolution, crop, small)]
+            loaded = [_rounded(s) for s in _make(part, camera, resolution, crop, size)]
             _write_cache(path, loaded)
         scenes += loaded
     return scenes
 
 
 def _make(
-    split: str, camera: CameraProfile, resolution: int | None, crop: Crop, small: bool
+    split: str, camera: CameraProfile, resolution: int | None, crop: Crop, size: Size
 ) -> Iterator[Scene]:
     logger.info("making the bundled scenes of split %r for camera %s", split, camera.name)
-    for entry in _entries(split, small):
+    for entry in _entries(split, size):
         yield _procedural_scene(entry, camera).resized(resolution, crop)
     photographs = [p for p in PHOTOGRAPHS if p.split == split]
-    for photograph in photographs[:SMALL_GROUPS] if small else photographs:
+    for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
         for scene in photograph_scenes(photograph, camera):
             yield scene.resized(resolution, crop)
 
 
-def _entries(split: str, small: bool) -> Iterator[_Entry]:
+def _entries(split: str, size: Size) -> Iterator[_Entry]:
     for kind, (train, test) in GROUPS_PER_KIND.items():
         first, count = (0, train) if split == "train" else (FIRST_TEST_INDEX, test)
-        for index in range(first, first + (min(count, SMALL_GROUPS) if small else count)):
+        if size == "small":
+            count = min(count, SMALL_GROUPS)
+        elif size == "large" and split == "train":
+            count *= LARGE_FACTOR
+        for index in range(first, first + count):
             yield _Entry(kind, index, split)
 
 
@@ -134,19 +142,19 @@ _FIELDS = (
 
 
 def _cache_path(
-    split: str, camera: CameraProfile, resolution: int | None, crop: str, small: bool
+    split: str, camera: CameraProfile, resolution: int | None, crop: str, size: Size
 ) -> Path:
     key = cache_key(
         {
             "generator": GENERATOR_VERSION,
-            "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX],
+            "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,
             "colour_matrix": camera.colour_matrix,
             "split": split,
             "resolution": resolution,
             "crop": crop,
-            "small": small,
+            "size": size if split == "train" or size == "small" else "normal",
         }
     )
     return cache_dir() / "scenes" / f"bundled-{split}-{resolution}-{key}.safetensors"

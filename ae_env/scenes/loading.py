@@ -11,13 +11,17 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
-from ae_env.scenes.bundled import Split, bundled_scenes
+from ae_env.scenes.bundled import Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes
 from ae_env.scenes.scene import Crop, Scene
 from simulator.camera import CameraProfile
 
 #: Names of the scenes that come with the package.
-BUNDLED = ("bundled", "bundled:small")
+BUNDLED: dict[str, Size] = {
+    "bundled": "normal",
+    "bundled:small": "small",
+    "bundled:large": "large",
+}
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
@@ -34,7 +38,8 @@ def load_scenes(
     Args:
         spec: What to load:
 
-            - ``"bundled"``, or ``"bundled:small"``: the first two source groups of each kind;
+            - ``"bundled"``; ``"bundled:small"``: the first two source groups of each kind;
+              ``"bundled:large"``: four times the training groups, the same test groups;
             - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
             - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
               given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
@@ -79,7 +84,7 @@ def _by_name(
     spec: str, split: Split, camera: CameraProfile, resolution: int | None, crop: Crop
 ) -> list[Scene]:
     if spec in BUNDLED:
-        return bundled_scenes(split, camera, resolution, crop, small=spec == "bundled:small")
+        return bundled_scenes(split, camera, resolution, crop, size=BUNDLED[spec])
     if not Path(spec).expanduser().exists():
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             known = {"split": split, "camera": camera, "resolution": resolution}

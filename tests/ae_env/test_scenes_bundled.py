@@ -72,7 +72,7 @@ def test_split_has_enough_groups_and_half_of_them_are_hard(test_scenes: list[Sce
 
 
 def test_splits_share_no_group(test_scenes: list[Scene]) -> None:
-    train = {f"{e.kind}-{e.index:03d}" for e in _entries("train", small=False)}
+    train = {f"{e.kind}-{e.index:03d}" for e in _entries("train", "large")}
     train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
     assert len(train) >= 195
     assert not train & {scene.group for scene in test_scenes}

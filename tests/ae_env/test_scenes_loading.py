@@ -171,7 +171,7 @@ def test_unknown_split_and_too_small_scenes() -> None:
         load(MINE, "val")
     with pytest.raises(ValueError, match=r"`resolution` \(=17\)"):
         load(MINE, resolution=17)
-    with pytest.raises(ValueError, match=r"dead_leaves-046.*`resolution` \(=512\)"):
+    with pytest.raises(ValueError, match=r"dead_leaves-1000.*`resolution` \(=512\)"):
         load("bundled", "test", resolution=512)
 
 

@@ -19,25 +19,25 @@ from agents.regression import (
     train_regression,
 )
 
-TRAINING = RegressionTraining(frames=320, width=16, seed=5)
+TRAINING = RegressionTraining(frames=160, width=16, seed=5)
 
 
 def test_training_lowers_the_loss(make_tiny_envs) -> None:
     losses = []
     train_regression(
         make_tiny_envs(num_envs=8),
-        RegressionTraining(frames=960, width=32),
+        RegressionTraining(frames=480, width=32),
         progress=lambda done, total, values: losses.append((done, total, values["mse"])),
     )
-    assert [done for done, _, _ in losses] == list(range(8, 961, 8))
-    assert {total for _, total, _ in losses} == {960}
+    assert [done for done, _, _ in losses] == list(range(8, 481, 8))
+    assert {total for _, total, _ in losses} == {480}
     begin, end = (np.mean([v for _, _, v in part]) for part in (losses[:10], losses[-20:]))
     assert end < 0.6 * begin
 
 
 def test_same_seed_same_weights(make_tiny_envs) -> None:
     def train(seed: int) -> dict[str, torch.Tensor]:
-        training = RegressionTraining(frames=160, width=16, seed=seed)
+        training = RegressionTraining(frames=80, width=16, seed=seed)
         return train_regression(make_tiny_envs(), training).state_dict()
 
     first, again, other = train(1), train(1), train(2)
@@ -61,7 +61,7 @@ def test_a_killed_training_goes_on(make_tiny_envs, tmp_path, monkeypatch) -> Non
 
     def stop(done: int, total: int, values: dict[str, float]) -> None:
         first.append(done)
-        if done == 200:
+        if done == 100:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -75,7 +75,7 @@ def test_a_killed_training_goes_on(make_tiny_envs, tmp_path, monkeypatch) -> Non
         progress=lambda done, total, values: second.append(done),
     )
     # The step that was under way when it was stopped is taken again, no other.
-    assert second == list(range(200, 321, 4))
+    assert second == list(range(100, 161, 4))
     # The state that is kept is that of the network: a third call has nothing left to do.
     third: list[int] = []
     again = train_regression(
