@@ -7,19 +7,25 @@ import importlib
 import logging
 import shlex
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
+from rich.markup import escape
+
+from ae_env.console import (
+    console,
+    make_folder,
+    parse_seconds,
+    print_files,
+    progress_bars,
+    save_picture,
+    torch_device,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from agents.evaluation_result import EvaluationResult
     from simulator.raw_image import RawImage
 
@@ -30,7 +36,6 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`.",
 )
-console = Console()
 BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "throughput")
 #: Exit status after Ctrl-C.
 _INTERRUPTED = 130
@@ -55,7 +60,7 @@ def main() -> None:
         if "--debug" in sys.argv:
             raise
         text = " ".join(str(error).split())
-        Console(stderr=True).print(f"[bold red]error[/] {_escape(text)}", soft_wrap=True)
+        Console(stderr=True).print(f"[bold red]error[/] {escape(text)}", soft_wrap=True)
         raise SystemExit(2) from None
     except SystemExit as stop:
         if stop.code == _INTERRUPTED:  # what Typer makes of Ctrl-C
@@ -82,14 +87,14 @@ def quickstart(
     """
     from agents.quickstart import next_commands, run_quickstart
 
-    _make_folder(out)
-    with _bars() as progress:
+    make_folder(out)
+    with progress_bars() as progress:
         done = run_quickstart(scenes, out, seed=seed, progress=progress, command=_command())
     if done.zero_shot:
         text = f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes"
         console.print(text, soft_wrap=True, markup=False)
     _print_scores(done.result)
-    _print_files(done.files)
+    print_files(done.files)
     console.print("\nTry next:")
     for line in next_commands(scenes, out, done.agents):
         console.print(f"  {line}", soft_wrap=True, highlight=False, markup=False)
@@ -112,13 +117,13 @@ def simulate(
     """
     from simulator import CameraSettings, CameraSimulator, read_raw, write_dng
 
-    settings = CameraSettings(iso, _seconds(shutter), aperture)
+    settings = CameraSettings(iso, parse_seconds(shutter), aperture)
     if out.suffix.lower() != ".dng":
         raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
-    device = _device(device)
+    device = torch_device(device)
     source = read_raw(raw)
     for path in (out, png or out):
-        _make_folder(path.parent)
+        make_folder(path.parent)
     simulator = CameraSimulator(device=device)
     latent = simulator.prepare(source)
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
@@ -128,7 +133,7 @@ def simulate(
     files = {"DNG": out}
     if png is not None:
         files["PNG"] = _write_png(png, result)
-    _print_files(files)
+    print_files(files)
 
 
 @app.command()
@@ -148,23 +153,23 @@ def sweep(
     from ae_env.scenes import Scene
     from simulator import CameraSimulator, read_raw, write_dng
 
-    device = _device(device)
+    device = torch_device(device)
     source = read_raw(raw)
-    _make_folder(out)
+    make_folder(out)
     scene = Scene.from_raw(source, scene_id=raw.stem)
     scene = scene.resized(min(128, *scene.light.shape[1:]))
     sheet = out / "contact_sheet.png"
-    _save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
+    save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
     files = {"contact sheet": sheet}
     if dngs:
         grid, simulator = ExposureGrid.default(), CameraSimulator(device=device)
-        with _bars() as progress, progress("DNGs") as task:
+        with progress_bars() as progress, progress("DNGs") as task:
             for i, settings in enumerate(grid):
                 path = out / f"{raw.stem}-{i:02d}.dng"
                 write_dng(path, simulator.simulate(source, settings, seed=seed))
                 task(i + 1, len(grid))
         files["DNGs"] = out
-    _print_files(files)
+    print_files(files)
 
 
 @app.command()
@@ -185,18 +190,18 @@ def train(
     from agents.weights import sibling
 
     agent = load_config(config)
-    _make_folder(sibling(out, ".json").parent)
+    make_folder(sibling(out, ".json").parent)
     if seed is not None:
         agent = agent.with_seed(seed)
-    device = _device(device)
-    with _bars() as progress, progress(f"training {agent.agent}") as task:
+    device = torch_device(device)
+    with progress_bars() as progress, progress(f"training {agent.agent}") as task:
 
         def report(done: int, total: int, values: dict[str, float]) -> None:
             task(done, total, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
 
         train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
     files = (sibling(out, ".safetensors"), sibling(out, ".json"))
-    _print_files({"weights": files[0], "description": files[1]})
+    print_files({"weights": files[0], "description": files[1]})
     command = shlex.join(["ae-env", "evaluate", "--policy", f"{agent.agent}:{out}"])
     console.print(f"next: {command}", highlight=False, soft_wrap=True, markup=False)
 
@@ -237,9 +242,9 @@ def evaluate(
     envs = make_envs(options, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
     policies = {name: make_policy(name, context) for name in policy}
-    _make_folder(out)
+    make_folder(out)
     training = {**options, "scenes": training_scenes(scenes)[0], "lighting": "static", "delay": 0}
-    with _bars() as progress:
+    with progress_bars() as progress:
         with progress("fitting on training scenes") as task:
             fit_policies(policies, training, seed=seed, progress=task)
             task(1, 1)
@@ -254,7 +259,7 @@ def evaluate(
             )
     files = write_report(result, out, command=_command(), source=scenes, split=split)
     _print_scores(result)
-    _print_files(files)
+    print_files(files)
 
 
 @app.command()
@@ -282,44 +287,11 @@ def bench(
             "the benchmarks are not part of the installed package: run this in a clone of the "
             "repository"
         ) from None
-    _make_folder(out)
+    make_folder(out)
     module.run(out, seed=seed, quick=quick)
 
 
 # -- what the commands share ------------------------------------------------------------------
-
-
-@contextmanager
-def _bars() -> Iterator[Any]:
-    """Progress bars with time left; yields a function that opens one."""
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("[dim]{task.fields[note]}"),
-    )
-    with Progress(*columns, console=console) as display:
-
-        @contextmanager
-        def bar(title: str) -> Iterator[Any]:
-            task = display.add_task(title, total=None, note="")
-
-            def move(done: int, total: int, note: str = "") -> None:
-                display.update(task, completed=done, total=total, note=note)
-
-            yield move
-
-        yield bar
 
 
 def _print_scores(result: EvaluationResult) -> None:
@@ -345,69 +317,14 @@ def _print_scores(result: EvaluationResult) -> None:
     console.print(table)
 
 
-def _print_files(files: Mapping[str, Path]) -> None:
-    for name, path in files.items():
-        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True, markup=False)
-
-
 def _write_png(path: Path, raw: RawImage) -> Path:
     from PIL import Image
 
     from simulator import render_srgb
 
     picture = render_srgb(raw).permute(1, 2, 0).cpu().numpy()
-    return _save_picture(path, Image.fromarray(picture))
-
-
-def _save_picture(path: Path, picture: Any) -> Path:
-    import io
-
-    from simulator.files import write_atomically
-
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return write_atomically(path, buffer.getvalue())
-
-
-def _seconds(text: str) -> float:
-    """Seconds from ``"1/60"`` or ``"0.5"``."""
-    numerator, _, denominator = text.removesuffix("s").partition("/")
-    try:
-        return float(numerator) / float(denominator or 1)
-    except (ValueError, ZeroDivisionError):
-        raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
-
-
-def _make_folder(path: Path) -> None:
-    """Makes a folder for results before any time is spent on them."""
-    existing = next(p for p in (path, *path.parents) if p.exists())
-    if not existing.is_dir():
-        raise ValueError(f"`out` (={str(path)!r}) must be a folder, but {existing} is a file")
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise ValueError(f"`out` (={str(path)!r}) cannot be written: {error.strerror}") from error
-
-
-def _device(name: str) -> str:
-    """The torch device called `name`, checked before any work is done."""
-    import torch
-
-    cuda = torch.cuda.is_available()
-    if name == "auto":
-        return "cuda" if cuda else "cpu"
-    if name != "cpu" and not (cuda and name.partition(":")[0] == "cuda"):
-        raise ValueError(f"`device` (={name!r}) must be auto, cpu{', cuda' if cuda else ''} here")
-    return name
+    return save_picture(path, Image.fromarray(picture))
 
 
 def _command() -> str:
     return shlex.join(["ae-env", *sys.argv[1:]])
-
-
-def _escape(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ae_env.cache import cache_dir, write_bytes
+from ae_env.cache import cache_dir
 from ae_env.grid import ExposureGrid
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.composite import CompositeScorer
@@ -26,6 +26,7 @@ from ae_env.scorers.protocol import Captures, DependsOn
 from ae_env.scorers.registry import scorer_fingerprint
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import Latent
+from simulator.files import write_atomically
 from simulator.settings import CameraSettings, exposure_ratio
 
 _LOGGER = logging.getLogger(__name__)
@@ -294,4 +295,4 @@ def _load_parts(path: Path) -> dict[str, np.ndarray] | None:
 def _save_parts(path: Path, parts: dict[str, np.ndarray]) -> None:
     buffer = io.BytesIO()
     np.savez(buffer, **parts)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
+    write_atomically(path, buffer.getvalue())

@@ -8,6 +8,7 @@ each weighted by the network's own confidence.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -162,11 +163,9 @@ class RegressionTraining:
             memory=(1, 1e9),
             explore=(0.0, 1.0),
             width=(1, 65536),
+            dropout=(0.0, 0.99),
             seed=(0, 2**63),
         )
-
-    def check_batch(self, num_envs: int) -> None:
-        """Any number of environments will do."""
 
 
 def train_regression(
@@ -196,8 +195,7 @@ def train_regression(
     from agents.checkpoint import Checkpoint
 
     context = PolicyContext.from_envs(envs)
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(training.seed)
+    with _seeded("cpu", training.seed):
         network = ScoreRegressor(
             context.observation_space, context.grid, training.width, training.dropout
         )
@@ -220,7 +218,8 @@ def train_regression(
     for step in range(first, steps):
         observations, target = replay.batch(*next(frames))
         network.train()
-        scores, log_variance = network(*observation_tensors(observations, device))
+        with _seeded(device, training.seed, step):  # the dropout draws from the global generator
+            scores, log_variance = network(*observation_tensors(observations, device))
         error = (scores - torch.from_numpy(target).float().to(device)).square()
         # The mean learns from the plain squared error, the confidence from the likelihood.
         likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
@@ -238,6 +237,15 @@ def train_regression(
         store.save(step + 1)
     store.save(steps, force=True)
     return network
+
+
+@contextmanager
+def _seeded(device: str, *seeds: int) -> Iterator[None]:
+    """torch's global generators seeded within, and as they were after."""
+    cuda = [torch.device(device)] if torch.device(device).type == "cuda" else []
+    with torch.random.fork_rng(devices=cuda):
+        torch.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1)[0]))
+        yield
 
 
 class _Replay:

@@ -20,7 +20,8 @@ from agents.result_table import (
 )
 from agents.score_plot import plot_scores
 from agents.statistics import MIN_GROUPS
-from simulator.results import result_meta, write_results, write_text
+from simulator.files import write_atomically
+from simulator.results import result_meta, write_results
 from simulator.settings import format_exposure_time
 
 _TABLE = (
@@ -84,9 +85,9 @@ def write_report(
     title = f"{source}, {split} split: {meta['scenes']} scenes"
     return {
         "results.json": write_results(folder / "results.json", rows, meta),
-        "scenes.csv": write_text(folder / "scenes.csv", scenes_csv(result)),
+        "scenes.csv": write_atomically(folder / "scenes.csv", scenes_csv(result)),
         "scores.png": plot_scores(folder / "scores.png", rows, title),
-        "report.md": write_text(folder / "report.md", text),
+        "report.md": write_atomically(folder / "report.md", text),
     }
 
 

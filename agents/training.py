@@ -53,7 +53,8 @@ class AgentConfig(BaseModel):
                 f"environment: `observation` (={options.observation!r}) must be 'uint8', which is "
                 "what the agents' networks take"
             )
-        hyperparameters.check_batch(self.num_envs)
+        if self.agent == "ppo":
+            hyperparameters.check_batch(self.num_envs)
         try:
             json.dumps(self.card())
         except TypeError as error:  # found out before the training, not when it is saved

@@ -34,8 +34,9 @@ from simulator import (
     estimate_nlf,
     exposure_ratio,
 )
+from simulator.files import write_atomically
 from simulator.raw_image import PLANES
-from simulator.results import result_meta, write_results, write_text
+from simulator.results import result_meta, write_results
 
 SCENES = {"left_c0": "static", "left_c5": "moving"}
 TIMES_MS = (1, 2, 4, 8, 16, 32)
@@ -350,7 +351,7 @@ def main(arguments: list[str] | None = None) -> None:
     meta["blind_nlf_of_green"] = {"exposure_ms": list(TIMES_MS), **estimates}
     meta["frame"] = list(frames[1].data.shape)
     write_results(options.out, rows, meta)
-    path = write_text(options.out.with_suffix(".md"), report(rows, meta))
+    path = write_atomically(options.out.with_suffix(".md"), report(rows, meta))
     print(f"wrote {options.out} and {path}")
 
 

@@ -27,7 +27,8 @@ from ae_env.score_table import scene_latent
 from ae_env.scorers import make_scorer
 from simulator import CameraProfile, develop
 from simulator.capture import clip_and_quantise
-from simulator.results import result_meta, write_results, write_text
+from simulator.files import write_atomically
+from simulator.results import result_meta, write_results
 
 SCORERS = ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced")
 #: What each scorer alone is about, measured on captures with no other fault than that one.
@@ -68,7 +69,7 @@ def run(out: Path, seed: int = 0, quick: bool = False) -> None:
     meta = result_meta(f"ae-env bench scorers{' --quick' * quick}", seed)
     meta |= {"scenes": len(core.scenes), "states": len(core.grid), "aspects": ASPECTS}
     write_results(out / "scorers.json", rows, meta)
-    write_text(out / "scorers.md", _markdown(rows, meta))
+    write_atomically(out / "scorers.md", _markdown(rows, meta))
 
 
 def _closeness(

@@ -31,7 +31,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import ae_env.core
 from ae_env.observation import PEDESTAL
-from simulator.results import result_meta, write_results, write_text
+from simulator.files import write_atomically
+from simulator.results import result_meta, write_results
 
 ID = "ae_env/AutoExposure-v0"
 SCENES = "bundled:small"
@@ -80,7 +81,7 @@ def run(out: Path, seed: int = 0, quick: bool = False) -> None:
     rows = _rows(cases)
     meta |= {"rounds": rounds, "frames_per_round": frames, "profile": profile, "scenes": SCENES}
     write_results(out / "throughput.json", rows, meta)
-    write_text(out / "throughput.md", _markdown(rows, meta))
+    write_atomically(out / "throughput.md", _markdown(rows, meta))
 
 
 # -- the cases ------------------------------------------------------------------------------------

@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from simulator.files import write_atomically
+
 _DISTRIBUTIONS = (
     "ae-env",
     "torch",
@@ -74,20 +76,7 @@ def write_results(
         )
     except (TypeError, ValueError) as error:
         raise ValueError(f"`rows` and `meta` must hold finite JSON values: {error}") from None
-    return write_text(path, text + "\n")
-
-
-def write_text(path: str | os.PathLike[str], text: str) -> Path:
-    """Write `text` to a temporary file beside `path`, then rename it."""
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return target
+    return write_atomically(path, text + "\n")
 
 
 def machine() -> dict[str, Any]:

@@ -15,7 +15,7 @@ import safetensors
 import safetensors.torch
 import torch
 
-from ae_env.cache import cache_dir, cache_key, write_bytes
+from ae_env.cache import cache_dir, cache_key
 from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
 from ae_env.scenes.procedural import (
     GENERATOR_VERSION,
@@ -25,6 +25,7 @@ from ae_env.scenes.procedural import (
 )
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
 from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.files import write_atomically
 from simulator.settings import CameraSettings
 
 logger = logging.getLogger(__name__)
@@ -170,7 +171,7 @@ def _write_cache(path: Path, scenes: list[Scene]) -> None:
         rows.append(row)
     metadata = {"scenes": json.dumps(rows), "checksum": _checksum(tensors)}
     try:
-        write_bytes(path, safetensors.torch.save(tensors, metadata))
+        write_atomically(path, safetensors.torch.save(tensors, metadata))
     except OSError as error:  # a full or read-only disk must not stop the run
         logger.warning("the bundled scenes could not be cached in %s: %s", path, error)
 

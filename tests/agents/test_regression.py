@@ -177,7 +177,7 @@ def test_replay_memory_is_bounded(memory: int) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"frames": 0}, {"learning_rate": -1.0}, {"explore": 1.5}, {"replay": -1}, {"width": 0}],
+    [{"frames": 0}, {"learning_rate": -1.0}, {"explore": 1.5}, {"replay": -1}, {"dropout": 1.0}],
 )
 def test_bad_hyperparameters(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=rf"`{next(iter(wrong))}` \(=.*\) must be in \["):

@@ -1,0 +1,96 @@
+"""What the commands share: the console, progress bars, and checks of what the user typed."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from simulator.files import write_atomically
+
+console = Console()
+
+
+@contextmanager
+def progress_bars() -> Iterator[Any]:
+    """Progress bars with time left; yields a function that opens one."""
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("[dim]{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console) as display:
+
+        @contextmanager
+        def bar(title: str) -> Iterator[Any]:
+            task = display.add_task(title, total=None, note="")
+
+            def move(done: int, total: int, note: str = "") -> None:
+                display.update(task, completed=done, total=total, note=note)
+
+            yield move
+
+        yield bar
+
+
+def print_files(files: Mapping[str, Path]) -> None:
+    """Says what was written where."""
+    for name, path in files.items():
+        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True, markup=False)
+
+
+def save_picture(path: Path, picture: Any) -> Path:
+    """Writes a PIL image as PNG."""
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return write_atomically(path, buffer.getvalue())
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds from ``"1/60"`` or ``"0.5"``."""
+    numerator, _, denominator = text.removesuffix("s").partition("/")
+    try:
+        return float(numerator) / float(denominator or 1)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder for results before any time is spent on them."""
+    existing = next(p for p in (path, *path.parents) if p.exists())
+    if not existing.is_dir():
+        raise ValueError(f"`out` (={str(path)!r}) must be a folder, but {existing} is a file")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise ValueError(f"`out` (={str(path)!r}) cannot be written: {error.strerror}") from error
+
+
+def torch_device(name: str) -> str:
+    """The torch device called `name`, checked before any work is done."""
+    import torch
+
+    cuda = torch.cuda.is_available()
+    if name == "auto":
+        return "cuda" if cuda else "cpu"
+    if name != "cpu" and not (cuda and name.partition(":")[0] == "cuda"):
+        raise ValueError(f"`device` (={name!r}) must be auto, cpu{', cuda' if cuda else ''} here")
+    return name
