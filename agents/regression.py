@@ -244,7 +244,10 @@ def _seeded(device: str, *seeds: int) -> Iterator[None]:
     """torch's global generators seeded within, and as they were after."""
     cuda = [torch.device(device)] if torch.device(device).type == "cuda" else []
     with torch.random.fork_rng(devices=cuda):
-        torch.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1)[0]))
+        number = int(np.random.SeedSequence(seeds).generate_state(1)[0])
+        torch.default_generator.manual_seed(number)
+        if cuda:
+            torch.cuda.manual_seed(number)
         yield
 
 

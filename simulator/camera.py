@@ -72,6 +72,12 @@ class NoiseLevelFunction:
         read = tuple(v * factor for v in self.read)
         return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
 
+    def at_least(self, other: NoiseLevelFunction) -> NoiseLevelFunction:
+        """The larger shot and the larger read noise of both, plane by plane."""
+        shot = tuple(map(max, self.shot, other.shot))
+        read = tuple(map(max, self.read, other.read))
+        return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
+
     def exposed(self, ratio: float) -> NoiseLevelFunction:
         """NLF of this noise after the raw was multiplied by `ratio` (paper, section 3.2)."""
         shot = tuple(v * ratio for v in self.shot)

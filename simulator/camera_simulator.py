@@ -135,6 +135,16 @@ class Latent:
             defocus_px=defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0,
         )
 
+    def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
+        """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
+
+        Shot and read noise are compared apart, so that a mixed case is stated too high rather than
+        too low.
+        """
+        exposure = self.exposure(settings)
+        source = exposure.source_noise.scaled(float(self.box_factor**2))
+        return self.camera.nlf(settings.iso).at_least(source)
+
     def plan(self, settings: CameraSettings) -> SimulationPlan:
         """Steps, reasons, predicted error and cost of a capture at `settings`."""
         exposure = self.exposure(settings)
@@ -322,7 +332,7 @@ class CameraSimulator:
             data=data,
             settings=settings,
             camera=latent.camera,
-            nlf=latent.camera.nlf(settings.iso),
+            nlf=latent.output_noise(settings),
             white_balance=latent.white_balance,
             box_factor=latent.box_factor,
             metadata=metadata,

@@ -395,3 +395,16 @@ def test_cuda_gives_the_same_digital_numbers() -> None:
         off = np.abs(numbers(frames[0]) - numbers(frames[1]))
         assert off.max() < 1.01  # rounding may fall either way
         assert (off > 0.5).mean() < 1e-3
+
+
+def test_a_noisy_source_is_stated_in_the_result() -> None:
+    """ISO 6400 exposed at ISO 100: what remains is the source's noise, and the raw must say so."""
+    camera = get_camera("nikon_z6")
+    noisy, clean = CameraSettings(6400, 1 / 64, 4), CameraSettings(100, 1 / 64, 4)
+    ratio = 100 / 6400
+    raw = RawImage(torch.full((4, 8, 8), 0.5), noisy, camera)
+    stated = CameraSimulator(device="cpu").simulate(raw, clean).noise
+    pairs = zip(camera.nlf(6400).shot, camera.nlf(100).shot, strict=True)
+    assert stated.shot == pytest.approx([max(ratio * a, b) for a, b in pairs])
+    pairs = zip(camera.nlf(6400).read, camera.nlf(100).read, strict=True)
+    assert stated.read == pytest.approx([max(ratio**2 * a, b) for a, b in pairs])
