@@ -7,7 +7,6 @@ Run ``ae-env bench agents`` in a clone of the repository. Trained agents are kep
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -108,12 +107,3 @@ def _train(jobs: dict[str, list[TrainingJob]]) -> None:
             display.update(tasks[name], completed=done, total=total)
 
         train_in_parallel(everything, progress=report)
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true")
-    arguments = parser.parse_args()
-    run(arguments.out, seed=arguments.seed, quick=arguments.quick)

@@ -1,6 +1,6 @@
 """The exposure step against a real multi-exposure bracket (1 to 32 ms in whole stops).
 
-    python benchmarks/brackets.py --out docs/results/brackets.json
+    ae-env bench brackets
 
 Measures, per plane, the ratio between consecutive exposures against `simulator.exposure_ratio`,
 then simulates the 2 to 32 ms frames from the 1 ms frame and the 1 ms frame from each of them, and
@@ -9,11 +9,7 @@ compares with the real ones. Writes the JSON and, beside it, the same as Markdow
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
-import shlex
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +21,7 @@ from skimage.io import imread
 from skimage.metrics import structural_similarity
 from skimage.registration import phase_cross_correlation
 
+from benchmarks.data import data_folder
 from simulator import (
     CameraProfile,
     CameraSettings,
@@ -39,6 +36,8 @@ from simulator.raw_image import PLANES
 from simulator.results import result_meta, write_results
 
 SCENES = {"left_c0": "static", "left_c5": "moving"}
+#: Timed runs of each simulation.
+REPEATS = 5
 TIMES_MS = (1, 2, 4, 8, 16, 32)
 #: Above this level the published response curve is not linear any more (see the ratios).
 LINEAR_BELOW = 0.4
@@ -324,36 +323,30 @@ def report(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", 1)[0])
-    default = os.environ.get("AE_ENV_DATA", "../shared/data")
-    parser.add_argument("--data", type=Path, default=Path(default), help="folder of real data")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/brackets.json"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--repeats", type=int, default=5, help="timed runs of each simulation")
-    options = parser.parse_args(arguments)
+def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
+    """Measures and writes ``brackets.json`` and ``brackets.md`` into `out`.
 
+    Args:
+        out: Folder of results.
+        seed: Of the simulated noise.
+        quick: Only the static scene, each simulation timed once.
+    """
+    folder = data_folder("boreal_brackets")
     rows: list[dict[str, Any]] = []
     estimates: dict[str, Any] = {}
-    for scene in SCENES:
-        loaded = {t: load(options.data / "boreal_brackets", scene, t) for t in TIMES_MS}
+    for scene in list(SCENES)[: 1 if quick else None]:
+        loaded = {t: load(folder, scene, t) for t in TIMES_MS}
         frames, estimates[scene] = calibrated({t: raw for t, (raw, _) in loaded.items()})
         rows += ratio_rows(scene, frames)
         steps = [(1, t) for t in TIMES_MS[1:]] + [(t, 1) for t in TIMES_MS[1:]]
         for source, target in steps:
             apart = abs(loaded[source][1] - loaded[target][1])
             pair = Pair(scene, source, target, frames[source], frames[target], apart)
-            rows += transition_rows(pair, options.repeats, options.seed)
+            rows += transition_rows(pair, 1 if quick else REPEATS, seed)
             best = rows[-5]
             print(f"{scene}: {source} -> {target} ms: {best['psnr_db']} dB, {best['ms']} ms")
-    command = shlex.join(["python", "benchmarks/brackets.py", *(arguments or sys.argv[1:])])
-    meta = result_meta(command, options.seed)
+    meta = result_meta("ae-env bench brackets" + (" --quick" if quick else ""), seed)
     meta["blind_nlf_of_green"] = {"exposure_ms": list(TIMES_MS), **estimates}
     meta["frame"] = list(frames[1].data.shape)
-    write_results(options.out, rows, meta)
-    path = write_atomically(options.out.with_suffix(".md"), report(rows, meta))
-    print(f"wrote {options.out} and {path}")
-
-
-if __name__ == "__main__":
-    main()
+    print(f"wrote {write_results(out / 'brackets.json', rows, meta)}")
+    print(f"wrote {write_atomically(out / 'brackets.md', report(rows, meta))}")

@@ -1,6 +1,6 @@
 """Colour accuracy of `simulator.develop` on real raws of a ColorChecker.
 
-    python benchmarks/colour_checker.py --out docs/results/colour_checker.json
+    ae-env bench colour_checker
 
 Every patch is averaged on the packed raw, brought to the chart's exposure by one scale, developed
 (linear tone) and compared with the chart's published colour: CIE dE2000, D50, 2 degree observer.
@@ -8,10 +8,6 @@ Every patch is averaged on the packed raw, brought to the chart's exposure by on
 
 from __future__ import annotations
 
-import argparse
-import os
-import shlex
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +17,7 @@ import numpy as np
 import torch
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
+from benchmarks.data import data_folder
 from simulator import RawImage, develop, read_raw
 from simulator.isp import TONES, XYZ_FROM_SRGB, srgb_from_camera
 from simulator.results import result_meta, write_results
@@ -327,16 +324,18 @@ def print_table(rows: list[dict]) -> None:
         print("| " + " | ".join(map(str, row.values())) + " |")
 
 
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", 1)[0])
-    default = os.environ.get("AE_ENV_DATA", "../shared/data")
-    parser.add_argument("--data", type=Path, default=Path(default), help="folder of real data")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/colour_checker.json"))
-    options = parser.parse_args(arguments)
+def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
+    """Measures, prints the tables and writes ``colour_checker.json`` into `out`.
 
+    Args:
+        out: Folder of results.
+        seed: Nothing here is random; only noted in the file.
+        quick: Only the first raw.
+    """
+    folder = data_folder("canon_crw_cc0")
     rows, summaries, lines, paper = [], [], [], {}
-    for file, chart in FILES.items():
-        raw = read_raw(options.data / "canon_crw_cc0" / file)
+    for file, chart in list(FILES.items())[: 1 if quick else None]:
+        raw = read_raw(folder / file)
         for reference in CHARTS:
             for white_balance in ("camera", "chart"):
                 part = measure(raw, chart, white_balance, reference)
@@ -350,15 +349,10 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"\nwhite paper around the chart, share of sensor white: {paper}")
     times = develop_times(np.array(raw.camera.colour_matrix))
     print_table(times)
-    command = shlex.join(["python", "benchmarks/colour_checker.py", *(arguments or sys.argv[1:])])
-    meta = result_meta(command, seed=None) | {
+    meta = result_meta("ae-env bench colour_checker" + (" --quick" if quick else ""), seed) | {
         "summary": summaries,
         "linearity": lines,
         "paper": paper,
         "develop_ms": times,
     }
-    print(f"\nwrote {write_results(options.out, rows, meta)}")
-
-
-if __name__ == "__main__":
-    main()
+    print(f"\nwrote {write_results(out / 'colour_checker.json', rows, meta)}")

@@ -1,6 +1,6 @@
 """Do the scorers tell good captures from bad ones? Their correlation with a reference picture.
 
-    ae-env bench scorers               # or: python -m benchmarks.scorers --out docs/results
+    ae-env bench scorers
 
 For every bundled test scene, with a motion and a defocus drawn as in an episode, the 64 states are
 simulated and compared with the reference: the same scene noise-free, blur-free and exposed for its
@@ -9,7 +9,6 @@ incident light. Each pixel carries the noise of one sensor pixel.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -199,16 +198,3 @@ def _markdown(rows: list[dict[str, Any]], meta: Mapping[str, Any]) -> str:
     lines += ["", "| scorer | error of its own aspect |", "|---|---|"]
     lines += [f"| `{name}` | {text} |" for name, text in ASPECTS.items()]
     return "\n".join(lines) + "\n"
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description="Correlation of the scorers with a reference.")
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args(arguments)
-    run(options.out, options.seed, options.quick)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Steps per second of the environment against what the machine could do, and where the time goes.
 
-    ae-env bench throughput            # or: python -m benchmarks.throughput --out docs/results
+    ae-env bench throughput
 
 Two limits are measured in the same run, frame for frame of the same size:
 
@@ -13,7 +13,6 @@ Everything runs on one torch thread, alternating between the cases, round after 
 
 from __future__ import annotations
 
-import argparse
 import functools
 import statistics
 import time
@@ -307,16 +306,3 @@ def _markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
         for p in meta["profile"]
     ]
     return "\n".join(lines) + "\n"
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description="Steps per second against the machine's limits.")
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args(arguments)
-    run(options.out, options.seed, options.quick)
-
-
-if __name__ == "__main__":
-    main()
