@@ -80,6 +80,7 @@ def quickstart(
     scenes: Scenes = "bundled",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("quickstart"),
     seed: Seed = 0,
+    device: Device = "cpu",
 ) -> None:
     """Train two agents, compare them with light meters on unseen scenes: about 5 minutes.
 
@@ -88,8 +89,11 @@ def quickstart(
     from agents.quickstart import next_commands, run_quickstart
 
     make_folder(out)
+    device = torch_device(device)
     with progress_bars() as progress:
-        done = run_quickstart(scenes, out, seed=seed, progress=progress, command=_command())
+        done = run_quickstart(
+            scenes, out, seed=seed, progress=progress, command=_command(), device=device
+        )
     if done.zero_shot:
         text = f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes"
         console.print(text, soft_wrap=True, markup=False)
@@ -220,6 +224,7 @@ def evaluate(
     frames: Annotated[int, typer.Option(help="Frames per episode.", min=1)] = 8,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("evaluation"),
     seed: Seed = 0,
+    device: Device = "cpu",
 ) -> None:
     """Compare policies on the same episodes: scores, regret, convergence, flicker.
 
@@ -241,7 +246,8 @@ def evaluate(
     }
     envs = make_envs(options, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
-    policies = {name: make_policy(name, context) for name in policy}
+    device = torch_device(device)
+    policies = {name: make_policy(name, context, device=device) for name in policy}
     make_folder(out)
     training = {**options, "scenes": training_scenes(scenes)[0], "lighting": "static", "delay": 0}
     with progress_bars() as progress:

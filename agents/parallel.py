@@ -30,11 +30,13 @@ class TrainingJob:
         name: Shown to the user.
         config: What to train.
         out: File name of the agent, without suffix.
+        device: Torch device of the network.
     """
 
     name: str
     config: AgentConfig
     out: Path
+    device: str = "cpu"
 
 
 def train_in_parallel(
@@ -130,4 +132,4 @@ def _train(job: TrainingJob, threads: int, messages: Any) -> None:
             messages.put((job.name, done, total, values))
 
     if _stop is None or not _stop.is_set():
-        train_agent(job.config, job.out, progress=report)
+        train_agent(job.config, job.out, progress=report, device=job.device)

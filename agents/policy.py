@@ -123,7 +123,9 @@ def list_policies() -> list[str]:
     return sorted([*_SIMPLE, *(f"{m}:{p}" for m in METERS for p in PROGRAMS)])
 
 
-def make_policy(name: str, context: PolicyContext, **options: Any) -> Policy:
+def make_policy(
+    name: str, context: PolicyContext, *, device: str = "cpu", **options: Any
+) -> Policy:
     """The policy called `name`.
 
     Args:
@@ -132,6 +134,7 @@ def make_policy(name: str, context: PolicyContext, **options: Any) -> Policy:
             ``"ppo:PATH"`` with the weights of a trained agent; ``"package.module:Class"`` or
             ``"path/to/file.py:Class"`` for a policy of one's own.
         context: What the policy is told about the camera.
+        device: Torch device of a learnt agent's network.
         options: Passed to the class.
 
     Raises:
@@ -149,7 +152,7 @@ def make_policy(name: str, context: PolicyContext, **options: Any) -> Policy:
         return _construct(cls, name, context, {"meter": head, "program": tail or "P", **options})
     if head in _TRAINED:
         if tail:
-            options = {"weights": tail, **options}
+            options = {"weights": tail, "device": device, **options}
         elif "weights" not in options:
             raise ValueError(f"`policy` (={name!r}) needs its weights: '{head}:PATH'")
         return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)

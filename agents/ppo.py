@@ -182,6 +182,7 @@ class PPOPolicy(Policy):
         context: The camera, the grid and the observation.
         weights: File written by `save_ppo`; or give `network`.
         network: A network in memory.
+        device: Torch device for `weights`.
 
     Raises:
         ValueError: If the weights were trained for another grid or observation.
@@ -192,6 +193,7 @@ class PPOPolicy(Policy):
         context: PolicyContext,
         weights: str | Path | None = None,
         network: ExposureActorCritic | None = None,
+        device: str = "cpu",
     ) -> None:
         super().__init__(context)
         if (weights is None) == (network is None):
@@ -201,6 +203,7 @@ class PPOPolicy(Policy):
             check_context(card, context)
             network = make_policy_network(context, card["width"])
             load_into(network, tensors, str(weights))
+            network.to(device)
         network.set_training_mode(False)
         self.network = network
 

@@ -65,7 +65,7 @@ class QuickstartResult:
 
 
 def run_quickstart(
-    scenes: str, out: Path, *, seed: int, progress: Progress, command: str
+    scenes: str, out: Path, *, seed: int, progress: Progress, command: str, device: str = "cpu"
 ) -> QuickstartResult:
     """Score tables, trainings, evaluation, report; a second run goes on where the first stopped.
 
@@ -75,14 +75,15 @@ def run_quickstart(
         seed: Of trainings and evaluation.
         progress: Opens progress bars.
         command: The command line, for the report.
+        device: Torch device of the agents' networks.
     """
     source, zero_shot = training_scenes(scenes)
     environment = {"scenes": source, "split": "train", "resolution": 64}
     with progress("scenes and score tables") as task:
         prepare_tables(environment, task)
-    agents = _train(environment, out, seed, progress)
+    agents = _train(environment, out, seed, progress, device)
     evaluation = {"scenes": scenes, "split": "test", "resolution": 64}
-    policies = _policies(evaluation, agents)
+    policies = _policies(evaluation, agents, device)
     with progress("light meters learn their programs") as task:
         fit_policies(policies, environment, seed=seed, progress=task)
     with progress("evaluation on unseen scenes") as task:
@@ -128,7 +129,7 @@ def prepare_tables(environment: Mapping[str, Any], task: Task) -> None:
 
 
 def _train(
-    environment: dict[str, Any], out: Path, seed: int, progress: Progress
+    environment: dict[str, Any], out: Path, seed: int, progress: Progress, device: str
 ) -> dict[str, Path]:
     settings: dict[str, dict[str, Any]] = {
         "regression": {"frames": REGRESSION_FRAMES, "seed": seed},
@@ -139,6 +140,7 @@ def _train(
             name,
             AgentConfig(agent=name, environment=environment, training=training),  # type: ignore[arg-type]
             out / "agents" / name,
+            device,
         )
         for name, training in settings.items()
     ]
@@ -154,14 +156,18 @@ def _train(
     return {job.name: job.out for job in jobs}
 
 
-def _policies(evaluation: dict[str, Any], agents: Mapping[str, Path]) -> dict[str, Policy]:
+def _policies(
+    evaluation: dict[str, Any], agents: Mapping[str, Path], device: str
+) -> dict[str, Policy]:
     from agents.episodes import make_envs
 
     envs = make_envs(evaluation, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
     envs.close()
     policies = {name: make_policy(name, context) for name in BASELINES}
-    learnt = {name: make_policy(f"{name}:{path}", context) for name, path in agents.items()}
+    learnt = {
+        name: make_policy(f"{name}:{path}", context, device=device) for name, path in agents.items()
+    }
     oracle = policies.pop("oracle")
     return {**policies, **learnt, "oracle": oracle}
 

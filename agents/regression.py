@@ -79,6 +79,7 @@ class RegressionPolicy(Policy):
         context: The camera, the grid and the observation.
         weights: File written by `train_regression`; or give `network`.
         network: A network in memory.
+        device: Torch device for `weights`.
 
     Raises:
         ValueError: If the weights were trained for another grid or observation.
@@ -89,6 +90,7 @@ class RegressionPolicy(Policy):
         context: PolicyContext,
         weights: str | Path | None = None,
         network: ScoreRegressor | None = None,
+        device: str = "cpu",
     ) -> None:
         super().__init__(context)
         if (weights is None) == (network is None):
@@ -98,6 +100,7 @@ class RegressionPolicy(Policy):
             check_context(card, context)
             network = ScoreRegressor(context.observation_space, context.grid, card["width"])
             load_into(network, tensors, str(weights))
+            network.to(device)
         self.network = network.eval()
         self._weighted = np.zeros((0, len(context.grid)))
         self._precision = np.zeros((0, len(context.grid)))

@@ -57,9 +57,9 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     policies = {name: make_policy(name, context) for name in names}
     with Progress() as display:
         task = display.add_task("light meters learn their programs")
-        fit_policies(
+        fit_policies(  # on the same scenes as the agents
             policies,
-            test,
+            jobs["regression"][0].config.environment,
             seed=seed,
             progress=lambda done, total, _: display.update(task, completed=done, total=total),
         )
