@@ -27,6 +27,8 @@ Observations = Mapping[str, NDArray[Any]]
 METERS = ("average", "centre_weighted", "matrix", "spot")
 PROGRAMS = ("P", "A", "S", "tuned", "tuned_blind")
 _SIMPLE = {"best_fixed": "BestFixed", "oracle": "Oracle", "random": "Random"}
+#: Agents that come with the package: training seed 0 of ``ae-env bench agents``.
+PRETRAINED = Path(__file__).parent / "pretrained"
 _TRAINED = {"ppo": "PPOPolicy", "regression": "RegressionPolicy"}
 
 
@@ -120,7 +122,7 @@ def masked_argmax(
 
 def list_policies() -> list[str]:
     """Names of the built-in policies that need no file."""
-    return sorted([*_SIMPLE, *(f"{m}:{p}" for m in METERS for p in PROGRAMS)])
+    return sorted([*_SIMPLE, *_TRAINED, *(f"{m}:{p}" for m in METERS for p in PROGRAMS)])
 
 
 def make_policy(
@@ -130,8 +132,9 @@ def make_policy(
 
     Args:
         name: ``"random"``, ``"best_fixed"``, ``"oracle"``; a meter and a program such as
-            ``"centre_weighted:P"`` (the program defaults to P); ``"regression:PATH"`` and
-            ``"ppo:PATH"`` with the weights of a trained agent; ``"package.module:Class"`` or
+            ``"centre_weighted:P"`` (the program defaults to P); ``"regression"`` and ``"ppo"``, the
+            agents that come with the package, or ``"regression:PATH"`` and ``"ppo:PATH"`` with
+            weights of one's own; ``"package.module:Class"`` or
             ``"path/to/file.py:Class"`` for a policy of one's own.
         context: What the policy is told about the camera.
         device: Torch device of a learnt agent's network.
@@ -151,10 +154,9 @@ def make_policy(
         cls = _class_in("agents.programs", "MeteringPolicy")
         return _construct(cls, name, context, {"meter": head, "program": tail or "P", **options})
     if head in _TRAINED:
-        if tail:
-            options = {"weights": tail, "device": device, **options}
-        elif "weights" not in options:
-            raise ValueError(f"`policy` (={name!r}) needs its weights: '{head}:PATH'")
+        if "network" not in options:
+            weights = tail or str(PRETRAINED / head)
+            options = {"weights": weights, "device": device, **options}
         return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)
     if tail and (head not in METERS and head not in _SIMPLE):
         return _construct(_class_in_module(head, tail, name), name, context, options)
@@ -168,7 +170,7 @@ def _unknown(name: str) -> str:
     return (
         f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
         f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
-        f"regression:PATH, ppo:PATH; package.module:Class or path.py:Class{hint}"
+        f"regression or ppo, alone or with :PATH; package.module:Class or path.py:Class{hint}"
     )
 
 

@@ -28,7 +28,6 @@ def test_every_listed_name_makes_a_policy(context):
         ("matrix:Q", r"must be one of .*:tuned_blind"),
         ("oracle:P", r"must be one of"),
         ("", r"must be one of"),
-        ("ppo", r"needs its weights: 'ppo:PATH'"),
         ("no_such_pkg.mod:Class", r"no module 'no_such_pkg'"),
         ("agents.simple:Rundom", r"no class 'Rundom' there; found Random, BestFixed, Oracle"),
         ("agents.metrics:flicker", r"must name a class, not a function"),
