@@ -204,6 +204,7 @@ class PPOPolicy(Policy):
             network = make_policy_network(context, card["width"])
             load_into(network, tensors, str(weights))
             network.to(device)
+        self.name = "ppo"
         network.set_training_mode(False)
         self.network = network
 

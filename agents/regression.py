@@ -101,6 +101,7 @@ class RegressionPolicy(Policy):
             network = ScoreRegressor(context.observation_space, context.grid, card["width"])
             load_into(network, tensors, str(weights))
             network.to(device)
+        self.name = "regression"
         self.network = network.eval()
         self._weighted = np.zeros((0, len(context.grid)))
         self._precision = np.zeros((0, len(context.grid)))

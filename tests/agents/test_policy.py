@@ -12,8 +12,8 @@ from agents.policy import METERS, PROGRAMS, Policy, list_policies, make_policy, 
 
 def test_every_listed_name_makes_a_policy(context):
     names = list_policies()
-    assert len(names) == len(set(names)) == 3 + len(METERS) * len(PROGRAMS)
-    for name in names:
+    assert len(names) == len(set(names)) == 5 + len(METERS) * len(PROGRAMS)
+    for name in set(names) - {"ppo", "regression"}:  # they come at one resolution: test_pretrained
         policy = make_policy(name, context)
         assert policy.name == name
         assert isinstance(policy, Policy)
