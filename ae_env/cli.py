@@ -64,7 +64,9 @@ def main() -> None:
         raise SystemExit(2) from None
     except SystemExit as stop:
         if stop.code == _INTERRUPTED:  # what Typer makes of Ctrl-C
-            Console(stderr=True).print("\nstopped; the same command goes on where it was")
+            resumes = any(name in sys.argv[1:] for name in ("quickstart", "train", "bench"))
+            more = "; the same command goes on where it was" if resumes else ""
+            Console(stderr=True).print(f"\nstopped{more}")
         raise
 
 
@@ -126,6 +128,8 @@ def simulate(
         raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
     device = torch_device(device)
     source = read_raw(raw)
+    if png is not None and png.suffix.lower() != ".png":
+        raise ValueError(f"`png` (={str(png)!r}) must end in .png")
     for path in (out, png or out):
         make_folder(path.parent)
     simulator = CameraSimulator(device=device)
@@ -307,7 +311,7 @@ def _print_scores(result: EvaluationResult) -> None:
 
     rows = result_rows(result, source="", split="", resamples=2000)
     conditions = list(dict.fromkeys(row["condition"] for row in rows))
-    table = Table(title="normalised score: 0 is random, 1 the oracle")
+    table = Table(title="normalised score: 0 is random, 1 the best state of every frame")
     table.add_column("policy")
     for condition in conditions:
         table.add_column(condition, justify="right")

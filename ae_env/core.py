@@ -73,7 +73,7 @@ class EpisodeCore:
         self.scorer = options.make_scorer()
         self.lighting = make_lighting(options.lighting)
         self.scenes = options.load_scenes()
-        self.tables = ScoreTables(self.grid, self.camera, self.scorer)
+        self.tables = ScoreTables(self.grid, self.camera, self.scorer, noise=options.noise)
         self.episodes: list[Episode | None] = [None] * num_envs
         self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
         states = self.grid.states

@@ -40,11 +40,13 @@ class EnvOptions:
     with_oracle: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.scenes, str) and not self.scenes:
+            raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
         _one_of("split", self.split, ("train", "test", "all"))
         _one_of("observation", self.observation, ("uint8", "linear", "dn"))
         _one_of("crop", self.crop, ("box", "native"))
         _one_of("reward", self.reward, ("capture", "expected"))
-        if isinstance(self.resolution, bool) or not isinstance(self.resolution, int):
+        if not _is_integer(self.resolution):
             raise ValueError(f"`resolution` (={self.resolution!r}) must be an integer")
         if not MIN_RESOLUTION <= self.resolution <= 4096:
             raise ValueError(
@@ -57,8 +59,8 @@ class EnvOptions:
                 _one_of(name, value, ("random", off))
             elif isinstance(value, bool) or not 0.0 <= float(value) < 1e3:
                 raise ValueError(f"`{name}` (={value!r}) must be 'random', {off!r} or in [0, 1000)")
-        if isinstance(self.delay, bool) or not 0 <= int(self.delay) <= 16:
-            raise ValueError(f"`delay` (={self.delay!r}) must be in [0, 16] frames")
+        if not _is_integer(self.delay) or not 0 <= self.delay <= 16:
+            raise ValueError(f"`delay` (={self.delay!r}) must be an integer in [0, 16] frames")
         for name, weight in self.costs.items():
             _one_of("costs", name, COSTS)
             if not 0.0 <= float(weight) < float("inf"):
@@ -109,6 +111,10 @@ class EnvOptions:
 
 
 _LOADED: dict[tuple[Any, ...], list[Scene]] = {}
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _one_of(name: str, value: Any, known: tuple[str, ...]) -> None:

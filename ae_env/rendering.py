@@ -57,7 +57,7 @@ def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
     else:
         signal = raw
     scene = core.scenes[core.episode(index).scene]
-    image = developed(torch.from_numpy(signal)[None], scene, core.camera)[0]
+    image = developed(torch.from_numpy(signal)[None], scene)[0]
     factor = -(-FRAME_PIXELS // min(image.shape[:2]))
     picture = Image.fromarray(np.repeat(np.repeat(image, factor, 0), factor, 1))
     info = frames.info
@@ -69,9 +69,9 @@ def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
     return np.asarray(_captioned(picture, lines)).copy()
 
 
-def developed(signal: torch.Tensor, scene: Scene, camera: CameraProfile) -> np.ndarray:
+def developed(signal: torch.Tensor, scene: Scene) -> np.ndarray:
     """Captures (B, 4, H, W) of `scene` as sRGB pictures (B, H, W, 3) uint8."""
-    rgb = develop(signal, scene.white_balance, camera.colour_matrix)
+    rgb = develop(signal, scene.white_balance, scene.camera.colour_matrix)
     return rgb.mul(255.0).round_().byte().permute(0, 2, 3, 1).numpy()
 
 
@@ -140,7 +140,7 @@ def contact_sheet(
     table = tables.table(scene, speed=speed, defocus=defocus)
     latent = scene_latent(scene, camera, speed=speed, defocus=defocus)
     frames = latent.stream(grid.states, seed=seed)
-    pictures = [Image.fromarray(developed(frame[None], scene, camera)[0]) for frame in frames]
+    pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, speed, defocus, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)
 

@@ -26,12 +26,13 @@ from ae_env.scorers.protocol import Captures, DependsOn
 from ae_env.scorers.registry import scorer_fingerprint
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import Latent
+from simulator.capture import clip_and_quantise
 from simulator.files import write_atomically
 from simulator.settings import CameraSettings, exposure_ratio
 
 _LOGGER = logging.getLogger(__name__)
 #: Bumped when the way that scores are computed changes.
-TABLE_VERSION = 1
+TABLE_VERSION = 2
 #: States evaluated at once: more only spends time in memory paging. Where only the blur matters,
 #: which seldom looks at pixels, as many as this number of samples allows.
 _CHUNK = 16
@@ -130,7 +131,7 @@ def describe_captures(
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
         blur_px=torch.from_numpy(blur),
         white_balance=torch.tensor([c.white_balance for c in scenes]),
-        colour_matrix=camera.colour_matrix,
+        colour_matrices=[c.camera.colour_matrix for c in scenes],
     )
 
 
@@ -142,6 +143,7 @@ class ScoreTables:
         camera: The body that takes the captures.
         scorer: What rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
+        noise: Whether the captures that are scored are noisy.
         use_cache: Whether to keep the per-scene parts on disk.
     """
 
@@ -152,12 +154,13 @@ class ScoreTables:
         scorer: CompositeScorer,
         *,
         noise_seeds: int = 2,
+        noise: bool = True,
         use_cache: bool = True,
     ) -> None:
         if noise_seeds < 1:
             raise ValueError(f"`noise_seeds` (={noise_seeds}) must be at least 1")
         self.grid, self.camera, self.scorer = grid, camera, scorer
-        self.noise_seeds = noise_seeds
+        self.noise, self.noise_seeds = noise, noise_seeds if noise else 1
         fingerprint = scorer_fingerprint(scorer) if use_cache else None
         self._fingerprint = fingerprint
         self._light_parts: dict[tuple[int, float], dict[str, np.ndarray]] = {}
@@ -168,12 +171,22 @@ class ScoreTables:
     ) -> ScoreTable:
         """Expected scores of all states of `scene` in an episode (see `scene_latent`)."""
         parts = self.closed_parts(scene, speed=speed, defocus=defocus, gain=gain)
-        errors = np.zeros(len(self.grid))
-        if not self.scorer.closed_form:
-            means, errors = self._sampled_parts(scene, parts, speed, defocus, gain)
-            parts |= means
-        parts = {name: parts[name] for name in self.scorer.parts}
-        return ScoreTable(np.asarray(self.scorer.combine(parts)), errors, parts)
+        if self.scorer.closed_form:
+            parts = {name: parts[name] for name in self.scorer.parts}
+            mean = np.asarray(self.scorer.combine(parts))
+            return ScoreTable(mean, np.zeros(len(self.grid)), parts)
+        samples = self._samples(scene, speed, defocus, gain)
+        totals = np.asarray(self.scorer.combine({**parts, **samples}))  # (seeds, S)
+        if not self.noise:
+            error = np.zeros(len(self.grid))
+        elif self.noise_seeds > 1:
+            error = totals.std(axis=0, ddof=1) / np.sqrt(self.noise_seeds)
+        else:
+            error = np.full(len(self.grid), np.nan)  # one sample has no standard error
+        parts |= {name: values.mean(axis=0) for name, values in samples.items()}
+        return ScoreTable(
+            totals.mean(axis=0), error, {name: parts[name] for name in self.scorer.parts}
+        )
 
     def closed_parts(
         self, scene: Scene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
@@ -231,14 +244,10 @@ class ScoreTables:
             light=scene.light.expand(count, -1, -1, -1),
         )
 
-    def _sampled_parts(
-        self,
-        scene: Scene,
-        closed: dict[str, np.ndarray],
-        speed: float,
-        defocus: float,
-        gain: float,
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def _samples(
+        self, scene: Scene, speed: float, defocus: float, gain: float
+    ) -> dict[str, np.ndarray]:
+        """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
         latent = scene_latent(scene, self.camera, speed=speed, defocus=defocus, gain=gain)
         names = self.scorer.names("image")
         samples = {name: np.zeros((self.noise_seeds, len(self.grid))) for name in names}
@@ -246,16 +255,16 @@ class ScoreTables:
         for states in _chunks(list(self.grid.states)):
             captures = self._captures(scene, states, speed, defocus, gain)
             for seed in range(self.noise_seeds):
-                images = latent.expose(states, seed=seed).clamp_(0.0, 1.0)
+                if self.noise:
+                    images = latent.expose(states, seed=seed)
+                else:
+                    light = torch.stack([latent.expected(state) for state in states])
+                    images = clip_and_quantise(light, self.camera)
+                images = images.clamp_(0.0, 1.0)
                 for name, values in self.scorer.score_parts(images, captures, ("image",)).items():
                     samples[name][seed, start : start + len(states)] = values.numpy()
             start += len(states)
-        totals = self.scorer.combine({**closed, **samples})
-        spread = np.full(len(self.grid), np.nan)  # one sample has no standard error
-        if self.noise_seeds > 1:
-            spread = totals.std(axis=0, ddof=1)
-        means = {name: values.mean(axis=0) for name, values in samples.items()}
-        return means, spread / np.sqrt(self.noise_seeds)
+        return samples
 
     def _cache_path(self, scene: Scene) -> Path | None:
         if self._fingerprint is None or not self.scorer.names("light"):
@@ -271,6 +280,9 @@ class ScoreTables:
             [(iso, n.shot, n.read) for iso, n in sorted(self.camera.nlf_by_iso.items())],
             scene.reference.log2_exposure,
             scene.ev100,
+            scene.scene_id,
+            scene.white_balance,
+            scene.camera.colour_matrix,
         ]
         digest.update(json.dumps(description).encode())
         return cache_dir() / "score_tables" / f"{digest.hexdigest()[:32]}.npz"

@@ -229,6 +229,7 @@ class _TrainingCallback(BaseCallback):
     ) -> None:
         super().__init__()
         self.training, self.store, self.progress = training, store, progress
+        self.updated = 0  # frames that the policy has learnt from
         self._rewards: list[float] = []
 
     def _on_step(self) -> bool:
@@ -241,7 +242,8 @@ class _TrainingCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         done = self.num_timesteps / self.training.total_timesteps
         self.model.ent_coef = self.training.ent_coef * (1.0 - 0.9 * min(done, 1.0))  # type: ignore[attr-defined]
-        self.store.save(self.num_timesteps)
+        self.updated = self.num_timesteps
+        self.store.save(self.updated)
 
 
 def train_ppo(
@@ -298,7 +300,11 @@ def train_ppo(
     remaining = training.total_timesteps - done
     if remaining > 0:
         callback = _TrainingCallback(training, store, progress)
-        model.learn(remaining, callback=callback, reset_num_timesteps=done == 0)
+        try:
+            model.learn(remaining, callback=callback, reset_num_timesteps=done == 0)
+        except KeyboardInterrupt:
+            store.save(callback.updated, force=True)
+            raise
     store.save(model.num_timesteps, force=True)
     return model.policy  # type: ignore[return-value]
 

@@ -219,28 +219,43 @@ def train_regression(
     first = store.restore()
     frames = _rollout(envs, RegressionPolicy(context, network=network), training, first)
     replay = _Replay(training, np.random.default_rng([training.seed, first, 1]))
-    for step in range(first, steps):
-        observations, target = replay.batch(*next(frames))
-        network.train()
-        with _seeded(device, training.seed, step):  # the dropout draws from the global generator
-            scores, log_variance = network(*observation_tensors(observations, device))
-        error = (scores - torch.from_numpy(target).float().to(device)).square()
-        # The mean learns from the plain squared error, the confidence from the likelihood.
-        likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
-        loss = error.mean() + 0.01 * likelihood
-        optimiser.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        network.eval()
-        if progress is not None:
-            progress(
-                (step + 1) * envs.num_envs, steps * envs.num_envs, {"mse": error.mean().item()}
-            )
-        store.save(step + 1)
+    done = first
+    try:
+        for step in range(first, steps):
+            observations, target = replay.batch(*next(frames))
+            network.train()
+            with _seeded(device, training.seed, step):  # dropout draws from the global generator
+                loss, error = _loss(network, observations, target)
+            optimiser.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimiser.step()
+            schedule.step()
+            done = step + 1
+            network.eval()
+            if progress is not None:
+                progress(done * envs.num_envs, steps * envs.num_envs, {"mse": error})
+            store.save(done)
+    except KeyboardInterrupt:
+        store.save(done, force=True)
+        raise
     store.save(steps, force=True)
     return network
+
+
+def _loss(
+    network: ScoreRegressor, observations: Observations, target: NDArray[np.float64]
+) -> tuple[torch.Tensor, float]:
+    """Loss to minimise, and the mean squared error.
+
+    The mean learns from the plain squared error, the confidence from the likelihood with that
+    error held fixed.
+    """
+    device = next(network.parameters()).device
+    scores, log_variance = network(*observation_tensors(observations, device))
+    error = (scores - torch.from_numpy(target).float().to(device)).square()
+    likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
+    return error.mean() + 0.01 * likelihood, error.mean().item()
 
 
 @contextmanager

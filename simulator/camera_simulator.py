@@ -125,6 +125,8 @@ class Latent:
 
     def exposure(self, settings: CameraSettings) -> Exposure:
         """What a capture at `settings` does to this light."""
+        if not isinstance(settings, CameraSettings):
+            raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
         motion_px = self.image_speed * settings.exposure_time * self.light.shape[-2]
         defocus_px = self.defocus * 4.0 / settings.effective_f_number
         return Exposure(

@@ -16,6 +16,7 @@ from simulator.dng_tags import (
     CFA_PLANE_COLOUR,
     D65,
     NOISE_PROFILE,
+    ORIENTATIONS,
     SOFTWARE_NAME,
     USER_COMMENT,
     OwnRecord,
@@ -32,8 +33,6 @@ DEFAULT_COLOUR_MATRIX = (
     (-0.9689, 1.8758, 0.0415),
     (0.0557, -0.2040, 1.0570),
 )
-#: EXIF orientation for LibRaw's flip codes.
-_ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
 #: What EXIF writes for a date that is not known.
 _NO_DATE = "    :  :     :  :  "
 _CFA_BYTE = {"R": 0, "G": 1, "B": 2}
@@ -82,7 +81,7 @@ def _image_tags(raw: RawImage) -> dict[int, Tag]:
         262: Tag(TiffType.SHORT, [32803]),  # colour filter array
         MAKE: Tag(TiffType.ASCII, make),
         MODEL: Tag(TiffType.ASCII, model),
-        274: Tag(TiffType.SHORT, [_ORIENTATION.get(raw.metadata.get("flip", 0), 1)]),
+        274: Tag(TiffType.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
         277: Tag(TiffType.SHORT, [1]),
         278: Tag(TiffType.LONG, [height]),  # one strip
         284: Tag(TiffType.SHORT, [1]),

@@ -26,6 +26,8 @@ ANALOG_BALANCE, D65 = 50727, 21
 _COLOUR_SETS = ((50721, 50723, 50778), (50722, 50724, 50779))
 #: ISO speeds above 65534 stand in these; PhotographicSensitivity then says 65535.
 _LONG_ISO_TAGS = (34866, 34867, 34865)
+#: EXIF orientation for LibRaw's flip codes.
+ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}
 _EXPOSURE_TAGS = {"iso": 34866, "exposure_time": 33434, "f_number": 33437}
 
 
@@ -162,3 +164,23 @@ def read_black_level(
     return tuple(  # type: ignore[return-value]
         float(values[2 * ((row + down) % 2) + (column + right) % 2]) for row, column in cfa.offsets
     )
+
+
+def read_plain_mosaic(data: bytes, directories: list[Directory]) -> np.ndarray | None:
+    """The pixels of an uncompressed one-strip Bayer DNG as `write_dng` writes it, (H, W) uint16.
+
+    LibRaw crops and misreads very small frames of some makes; these pixels are plainly there.
+
+    Returns:
+        None if the file is laid out in another way.
+    """
+    where = next((d for d in directories if d.get(262, (0,))[0] == 32803), None)
+    if where is None or where.get(259, (0,))[0] != 1 or len(where.get(273, ())) != 1:
+        return None
+    width, height = int(where[256][0]), int(where[257][0])
+    start, size = int(where[273][0]), 2 * width * height
+    if where.get(258, (0,))[0] != 16 or int(where[279][0]) != size:
+        return None
+    order = "<u2" if data[:2] == b"II" else ">u2"
+    strip = np.frombuffer(data, order, count=width * height, offset=start)
+    return strip.reshape(height, width).astype(np.uint16)

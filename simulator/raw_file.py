@@ -6,6 +6,7 @@ import logging
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ from simulator.camera import (
     list_cameras,
 )
 from simulator.dng_tags import (
+    ORIENTATIONS,
     OwnRecord,
     read_black_level,
     read_colour_matrix,
     read_long_iso,
     read_noise_profile,
     read_own_record,
+    read_plain_mosaic,
 )
 from simulator.exif import UNKNOWN_FILE, camera_identity, describe_file, normalised_model
 from simulator.noise_estimation import estimate_nlf
@@ -102,8 +105,10 @@ def read_raw(
     directories = read_directories(data)
     make, model = camera_identity(data, directories)
     _refuse_early(path, data, directories, model)
-    decoded = _decode(path, data, directories)
     own = read_own_record(directories)
+    decoded = None if own is None else _from_own_dng(data, directories, own)
+    if decoded is None:
+        decoded = _decode(path, data, directories)
     known = settings or _settings(path, decoded.exposure, own)
     profile = _profile(path, decoded, make, model, camera, own)
     box_factor = own.box_factor if own is not None else 1
@@ -139,6 +144,39 @@ def _refuse_early(path: Path, data: bytes, directories: list[Directory], model: 
             f"`path` (={path.name!r}) must be a Bayer raw, but is a linear DNG: already "
             "demosaicked, its noise is no longer per pixel"
         )
+
+
+def _from_own_dng(data: bytes, directories: list[Directory], own: OwnRecord) -> _Decoded | None:
+    """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes."""
+    tags = {tag: value for directory in reversed(directories) for tag, value in directory.items()}
+    mosaic = read_plain_mosaic(data, directories)
+    if mosaic is None:
+        return None
+    cfa = BayerPattern("".join("RGB"[colour] for colour in tags[33422]))
+    black = read_black_level(directories, cfa, (0, 0))
+    if black is None:
+        return None
+    red, green, blue = tags[50728]
+    flips = {orientation: flip for flip, orientation in ORIENTATIONS.items()}
+    extra: dict[str, Any] = {"flip": flips.get(tags[274][0], 0)}
+    moment = str(tags[36867][0]).strip()
+    if moment[:1].isdigit():
+        extra["datetime"] = datetime.strptime(moment, "%Y:%m:%d %H:%M:%S").isoformat()
+    if tags[37386][0] > 0:
+        extra["focal_length"] = float(tags[37386][0])
+    settings = own.settings
+    return _Decoded(
+        mosaic=mosaic,
+        cfa=cfa,
+        black_level=black,
+        white_level=float(tags[50717][0]),
+        white_balance=(green / red, 1.0, green / blue),
+        white_balance_source="camera",
+        colour_matrix=read_colour_matrix(directories),
+        colour_matrix_source="XYZ to camera RGB, ColorMatrix of the file",
+        exposure=(settings.iso, settings.exposure_time, settings.f_number),
+        extra=extra,
+    )
 
 
 def _decode(path: Path, data: bytes, directories: list[Directory]) -> _Decoded:

@@ -59,7 +59,7 @@ class CameraSettings:
         ):
             value = getattr(self, name)
             try:
-                number = math.nan if isinstance(value, str | bytes) else float(value)
+                number = math.nan if isinstance(value, str | bytes | bool) else float(value)
             except (TypeError, ValueError):
                 number = math.nan
             if not low <= number <= high:

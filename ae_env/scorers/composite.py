@@ -84,7 +84,7 @@ class CompositeScorer:
                 view = images
                 if part.domain == "srgb":
                     if srgb is None:
-                        srgb = develop(images, captures.white_balance, captures.colour_matrix)
+                        srgb = _developed(images, captures)
                     view = srgb
             scores[name] = _checked(name, part(view, captures), len(captures))
         return scores
@@ -127,6 +127,15 @@ class Balanced(CompositeScorer):
         for name, weight in self.weights.items():
             score = score * scores[name] ** weight
         return score
+
+
+def _developed(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+    """sRGB (B, 3, H, W), each image with the colours of its own scene's camera."""
+    kinds = set(captures.colour_matrices)
+    if len(kinds) == 1:
+        return develop(images, captures.white_balance, kinds.pop())
+    pairs = zip(images, captures.white_balance, captures.colour_matrices, strict=True)
+    return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
 
 
 def _log(values: Any) -> Any:

@@ -12,6 +12,7 @@ import torch
 from simulator.camera import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
+ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
 #: What a score varies with: the recorded image (noise and all); the noise-free light on the sensor;
 #: or also (or only) the extent of the blur, which changes from episode to episode. The last two
@@ -49,7 +50,8 @@ class Captures:
             it is unknown, the one at which the mean of the recorded green is 0.12.
         blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame].
         white_balance: (B, 3) gains of R, G, B.
-        colour_matrix: XYZ (D65) to camera RGB, 3 x 3; None if unknown.
+        colour_matrices: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where
+            unknown.
     """
 
     settings: Sequence[CameraSettings]
@@ -60,7 +62,7 @@ class Captures:
     proper_ev: torch.Tensor
     blur_px: torch.Tensor
     white_balance: torch.Tensor
-    colour_matrix: tuple[tuple[float, float, float], ...] | None = None
+    colour_matrices: Sequence[ColourMatrix | None]
 
     def __len__(self) -> int:
         return len(self.settings)

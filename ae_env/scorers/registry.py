@@ -128,18 +128,22 @@ def _with_domain(name: str, scorer: Any) -> Scorer:
 
 
 def scorer_fingerprint(scorer: CompositeScorer) -> str | None:
-    """A hash of everything that decides `scorer`'s scores, or None where that cannot be known.
+    """A hash of everything that decides the scores of `scorer`, or None where that is not known.
 
-    Class sources, weights and simple attributes enter; a scorer whose source is not available, or
-    that holds anything else (a network), gets None and is not cached on disk.
+    What a scorer of one's own calls or closes over cannot be seen from its class, so its scores are
+    kept on disk only if it has a ``version`` (a string or number that its author changes with it).
     """
     digest = hashlib.sha256()
     for name, part in [("", scorer), *scorer.parts.items()]:
+        kind = part if inspect.isfunction(part) else type(part)
+        version = getattr(part, "version", None)
+        if not kind.__module__.startswith("ae_env.") and not isinstance(version, str | int | float):
+            return None
         try:
-            source = inspect.getsource(type(part) if not inspect.isfunction(part) else part)
+            source = inspect.getsource(kind)
         except (OSError, TypeError):
             return None
-        digest.update(f"{name}\0{source}\0".encode())
+        digest.update(f"{name}\0{version}\0{source}\0".encode())
         for key, value in sorted(getattr(part, "__dict__", {}).items()):
             if key in ("parts", "closed_form"):
                 continue

@@ -202,6 +202,7 @@ def test_class_constants_enter_the_key(cache: Path) -> None:
     """A subclass that only changes a constant is another scorer."""
 
     class Strict(Highlights):
+        version = 1
         scale = 0.05
 
     scene = _scene()
@@ -222,3 +223,34 @@ def test_scorers_with_state_that_cannot_be_keyed_are_not_cached(cache: Path) -> 
 def test_noise_seeds_must_be_positive() -> None:
     with pytest.raises(ValueError, match="`noise_seeds`"):
         _tables(noise_seeds=0)
+
+
+def test_a_scorer_of_ones_own_is_not_kept_on_disk_unless_it_has_a_version() -> None:
+    """What a scorer closes over cannot be hashed: a changed constant must not find old scores."""
+
+    def constant(value: float) -> Any:
+        def score(images: Any, captures: Any) -> torch.Tensor:
+            return torch.full((len(captures),), value)
+
+        score.domain, score.depends_on = "raw", "light"  # type: ignore[attr-defined]
+        return score
+
+    scene, grid, camera = _scene(), ExposureGrid((100,), (1 / 100,), (4,)), get_camera("nikon_z6")
+    for value in (0.2, 0.9):
+        table = ScoreTables(grid, camera, make_scorer(constant(value))).table(scene)
+        assert table.mean == pytest.approx(value)
+
+
+def test_without_noise_the_expected_score_is_that_of_the_noise_free_capture() -> None:
+    def spread(images: torch.Tensor, captures: Any) -> torch.Tensor:
+        return images.std(dim=(1, 2, 3)).clamp(0.0, 1.0)
+
+    spread.domain = "raw"  # type: ignore[attr-defined]
+    flat = torch.full((4, 36, 36), 0.2)
+    scene = replace(_scene(), light=flat, saturated=None)
+    grid, camera = ExposureGrid((6400,), (1 / 1000,), (4,)), get_camera("nikon_z6")
+    clean = ScoreTables(grid, camera, make_scorer(spread), noise=False).table(scene)
+    noisy = ScoreTables(grid, camera, make_scorer(spread)).table(scene)
+    assert clean.mean == pytest.approx(0.0, abs=1e-4)
+    assert clean.standard_error == pytest.approx(0.0)
+    assert noisy.mean > 1e-3
