@@ -37,6 +37,8 @@ app = typer.Typer(
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`.",
 )
 BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "throughput")
+#: Source groups in one table on the terminal.
+_GROUPS_ABREAST = 4
 #: Exit status after Ctrl-C.
 _INTERRUPTED = 130
 
@@ -307,10 +309,12 @@ def bench(
 def _print_scores(result: EvaluationResult) -> None:
     from rich.table import Table
 
+    from agents.report import group_values
     from agents.result_table import result_rows
+    from agents.statistics import MIN_GROUPS
 
     rows = result_rows(result, source="", split="", resamples=2000)
-    conditions = list(dict.fromkeys(row["condition"] for row in rows))
+    conditions = result.conditions
     table = Table(title="normalised score: 0 is random, 1 the best state of every frame")
     table.add_column("policy")
     for condition in conditions:
@@ -325,6 +329,18 @@ def _print_scores(result: EvaluationResult) -> None:
         scores = [f"{own[c]['normalised_score']:.3f}" for c in conditions]
         table.add_row(policy, *scores, interval)
     console.print(table)
+    if rows[0]["num_groups"] < MIN_GROUPS:
+        head, body = group_values(result)
+        for first in range(0, len(body), _GROUPS_ABREAST):
+            own_groups = body[first : first + _GROUPS_ABREAST]
+            values = Table(title="mean score of every source group")
+            for i, column in enumerate(zip(head, *own_groups, strict=True)):
+                if i == 0:
+                    for name in column:
+                        values.add_column(name, justify="left" if name == head[0] else "right")
+                else:
+                    values.add_row(*column)
+            console.print(values)
 
 
 def _write_png(path: Path, raw: RawImage) -> Path:

@@ -126,6 +126,11 @@ class EvaluationResult:
             "clipped_low": track.clipped_low.mean(axis=-1),
         }
 
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """``("all", "hard", "rest")``, or ``("all",)`` where one of the two parts has no scenes."""
+        return CONDITIONS if self.hard.any() and not self.hard.all() else CONDITIONS[:1]
+
     def condition(self, name: str) -> NDArray[np.bool_]:
         """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
         masks = {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from agents import metrics
-from agents.evaluation_result import CONDITIONS, EvaluationResult
+from agents.evaluation_result import EvaluationResult
 from agents.result_table import (
     best_meter,
     difference,
@@ -94,9 +94,7 @@ def write_report(
 def _differences(result: EvaluationResult, best: str) -> list[dict[str, Any]]:
     """Every other policy minus the best meter, in each condition that has scenes."""
     rows = []
-    for condition in CONDITIONS:
-        if not result.condition(condition).any():
-            continue
+    for condition in result.conditions:
         for policy in result.tracks:
             if policy == best:
                 continue
@@ -134,15 +132,14 @@ def report_markdown(
         f"{_seeds_note(result)}. How everything is defined: `docs/evaluation.md`.",
         "![Scores](scores.png)",
     ]
-    for condition in CONDITIONS:
+    for condition in result.conditions:
         own = [r for r in rows if r["condition"] == condition]
-        if own:
-            parts += [f"## Scenes: {condition} ({own[0]['num_groups']} groups)", _table(own)]
+        parts += [f"## Scenes: {condition} ({own[0]['num_groups']} groups)", _table(own)]
     if groups < MIN_GROUPS:
         parts += [
             "## Every source group",
             f"Fewer than {MIN_GROUPS} source groups: no intervals, but every value (mean score).",
-            _group_table(result),
+            _markdown(*group_values(result)),
         ]
     if differences:
         parts += [
@@ -192,14 +189,15 @@ def _difference_table(differences: Sequence[Mapping[str, Any]]) -> str:
     return _markdown(["policy", "scenes", "difference", "95 % interval"], body)
 
 
-def _group_table(result: EvaluationResult) -> str:
+def group_values(result: EvaluationResult) -> tuple[list[str], list[list[str]]]:
+    """Mean score of every source group: the header, and a row of cells per group."""
     columns = {"oracle q": result.oracle, "random q": result.random}
     for name in result.tracks:
         columns[name] = result.episode_metrics(name)["score"].mean(axis=0)
     names = metrics.group_means(result.oracle, result.groups)[1]
     values = [metrics.group_means(v, result.groups)[0] for v in columns.values()]
     body = [[str(n), *(f"{v[i]:.3f}" for v in values)] for i, n in enumerate(names)]
-    return _markdown(["source group", *columns], body)
+    return ["source group", *columns], body
 
 
 def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
@@ -223,9 +221,7 @@ def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
 def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
     """Normalised score per policy, training seed and condition, for those with several seeds."""
     rows = []
-    for condition in CONDITIONS:
-        if not result.condition(condition).any():
-            continue
+    for condition in result.conditions:
         for policy, track in result.tracks.items():
             if len(track.states) < 2:
                 continue

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents import metrics
-from agents.evaluation_result import CONDITIONS, EvaluationResult
+from agents.evaluation_result import EvaluationResult
 from agents.policy import METERS
 from agents.statistics import Interval, difference_interval, score_interval
 
@@ -41,7 +41,7 @@ SCENE_COLUMNS = (
 def result_rows(
     result: EvaluationResult, *, source: str, split: str, resamples: int = 10_000
 ) -> list[dict[str, Any]]:
-    """A row per policy and condition (``all``, ``hard``, ``rest``; those that have scenes).
+    """A row per policy and condition (see `EvaluationResult.conditions`).
 
     Args:
         result: What `evaluate` returns.
@@ -56,8 +56,7 @@ def result_rows(
     """
     return [
         _row(result, policy, condition, source, split, resamples)
-        for condition in CONDITIONS
-        if result.condition(condition).any()
+        for condition in result.conditions
         for policy in result.tracks
     ]
 

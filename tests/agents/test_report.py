@@ -136,7 +136,7 @@ def test_one_condition_only_and_no_meter(tmp_path):
     result = replace(result, hard=np.zeros_like(result.hard), tracks={"ppo": result.tracks["ppo"]})
     files = write_report(result, tmp_path, command="x", source="mine", split="all")
     results = json.loads(files["results.json"].read_text())
-    assert {row["condition"] for row in results["rows"]} == {"all", "rest"}
+    assert {row["condition"] for row in results["rows"]} == {"all"}
     assert results["meta"]["best_meter"] is None
 
 
