@@ -129,9 +129,11 @@ class _Recorder:
         self.batches: dict[int, tuple[EpisodeBatch, Ints, Floats]] = {}
 
     def close(self) -> None:
+        """Ends the first policy's run: from here on the episodes are known."""
         self.first_run = False
 
     def begin(self, batch: EpisodeBatch) -> None:
+        """Checks that the episodes of `batch` are those of the first policy."""
         if self.first_run:
             return
         known, start, _ = self.batches[batch.seed]
@@ -143,10 +145,12 @@ class _Recorder:
             )
 
     def end(self, batch: EpisodeBatch, scores: Floats) -> None:
+        """Keeps the episodes of `batch` with their scores in every frame."""
         start = np.array(batch.info["state"], dtype=np.int64)
         self.batches[batch.seed] = (batch, start, scores)
 
     def result(self, scenes: Any, tracks: dict[str, Track], seed: int) -> EvaluationResult:
+        """Everything recorded, with what the policies did."""
         parts = list(self.batches.values())
         valid = np.concatenate([b.valid for b, _, _ in parts])
         index = np.concatenate([b.scenes for b, _, _ in parts])[valid]

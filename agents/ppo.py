@@ -59,6 +59,7 @@ class _StateLogits(nn.Module):
         nn.init.zeros_(self.head.values.bias)
 
     def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        """Logits (B, S)."""
         features, sensors = latent[:, : self.width], latent[:, self.width :]
         return self.head(features, sensors if sensors.shape[1] else None)[..., 0]
 

@@ -150,11 +150,9 @@ def _from_own_dng(data: bytes, directories: list[Directory], own: OwnRecord) -> 
     """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes."""
     tags = {tag: value for directory in reversed(directories) for tag, value in directory.items()}
     mosaic = read_plain_mosaic(data, directories)
-    if mosaic is None:
-        return None
     cfa = BayerPattern("".join("RGB"[colour] for colour in tags[33422]))
     black = read_black_level(directories, cfa, (0, 0))
-    if black is None:
+    if mosaic is None or black is None:
         return None
     red, green, blue = tags[50728]
     flips = {orientation: flip for flip, orientation in ORIENTATIONS.items()}
@@ -164,7 +162,6 @@ def _from_own_dng(data: bytes, directories: list[Directory], own: OwnRecord) -> 
         extra["datetime"] = datetime.strptime(moment, "%Y:%m:%d %H:%M:%S").isoformat()
     if tags[37386][0] > 0:
         extra["focal_length"] = float(tags[37386][0])
-    settings = own.settings
     return _Decoded(
         mosaic=mosaic,
         cfa=cfa,
@@ -174,7 +171,7 @@ def _from_own_dng(data: bytes, directories: list[Directory], own: OwnRecord) -> 
         white_balance_source="camera",
         colour_matrix=read_colour_matrix(directories),
         colour_matrix_source="XYZ to camera RGB, ColorMatrix of the file",
-        exposure=(settings.iso, settings.exposure_time, settings.f_number),
+        exposure=(own.settings.iso, own.settings.exposure_time, own.settings.f_number),
         extra=extra,
     )
 
