@@ -23,11 +23,12 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.checkpoint import Checkpoint
+from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
-from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.ranges import check_ranges
 from agents.sb3_adapter import SB3VectorAdapter
-from agents.weights import check_context, describe_context, load_agent, load_into, save_agent
+from agents.weights import describe_context, save_agent
 
 
 class ExposureExtractor(BaseFeaturesExtractor):
@@ -168,46 +169,18 @@ class PPOTraining:
             )
 
 
-def make_policy_network(context: PolicyContext, width: int) -> ExposureActorCritic:
-    """The actor and critic on their own, to load weights into."""
-    actions = gym.spaces.Discrete(len(context.grid))
-    return ExposureActorCritic(
-        context.observation_space, actions, lambda _: 0.0, grid=context.grid, width=width
-    )
+class PPOPolicy(NetworkPolicy):
+    """Takes the most probable state; remembers nothing between frames. See `NetworkPolicy`."""
 
+    kind = "ppo"
 
-class PPOPolicy(Policy):
-    """Takes the most probable state; remembers nothing between frames.
-
-    Args:
-        context: The camera, the grid and the observation.
-        weights: File written by `save_ppo`; or give `network`.
-        network: A network in memory.
-        device: Torch device for `weights`.
-
-    Raises:
-        ValueError: If the weights were trained for another grid or observation.
-    """
-
-    def __init__(
-        self,
-        context: PolicyContext,
-        weights: str | Path | None = None,
-        network: ExposureActorCritic | None = None,
-        device: str = "cpu",
-    ) -> None:
-        super().__init__(context)
-        if (weights is None) == (network is None):
-            raise ValueError("give either `weights` or `network`")
-        if network is None:
-            tensors, card = load_agent(str(weights), "ppo")
-            check_context(card, context)
-            network = make_policy_network(context, card["width"])
-            load_into(network, tensors, str(weights))
-            network.to(device)
-        self.name = "ppo"
-        network.set_training_mode(False)
-        self.network = network
+    @staticmethod
+    def make_network(context: PolicyContext, width: int) -> ExposureActorCritic:
+        """See `NetworkPolicy`."""
+        actions = gym.spaces.Discrete(len(context.grid))
+        return ExposureActorCritic(
+            context.observation_space, actions, lambda _: 0.0, grid=context.grid, width=width
+        )
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None

@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from ae_env.grid import ExposureGrid
+from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
-from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.ranges import check_ranges
-from agents.weights import check_context, describe_context, load_agent, load_into, save_agent
+from agents.weights import describe_context, save_agent
 
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
@@ -72,39 +73,15 @@ def observation_tensors(
     return codes, settings, None if sensors is None else torch.as_tensor(sensors, device=device)
 
 
-class RegressionPolicy(Policy):
-    """Takes the state with the highest accumulated prediction.
+class RegressionPolicy(NetworkPolicy):
+    """Takes the state with the highest accumulated prediction; see `NetworkPolicy`."""
 
-    Args:
-        context: The camera, the grid and the observation.
-        weights: File written by `train_regression`; or give `network`.
-        network: A network in memory.
-        device: Torch device for `weights`.
+    kind = "regression"
 
-    Raises:
-        ValueError: If the weights were trained for another grid or observation.
-    """
-
-    def __init__(
-        self,
-        context: PolicyContext,
-        weights: str | Path | None = None,
-        network: ScoreRegressor | None = None,
-        device: str = "cpu",
-    ) -> None:
-        super().__init__(context)
-        if (weights is None) == (network is None):
-            raise ValueError("give either `weights` or `network`")
-        if network is None:
-            tensors, card = load_agent(str(weights), "regression")
-            check_context(card, context)
-            network = ScoreRegressor(context.observation_space, context.grid, card["width"])
-            load_into(network, tensors, str(weights))
-            network.to(device)
-        self.name = "regression"
-        self.network = network.eval()
-        self._weighted = np.zeros((0, len(context.grid)))
-        self._precision = np.zeros((0, len(context.grid)))
+    @staticmethod
+    def make_network(context: PolicyContext, width: int) -> ScoreRegressor:
+        """See `NetworkPolicy`."""
+        return ScoreRegressor(context.observation_space, context.grid, width)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forgets the frames so far."""
