@@ -11,8 +11,8 @@ from ae_env.scenes.scene import Scene
 from ae_env.score_table import ScoreTable, scene_latent
 from simulator.blur import motion_blur
 from simulator.camera import CameraProfile
-from simulator.camera_simulator import Latent
 from simulator.capture import Exposure, defocused_light
+from simulator.latent import Latent
 
 
 @dataclass

@@ -25,9 +25,9 @@ from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures, DependsOn
 from ae_env.scorers.registry import scorer_fingerprint
 from simulator.camera import CameraProfile
-from simulator.camera_simulator import Latent
 from simulator.capture import clip_and_quantise
 from simulator.files import write_atomically
+from simulator.latent import Latent
 from simulator.settings import CameraSettings, exposure_ratio
 
 _LOGGER = logging.getLogger(__name__)

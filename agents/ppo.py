@@ -22,13 +22,13 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.checkpoint import Checkpoint
 from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.ranges import check_ranges
 from agents.sb3_adapter import SB3VectorAdapter
 from agents.weights import describe_context, save_agent
+from simulator.checkpoint import Checkpoint
 
 
 class ExposureExtractor(BaseFeaturesExtractor):

@@ -173,7 +173,7 @@ def train_regression(
     Returns:
         The trained network.
     """
-    from agents.checkpoint import Checkpoint
+    from simulator.checkpoint import Checkpoint
 
     context = PolicyContext.from_envs(envs)
     with _seeded("cpu", training.seed):

@@ -10,11 +10,11 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from agents.regression import RegressionTraining
 from agents.weights import load_agent, sibling
+from simulator.config_file import load_yaml, one_line
 
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -76,7 +76,7 @@ class AgentConfig(BaseModel):
         try:
             return TypeAdapter(kind).validate_python(self.training)
         except ValidationError as error:
-            raise ValueError(_one_line(error, "training.")) from error
+            raise ValueError(one_line(error, "training.")) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
         """The same training with another seed."""
@@ -94,27 +94,7 @@ def load_config(path: str | Path) -> AgentConfig:
         ValueError: If the file is missing or not YAML, or an entry is unknown or out of range; the
             message names the file and the entry.
     """
-    file = Path(path).expanduser()
-    if not file.is_file():
-        raise ValueError(f"`config` (={str(path)!r}): there is no such file")
-    try:
-        return AgentConfig.model_validate(yaml.safe_load(file.read_text(encoding="utf-8")))
-    except ValidationError as error:
-        raise ValueError(f"`config` (={str(path)!r}): {_one_line(error)}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        text = " ".join(str(error).split())
-        raise ValueError(f"`config` (={str(path)!r}) is not YAML: {text}") from error
-
-
-def _one_line(error: ValidationError, prefix: str = "") -> str:
-    """Every complaint of pydantic's, with the entry that it is about."""
-    parts = []
-    for item in error.errors():
-        entry = ".".join(str(key) for key in item["loc"])
-        message = item["msg"].removeprefix("Value error, ")
-        given = f" (={item['input']!r})" if entry and item["type"] != "missing" else ""
-        parts.append(f"{prefix}{entry}{given}: {message}" if entry else message)
-    return "; ".join(parts)
+    return load_yaml(path, AgentConfig)
 
 
 def is_trained(config: AgentConfig, out: Path) -> bool:

@@ -12,26 +12,11 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from agents.policy import PolicyContext
-from simulator.files import write_atomically
+from simulator.files import sibling, write_atomically
 
 FORMAT_VERSION = 1
 #: What every card says.
 _ENTRIES = ("width", "context", "training", "aliases")
-
-
-def sibling(path: str | Path, suffix: str) -> Path:
-    """The file of an agent that ends in `suffix`; only the two endings of an agent are replaced.
-
-    >>> sibling("runs/ppo-0.5", ".json").name, sibling("runs/ppo.safetensors", ".json").name
-    ('ppo-0.5.json', 'ppo.json')
-    """
-    path = Path(path).expanduser()
-    name = path.name
-    for ending in (".safetensors", ".json"):
-        name = name.removesuffix(ending)
-    if name in ("", ".."):
-        raise ValueError(f"agent file (={str(path)!r}) must have a name, such as runs/ppo")
-    return path.with_name(name + suffix)
 
 
 def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, Any]) -> None:

@@ -10,10 +10,10 @@ _EXPORTS = {
     "CameraProfile": "camera",
     "CameraSettings": "settings",
     "CameraSimulator": "camera_simulator",
-    "Latent": "camera_simulator",
+    "Latent": "latent",
     "NoiseLevelFunction": "camera",
     "RawImage": "raw_image",
-    "SimulationPlan": "camera_simulator",
+    "SimulationPlan": "plan",
     "develop": "isp",
     "estimate_nlf": "noise_estimation",
     "exposure_ratio": "settings",
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from simulator.camera import get_camera as get_camera
     from simulator.camera import list_cameras as list_cameras
     from simulator.camera_simulator import CameraSimulator as CameraSimulator
-    from simulator.camera_simulator import Latent as Latent
-    from simulator.camera_simulator import SimulationPlan as SimulationPlan
     from simulator.dng import write_dng as write_dng
     from simulator.isp import develop as develop
     from simulator.isp import render_srgb as render_srgb
+    from simulator.latent import Latent as Latent
     from simulator.noise_estimation import estimate_nlf as estimate_nlf
+    from simulator.plan import SimulationPlan as SimulationPlan
     from simulator.raw_file import read_raw as read_raw
     from simulator.raw_image import RawImage as RawImage
     from simulator.settings import CameraSettings as CameraSettings

@@ -1,234 +1,61 @@
 """The camera simulator: plans which steps a change of settings needs, and runs those.
 
 A raw or a scene is prepared once (`CameraSimulator.prepare`): everything that does not depend on
-the target settings is in the `Latent`. Exposing it at any settings is then a few element-wise
-steps.
+the target settings, the networks included, is in the `Latent`. Exposing it at any settings is then
+a few element-wise steps.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
 
 import torch
 
-from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture import (
-    SIGNAL_LIMIT,
-    Exposure,
-    add_noise,
-    clip_and_quantise,
-    sensor_light,
-)
-from simulator.noise import noise_generator, noise_variance, top_up_variance
-from simulator.raw_image import RawImage, check_packed
+from simulator.capture import add_noise, clip_and_quantise
+from simulator.latent import HasLatent, Latent
+from simulator.modules.aperture import ApertureModule
+from simulator.modules.exposure import ExposureModule
+from simulator.modules.noise import NoiseModule, Preset, smoothed, variance_map
+from simulator.noise import noise_generator
+from simulator.opening import MapOpening, NetworkOpening, Opening
+from simulator.plan import SimulationPlan
+from simulator.raw_image import RawImage
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.tiles import in_tiles
 
-#: Blur below this extent [pixel] changes nothing that a digital number could show.
-NEGLIGIBLE_BLUR = 1e-3
-_EXPOSE_OPERATIONS = 2
-_NOISE_OPERATIONS = 14
-_CLIP_OPERATIONS = 6
-_STREAK_OPERATIONS = 6
-
-
-@dataclass(frozen=True)
-class SimulationPlan:
-    """What a change of settings takes, and what it will cost in error and in work.
-
-    Args:
-        settings: Settings to simulate.
-        exposure_ratio: How much brighter than the source the result is.
-        modules: Steps that run, in order.
-        left_out: Every other step and the reason why this scene does not need it.
-        excess_noise: Variance that the source brings beyond the target's, relative to the target's,
-            mean over the pixels. 0 means that the noise is exact.
-        clipped_source: Share of the pixels that are saturated in the source: what they would show
-            at a darker exposure is unknown.
-        extrapolated_noise: Whether the target's ISO lies outside the camera's calibration.
-        predicted_rmse: Root mean square of the excess noise, 1 is sensor white.
-        operations: Arithmetic operations that the steps need, all pixels together.
-    """
-
-    settings: CameraSettings
-    exposure_ratio: float
-    modules: tuple[str, ...]
-    left_out: Mapping[str, str]
-    excess_noise: float
-    clipped_source: float
-    extrapolated_noise: bool
-    predicted_rmse: float
-    operations: int
-
-    def __str__(self) -> str:
-        lines = [
-            f"{self.settings}: {self.exposure_ratio:.4g} x the light of the source",
-            f"  runs      {' -> '.join(self.modules)}",
-        ]
-        lines += [f"  left out  {name}: {reason}" for name, reason in self.left_out.items()]
-        lines.append(
-            f"  error     noise variance {self.excess_noise:.1%} above the target's "
-            f"(RMSE {self.predicted_rmse:.2e} of white); "
-            f"{self.clipped_source:.2%} of the source is saturated"
-        )
-        if self.extrapolated_noise:
-            lines.append("  warning   the ISO is outside the camera's noise calibration")
-        lines.append(f"  cost      {self.operations / 1e6:.1f} million operations")
-        return "\n".join(lines)
-
-
-class HasLatent(Protocol):
-    """Anything that can be photographed, such as a scene of the environment."""
-
-    @property
-    def latent(self) -> Latent:
-        """Its light."""
+Depth = Literal["far", "unknown"]
+#: What the compact networks see around a pixel [pixel]; tiles overlap by it.
+_NOISE_HALO, _MAP_HALO = 48, 64
 
 
 @dataclass(frozen=True, eq=False)
-class Latent:
-    """Light of a scene at reference settings, ready to be exposed at any others.
+class Stages:
+    """Every intermediate result of the full pipeline (paper, figure 2), each (4, H, W).
 
     Args:
-        light: (4, H, W) float32, linear, not clipped: above 1 where highlights are known.
-        reference: Settings at which `light` is on the scale where sensor white is 1.
-        camera: The body that takes the captures.
-        nlf: Noise left in `light`, at the reference settings.
-        saturated: (H, W) bool, pixels whose light is only known to be at least this; None if none.
-        white_balance: Gains of R, G, B of the scene's light.
-        box_factor: Sensor pixels averaged per side into one pixel of `light`.
-        image_speed: Speed of the image along the rows [frame heights per second].
-        defocus: Diameter of the defocus disc at f/4 [pixel of `light`]; 0 for a scene that is far
-            or in focus throughout.
-        gain: Light relative to `light`, where it changes over time.
+        exposed: After the exposure module (EXP).
+        denoised: After the noise module (NS).
+        opened: After the aperture module, before the output's noise (Full).
+        capture: With the output settings' noise, clipped and quantised.
     """
 
-    light: torch.Tensor
-    reference: CameraSettings
-    camera: CameraProfile
-    nlf: NoiseLevelFunction
-    saturated: torch.Tensor | None = None
-    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    box_factor: int = 1
-    image_speed: float = 0.0
-    defocus: float = 0.0
-    gain: float = 1.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "light", check_packed("light", self.light))
-        for name in ("image_speed", "defocus"):
-            value = getattr(self, name)
-            if not 0.0 <= value < float("inf"):
-                raise ValueError(f"`{name}` (={value!r}) must be finite and >= 0")
-
-    def exposure(self, settings: CameraSettings) -> Exposure:
-        """What a capture at `settings` does to this light."""
-        if not isinstance(settings, CameraSettings):
-            raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
-        motion_px = self.image_speed * settings.exposure_time * self.light.shape[-2]
-        defocus_px = self.defocus * 4.0 / settings.effective_f_number
-        return Exposure(
-            ratio=self.gain * exposure_ratio(self.reference, settings),
-            source=self.nlf,
-            target=_averaged_nlf(self.camera, settings.iso, self.box_factor),
-            motion_px=motion_px if motion_px > NEGLIGIBLE_BLUR else 0.0,
-            defocus_px=defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0,
-        )
-
-    def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
-        """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
-
-        Shot and read noise are compared apart, so that a mixed case is stated too high rather than
-        too low.
-        """
-        exposure = self.exposure(settings)
-        source = exposure.source_noise.scaled(float(self.box_factor**2))
-        return self.camera.nlf(settings.iso).at_least(source)
-
-    def plan(self, settings: CameraSettings) -> SimulationPlan:
-        """Steps, reasons, predicted error and cost of a capture at `settings`."""
-        exposure = self.exposure(settings)
-        pixels = self.light.numel()
-        signal = (self.light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
-        missing, excess = top_up_variance(signal, exposure.source_noise, exposure.target)
-        wanted = noise_variance(signal, exposure.target).clamp_(min=torch.finfo(torch.float32).tiny)
-        relative_excess = float((excess / wanted).mean(dtype=torch.float64))
-
-        steps = {"exposure": (_EXPOSE_OPERATIONS * pixels, "")}
-        taps = 1 + int(exposure.defocus_px) ** 2
-        steps["defocus"] = (
-            taps * 2 * pixels * (exposure.defocus_px > 0),
-            "the scene is taken as far or in focus throughout"
-            if self.defocus == 0
-            else f"the defocus disc is below {NEGLIGIBLE_BLUR} pixel",
-        )
-        steps["motion_blur"] = (
-            _STREAK_OPERATIONS * pixels * (exposure.motion_px > 0),
-            "the image does not move"
-            if self.image_speed == 0
-            else f"the image moves less than {NEGLIGIBLE_BLUR} pixel during the exposure",
-        )
-        steps["noise"] = (
-            _NOISE_OPERATIONS * pixels * bool((missing > 0).any()),
-            "no pixel lacks noise: the source has the target's already, or more",
-        )
-        steps["clip_and_quantise"] = (_CLIP_OPERATIONS * pixels, "")
-        return SimulationPlan(
-            settings=settings,
-            exposure_ratio=exposure.ratio,
-            modules=tuple(name for name, (cost, _) in steps.items() if cost),
-            left_out={name: reason for name, (cost, reason) in steps.items() if not cost},
-            excess_noise=relative_excess,
-            clipped_source=0.0
-            if self.saturated is None
-            else float(self.saturated.float().mean(dtype=torch.float64)),
-            extrapolated_noise=exposure.target.extrapolated,
-            predicted_rmse=float(excess.mean(dtype=torch.float64)) ** 0.5,
-            operations=sum(cost for cost, _ in steps.values()),
-        )
-
-    def expected(self, settings: CameraSettings) -> torch.Tensor:
-        """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped."""
-        return sensor_light(self.light, self.exposure(settings))
-
-    def capture(self, settings: CameraSettings, seed: int = 0) -> tuple[torch.Tensor, float]:
-        """One simulated capture.
-
-        The noise is a function of `seed` and of `settings`: the same frame comes back alone or in
-        a sweep, and the frames of a sweep are independent.
-
-        Returns:
-            (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
-        """
-        exposure = self.exposure(settings)
-        light = sensor_light(self.light, exposure)
-        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
-        noisy, excess_noise = add_noise(light[None], [exposure], [generator])
-        return clip_and_quantise(noisy[0], self.camera), float(excess_noise[0])
-
-    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> torch.Tensor:
-        """A sweep: one capture per state, (S, 4, H, W) float32."""
-        return torch.stack(list(self.stream(states, seed=seed)))
-
-    def stream(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Iterator[torch.Tensor]:
-        """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once."""
-        for settings in states:
-            yield self.capture(settings, seed)[0]
-
-
-@functools.lru_cache(maxsize=4096)
-def _averaged_nlf(camera: CameraProfile, iso: float, box_factor: int) -> NoiseLevelFunction:
-    """Noise of `box_factor` squared sensor pixels averaged."""
-    return camera.nlf(iso).scaled(1.0 / box_factor**2)
+    exposed: torch.Tensor
+    denoised: torch.Tensor
+    opened: torch.Tensor
+    capture: torch.Tensor
 
 
 class CameraSimulator:
     """Simulates what a camera would have recorded at other settings.
 
     Args:
+        preset: Networks with random weights to train or to time, ``"compact"`` or ``"paper"``; see
+            `from_pretrained` for trained ones. None has none: noise is only added, and every scene
+            is taken as far.
         device: ``"auto"`` (CUDA where there is one), or any torch device.
+        precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32.
 
     >>> import torch
     >>> from simulator import RawImage, get_camera
@@ -239,13 +66,62 @@ class CameraSimulator:
     0.4
     """
 
-    def __init__(self, device: str | torch.device = "auto") -> None:
+    def __init__(
+        self,
+        preset: Preset | None = None,
+        *,
+        device: str | torch.device = "auto",
+        precision: Literal["float32", "bfloat16"] = "float32",
+    ) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
             self.device = torch.device(device)
         except RuntimeError as error:
             raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
+        if precision not in ("float32", "bfloat16"):
+            raise ValueError(f"`precision` (={precision!r}) must be 'float32' or 'bfloat16'")
+        self.precision = precision
+        self.exposure = ExposureModule().requires_grad_(False).to(self.device)
+        self.noise = None if preset is None else self._ready(NoiseModule(preset))
+        self.aperture = None if preset is None else self._ready(ApertureModule(preset))
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        name: str | Path = "compact",
+        *,
+        device: str | torch.device = "auto",
+        precision: Literal["float32", "bfloat16"] = "float32",
+        body_correction: bool = False,
+    ) -> CameraSimulator:
+        """A simulator with trained networks.
+
+        Args:
+            name: ``"compact"``, or the path of weights that `ae-env train-simulator` wrote.
+            device: See `CameraSimulator`.
+            precision: See `CameraSimulator`.
+            body_correction: Whether to apply the exposure module's w and b. They make up for the
+                errors of the one body that was trained on and are wrong for any other.
+
+        Raises:
+            ValueError: If there are no such weights, or they are damaged or those of a baseline.
+        """
+        from simulator.weights import load_modules
+
+        modules, card = load_modules(name)
+        if card["preset"] not in get_args(Preset):
+            raise ValueError(f"`name` (={str(name)!r}) holds the baseline {card['preset']!r}")
+        simulator = cls(device=device, precision=precision)
+        simulator.noise = simulator._ready(cast(NoiseModule, modules["noise"]))
+        simulator.aperture = simulator._ready(cast(ApertureModule, modules["aperture"]))
+        if body_correction:
+            simulator.exposure = cast(ExposureModule, modules["exposure"]).to(simulator.device)
+        return simulator
+
+    def _ready(self, module: Any) -> Any:
+        module = module.eval().requires_grad_(False)
+        return module.to(device=self.device, memory_format=torch.channels_last)
 
     def prepare(
         self,
@@ -253,6 +129,7 @@ class CameraSimulator:
         *,
         image_speed: float | None = None,
         defocus: float | None = None,
+        depth: Depth = "far",
     ) -> Latent:
         """Everything that does not depend on the target settings, done once.
 
@@ -262,10 +139,32 @@ class CameraSimulator:
                 the source's own, 0 for a raw.
             defocus: Diameter of the defocus disc at f/4 [pixel]; by default the source's own. 0
                 takes the scene as far or in focus throughout, where every aperture is exact.
+            depth: ``"unknown"`` lets the aperture module find what is out of focus, and blur that
+                more where the aperture opens; ``"far"`` takes the scene as in focus throughout.
 
         Raises:
-            ValueError: If an argument is out of range.
+            ValueError: If an argument is out of range, or `depth` needs networks that are not here.
         """
+        if depth not in get_args(Depth):
+            raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
+        if depth == "unknown" and self.aperture is None:
+            raise ValueError(
+                "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
+            )
+        latent = self._latent(source)
+        if image_speed is not None:
+            latent = replace(latent, image_speed=image_speed)
+        if defocus is not None:
+            latent = replace(latent, defocus=defocus)
+        if not self.exposure.is_identity:
+            latent = replace(latent, light=self.exposure(latent.light, 1.0))
+        if self.noise is not None and latent.denoised is None and not latent.nlf.is_zero:
+            latent = replace(latent, denoised=self.denoise(latent))
+        if depth == "unknown":
+            latent = replace(latent, opening=self._opening(latent))
+        return latent
+
+    def _latent(self, source: RawImage | Latent | HasLatent) -> Latent:
         if isinstance(source, RawImage):
             saturated = source.saturated
             latent = Latent(
@@ -280,25 +179,119 @@ class CameraSimulator:
             if source.nlf is not None and not source.camera.nlf_by_iso:
                 camera = source.camera.with_nlf(source.settings.iso, source.nlf)
                 latent = replace(latent, camera=camera)
-        elif isinstance(source, Latent):
-            latent = replace(source, light=source.light.to(self.device))
-        elif hasattr(source, "latent"):
-            latent = self.prepare(source.latent)
-        else:
-            raise ValueError(
-                f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene"
-            )
-        if image_speed is not None:
-            latent = replace(latent, image_speed=image_speed)
-        if defocus is not None:
-            latent = replace(latent, defocus=defocus)
-        return latent
+            return latent
+        if isinstance(source, Latent):
+            return replace(source, light=source.light.to(self.device))
+        if hasattr(source, "latent"):
+            return self._latent(source.latent)
+        raise ValueError(
+            f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene"
+        )
+
+    @torch.no_grad()
+    def denoise(self, latent: Latent) -> torch.Tensor:
+        """The latent's light (4, H, W) with little noise.
+
+        The result serves every exposure: the compact network commutes with exposure, and the
+        paper's does after its scaling by one number from the metadata.
+
+        Raises:
+            ValueError: If this simulator has no noise module.
+        """
+        if self.noise is None:
+            raise ValueError("there is no noise module: use CameraSimulator.from_pretrained")
+        image, (shot, read) = latent.light[None], self._noise_of(latent)
+        noise = self.noise
+
+        def network(part: torch.Tensor) -> torch.Tensor:
+            with self._autocast():
+                return noise(part, shot, read)
+
+        if noise.preset == "compact":
+            return in_tiles(network, image, halo=_NOISE_HALO)[0]
+        return network(image)[0]
+
+    @torch.no_grad()
+    def estimate_defocus(self, latent: Latent) -> torch.Tensor:
+        """Circle of confusion of each pixel (H, W), at the latent's own aperture [pixel].
+
+        Raises:
+            ValueError: If this simulator's aperture module has no such map.
+        """
+        if self.aperture is None:
+            raise ValueError("there is no aperture module: use CameraSimulator.from_pretrained")
+        aperture = self.aperture
+        shot, read = self._noise_of(latent)
+        deviation = variance_map(smoothed(latent.light[None]), shot, read).sqrt()
+        image = latent.light if latent.denoised is None else latent.denoised
+
+        def network(part: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+            with self._autocast():
+                return aperture.defocus(part, noise)
+
+        return in_tiles(network, image[None], deviation, halo=_MAP_HALO)[0]
+
+    def _opening(self, latent: Latent) -> Opening:
+        assert self.aperture is not None
+        f_number = latent.reference.effective_f_number
+        denoised = latent.light if latent.denoised is None else latent.denoised
+        if self.aperture.preset == "paper":
+            return NetworkOpening(denoised, self.aperture, f_number)
+        return MapOpening(latent.light, denoised, self.estimate_defocus(latent), f_number)
+
+    def _noise_of(self, latent: Latent) -> tuple[torch.Tensor, torch.Tensor]:
+        shot, read = (torch.tensor([v]) for v in (latent.nlf.shot, latent.nlf.read))
+        return shot.to(self.device), read.to(self.device)
+
+    def _autocast(self) -> torch.autocast:
+        enabled = self.precision == "bfloat16"
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
 
     def plan(
         self, source: RawImage | Latent | HasLatent, settings: CameraSettings, **scene: Any
     ) -> SimulationPlan:
         """Which steps the change to `settings` takes, why others are left out, error and cost."""
         return self.prepare(source, **scene).plan(settings)
+
+    @torch.no_grad()
+    def stages(self, source: RawImage, settings: CameraSettings, *, seed: int = 0) -> Stages:
+        """Runs the whole pipeline on one raw, every module for this very transition.
+
+        Nothing is left out and nothing shared: this is what `simulate` is an approximation of. The
+        preset ``"paper"`` clips to [0, 1] after the exposure, as the paper does.
+
+        Args:
+            source: The raw.
+            settings: Target settings. The aperture module only opens: a smaller aperture than the
+                source's leaves its blur.
+            seed: Seed of the output's noise.
+
+        Raises:
+            ValueError: If this simulator has no networks.
+        """
+        if self.noise is None or self.aperture is None:
+            raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
+        latent = self._latent(source)
+        ratio = exposure_ratio(latent.reference, settings)
+        exposed = self.exposure(latent.light[None], ratio)
+        if self.noise.preset == "paper":
+            exposed = exposed.clamp(0.0, 1.0)
+        shot, read = self._noise_of(latent)
+        scale = float(self.exposure.w) * ratio
+        shot, read = shot * scale, read * scale * scale
+        with self._autocast():
+            denoised = self.noise(exposed, shot, read)
+            deviation = variance_map(smoothed(exposed), shot, read).sqrt()
+            f_numbers = (
+                torch.tensor([s.effective_f_number], device=self.device)
+                for s in (latent.reference, settings)
+            )
+            opened = self.aperture(denoised, deviation, *f_numbers)
+        clean = replace(latent.exposure(settings), source=latent.nlf.zero(), remaining=None)
+        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
+        noisy, _ = add_noise(opened, [clean], [generator])
+        capture = clip_and_quantise(noisy[0], latent.camera)
+        return Stages(exposed[0], denoised[0], opened[0], capture)
 
     def simulate(
         self,
@@ -314,7 +307,7 @@ class CameraSimulator:
             source: A raw, a latent, or a scene.
             settings: Target ISO, exposure time and f-number.
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
-            scene: Further arguments of `prepare`: ``image_speed``, ``defocus``.
+            scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and

@@ -35,6 +35,10 @@ class Exposure:
         target: Noise of the camera at the capture's settings.
         motion_px: How far the image moves while the shutter is open [pixel].
         defocus_px: Diameter of the defocus disc [pixel].
+        denoised: Whether it starts from the noise-reduced light; `source` is zero then.
+        opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
+            None where it does not.
+        remaining: (H, W) share of the source's noise variance that this blur leaves; None for all.
     """
 
     ratio: float
@@ -42,6 +46,9 @@ class Exposure:
     target: NoiseLevelFunction
     motion_px: float = 0.0
     defocus_px: float = 0.0
+    denoised: bool = False
+    opened_to: float | None = None
+    remaining: torch.Tensor | None = None
 
     @property
     def source_noise(self) -> NoiseLevelFunction:
@@ -89,6 +96,9 @@ def add_noise(
     missing = light.clamp(min=0.0).mul_(shot.to(light)).add_(read.to(light))
     excess_noise = np.zeros(len(exposures))
     for i, (source, target) in enumerate(zip(sources, targets, strict=True)):
+        remaining = exposures[i].remaining
+        if remaining is not None:  # what the blur of the aperture took away is to be added again
+            missing[i] += (1.0 - remaining) * noise_variance(light[i], source)
         if not source.is_zero:
             wanted = noise_variance(light[i], target).clamp_(min=torch.finfo(torch.float32).tiny)
             relative = (missing[i] / wanted).clamp_(max=0.0).mean(dtype=torch.float64)

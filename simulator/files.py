@@ -31,3 +31,18 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> Path
         Path(name).unlink(missing_ok=True)
         raise
     return path
+
+
+def sibling(path: str | Path, suffix: str) -> Path:
+    """The file of trained weights that ends in `suffix`; only its two endings are replaced.
+
+    >>> sibling("runs/ppo-0.5", ".json").name, sibling("runs/ppo.safetensors", ".json").name
+    ('ppo-0.5.json', 'ppo.json')
+    """
+    path = Path(path).expanduser()
+    name = path.name
+    for ending in (".safetensors", ".json"):
+        name = name.removesuffix(ending)
+    if name in ("", ".."):
+        raise ValueError(f"weights file (={str(path)!r}) must have a name, such as runs/ppo")
+    return path.with_name(name + suffix)

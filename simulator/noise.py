@@ -38,7 +38,10 @@ def noise_variance(signal: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tenso
 
 
 def top_up_variance(
-    signal: torch.Tensor, source: NoiseLevelFunction, target: NoiseLevelFunction
+    signal: torch.Tensor,
+    source: NoiseLevelFunction,
+    target: NoiseLevelFunction,
+    remaining: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Variance to add so that a pixel with `source` noise carries `target` noise.
 
@@ -46,6 +49,7 @@ def top_up_variance(
         signal: (..., 4, H, W), on the target's scale.
         source: Noise already in `signal` on that scale (`NoiseLevelFunction.exposed`).
         target: Noise that the capture should have.
+        remaining: (H, W) share of the source's variance that a blur has left; None for all of it.
 
     Returns:
         ``(missing, excess)``, both >= 0: ``missing`` is to be added; ``excess`` is how much the
@@ -56,4 +60,6 @@ def top_up_variance(
     slope = torch.tensor(shot, dtype=torch.float32, device=signal.device)[:, None, None]
     offset = torch.tensor(read, dtype=torch.float32, device=signal.device)[:, None, None]
     difference = signal.float().clamp(min=0.0) * slope + offset
+    if remaining is not None:
+        difference += (1.0 - remaining) * noise_variance(signal, source)
     return difference.clamp(min=0.0), (-difference).clamp_(min=0.0)

@@ -66,7 +66,7 @@ def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = N
     """
     style = LeafStyle() if style is None else style
     radius, centre_y, centre_x, shape = _draw_leaves(rng, size, style)
-    label = _paint(size, radius, centre_y, centre_x, shape)
+    label = paint_leaves(size, radius, centre_y, centre_x, shape)
     number = len(radius) + 1  # label 0 is the ground
 
     tone = rng.normal(0.0, style.contrast, number).astype(np.float32)
@@ -116,7 +116,7 @@ def _draw_leaves(
     return radius, centre_y, centre_x, shape
 
 
-def _paint(
+def paint_leaves(
     size: int,
     radius: np.ndarray,
     centre_y: np.ndarray,

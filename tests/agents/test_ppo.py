@@ -10,7 +10,7 @@ import torch
 from stable_baselines3 import PPO
 from torch import nn
 
-from agents.checkpoint import Checkpoint
+from simulator.checkpoint import Checkpoint
 from agents.policy import PolicyContext, make_policy
 from agents.ppo import ExposureExtractor, PPOPolicy, PPOTraining, save_ppo, train_ppo
 from agents.sb3_adapter import SB3VectorAdapter

@@ -15,7 +15,7 @@ import torch
 from scipy.stats import norm
 
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
-from simulator.camera_simulator import Latent
+from simulator.latent import Latent
 from simulator.capture import Exposure, add_noise, clip_and_quantise, sensor_light
 from simulator.noise import noise_generator
 from simulator.settings import CameraSettings

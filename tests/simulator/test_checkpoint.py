@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from agents.checkpoint import Checkpoint
+from simulator.checkpoint import Checkpoint
 
 
 class Run:

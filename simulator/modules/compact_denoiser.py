@@ -1,0 +1,81 @@
+"""A small denoiser that commutes with exposure: scaling its input scales its output."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class ResidualBlock(nn.Module):
+    """``x + conv(relu(conv(x)))``, 3 x 3, without biases."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.second = nn.Conv2d(width, width, 3, padding=1, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        return x + self.second(F.relu(self.first(x)))
+
+
+class CompactDenoiser(nn.Module):
+    """A bias-free U-Net of raw and standard-deviation map, positively homogeneous of degree one.
+
+    Convolutions without biases, ReLU, additive skips and no normalisation: every layer satisfies
+    ``f(c x) = c f(x)`` for c > 0, so the whole network does. "Expose, denoise" then equals
+    "denoise, expose", no exposure ratio lies outside the training range, and one denoised latent
+    serves every target. (Mohan et al. 2020, Robust and interpretable blind image denoising via
+    bias-free convolutional neural networks.)
+
+    Args:
+        widths: Channels of the three levels, each half the resolution of the one before.
+    """
+
+    def __init__(self, widths: tuple[int, int, int] = (32, 48, 96)) -> None:
+        super().__init__()
+        fine, middle, coarse = widths
+        self.head = nn.Conv2d(8, fine, 3, padding=1, bias=False)
+        self.encode_fine = ResidualBlock(fine)
+        self.to_middle = nn.Conv2d(fine, middle, 2, stride=2, bias=False)
+        self.encode_middle = ResidualBlock(middle)
+        self.to_coarse = nn.Conv2d(middle, coarse, 2, stride=2, bias=False)
+        self.coarse = nn.Sequential(ResidualBlock(coarse), ResidualBlock(coarse))
+        self.from_coarse = nn.ConvTranspose2d(coarse, middle, 2, stride=2, bias=False)
+        self.decode_middle = ResidualBlock(middle)
+        self.from_middle = nn.ConvTranspose2d(middle, fine, 2, stride=2, bias=False)
+        self.decode_fine = ResidualBlock(fine)
+        self.tail = nn.Conv2d(fine, 4, 3, padding=1, bias=False)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+            if isinstance(module, ResidualBlock):  # starts near the identity: no warm-up needed
+                with torch.no_grad():
+                    module.second.weight.mul_(0.1)
+        with torch.no_grad():
+            self.tail.weight.mul_(0.01)
+
+    def forward(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """Noise-reduced image.
+
+        Args:
+            image: (B, 4, H, W) noisy raw, any exposure; H, W >= 1.
+            deviation: (B, 4, H, W) standard deviation of each pixel's noise, on the same scale.
+
+        Returns:
+            (B, 4, H, W).
+        """
+        height, width = image.shape[-2:]
+        # Fewer than 4 pixels of padding: three levels need a multiple of 4.
+        pad = (0, -width % 4, 0, -height % 4)
+        x = F.pad(torch.cat([image, deviation], dim=1), pad, mode="replicate")
+        fine = self.encode_fine(self.head(x))
+        middle = self.encode_middle(self.to_middle(fine))
+        coarse = self.coarse(self.to_coarse(middle))
+        middle = self.decode_middle(middle + self.from_coarse(coarse))
+        fine = self.decode_fine(fine + self.from_middle(middle))
+        return image + self.tail(fine)[..., :height, :width]

@@ -1,0 +1,99 @@
+"""Defocus that varies from pixel to pixel, as a blend of a few uniform disc blurs.
+
+Blurring once with every disc of a bank and interpolating between neighbours, per pixel and in the
+*squared* diameter (second moments add, so that is where blur is linear), makes any map of blur
+diameters and any f-number for the cost of a gather.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from simulator.blur import disc_blur, disc_kernel
+
+#: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
+#: discs is within 2 % of the disc between them.
+DIAMETERS = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6, 32.0)
+
+
+class DiscBank:
+    """An image behind every disc of the bank; each blur is computed when it is first needed.
+
+    Args:
+        image: (..., H, W) linear light. No gradient flows into it.
+    """
+
+    def __init__(self, image: Tensor) -> None:
+        self._levels = {0: image.detach()}
+
+    def level(self, index: int) -> Tensor:
+        """The image behind disc `index` of `DIAMETERS`."""
+        if index not in self._levels:
+            self._levels[index] = disc_blur(self._levels[0], DIAMETERS[index])
+        return self._levels[index]
+
+    def blurred(self, diameter: Tensor) -> Tensor:
+        """The image blurred by `diameter`, differentiable in it.
+
+        Args:
+            diameter: (..., H, W) blur diameter of each pixel [pixel], >= 0, broadcast against the
+                image; beyond the largest disc of the bank it stays there.
+        """
+        squared = diameter.square().clamp(max=DIAMETERS[-1] ** 2)
+        total: Tensor | None = None
+        for index, weight in _weights(squared):
+            term = self.level(index) * weight
+            total = term if total is None else total + term
+        assert total is not None
+        return total
+
+
+def remaining_variance(diameter: Tensor) -> Tensor:
+    """Share of white noise's variance that `DiscBank.blurred` leaves, per pixel of `diameter`.
+
+    The sum of squared weights of the blended kernel,
+    ``(1 - t)^2 E_aa + 2 t (1 - t) E_ab + t^2 E_bb`` between discs a and b.
+    """
+    squared = diameter.square().clamp(max=DIAMETERS[-1] ** 2)
+    energy = _kernel_products()
+    total = torch.zeros_like(squared)
+    weights = dict(_weights(squared))
+    for index, weight in weights.items():
+        total += weight.square() * energy[index, index]
+        if index + 1 in weights:
+            total += 2.0 * weight * weights[index + 1] * energy[index, index + 1]
+    return total
+
+
+def _weights(squared: Tensor) -> list[tuple[int, Tensor]]:
+    """(index, weight) of every disc that some pixel needs: hat functions of squared diameter."""
+    knots = [d * d for d in DIAMETERS]
+    low, high = (float(v) for v in torch.aminmax(squared.detach()))
+    weights = []
+    for index, knot in enumerate(knots):
+        before = knots[index - 1] if index else -1.0
+        after = knots[index + 1] if index + 1 < len(knots) else knot + 1.0
+        if before < high and low < after and not (high <= before or low >= after):
+            rising = (squared - before) / (knot - before)
+            falling = (after - squared) / (after - knot)
+            weights.append((index, torch.minimum(rising, falling).clamp(min=0.0)))
+    return weights
+
+
+@functools.cache
+def _kernel_products() -> np.ndarray:
+    """(K, K) sums of products of the weights of each disc and itself or its successor."""
+    kernels = [disc_kernel(d) for d in DIAMETERS]
+    products = np.zeros((len(kernels), len(kernels)))
+    for i, kernel in enumerate(kernels):
+        products[i, i] = (kernel**2).sum()
+        if i + 1 < len(kernels):
+            larger = kernels[i + 1]
+            margin = (larger.shape[0] - kernel.shape[0]) // 2
+            inner = larger[margin : margin + kernel.shape[0], margin : margin + kernel.shape[0]]
+            products[i, i + 1] = (kernel * inner).sum()
+    return products

@@ -1,0 +1,117 @@
+"""What decides a training of the simulator's modules."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from simulator.camera import get_camera
+from simulator.config_file import load_yaml
+
+
+class StageConfig(BaseModel):
+    """One stage of the training.
+
+    Args:
+        steps: Optimiser steps; the whole budget, unless `minutes` is given.
+        minutes: Budget in time instead of in steps: processor minutes of the training process on a
+            CPU, so that other work on the machine does not count; wall-clock minutes on a GPU.
+        batch: Pairs per step and process.
+        crop: Height and width of the crops [packed pixel].
+        learning_rate: Peak of a one-cycle schedule (rise over 5 %, cosine fall to 0).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    steps: int | None = Field(default=None, ge=1, le=10_000_000)
+    minutes: float | None = Field(default=None, gt=0, le=100_000)
+    batch: int = Field(default=8, ge=1, le=4096)
+    crop: int = Field(default=64, ge=16, le=4096)
+    learning_rate: float = Field(default=1e-3, gt=0, le=1.0)
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> StageConfig:
+        if (self.steps is None) == (self.minutes is None):
+            raise ValueError("exactly one of `steps` and `minutes` must be given")
+        return self
+
+
+class SceneConfig(BaseModel):
+    """What the reference camera photographs.
+
+    Args:
+        procedural: Procedural scenes in the training split; three quarters of them have depth.
+        size: Height and width of a scene [packed pixel].
+        radiance: Folder of radiance maps (those named in `ae_env.scenes.reference`), searched with
+            its subfolders; null leaves them out.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    procedural: int = Field(default=240, ge=1, le=100_000)
+    size: int = Field(default=256, ge=32, le=4096)
+    radiance: str | None = None
+
+
+class SimulatorConfig(BaseModel):
+    """A training of the three modules, or of a baseline.
+
+    Args:
+        preset: ``"compact"`` or ``"paper"``; ``"pc"`` (parameter concatenation) and ``"dl"``
+            (decoupled learning) are the paper's baselines, one network trained in one stage.
+        camera: Built-in camera that records the sequences.
+        body: Seed of the hidden error of its body.
+        seed: Seed of everything that is random.
+        precision: Of the networks; weights, optimiser and losses stay float32.
+        scenes: What is photographed.
+        exposure, noise, aperture: The three stages of a preset.
+        baseline: The stage of ``"pc"`` and ``"dl"``.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: Literal["compact", "paper", "pc", "dl"]
+    camera: str = "nikon_z6"
+    body: int = Field(default=1, ge=0)
+    seed: int = Field(default=0, ge=0)
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    scenes: SceneConfig = SceneConfig()
+    exposure: StageConfig | None = None
+    noise: StageConfig | None = None
+    aperture: StageConfig | None = None
+    baseline: StageConfig | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> SimulatorConfig:
+        get_camera(self.camera)
+        for name in ("exposure", "noise", "aperture", "baseline"):
+            wanted = (name == "baseline") == (self.preset in ("pc", "dl"))
+            if wanted != (getattr(self, name) is not None):
+                rule = "must be given" if wanted else "must be left out"
+                raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
+        for name, stage in self.stages().items():
+            if stage.crop > self.scenes.size:
+                raise ValueError(
+                    f"`{name}.crop` (={stage.crop}) must not exceed `scenes.size` "
+                    f"(={self.scenes.size})"
+                )
+        return self
+
+    def stages(self) -> dict[str, StageConfig]:
+        """The stages by name, in order."""
+        names = ("exposure", "noise", "aperture", "baseline")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    def card(self, last_stage: str | None = None) -> dict[str, Any]:
+        """JSON values that identify the training, or what it does up to and with `last_stage`."""
+        values = self.model_dump(mode="json", exclude_none=True)
+        names = list(self.stages())
+        later = [] if last_stage is None else names[names.index(last_stage) + 1 :]
+        return {name: value for name, value in values.items() if name not in later}
+
+
+def load_config(path: str | Path) -> SimulatorConfig:
+    """The configuration in a YAML file; see `simulator.config_file.load_yaml`."""
+    return load_yaml(path, SimulatorConfig)

@@ -1,0 +1,194 @@
+"""Pairs of captures as batches, drawn by step number: the same step gives the same batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from simulator.camera import CameraProfile
+from simulator.noise import noise_generator
+from simulator.reference import ReferenceCamera, ReferenceScene
+from simulator.sequences import Pair, Stage, draw_settings, select_pairs
+from simulator.sequences import Sequence as CaptureSequence
+from simulator.settings import CameraSettings, exposure_ratio
+
+#: Called with what is done and what there is to do.
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class Batch:
+    """B pairs of captures of the same crop.
+
+    Args:
+        source: (B, 4, H, W) the input capture, noisy.
+        target: (B, 4, H, W) what the target settings show without noise, clipped.
+        sample: (B, 4, H, W) the target capture, noisy.
+        ratio: (B,) nominal exposure ratio from source to target.
+        shot: (B, 4) slope of the source's noise variance, on the source's scale.
+        read: (B, 4) its noise variance at zero signal.
+        f_source: (B,) effective f-number of the source.
+        f_target: (B,) effective f-number of the target.
+        parameters: (B, 6) log2 of ISO / 100, exposure time and f-number, source then target.
+        defocus: (B, H, W) true circle of confusion of the source [pixel].
+    """
+
+    source: Tensor
+    target: Tensor
+    sample: Tensor
+    ratio: Tensor
+    shot: Tensor
+    read: Tensor
+    f_source: Tensor
+    f_target: Tensor
+    parameters: Tensor
+    defocus: Tensor
+
+    def to(self, device: torch.device) -> Batch:
+        """The batch on another device."""
+        return Batch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+def draw_sequences(
+    scenes: Sequence[ReferenceScene], camera: CameraProfile, seed: int
+) -> list[CaptureSequence]:
+    """One sequence of 20 to 25 captures of each scene, as the paper took its own."""
+    sequences = []
+    for index, scene in enumerate(scenes):
+        if scene.illuminance is None:
+            raise ValueError(f"scene {scene.scene_id!r}: `illuminance` must be known to expose it")
+        rng = np.random.default_rng([seed, index])
+        settings = draw_settings(scene.illuminance, rng, camera)
+        sequences.append(CaptureSequence(scene, tuple(settings)))
+    return sequences
+
+
+class ReferencePairs:
+    """Pairs of one stage, photographed by the reference camera whenever they are asked for.
+
+    Which pairs there are is fixed when this is made. Light behind every aperture is rendered once;
+    a batch then costs the exposure and the noise of its crops. Noise is drawn anew every time: a
+    pair that is shown twice was photographed twice.
+
+    Args:
+        sequences: Scenes and settings.
+        camera: The body.
+        stage: Whose pairs, see `simulator.sequences.select_pairs`.
+        seed: Seed of pairs, crops and noise.
+        optics: Rendered light to share between stages; filled as needed.
+        progress: Called while the light is rendered.
+
+    Raises:
+        ValueError: If the sequences hold no pair for this stage.
+    """
+
+    def __init__(
+        self,
+        sequences: Sequence[CaptureSequence],
+        camera: ReferenceCamera,
+        stage: Stage,
+        *,
+        seed: int = 0,
+        optics: dict[tuple[str, int], Tensor] | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self.sequences, self.camera, self.stage, self.seed = sequences, camera, stage, seed
+        self.pairs: list[Pair] = select_pairs(list(sequences), stage, camera.camera)
+        if not self.pairs:
+            raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
+        self._optics = {} if optics is None else optics
+        self._defocus: dict[tuple[str, int], Tensor] = {}
+        self._render(progress)
+
+    def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch:
+        """The pairs of one step.
+
+        Args:
+            step: Number of the step.
+            size: Pairs.
+            crop: Height and width of the crops [packed pixel].
+            process: Rank among several processes, each of which gets pairs of its own.
+        """
+        words = [self.seed, len(self.stage), step, process]
+        rng = np.random.default_rng(words)
+        chosen = rng.integers(len(self.pairs), size=size)
+        generator = noise_generator(self.seed, step, process, len(self.stage))
+        items = [self._pair(self.pairs[i], crop, rng, generator) for i in chosen]
+        return Batch(
+            **{f.name: torch.stack([item[f.name] for item in items]) for f in fields(Batch)}
+        )
+
+    def _render(self, progress: Progress | None) -> None:
+        wanted: dict[int, dict[int, CameraSettings]] = {}
+        for pair in self.pairs:
+            settings = self.sequences[pair.sequence].settings
+            for index in (pair.source, pair.target):
+                by_stop = wanted.setdefault(pair.sequence, {})
+                by_stop[settings[index].aperture_stop] = settings[index]
+        for done, (index, by_stop) in enumerate(sorted(wanted.items())):
+            if progress is not None:
+                progress(done, len(wanted))
+            scene = self.sequences[index].scene
+            for stop, chosen in by_stop.items():
+                if (scene.scene_id, stop) not in self._optics:
+                    light = self.camera.optics(scene, chosen.f_number)
+                    self._optics[scene.scene_id, stop] = light
+        if progress is not None:
+            progress(len(wanted), len(wanted))
+
+    def _pair(
+        self, pair: Pair, crop: int, rng: np.random.Generator, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        sequence = self.sequences[pair.sequence]
+        scene = sequence.scene
+        source, target = sequence.settings[pair.source], sequence.settings[pair.target]
+        height, width = scene.light.shape[1:]
+        top = int(rng.integers(height - crop + 1))
+        left = int(rng.integers(width - crop + 1))
+        flips = [axis for axis in (-2, -1) if rng.random() < 0.5]
+        transposed = rng.random() < 0.5
+
+        def cut(image: Tensor) -> Tensor:
+            part = image[..., top : top + crop, left : left + crop].flip(flips)
+            return (part.transpose(-2, -1) if transposed else part).contiguous()
+
+        def record(settings: CameraSettings) -> tuple[Tensor, Tensor]:
+            light = cut(self._optics[scene.scene_id, settings.aperture_stop])
+            signal = self.camera.expose(light, scene.reference, settings)
+            return signal, self.camera.record(signal, settings.iso, generator)
+
+        _, noisy = record(source)
+        signal, sample = record(target)
+        nlf = self.camera.camera.nlf(source.iso)
+        return {
+            "source": noisy,
+            "target": self.camera.clip(signal, target.iso),
+            "sample": sample,
+            "ratio": torch.tensor(exposure_ratio(source, target), dtype=torch.float32),
+            "shot": torch.tensor(nlf.shot),
+            "read": torch.tensor(nlf.read),
+            "f_source": torch.tensor(source.effective_f_number),
+            "f_target": torch.tensor(target.effective_f_number),
+            "parameters": torch.tensor([*_parameters(source), *_parameters(target)]),
+            "defocus": cut(self._blur(pair, source)),
+        }
+
+    def _blur(self, pair: Pair, settings: CameraSettings) -> Tensor:
+        scene = self.sequences[pair.sequence].scene
+        key = (scene.scene_id, settings.aperture_stop)
+        if key not in self._defocus:
+            self._defocus[key] = self.camera.blur_diameter(scene, settings.effective_f_number)
+        return self._defocus[key]
+
+
+def _parameters(settings: CameraSettings) -> tuple[float, float, float]:
+    return (
+        math.log2(settings.iso / 100.0),
+        math.log2(settings.exposure_time),
+        math.log2(settings.effective_f_number),
+    )

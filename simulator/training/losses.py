@@ -1,0 +1,124 @@
+"""What each stage minimises: one number per batch, and values worth a plot."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from simulator.modules.aperture import ApertureModule, added_blur, dead_zone
+from simulator.modules.defocus_map import LOG_OFFSET, DefocusMap, to_diameter
+from simulator.modules.disc_bank import DiscBank
+from simulator.modules.exposure import OVER_EXPOSED, ExposureModule
+from simulator.modules.noise import NoiseModule, smoothed, variance_map
+from simulator.training.data import Batch
+
+#: Weight of the loss on the logarithm of the circle of confusion beside that on the picture.
+_MAP_WEIGHT = 0.1
+#: Pixels around a clipped highlight that the aperture stage leaves out: what was there is unknown.
+_CLIP_MARGIN = 7
+
+
+class ExposureLoss(nn.Module):
+    """L1 of the exposed source against the target, source pixels above 0.99 left out."""
+
+    def __init__(self, exposure: ExposureModule) -> None:
+        super().__init__()
+        self.exposure = exposure
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """The loss on `batch`."""
+        exposed = self.exposure(batch.source, batch.ratio).clamp(0.0, 1.0)
+        used = batch.source <= OVER_EXPOSED
+        error = (exposed - batch.sample).abs() * used
+        return {"loss": error.sum() / used.sum().clamp(min=1)}
+
+
+class NoiseLoss(nn.Module):
+    """L1 of the denoised source against the target, in units of the source's noise.
+
+    The unit lets sources of every ISO and exposure count alike.
+    """
+
+    def __init__(self, exposure: ExposureModule, noise: NoiseModule) -> None:
+        super().__init__()
+        self.exposure, self.noise = exposure, noise
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """The loss on `batch`, and the gain over not denoising [dB]."""
+        exposed, shot, read = expose(self.exposure, batch)
+        output = self.noise(exposed, shot, read)
+        used = (batch.source <= OVER_EXPOSED) & (batch.target < 1.0)
+        unit = variance_map(smoothed(exposed), shot, read).mean(dim=(1, 2, 3), keepdim=True).sqrt()
+        error = (output - batch.target) / unit * used
+        before = (exposed - batch.target) / unit * used
+        gain = 10 * torch.log10(before.square().sum() / error.detach().square().sum())
+        return {"loss": error.abs().sum() / used.sum().clamp(min=1), "gain_db": gain}
+
+
+class ApertureLoss(nn.Module):
+    """L1 of the opened source against the target, in units of the change that opening makes.
+
+    Preset ``"compact"`` adds a loss on the logarithm of its map, without which the map collapses to
+    a constant.
+    """
+
+    def __init__(
+        self, exposure: ExposureModule, noise: NoiseModule, aperture: ApertureModule
+    ) -> None:
+        super().__init__()
+        self.exposure, self.noise, self.aperture = exposure, noise, aperture
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """The loss on `batch`, and the error relative to not opening."""
+        with torch.no_grad():
+            exposed, shot, read = expose(self.exposure, batch)
+            denoised = self.noise(exposed, shot, read)
+            deviation = variance_map(smoothed(exposed), shot, read).sqrt()
+        values: dict[str, Tensor] = {}
+        if isinstance(self.aperture.network, DefocusMap):
+            log_blur = self.aperture.network(denoised, deviation)
+            truth = torch.log(batch.defocus + LOG_OFFSET)
+            values["map"] = (log_blur - truth).abs().mean()
+            diameter = dead_zone(to_diameter(log_blur))
+            ratio = added_blur(
+                diameter, batch.f_source[:, None, None], batch.f_target[:, None, None]
+            )
+            output = DiscBank(denoised).blurred(ratio[:, None])
+        else:
+            output = self.aperture(denoised, deviation, batch.f_source, batch.f_target)
+        used = away_from_clipping(batch.source, batch.target)
+        error = (output - batch.target).abs() * used
+        before = (denoised - batch.target).abs() * used
+        # Per pair, so that bright ones do not outweigh the others; not below the noise.
+        unit = before.sum(dim=(1, 2, 3)) + (0.1 * deviation * used).sum(dim=(1, 2, 3)) + 1e-9
+        picture = (error.sum(dim=(1, 2, 3)) / unit).mean()
+        values["relative"] = error.detach().sum() / before.sum().clamp(min=1e-9)
+        return {"loss": picture + _MAP_WEIGHT * values.get("map", 0.0), **values}
+
+
+class BaselineLoss(nn.Module):
+    """L1 of a network that maps the source and both settings directly to the target."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, batch: Batch) -> dict[str, Tensor]:
+        """The loss on `batch`."""
+        output = self.network(batch.source, batch.parameters).float()
+        return {"loss": (output - batch.sample).abs().mean()}
+
+
+def expose(exposure: ExposureModule, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    """The exposed source, and the shot and read noise (B, 4) that it has there."""
+    ratio = (exposure.w * batch.ratio).detach()[:, None]
+    exposed = exposure(batch.source, batch.ratio).detach()
+    return exposed, batch.shot * ratio, batch.read * ratio.square()
+
+
+def away_from_clipping(source: Tensor, target: Tensor) -> Tensor:
+    """(B, 1, H, W) bool: no plane is clipped within 7 pixels, before or after."""
+    clipped = ((source > OVER_EXPOSED) | (target >= 1.0)).any(dim=1, keepdim=True).float()
+    near = F.max_pool2d(clipped, 2 * _CLIP_MARGIN + 1, stride=1, padding=_CLIP_MARGIN)
+    return near == 0

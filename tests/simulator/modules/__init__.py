@@ -1,0 +1,1 @@
+"""Tests of the project, in the folders of its packages."""
