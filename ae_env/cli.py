@@ -16,18 +16,19 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from ae_env.console import (
+    Device,
+    Seed,
+    command_line,
     console,
     make_folder,
-    parse_seconds,
     print_files,
     progress_bars,
-    save_picture,
     torch_device,
 )
+from ae_env.simulator_commands import simulate, sweep, train_simulator
 
 if TYPE_CHECKING:
     from agents.evaluation_result import EvaluationResult
-    from simulator.raw_image import RawImage
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -36,17 +37,17 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`.",
 )
-BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "throughput")
+BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "simulator", "throughput")
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
+#: Commands that go on where they were stopped.
+_RESUMING = ("quickstart", "train", "train-simulator", "bench")
 #: Exit status after Ctrl-C.
 _INTERRUPTED = 130
 
-Seed = Annotated[int, typer.Option(help="Seed of everything that is random.", min=0)]
 Scenes = Annotated[
     str, typer.Option(help="'bundled', or a folder or file of raws or .hdr/.exr radiance maps.")
 ]
-Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
 
 
 def main() -> None:
@@ -66,7 +67,9 @@ def main() -> None:
         raise SystemExit(2) from None
     except SystemExit as stop:
         if stop.code == _INTERRUPTED:  # what Typer makes of Ctrl-C
-            resumes = any(name in sys.argv[1:] for name in ("quickstart", "train", "bench"))
+            resumes = any(
+                name in sys.argv[1:] for name in ("quickstart", "train", "train-simulator", "bench")
+            )
             more = "; the same command goes on where it was" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
         raise
@@ -96,7 +99,7 @@ def quickstart(
     device = torch_device(device)
     with progress_bars() as progress:
         done = run_quickstart(
-            scenes, out, seed=seed, progress=progress, command=_command(), device=device
+            scenes, out, seed=seed, progress=progress, command=command_line(), device=device
         )
     if done.zero_shot:
         text = f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes"
@@ -108,78 +111,9 @@ def quickstart(
         console.print(f"  {line}", soft_wrap=True, highlight=False, markup=False)
 
 
-@app.command()
-def simulate(
-    raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
-    iso: Annotated[float, typer.Option(help="Target ISO speed.")],
-    shutter: Annotated[str, typer.Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
-    aperture: Annotated[float, typer.Option(help="Target f-number.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="DNG to write.")] = Path("out.dng"),
-    png: Annotated[Path | None, typer.Option(help="Also write the developed picture here.")] = None,
-    seed: Seed = 0,
-    device: Device = "auto",
-) -> None:
-    """Simulate one raw at other settings and write it as a DNG; prints the plan.
-
-    Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
-    """
-    from simulator import CameraSettings, CameraSimulator, read_raw, write_dng
-
-    settings = CameraSettings(iso, parse_seconds(shutter), aperture)
-    if out.suffix.lower() != ".dng":
-        raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
-    device = torch_device(device)
-    source = read_raw(raw)
-    if png is not None and png.suffix.lower() != ".png":
-        raise ValueError(f"`png` (={str(png)!r}) must end in .png")
-    for path in (out, png or out):
-        make_folder(path.parent)
-    simulator = CameraSimulator(device=device)
-    latent = simulator.prepare(source)
-    console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
-    console.print(str(latent.plan(settings)), highlight=False, soft_wrap=True)
-    result = simulator.simulate(source, settings, seed=seed)
-    write_dng(out, result)
-    files = {"DNG": out}
-    if png is not None:
-        files["PNG"] = _write_png(png, result)
-    print_files(files)
-
-
-@app.command()
-def sweep(
-    raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("sweep"),
-    dngs: Annotated[bool, typer.Option(help="Also write the 64 DNGs, full size.")] = False,
-    seed: Seed = 0,
-    device: Device = "auto",
-) -> None:
-    """All 64 exposure states of one raw as a contact sheet, coloured by score.
-
-    Example: `ae-env sweep IMG_0001.CRW --out sweep`
-    """
-    from ae_env.grid import ExposureGrid
-    from ae_env.rendering import contact_sheet
-    from ae_env.scenes import Scene
-    from simulator import CameraSimulator, read_raw, write_dng
-
-    device = torch_device(device)
-    source = read_raw(raw)
-    make_folder(out)
-    scene = Scene.from_raw(source, scene_id=raw.stem)
-    scene = scene.resized(min(128, *scene.light.shape[1:]))
-    sheet = out / "contact_sheet.png"
-    save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
-    files = {"contact sheet": sheet}
-    if dngs:
-        grid, simulator = ExposureGrid.default(), CameraSimulator(device=device)
-        with progress_bars() as progress, progress("DNGs") as task:
-            for i, settings in enumerate(grid):
-                path = out / f"{raw.stem}-{i:02d}.dng"
-                write_dng(path, simulator.simulate(source, settings, seed=seed))
-                task(i + 1, len(grid))
-        files["DNGs"] = out
-    print_files(files)
+app.command()(simulate)
+app.command()(sweep)
+app.command()(train_simulator)
 
 
 @app.command()
@@ -269,7 +203,7 @@ def evaluate(
                 seed=seed,
                 progress=task,
             )
-    files = write_report(result, out, command=_command(), source=scenes, split=split)
+    files = write_report(result, out, command=command_line(), source=scenes, split=split)
     _print_scores(result)
     print_files(files)
 
@@ -341,16 +275,3 @@ def _print_scores(result: EvaluationResult) -> None:
                 else:
                     values.add_row(*column)
             console.print(values)
-
-
-def _write_png(path: Path, raw: RawImage) -> Path:
-    from PIL import Image
-
-    from simulator import render_srgb
-
-    picture = render_srgb(raw).permute(1, 2, 0).cpu().numpy()
-    return save_picture(path, Image.fromarray(picture))
-
-
-def _command() -> str:
-    return shlex.join(["ae-env", *sys.argv[1:]])

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import io
+import shlex
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.console import Console
 
 from simulator.files import write_atomically
 
 console = Console()
+
+Seed = Annotated[int, typer.Option(help="Seed of everything that is random.", min=0)]
+Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
 
 
 @contextmanager
@@ -94,3 +100,8 @@ def torch_device(name: str) -> str:
     if name != "cpu" and not (cuda and name.partition(":")[0] == "cuda"):
         raise ValueError(f"`device` (={name!r}) must be auto, cpu{', cuda' if cuda else ''} here")
     return name
+
+
+def command_line() -> str:
+    """What the user typed, for result files."""
+    return shlex.join(["ae-env", *sys.argv[1:]])

@@ -6,6 +6,7 @@ happens here, so that the two cannot differ.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,7 @@ from simulator.capture import (
     add_noise,
     clip_and_quantise,
 )
+from simulator.modules.disc_bank import DIAMETERS
 from simulator.noise import noise_generator
 
 #: Share of the episodes in which nothing moves.
@@ -80,8 +82,17 @@ class EpisodeCore:
         self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
         self._bounds = np.array([[s.iso, s.exposure_time, s.f_number, s.ev100] for s in states])
         frame_bytes = 16 * options.resolution**2
-        kept = num_envs * (len(self.grid.f_numbers) + 1) * frame_bytes
-        self._keep_defocused = kept <= OPTICS_BYTES
+        self._keep_defocused = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
+
+    def _kept_frames(self) -> int:
+        """Blurred frames that an episode keeps at most."""
+        apertures = len(self.grid.f_numbers)
+        if (
+            self.options.depth == "unknown"
+        ):  # also what opens them: a bank of blurs, and its results
+            apertures += len(DIAMETERS) + apertures
+        as_recorded_and_denoised = 1 + any(s.denoised is not None for s in self.scenes)
+        return as_recorded_and_denoised * apertures + 1
 
     # -- spaces -------------------------------------------------------------------------------
 
@@ -123,9 +134,9 @@ class EpisodeCore:
         self.episodes[index] = Episode(
             scene=scene,
             state=self._chosen("state", options.get("state"), state, len(self.grid)),
-            speed=_fixed_or_drawn(self.options.motion, "none", float(drawn_speed)),
+            speed=_fixed_or_drawn(self.options.motion, float(drawn_speed)),
             defocus=_fixed_or_drawn(
-                self.options.depth, "far", float(np.clip(drawn_defocus, DEFOCUS_MIN, DEFOCUS_MAX))
+                self.options.depth, float(np.clip(drawn_defocus, DEFOCUS_MIN, DEFOCUS_MAX))
             ),
             phase=float(phase),
             noise_seed=noise_seed,
@@ -219,7 +230,7 @@ class EpisodeCore:
         settings = encode_settings(self._apex[[e.state for e in episodes]])
         observation = {"raw": raw, "settings": settings}
         if self.options.sensors:
-            speed, defocus = np.array([(e.speed, e.defocus) for e in episodes]).T
+            speed, defocus = np.array([(e.speed, self._focus_drive(e)) for e in episodes]).T
             observation["sensors"] = encode_sensors(speed, defocus, columns.pop("sensor_noise"))
         info = self._info(episodes) | columns | {"rewards": rewards}
         if self.options.with_oracle:
@@ -228,6 +239,11 @@ class EpisodeCore:
             info["oracle_state"] = np.array([t.oracle for t in tables])
             info["regret"] = best - [t.mean[e.state] for t, e in zip(tables, episodes, strict=True)]
         return Frames(observation, info, reward)
+
+    def _focus_drive(self, episode: Episode) -> float:
+        """Blur at f/4 [pixel of a 64-pixel frame]: what was drawn, or the scene's own."""
+        own = self.scenes[episode.scene].own_blur(4.0)
+        return math.hypot(episode.defocus, own * 64.0 / self.options.resolution)
 
     def _scores(self, parts: dict[str, np.ndarray], indices: Sequence[int]) -> np.ndarray:
         if self.options.reward == "expected":
@@ -287,7 +303,7 @@ class EpisodeCore:
             gain = self.gain(episode, state.exposure_time)
             latent = episode.latent(self.scenes[episode.scene], self.camera, gain)
             exposure = latent.exposure(state)
-            blurred = episode.blurred_light(latent.light, exposure, self._keep_defocused)
+            blurred = episode.blurred_light(latent, exposure, self._keep_defocused)
             torch.mul(blurred, exposure.ratio, out=light[i])
             exposures.append(exposure)
             gains.append(gain)
@@ -366,13 +382,16 @@ def _share(mask: np.ndarray) -> np.ndarray:
     return np.array([np.count_nonzero(image) for image in mask]) / mask[0].size
 
 
-def _fixed_or_drawn(option: str | float, off: str, drawn: float) -> float:
+def _fixed_or_drawn(option: str | float, drawn: float) -> float:
+    """`drawn` for ``"random"``, 0 for every other word, or the number itself."""
     if option == "random":
         return drawn
-    return 0.0 if option == off else float(option)
+    return 0.0 if isinstance(option, str) else float(option)
 
 
 def _modules(exposure: Exposure, noise: bool) -> str:
     names = ["exposure"]
+    names += ["noise_reduction"] * exposure.denoised
+    names += ["aperture"] * (exposure.opened_to is not None)
     names += ["defocus"] * (exposure.defocus_px > 0) + ["motion_blur"] * (exposure.motion_px > 0)
     return "+".join(names + ["noise"] * noise)

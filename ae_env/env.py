@@ -61,7 +61,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
     log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
     defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
-    in [0.1, 8]). `reset(options={"scene": id, "state": index, "frame": 0})` chooses.
+    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses.
 
     ## Episode End
 
@@ -81,10 +81,11 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | `resolution` | 64 | height and width R of the packed frame, >= 36 |
     | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |
     | `motion` | `"random"` | `"random"`, `"none"`, or a speed [frame heights/s] |
-    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), or a blur diameter at f/4 |
+    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4 |
     | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, or a mapping with options |
     | `delay` | 0 | frames between an action and the first capture that has it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
+    | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
     | `noise` | `True` | whether captures are noisy |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |

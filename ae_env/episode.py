@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,29 +46,34 @@ class Episode:
     table: tuple[float, ScoreTable] | None = None
     closed_parts: dict[str, np.ndarray] | None = None
     _latent: tuple[float, Latent] | None = None  # by gain
-    _defocused: dict[float, torch.Tensor] = field(default_factory=dict)  # by blur diameter
-    _blurred: tuple[tuple[float, float], torch.Tensor] | None = None  # by both blurs
+    _defocused: dict[tuple[Any, ...], torch.Tensor] = field(default_factory=dict)  # by aperture
+    _blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
 
     def latent(self, scene: Scene, camera: CameraProfile, gain: float) -> Latent:
         """What `camera` sees of the episode's `scene` at `gain` times its own light."""
-        if self._latent is None or self._latent[0] != gain:
+        if self._latent is None:
             latent = scene_latent(scene, camera, speed=self.speed, defocus=self.defocus, gain=gain)
             self._latent = (gain, latent)
+        elif self._latent[0] != gain:  # the light that its aperture has opened serves on
+            self._latent = (gain, replace(self._latent[1], gain=gain))
         return self._latent[1]
 
-    def blurred_light(self, light: torch.Tensor, exposure: Exposure, keep: bool) -> torch.Tensor:
-        """The scene's `light` (4, H, W) with the blur of `exposure`, before it is exposed.
+    def blurred_light(self, latent: Latent, exposure: Exposure, keep: bool) -> torch.Tensor:
+        """The light (4, H, W) of `latent` with the blur of `exposure`, before it is exposed.
 
         The latest one is kept, because an agent that has settled repeats it, and with `keep` also
         the defocused light of each f-number.
         """
-        key = (exposure.defocus_px, exposure.motion_px)
+        lens = (exposure.denoised, exposure.opened_to, exposure.defocus_px)
+        key = (*lens, exposure.motion_px)
         if self._blurred is not None and self._blurred[0] == key:
             return self._blurred[1]
-        defocused = self._defocused.get(exposure.defocus_px)
+        defocused = self._defocused.get(lens)
         if defocused is None:
-            defocused = defocused_light(light, exposure.defocus_px)
+            defocused = defocused_light(latent.source_light(exposure), exposure.defocus_px)
             if keep:
-                self._defocused[exposure.defocus_px] = defocused
+                self._defocused[lens] = defocused
+            elif latent.opening is not None:
+                self._latent = None  # it keeps the light of each f-number, too
         self._blurred = (key, motion_blur(defocused, exposure.motion_px))
         return self._blurred[1]

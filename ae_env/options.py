@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.networks import (
+    DEFAULT_SIMULATOR,
+    SceneNetworks,
+    check_weights,
+    without_noise,
+)
+from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, make_scorer
 from simulator.camera import CameraProfile, get_camera
 
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36
 COSTS = ("flicker", "switch")
+DEPTHS = ("random", "far", "unknown")
 
 
 @dataclass(frozen=True)
@@ -35,6 +43,7 @@ class EnvOptions:
     lighting: Any = "static"
     delay: int = 0
     camera: Any = "nikon_z6"
+    simulator: str | None = DEFAULT_SIMULATOR
     noise: bool = True
     reward: str = "capture"
     with_oracle: bool = False
@@ -53,12 +62,21 @@ class EnvOptions:
                 f"`resolution` (={self.resolution}) must be in [{MIN_RESOLUTION}, 4096]: the "
                 "default CNNs of RL libraries take no smaller image"
             )
-        for name, off in (("motion", "none"), ("depth", "far")):
+        for name, words in (("motion", ("random", "none")), ("depth", DEPTHS)):
             value = getattr(self, name)
             if isinstance(value, str):
-                _one_of(name, value, ("random", off))
+                _one_of(name, value, words)
             elif isinstance(value, bool) or not 0.0 <= float(value) < 1e3:
-                raise ValueError(f"`{name}` (={value!r}) must be 'random', {off!r} or in [0, 1000)")
+                raise ValueError(
+                    f"`{name}` (={value!r}) must be one of {list(words)} or in [0, 1000)"
+                )
+        if self.depth == "unknown" and self.simulator is None:
+            raise ValueError(
+                "`depth` (='unknown') needs the networks that find a scene's defocus: give "
+                f"`simulator`, such as {DEFAULT_SIMULATOR!r}"
+            )
+        if self.simulator is not None:
+            check_weights(self.simulator)
         if not _is_integer(self.delay) or not 0 <= self.delay <= 16:
             raise ValueError(f"`delay` (={self.delay!r}) must be an integer in [0, 16] frames")
         for name, weight in self.costs.items():
@@ -92,22 +110,45 @@ class EnvOptions:
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; kept for the next environment like this."""
         camera = self.make_camera()
-        key = (repr(self.scenes), self.split, camera.name, self.resolution, self.crop)
+        finds_defocus = self.depth == "unknown"
+        key = (
+            repr(self.scenes),
+            self.split,
+            camera.name,
+            self.resolution,
+            self.crop,
+            finds_defocus,
+        )
         by_name = isinstance(self.scenes, str) and ":" not in self.scenes.removeprefix("bundled:")
-        if by_name and key in _LOADED:
+        # Weights in a file of one's own may be others next time.
+        kept = by_name and (not finds_defocus or self.simulator == DEFAULT_SIMULATOR)
+        if kept and key in _LOADED:
             return _LOADED[key]
+        networks = None if self.simulator is None else SceneNetworks(self.simulator)
+        resize: Resize = Scene.resized
+        if networks is not None and finds_defocus:
+            resize = networks.resized
         scenes = load_scenes(
             self.scenes,
             self.split,  # type: ignore[arg-type]
             camera=camera,
             resolution=self.resolution,
             crop=self.crop,  # type: ignore[arg-type]
+            resize=resize,
         )
         if not scenes:
             raise ValueError(f"`scenes` (={self.scenes!r}) has none in split {self.split!r}")
-        if by_name and self.scenes.startswith("bundled"):
+        scenes = [self._prepared(scene, networks) for scene in scenes]
+        if kept and self.scenes.startswith("bundled"):
             _LOADED[key] = scenes
         return scenes
+
+    def _prepared(self, scene: Scene, networks: SceneNetworks | None) -> Scene:
+        if self.depth != "unknown" and scene.defocus_map is not None:
+            scene = replace(scene, defocus_map=None)
+        if networks is not None:
+            scene = networks.denoised(scene)
+        return scene if self.noise else without_noise(scene)
 
 
 _LOADED: dict[tuple[Any, ...], list[Scene]] = {}

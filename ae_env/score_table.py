@@ -12,7 +12,7 @@ import io
 import json
 import logging
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,14 +82,9 @@ def scene_latent(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
         gain: Light relative to the scene's own.
     """
-    return Latent(
-        light=scene.light,
-        reference=scene.reference,
+    return replace(
+        scene.latent,
         camera=camera,
-        nlf=scene.nlf,
-        saturated=scene.saturated,
-        white_balance=scene.white_balance,
-        box_factor=scene.box_factor,
         image_speed=speed,
         defocus=defocus * scene.light.shape[-2] / 64.0,
         gain=gain,
@@ -115,17 +110,19 @@ def describe_captures(
         speed: (B,) image speed [frame heights per second].
         defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
         gain: (B,) light relative to the scenes' own.
-        light: (B, 4, H, W) the scenes' light where it is at hand already.
+        light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
     openings = np.array([4.0 / s.effective_f_number for s in settings])
     blur = np.hypot(speed * times * height, defocus * openings * height / 64.0)
+    own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
+    blur = np.hypot(blur, own)  # exactly `blur` where they are 0
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
     return Captures(
         settings=settings,
         scene_ids=[c.scene_id for c in scenes],
-        scene_light=torch.stack([c.light for c in scenes]) if light is None else light,
+        scene_light=torch.stack([c.clean_light for c in scenes]) if light is None else light,
         ratio=torch.from_numpy(np.array(ratios) * gain),
         nlf=[camera.nlf(s.iso) for s in settings],
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
@@ -241,7 +238,7 @@ class ScoreTables:
             speed=np.full(count, speed),
             defocus=np.full(count, defocus),
             gain=np.full(count, gain),
-            light=scene.light.expand(count, -1, -1, -1),
+            light=scene.clean_light.expand(count, -1, -1, -1),
         )
 
     def _samples(
@@ -284,6 +281,10 @@ class ScoreTables:
             scene.white_balance,
             scene.camera.colour_matrix,
         ]
+        for name in ("denoised", "defocus_map"):  # older tables of scenes without stay valid
+            found: torch.Tensor | None = getattr(scene, name)
+            if found is not None:
+                description += [name, hashlib.sha256(found.numpy().tobytes()).hexdigest()]
         digest.update(json.dumps(description).encode())
         return cache_dir() / "score_tables" / f"{digest.hexdigest()[:32]}.npz"
 

@@ -92,6 +92,23 @@ def load(folder: Path, scene: str, milliseconds: int) -> tuple[RawImage, float]:
     return RawImage.from_mosaic(linear, settings(milliseconds), CAMERA), taken
 
 
+def load_pairs(folder: Path, scene: str) -> tuple[list[Pair], dict[str, Any]]:
+    """Every transition from and to 1 ms, and the blind noise estimates of green.
+
+    Args:
+        folder: Of the data set.
+        scene: One of `SCENES`.
+    """
+    loaded = {t: load(folder, scene, t) for t in TIMES_MS}
+    frames, estimates = calibrated({t: raw for t, (raw, _) in loaded.items()})
+    steps = [(1, t) for t in TIMES_MS[1:]] + [(t, 1) for t in TIMES_MS[1:]]
+    pairs = []
+    for source, target in steps:
+        apart = abs(loaded[source][1] - loaded[target][1])
+        pairs.append(Pair(scene, source, target, frames[source], frames[target], apart))
+    return pairs, estimates
+
+
 def calibrated(frames: dict[int, RawImage]) -> tuple[dict[int, RawImage], dict[str, Any]]:
     """The frames of one gain with one NLF: the median of their blind estimates."""
     estimates = [estimate_nlf(frame.data) for frame in frames.values()]
@@ -335,16 +352,13 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     rows: list[dict[str, Any]] = []
     estimates: dict[str, Any] = {}
     for scene in list(SCENES)[: 1 if quick else None]:
-        loaded = {t: load(folder, scene, t) for t in TIMES_MS}
-        frames, estimates[scene] = calibrated({t: raw for t, (raw, _) in loaded.items()})
+        pairs, estimates[scene] = load_pairs(folder, scene)
+        frames = {pair.source_ms: pair.source for pair in pairs}
         rows += ratio_rows(scene, frames)
-        steps = [(1, t) for t in TIMES_MS[1:]] + [(t, 1) for t in TIMES_MS[1:]]
-        for source, target in steps:
-            apart = abs(loaded[source][1] - loaded[target][1])
-            pair = Pair(scene, source, target, frames[source], frames[target], apart)
+        for pair in pairs:
             rows += transition_rows(pair, 1 if quick else REPEATS, seed)
-            best = rows[-5]
-            print(f"{scene}: {source} -> {target} ms: {best['psnr_db']} dB, {best['ms']} ms")
+            best, step = rows[-5], f"{pair.source_ms} -> {pair.target_ms} ms"
+            print(f"{scene}: {step}: {best['psnr_db']} dB, {best['ms']} ms")
     meta = result_meta("ae-env bench brackets" + (" --quick" if quick else ""), seed)
     meta["blind_nlf_of_green"] = {"exposure_ms": list(TIMES_MS), **estimates}
     meta["frame"] = list(frames[1].data.shape)

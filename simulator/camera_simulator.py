@@ -156,8 +156,10 @@ class CameraSimulator:
             latent = replace(latent, image_speed=image_speed)
         if defocus is not None:
             latent = replace(latent, defocus=defocus)
-        if not self.exposure.is_identity:
-            latent = replace(latent, light=self.exposure(latent.light, 1.0))
+        # A latent may come from here, corrected already; a scene is no recording of this body.
+        if isinstance(source, RawImage) and not self.exposure.is_identity:
+            noise = latent.nlf.exposed(float(self.exposure.w))
+            latent = replace(latent, light=self.exposure(latent.light, 1.0), nlf=noise)
         if self.noise is not None and latent.denoised is None and not latent.nlf.is_zero:
             latent = replace(latent, denoised=self.denoise(latent))
         if depth == "unknown":
@@ -192,8 +194,8 @@ class CameraSimulator:
     def denoise(self, latent: Latent) -> torch.Tensor:
         """The latent's light (4, H, W) with little noise.
 
-        The result serves every exposure: the compact network commutes with exposure, and the
-        paper's does after its scaling by one number from the metadata.
+        The result serves every exposure: the compact network commutes with exposure. The paper's
+        does not; it is run at the exposure of the source.
 
         Raises:
             ValueError: If this simulator has no noise module.

@@ -14,12 +14,10 @@ from simulator.camera import CameraProfile, NoiseLevelFunction
 from simulator.capture import Exposure, add_noise, clip_and_quantise, sensor_light
 from simulator.noise import noise_generator
 from simulator.opening import NEGLIGIBLE_ADDED_BLUR, Opening
-from simulator.plan import SimulationPlan, make_plan
+from simulator.plan import NEGLIGIBLE_BLUR, SimulationPlan, make_plan
 from simulator.raw_image import check_packed
 from simulator.settings import CameraSettings, exposure_ratio
 
-#: Blur below this extent [pixel] changes nothing that a digital number could show.
-NEGLIGIBLE_BLUR = 1e-3
 #: Noise variance in excess of the target's, relative to it, from which the source is denoised.
 TOLERATED_EXCESS = 0.01
 #: Quantiles of the light at which a source's noise is compared with a target's.
@@ -90,24 +88,36 @@ class Latent:
         defocus_px = self.defocus * 4.0 / f_number
         ratio = self.gain * exposure_ratio(self.reference, settings)
         target = _averaged_nlf(self.camera, settings.iso, self.box_factor)
-        opening = self.opening
-        opens = opening is not None and opening.extent(f_number) > NEGLIGIBLE_ADDED_BLUR
-        denoise = self.denoised is not None and (
-            (opens and opening is not None and opening.needs_denoised)
-            or self._excess(ratio, target) > TOLERATED_EXCESS
-        )
+        opened_to = self._opened_to(f_number)
+        denoised = self._needs_denoising(ratio, target, opened_to)
+        remaining = None
+        if opened_to is not None and self.opening is not None and not denoised:
+            remaining = None if self.nlf.is_zero else self.opening.remaining(opened_to)
         return Exposure(
             ratio=ratio,
-            source=NoiseLevelFunction.zero() if denoise else self.nlf,
+            source=NoiseLevelFunction.zero() if denoised else self.nlf,
             target=target,
             motion_px=motion_px if motion_px > NEGLIGIBLE_BLUR else 0.0,
             defocus_px=defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0,
-            denoised=denoise,
-            opened_to=f_number if opens else None,
-            remaining=opening.remaining(f_number)
-            if opens and not denoise and opening is not None and not self.nlf.is_zero
-            else None,
+            denoised=denoised,
+            opened_to=opened_to,
+            remaining=remaining,
         )
+
+    def _opened_to(self, f_number: float) -> float | None:
+        """`f_number` where it blurs more than the reference's aperture did, else None."""
+        if self.opening is None or self.opening.extent(f_number) <= NEGLIGIBLE_ADDED_BLUR:
+            return None
+        return f_number
+
+    def _needs_denoising(
+        self, ratio: float, target: NoiseLevelFunction, opened_to: float | None
+    ) -> bool:
+        if self.denoised is None:
+            return False
+        if opened_to is not None and self.opening is not None and self.opening.needs_denoised:
+            return True
+        return self._excess(ratio, target) > TOLERATED_EXCESS
 
     @cached_property
     def _levels(self) -> torch.Tensor:

@@ -15,6 +15,8 @@ from simulator.settings import CameraSettings
 if TYPE_CHECKING:
     from simulator.latent import Latent
 
+#: Blur below this extent [pixel] changes nothing that a digital number could show.
+NEGLIGIBLE_BLUR = 1e-3
 _EXPOSE_OPERATIONS = 2
 _NOISE_OPERATIONS = 14
 _CLIP_OPERATIONS = 6
@@ -107,13 +109,15 @@ def _steps(
         ),
         "defocus": (
             taps * 2 * pixels * (exposure.defocus_px > 0),
-            "no uniform defocus is given" if latent.defocus == 0 else "the disc is below a pixel",
+            "the scene is taken as far or in focus throughout"
+            if latent.defocus == 0
+            else f"the defocus disc is below {NEGLIGIBLE_BLUR} pixel",
         ),
         "motion_blur": (
             _STREAK_OPERATIONS * pixels * (exposure.motion_px > 0),
             "the image does not move"
             if latent.image_speed == 0
-            else "the image moves less than a pixel during the exposure",
+            else f"the image moves less than {NEGLIGIBLE_BLUR} pixel during the exposure",
         ),
         "noise": (
             _NOISE_OPERATIONS * pixels * lacks_noise,
@@ -133,5 +137,5 @@ def _why_not_denoised(latent: Latent) -> str:
 
 def _why_not_opened(latent: Latent) -> str:
     if latent.opening is None:
-        return "the scene is taken as far or in focus throughout"
+        return "no defocus was estimated: `depth` is not 'unknown'"
     return "the aperture does not open, or nothing is defocused enough to show it"

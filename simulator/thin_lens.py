@@ -11,7 +11,6 @@ aperture, it sees past an edge, and the surface behind it is continued under the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
@@ -27,6 +26,9 @@ _Length = TypeVar("_Length", float, np.ndarray, torch.Tensor)
 SHARP = 0.1
 #: Below this share of the aperture a gap is the rounding of blurs to layers, not an edge.
 _GAP = 0.02
+#: A surface is clearly farther, with an edge between, from this step of blur [px] on, to which a
+#: share of the nearer surface's blur is added: a slope is no edge.
+_STEP, _STEP_SHARE = 0.5, 0.25
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,10 @@ class Lens:
 
 class _Layers(NamedTuple):
     number: np.ndarray  # (H, W) which layer a pixel belongs to, 0 is the nearest
-    diameters: Sequence[float]  # px, unsigned, one per layer
-    num_in_front: int  # layers in front of the plane in focus
+    diameters: np.ndarray  # (L,) signed [px], ascending
+
+    def radius(self, layer: int) -> int:
+        return disc_kernel(abs(float(self.diameters[layer]))).shape[0] // 2
 
 
 def _cut(diameter: np.ndarray) -> _Layers:
@@ -96,7 +100,7 @@ def _cut(diameter: np.ndarray) -> _Layers:
     number = number.reshape(diameter.shape)
     squares = np.bincount(number.ravel(), extent.ravel() ** 2)
     means = np.sqrt(squares / np.bincount(number.ravel()))
-    return _Layers(number, np.where(names == 0, 0.0, means).tolist(), int((names < 0).sum()))
+    return _Layers(number, np.sign(names) * means)
 
 
 def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
@@ -113,17 +117,16 @@ def defocus(light: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
     """
     layers = _cut(diameter.detach().cpu().double().numpy())
     if len(layers.diameters) == 1:
-        return disc_blur(light, layers.diameters[0])
+        return disc_blur(light, abs(float(layers.diameters[0])))
     canvas = _Canvas(light)
-    number = torch.from_numpy(layers.number).to(light.device)
-    for layer, blur in enumerate(layers.diameters):
-        if layer == layers.num_in_front:
+    in_focus = int(np.searchsorted(layers.diameters, 0.0))
+    for layer, blur in enumerate(layers.diameters.tolist()):
+        if layer == in_focus:
             canvas.pass_focus()
-        box = _grown_box(layers.number == layer, _radius(blur))
-        mask = (number[box] == layer).to(light.dtype)
-        canvas.paint(box, mask, light[:, *box], blur)
-    for layer in reversed(range(1, len(layers.diameters))):
-        _continue_under(canvas, light, layers, layer)
+        mask = layers.number == layer
+        box = _grown_box(mask, layers.radius(layer))
+        canvas.paint(box, mask[box], light[:, *box], blur)
+    _continue_behind(canvas, light, layers)
     return canvas.light / canvas.covered
 
 
@@ -146,10 +149,11 @@ class _Canvas:
         self.beyond = (1.0 - self.covered).clamp(min=0.0)
 
     def paint(
-        self, box: tuple[slice, slice], mask: torch.Tensor, light: torch.Tensor, diameter: float
+        self, box: tuple[slice, slice], mask: np.ndarray, light: torch.Tensor, diameter: float
     ) -> None:
         """Adds `light` (C, h, w) of the pixels in `mask` (h, w), where the aperture is free."""
-        blurred = disc_blur(torch.cat([mask[None], mask * light]), diameter)
+        own = torch.from_numpy(mask).to(light)
+        blurred = disc_blur(torch.cat([own[None], own * light]), abs(diameter))
         share = blurred[0].clamp(min=0.0) * self.beyond[box]
         passed = torch.minimum(share, (1.0 - self.covered[box]).clamp(min=0.0))
         part = passed / blurred[0].clamp(min=torch.finfo(share.dtype).tiny)
@@ -157,29 +161,30 @@ class _Canvas:
         self.covered[box] += passed
 
 
-def _continue_under(canvas: _Canvas, light: torch.Tensor, layers: _Layers, layer: int) -> None:
-    """Paints the continuation of `layer` under nearer ones into the gaps around it.
+def _continue_behind(canvas: _Canvas, light: torch.Tensor, layers: _Layers) -> None:
+    """Paints into the gaps at edges what the edges hide.
 
-    A hidden pixel shows what the nearest pixel shows that nothing hides from this layer's depth.
+    Behind a pixel lies the surface of the nearest pixel that is clearly farther.
     """
-    blur = layers.diameters[layer]
-    reach = _radius(blur) + _radius(max(layers.diameters[:layer]))
-    around = _grown_box(layers.number == layer, reach)
-    if not bool((canvas.covered[around] < 1.0 - _GAP).any()):
-        return
-    box = _grown_box(layers.number == layer, 2 * reach)  # rivals for a pixel within reach
-    number = layers.number[box]
-    distance, (row, column) = distance_transform_edt(number < layer, return_indices=True)
-    hidden = (distance > 0) & (distance <= reach) & (number[row, column] == layer)
-    if not hidden.any():
-        return
-    mask = torch.from_numpy(hidden).to(light)
-    rows, columns = (torch.from_numpy(i).long().to(light.device) for i in (row, column))
-    canvas.paint(box, mask, light[:, *box][:, rows, columns], blur)
-
-
-def _radius(diameter: float) -> int:
-    return disc_kernel(diameter).shape[0] // 2
+    owner = np.full(layers.number.shape, -1)  # layer of the surface behind a pixel
+    rows, columns = np.zeros_like(owner), np.zeros_like(owner)  # the pixel that shows it
+    widest = max(map(layers.radius, range(len(layers.diameters))))
+    for layer, blur in enumerate(layers.diameters[:-1]):
+        reach = layers.radius(layer) + widest
+        box = _grown_box(layers.number == layer, reach)
+        farther = layers.diameters[layers.number[box]] > blur + _STEP + _STEP_SHARE * abs(blur)
+        if not (farther.any() and bool((canvas.covered[box] < 1.0 - _GAP).any())):
+            continue
+        distance, (row, column) = distance_transform_edt(~farther, return_indices=True)
+        hiding = (layers.number[box] == layer) & (distance <= reach)
+        row, column = row[hiding] + box[0].start, column[hiding] + box[1].start
+        owner[box][hiding] = layers.number[row, column]
+        rows[box][hiding], columns[box][hiding] = row, column
+    for layer in np.unique(owner[owner >= 0]).tolist():
+        mask = owner == layer
+        box = _grown_box(mask, layers.radius(layer))
+        row, column = (torch.from_numpy(i[box]).to(light.device) for i in (rows, columns))
+        canvas.paint(box, mask[box], light[:, row, column], float(layers.diameters[layer]))
 
 
 def _grown_box(mask: np.ndarray, margin: int) -> tuple[slice, slice]:

@@ -15,6 +15,7 @@ from safetensors.torch import load, save
 from torch import nn
 
 from simulator.files import sibling, write_atomically
+from simulator.modules.build import PRESETS, build_modules
 
 #: Bumped when the networks change such that older weights no longer fit.
 FORMAT_VERSION = 1
@@ -23,7 +24,10 @@ FORMAT_VERSION = 1
 def list_pretrained() -> list[str]:
     """Names of the weights that come with the package."""
     folder = resources.files("simulator").joinpath("pretrained")
-    return sorted(f.name.removesuffix(".json") for f in folder.iterdir() if f.name.endswith("json"))
+    if not folder.is_dir():
+        return []
+    files = [f.name for f in folder.iterdir()]
+    return sorted(name.removesuffix(".json") for name in files if name.endswith(".json"))
 
 
 def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, Any]) -> None:
@@ -32,7 +36,7 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
     Args:
         path: File name, with or without one of the two endings.
         modules: Their state is stored.
-        preset: What `simulator.training.train.build_modules` makes them from.
+        preset: What `simulator.modules.build.build_modules` makes them from.
         card: JSON values: how they were trained and what they score.
     """
     content = save({k: v.detach().cpu().contiguous() for k, v in modules.state_dict().items()})
@@ -57,8 +61,6 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
         ValueError: If there is no such file, its hash is not the card's, or its tensors are not
             those of the preset's networks.
     """
-    from simulator.training.train import build_modules
-
     folder = resources.files("simulator").joinpath("pretrained")
     known = list_pretrained()
     if str(name) in known:
@@ -100,6 +102,6 @@ def _checked_card(text: str, content: bytes, name: str | Path) -> dict[str, Any]
             f"`weights` (={str(name)!r}): the hash of the .safetensors (={digest[:12]}...) must be "
             f"the model card's (={str(card.get('sha256'))[:12]}...); the file is damaged or another"
         )
-    if card.get("preset") not in ("compact", "paper", "pc", "dl"):
+    if card.get("preset") not in PRESETS:
         raise ValueError(f"`weights` (={str(name)!r}): unknown preset {card.get('preset')!r}")
     return card

@@ -20,7 +20,7 @@ from ae_env.scenes.grouping import (
     split_groups,
 )
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
-from ae_env.scenes.scene import Crop, Scene
+from ae_env.scenes.scene import Crop, Resize, Scene
 from simulator.camera import CameraProfile
 from simulator.raw_file import read_raw
 
@@ -113,11 +113,21 @@ def folder_scenes(
     resolution: int | None = 64,
     crop: Crop = "box",
     options: FolderOptions | None = None,
+    resize: Resize = Scene.resized,
 ) -> list[Scene]:
     """The scenes of `split` among the user's files.
 
     The source group of a file is, in this order: what ``groups.csv`` beside it says; its sub-folder
     under `spec`; for a radiance map the file itself; for a raw what `group_shots` finds.
+
+    Args:
+        spec: See `find_files`.
+        split: ``"train"``, ``"test"`` or ``"all"``.
+        camera: Whose colours the light of radiance maps is taken to.
+        resolution: Packed pixels a side; None keeps each scene's own size.
+        crop: See `Scene.resized`.
+        options: What the caller knows about the files.
+        resize: Brings each scene to `resolution`, before the next file is read.
 
     Raises:
         ValueError: If a file cannot be read (the message names it), or `split` is ``"train"`` and
@@ -142,12 +152,12 @@ def folder_scenes(
         try:
             if raw_file:
                 scene, shot = _raw_scene(path, name, group, fields)
-                scenes.append(scene.resized(resolution, crop))
+                scenes.append(resize(scene, resolution, crop))
                 if path.parent == base and path.resolve() not in named:
                     shots[name] = shot
             else:
                 fields |= {"name": name, "group": group, "resolution": resolution, "crop": crop}
-                scenes += radiance_scenes(path, camera, **fields)
+                scenes += radiance_scenes(path, camera, resize=resize, **fields)
         except ValueError as error:
             raise ValueError(f"scene file {str(path)!r}: {error}") from error
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from ae_env.scenes.bundled import Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes
-from ae_env.scenes.scene import Crop, Scene
+from ae_env.scenes.scene import Crop, Resize, Scene
 from simulator.camera import CameraProfile
 
 #: Names of the scenes that come with the package.
@@ -32,6 +32,7 @@ def load_scenes(
     camera: CameraProfile,
     resolution: int | None = 64,
     crop: Crop = "box",
+    resize: Resize = Scene.resized,
 ) -> list[Scene]:
     """The scenes that `spec` names, of one split, all at one resolution.
 
@@ -53,6 +54,8 @@ def load_scenes(
             camera.
         resolution: Packed pixels a side; None keeps each scene's own size.
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
+        resize: Called with each scene at its finest resolution, `resolution` and `crop`; see
+            `SceneNetworks.resized` for another than the default.
 
     Returns:
         At least one scene, in a stable order, with unique ids.
@@ -65,13 +68,13 @@ def load_scenes(
         raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
     if isinstance(spec, Mapping):
         path, options = _options(spec)
-        scenes = folder_scenes(path, split, camera, resolution, crop, options)
+        scenes = folder_scenes(path, split, camera, resolution, crop, options, resize)
     elif isinstance(spec, Path):
-        scenes = folder_scenes(spec, split, camera, resolution, crop)
+        scenes = folder_scenes(spec, split, camera, resolution, crop, resize=resize)
     elif isinstance(spec, str):
-        scenes = _by_name(spec, split, camera, resolution, crop)
+        scenes = _by_name(spec, split, camera, resolution, crop, resize)
     elif isinstance(spec, Sequence):
-        scenes = _checked(spec, "scenes", resolution, crop)
+        scenes = [resize(s, resolution, crop) for s in _checked(spec, "scenes")]
     else:
         raise ValueError(
             f"`scenes` (={spec!r}) must be a name, a path, a mapping or a list of Scene"
@@ -81,21 +84,30 @@ def load_scenes(
 
 
 def _by_name(
-    spec: str, split: Split, camera: CameraProfile, resolution: int | None, crop: Crop
+    spec: str,
+    split: Split,
+    camera: CameraProfile,
+    resolution: int | None,
+    crop: Crop,
+    resize: Resize,
 ) -> list[Scene]:
     if spec in BUNDLED:
-        return bundled_scenes(split, camera, resolution, crop, size=BUNDLED[spec])
+        if resize is Scene.resized:
+            return bundled_scenes(split, camera, resolution, crop, size=BUNDLED[spec])
+        finest = bundled_scenes(split, camera, None, size=BUNDLED[spec])
+        return [resize(scene, resolution, crop) for scene in finest]
     if not Path(spec).expanduser().exists():
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             known = {"split": split, "camera": camera, "resolution": resolution}
-            return _checked(_attribute(spec, known), spec, resolution, crop)
+            found = _checked(_attribute(spec, known), spec)
+            return [resize(scene, resolution, crop) for scene in found]
         near = difflib.get_close_matches(spec, BUNDLED, n=1, cutoff=0.7)
         if near:
             raise ValueError(
                 f"`scenes` (={spec!r}) must be one of {list(BUNDLED)}, an existing file, folder or "
                 f"glob, or 'pkg.mod:attr'; did you mean {near[0]!r}?"
             )
-    return folder_scenes(spec, split, camera, resolution, crop)
+    return folder_scenes(spec, split, camera, resolution, crop, resize=resize)
 
 
 def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
@@ -136,7 +148,7 @@ def _attribute(spec: str, known: Mapping[str, Any]) -> Any:
     return value(**{name: given for name, given in known.items() if name in parameters})
 
 
-def _checked(spec: Any, name: str, resolution: int | None, crop: Crop) -> list[Scene]:
+def _checked(spec: Any, name: str) -> Sequence[Scene]:
     if isinstance(spec, str | bytes) or not isinstance(spec, Sequence):
         raise ValueError(
             f"`scenes` (={name!r}) must give a list of Scene, not {type(spec).__name__}"
@@ -144,7 +156,7 @@ def _checked(spec: Any, name: str, resolution: int | None, crop: Crop) -> list[S
     for i, scene in enumerate(spec):
         if not isinstance(scene, Scene):
             raise ValueError(f"{name}[{i}] (={type(scene).__name__}) must be a Scene")
-    return [scene.resized(resolution, crop) for scene in spec]
+    return spec
 
 
 def _check_result(scenes: Sequence[Scene], spec: object, split: str) -> None:

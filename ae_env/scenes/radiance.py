@@ -18,8 +18,9 @@ import numpy as np
 import torch
 
 from ae_env.scenes.colour import camera_from_srgb
+from ae_env.scenes.light_scale import mean_anchor
 from ae_env.scenes.procedural import NATIVE_SIZE
-from ae_env.scenes.scene import Crop, Scene, mean_anchor
+from ae_env.scenes.scene import Crop, Resize, Scene
 from simulator.camera import CameraProfile
 
 logger = logging.getLogger(__name__)
@@ -70,6 +71,7 @@ def radiance_scenes(
     resolution: int | None = 64,
     crop: Crop = "box",
     ev100: float | None = None,
+    resize: Resize = Scene.resized,
     **fields: Any,
 ) -> Iterator[Scene]:
     """The scenes of one radiance map, all in one source group.
@@ -87,6 +89,7 @@ def radiance_scenes(
         crop: See `Scene.resized`.
         ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
             their relative brightness), if known; see `assumed_ev100`.
+        resize: Brings each view to `resolution`.
         **fields: Further arguments of `Scene.from_radiance`.
     """
     image = read_radiance(path)
@@ -112,7 +115,7 @@ def radiance_scenes(
             scene = Scene.from_radiance(view, camera, scene_id=scene_id, group=group, **fields)
         except ValueError as error:
             raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
-        yield scene.resized(resolution, crop)
+        yield resize(scene, resolution, crop)
 
 
 def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -11,33 +12,21 @@ import numpy as np
 import torch
 
 from ae_env.scenes.colour import camera_from_srgb
+from ae_env.scenes.light_scale import WHITE_SIGNAL, mean_anchor, reference_settings
 from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.latent import Latent
+from simulator.opening import MapOpening
 from simulator.raw_image import RawImage, check_packed
-from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
+from simulator.settings import CameraSettings, incident_ev100
 
-#: Signal of a perfectly white diffuse surface at the incident-light exposure, ``x = 0.663 * R``.
-#: Luminance R E / pi in ISO 12232's ``x = 100 L t / (120 N^2)`` with ``E = 2.5 * 2**EV100``.
-WHITE_SIGNAL = 100.0 * LUX_AT_EV0 / (SATURATION_CONSTANT * math.pi)
-#: Mean of green, clipped at white, that a scene of unknown light is anchored to.
-MEAN_SIGNAL = 0.12
-#: f-number and ISO of the reference settings made here; the exposure time carries the EV.
-_REFERENCE_ISO, _REFERENCE_F_NUMBER = 100.0, 4.0
 #: EV100 of a radiance map of unknown scale, unless the caller knows better.
 DEFAULT_EV100 = 10.0
 #: Median image speed of a moving episode [frame heights / s].
 DEFAULT_SPEED = 0.125
 
 Crop = Literal["box", "native"]
-
-
-def reference_settings(ev100: float) -> CameraSettings:
-    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`.
-
-    >>> reference_settings(10.0)
-    CameraSettings(iso=100.0, exposure_time=0.015625, f_number=4.0)
-    """
-    unit = CameraSettings(_REFERENCE_ISO, 1.0, _REFERENCE_F_NUMBER)
-    return replace(unit, exposure_time=2.0 ** (-unit.log2_exposure - ev100))
+#: Brings a scene to a resolution by a crop, as `Scene.resized` does.
+Resize = Callable[["Scene", int | None, Crop], "Scene"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +53,10 @@ class Scene:
         source: Provenance and licence in one line.
         saturated: (H, W) bool, pixels whose light is only a lower bound because the source raw
             was saturated there; None if there are none.
+        denoised: (4, H, W) `light` with its noise removed by a noise module; None where there is
+            no noise, or no such module.
+        defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
+            scene whose own defocus is to grow as the aperture opens; None takes it as far.
 
     Raises:
         ValueError: If a value has the wrong shape or lies outside its range.
@@ -83,6 +76,8 @@ class Scene:
     box_factor: int = 1
     source: str = ""
     saturated: torch.Tensor | None = None
+    denoised: torch.Tensor | None = None
+    defocus_map: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         for name in ("scene_id", "group", "kind"):
@@ -100,6 +95,7 @@ class Scene:
         if self.box_factor < 1:
             raise ValueError(f"`box_factor` (={self.box_factor}) must be at least 1")
         self._check_saturated()
+        self._check_networks()
 
     def _check_saturated(self) -> None:
         mask = self.saturated
@@ -113,10 +109,69 @@ class Scene:
         if not bool(mask.any()):
             object.__setattr__(self, "saturated", None)
 
+    def _check_networks(self) -> None:
+        size, found = self.light.shape[1:], self.defocus_map
+        if self.denoised is not None:
+            object.__setattr__(self, "denoised", check_packed("denoised", self.denoised))
+            if self.denoised.shape[1:] != size:
+                raise ValueError(
+                    f"`denoised` (shape {tuple(self.denoised.shape)}) must be of the shape of "
+                    f"`light`, {tuple(self.light.shape)}"
+                )
+        if found is not None:
+            if found.shape != size or not bool(torch.isfinite(found).all() & (found >= 0).all()):
+                raise ValueError(
+                    f"`defocus_map` (shape {tuple(found.shape)}) must be finite, >= 0 and of shape "
+                    f"{tuple(size)}"
+                )
+            object.__setattr__(self, "defocus_map", found.float())
+
     @property
     def noise_free(self) -> bool:
         """Whether no noise is left in `light`."""
-        return not any((*self.nlf.shot, *self.nlf.read))
+        return self.nlf.is_zero
+
+    @property
+    def clean_light(self) -> torch.Tensor:
+        """(4, H, W) the light as free of noise as it is known: `denoised`, or else `light`."""
+        return self.light if self.denoised is None else self.denoised
+
+    @property
+    def latent(self) -> Latent:
+        """The light, ready to be exposed: at rest, by the scene's own camera."""
+        opening = None
+        if self.defocus_map is not None:
+            f_number = self.reference.effective_f_number
+            opening = MapOpening(self.light, self.clean_light, self.defocus_map, f_number)
+        return Latent(
+            light=self.light,
+            reference=self.reference,
+            camera=self.camera,
+            nlf=self.nlf,
+            saturated=self.saturated,
+            white_balance=self.white_balance,
+            box_factor=self.box_factor,
+            denoised=self.denoised,
+            opening=opening,
+        )
+
+    def own_blur(self, f_number: float) -> float:
+        """Root mean square of the scene's own circle of confusion at `f_number` [pixel].
+
+        It grows as the aperture opens; a smaller aperture than the reference's leaves its blur. 0
+        without a `defocus_map`.
+
+        Args:
+            f_number: Effective f-number.
+        """
+        if self.defocus_map is None:
+            return 0.0
+        return self._own_blur * max(1.0, self.reference.effective_f_number / f_number)
+
+    @cached_property
+    def _own_blur(self) -> float:
+        assert self.defocus_map is not None
+        return float(self.defocus_map.double().square().mean().sqrt())
 
     @cached_property
     def ev100(self) -> float:
@@ -275,7 +330,8 @@ class Scene:
 
         Returns:
             The scene with ``nlf / k**2`` and ``box_factor * k``; a pixel counts as saturated if
-            any pixel averaged into it was.
+            any pixel averaged into it was. `defocus_map` is the root of the mean square, as second
+            moments add, divided by k: in pixels of the new light.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
@@ -298,16 +354,22 @@ class Scene:
         top, left = (height - k * resolution) // 2, (width - k * resolution) // 2
         window = (slice(top, top + k * resolution), slice(left, left + k * resolution))
         tiles = (resolution, k, resolution, k)
-        light = self.light[:, window[0], window[1]].reshape(4, *tiles).double().mean(dim=(2, 4))
-        mask = self.saturated
+
+        def averaged(planes: torch.Tensor) -> torch.Tensor:  # (..., H, W) to (..., R, R)
+            part = planes[..., window[0], window[1]]
+            return part.reshape(*planes.shape[:-2], *tiles).double().mean(dim=(-3, -1))
+
+        mask, found = self.saturated, self.defocus_map
         if mask is not None:
             mask = mask[window].reshape(tiles).permute(0, 2, 1, 3).flatten(2).any(dim=2)
         return replace(
             self,
-            light=light.float(),
+            light=averaged(self.light).float(),
             nlf=self.nlf.scaled(1.0 / k**2),
             box_factor=self.box_factor * k,
             saturated=mask,
+            denoised=None if self.denoised is None else averaged(self.denoised).float(),
+            defocus_map=None if found is None else averaged(found.square()).sqrt().float() / k,
         )
 
     def __repr__(self) -> str:
@@ -325,24 +387,3 @@ def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
     if not bool(torch.isfinite(image).all()) or bool((image < 0).any()):
         raise ValueError("`rgb` must be finite and at least 0 everywhere")
     return image.float()
-
-
-def mean_anchor(green: torch.Tensor) -> float:
-    """Factor at which the mean of `green` (any shape), clipped at 1, is `MEAN_SIGNAL`.
-
-    Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
-    """
-    values = green.double().clamp(min=0.0).flatten()
-    if float((values > 0).double().mean()) <= MEAN_SIGNAL:
-        raise ValueError(
-            f"`light` is 0 in all but {float((values > 0).double().mean()):.1%} of its pixels: no "
-            f"exposure brings its mean to {MEAN_SIGNAL}; give `illuminance`"
-        )
-    low, high = -40.0, 40.0  # log2 of the factor
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if float((values * 2.0**middle).clamp_(max=1.0).mean()) < MEAN_SIGNAL:
-            low = middle
-        else:
-            high = middle
-    return 2.0 ** (0.5 * (low + high))

@@ -11,7 +11,7 @@ from simulator.modules.disc_bank import DiscBank
 from simulator.modules.noise import Preset, check_preset
 
 #: Blur below this diameter [pixel] is not told from sharpness, and left as it is.
-DEAD_ZONE = 0.5
+DEAD_ZONE = 1.0
 
 
 class ApertureModule(nn.Module):
@@ -60,8 +60,13 @@ class ApertureModule(nn.Module):
         # One scalar per image makes the network see every exposure alike: it then commutes with
         # exposure, like the compact one.
         scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
-        f_numbers = torch.stack([f_source, f_target], dim=1).to(image)
-        residual = self.network(image / scale, f_numbers).float() * scale
+        f_numbers = torch.stack([f_source, f_target], dim=1).float()
+        # Eighteen normalisations in a row: bfloat16 would change half of the residual.
+        with torch.autocast(image.device.type, enabled=False):
+            residual = self.network((image / scale).float(), f_numbers)
+            # A picture without detail has a constant residual; without it, it stays as it is.
+            flat = self.network(image.new_zeros(len(image), 4, 1, 1).float(), f_numbers)
+        residual = (residual - flat) * scale
         opens = (f_target < f_source)[:, None, None, None]
         return torch.where(opens, image + residual, image)
 

@@ -150,8 +150,9 @@ class AttentionUNet(nn.Module):
     convolution. The f-numbers enter every normalisation and, as in the paper, as two planes
     beside the image; being constant, these cancel in the first normalisation as a bias would.
     8.78 M parameters at the default widths. A constant image has a constant residual, which
-    depends on the f-numbers only. Initialised by the global generator: seed it with
-    `torch.manual_seed` for the same network again.
+    depends on the f-numbers only. Run it in float32: so many normalisations in a row multiply
+    differences, and bfloat16's rounding grows to half the residual of a new network. Initialised
+    by the global generator: seed it with `torch.manual_seed` for the same network again.
 
     Args:
         widths: Channels of each level, finest first, two levels or more, each >= 1.

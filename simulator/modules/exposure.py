@@ -86,4 +86,4 @@ class LinearFit:
         with torch.no_grad():
             module.w.copy_(solution[0])
             module.b.copy_(solution[1:] / solution[0])
-        return module
+        return module.requires_grad_(False)

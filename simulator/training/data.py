@@ -113,6 +113,9 @@ class ReferencePairs:
             size: Pairs.
             crop: Height and width of the crops [packed pixel].
             process: Rank among several processes, each of which gets pairs of its own.
+
+        Raises:
+            ValueError: If a scene is smaller than `crop`.
         """
         words = [self.seed, len(self.stage), step, process]
         rng = np.random.default_rng(words)
@@ -148,6 +151,11 @@ class ReferencePairs:
         scene = sequence.scene
         source, target = sequence.settings[pair.source], sequence.settings[pair.target]
         height, width = scene.light.shape[1:]
+        if crop > min(height, width):
+            raise ValueError(
+                f"`crop` (={crop}) must not exceed the {height} x {width} pixels of scene "
+                f"{scene.scene_id!r}"
+            )
         top = int(rng.integers(height - crop + 1))
         left = int(rng.integers(width - crop + 1))
         flips = [axis for axis in (-2, -1) if rng.random() < 0.5]
@@ -164,7 +172,7 @@ class ReferencePairs:
 
         _, noisy = record(source)
         signal, sample = record(target)
-        nlf = self.camera.camera.nlf(source.iso)
+        nlf = self.camera.camera.nlf(source.iso).scaled(1.0 / self.camera.box_factor**2)
         return {
             "source": noisy,
             "target": self.camera.clip(signal, target.iso),

@@ -128,6 +128,7 @@ def train_stage(
     wrapped, stepper = accelerator.prepare(loss, optimiser)
     means: dict[str, float] = {}
     clock.start()
+    whole = True  # no step is half done
     try:
         while clock.share < 1.0:
             for group in optimiser.param_groups:
@@ -135,12 +136,15 @@ def train_stage(
             rank = accelerator.process_index
             batch = pairs.batch(clock.step, stage.batch, stage.crop, process=rank).to(device)
             values = wrapped(batch)
+            _follow(means, values, name)
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
+            whole = False
             stepper.step()
-            stepper.zero_grad()
             clock.tick()
-            _follow(means, values, name)
+            _agree(clock, accelerator)
+            whole = True
+            stepper.zero_grad()
             if clock.step % _LOG_EVERY == 0 or clock.share >= 1.0:
                 accelerator.log({f"{name}/{k}": v for k, v in means.items()}, step=clock.step)
                 if progress is not None:
@@ -148,9 +152,19 @@ def train_stage(
             if accelerator.is_main_process:
                 state.save(clock.step)
     finally:  # also after Ctrl-C
-        if accelerator.is_main_process:
+        if whole and accelerator.is_main_process:
             state.save(clock.step, force=True)
     return clock
+
+
+def _agree(clock: Clock, accelerator: Accelerator) -> None:
+    """Sets every process's clock by the main one's: they must stop after the same step, as each
+    step waits for all of them."""
+    if accelerator.num_processes > 1:
+        from accelerate.utils import broadcast
+
+        seconds = torch.tensor(clock.seconds, dtype=torch.float32, device=accelerator.device)
+        clock.seconds = float(broadcast(seconds))
 
 
 def _follow(means: dict[str, float], values: dict[str, torch.Tensor], name: str) -> None:

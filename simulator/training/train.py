@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,24 +14,32 @@ import torch
 from torch import nn
 
 from simulator.camera import get_camera
-from simulator.modules.aperture import ApertureModule
-from simulator.modules.baselines import DecoupledNet, ParameterConcatenation
-from simulator.modules.exposure import ExposureModule
-from simulator.modules.noise import NoiseModule
+from simulator.files import sibling
+from simulator.modules.build import build_modules
 from simulator.reference import BodyError, ReferenceCamera, ReferenceScene
+from simulator.results import result_meta
+from simulator.sequences import Stage
 from simulator.training.config import SimulatorConfig
 from simulator.training.data import ReferencePairs, draw_sequences
 from simulator.training.loop import train_stage
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
+from simulator.weights import save_modules
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-#: Makes the scenes of a split; `ae_env.scenes.reference` has them.
-SceneMaker = Callable[[SimulatorConfig], Sequence[ReferenceScene]]
+#: Makes the scenes of a split, ``"train"`` or ``"validation"``; `ae_env.scenes.reference` has them.
+SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]
-_PAIRS = {"exposure": "exposure", "noise": "noise", "aperture": "aperture", "baseline": "all"}
+#: Fixed batches that a trained stage is validated on.
+_VALIDATION_STEPS, _VALIDATION_BATCH = 8, 8
+_PAIRS: dict[str, Stage] = {
+    "exposure": "exposure",
+    "noise": "noise",
+    "aperture": "aperture",
+    "baseline": "all",
+}
 
 
 @dataclass
@@ -38,26 +48,13 @@ class Trained:
 
     Args:
         modules: By name: ``exposure``, ``noise``, ``aperture``, or ``baseline``.
-        stages: Per stage: pairs, steps, seconds, last values.
+        stages: Per stage: pairs, steps, seconds, and the loss on validation scenes.
+        scenes: Scenes of the training split by kind.
     """
 
     modules: nn.ModuleDict
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
-
-
-def build_modules(preset: str) -> nn.ModuleDict:
-    """The untrained modules of a preset, by stage."""
-    if preset == "pc":
-        return nn.ModuleDict({"baseline": ParameterConcatenation()})
-    if preset == "dl":
-        return nn.ModuleDict({"baseline": DecoupledNet()})
-    return nn.ModuleDict(
-        {
-            "exposure": ExposureModule(),
-            "noise": NoiseModule(preset),  # type: ignore[arg-type]
-            "aperture": ApertureModule(preset),  # type: ignore[arg-type]
-        }
-    )
+    scenes: dict[str, int] = field(default_factory=dict)
 
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:
@@ -68,8 +65,12 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
     """
     try:
         from accelerate import Accelerator
+        from accelerate.state import AcceleratorState
     except ImportError as error:
         raise ImportError("training the simulator needs: pip install 'ae-env[train]'") from error
+    # Device and precision are global there: those of an earlier training in this process would
+    # stay in force, or be refused.
+    AcceleratorState._reset_state(reset_partial_state=True)
     precision = {"float32": "no", "bfloat16": "bf16", "float16": "fp16"}[config.precision]
     accelerator = Accelerator(
         cpu=device == "cpu",
@@ -95,64 +96,133 @@ def train_simulator(
 
     Args:
         config: The training.
-        make_scenes: Gives the training scenes.
+        make_scenes: Gives the scenes of a split.
         folder: Where checkpoints and logs go.
         device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
         tensorboard: Whether to log there.
         progress: Called while scenes are rendered and every few steps.
     """
-    accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
+    logs = folder / "tensorboard" if tensorboard else None
+    accelerator = make_accelerator(config, device, logs)
     torch.manual_seed(config.seed)
     trained = Trained(build_modules(config.preset))
-    camera_profile = get_camera(config.camera)
-    camera = ReferenceCamera(camera_profile, body=BodyError.draw(camera_profile, config.body))
-    sequences = draw_sequences(make_scenes(config), camera_profile, config.seed)
-    optics: dict[tuple[str, int], torch.Tensor] = {}
+    sources = {split: _Source(config, make_scenes, split) for split in ("train", "validation")}
+    trained.scenes = dict(Counter(s.scene.kind for s in sources["train"].sequences))
     for name, stage in config.stages().items():
-
-        def rendering(done: int, total: int, name: str = name) -> None:
-            if progress is not None:
-                progress(f"{name}: light behind every aperture", done / max(total, 1), {})
-
-        # Only a scene of known depth tells what a wider aperture does to it.
-        known = [s for s in sequences if name != "aperture" or s.scene.depth is not None]
-        pairs = ReferencePairs(
-            known,
-            camera,
-            _PAIRS[name],  # type: ignore[arg-type]
-            seed=config.seed,
-            optics=optics,
-            progress=rendering,
-        )
-        values: dict[str, float] = {}
-
-        def report(
-            share: float, means: dict[str, float], name: str = name, last: dict = values
-        ) -> None:
-            last.update(means)
-            if progress is not None:
-                progress(f"{name}: training", share, means)
-
+        # Nobody looks at the bars of the other processes.
+        shown = progress if accelerator.is_main_process else None
+        pairs = sources["train"].pairs(name, _titled(shown, f"{name}: rendering"))
+        loss = _loss(name, trained.modules)
         clock = train_stage(
             name,
-            _loss(name, trained.modules),
+            loss,
             trained.modules[name],
             pairs,
             stage,
             accelerator,
             checkpoint=folder / f"{name}.checkpoint",
             identity=config.card(last_stage=name),
-            progress=report,
+            progress=None if shown is None else functools.partial(shown, f"{name}: training"),
         )
+        held_out = sources["validation"].pairs(name, None)
         trained.stages[name] = {
             "pairs": len(pairs.pairs),
             "steps": clock.step,
             "seconds": round(clock.seconds, 1),
-            **{k: round(v, 5) for k, v in values.items() if math.isfinite(v)},
+            "validation": validate(loss, held_out, stage.crop, accelerator),
         }
     accelerator.end_training()
     trained.modules.to("cpu").eval()
     return trained
+
+
+class _Source:
+    """The pairs of one split; what is rendered for a stage serves the next."""
+
+    def __init__(self, config: SimulatorConfig, make_scenes: SceneMaker, split: str) -> None:
+        camera = get_camera(config.camera)
+        self.camera = ReferenceCamera(camera, body=BodyError.draw(camera, config.body))
+        self.seed = config.seed
+        self.sequences = draw_sequences(make_scenes(config, split), camera, config.seed)
+        self._optics: dict[tuple[str, int], torch.Tensor] = {}
+
+    def pairs(self, stage: str, progress: Callable[[int, int], None] | None) -> ReferencePairs:
+        # Only a scene of known depth tells what a wider aperture does to it.
+        used = [s for s in self.sequences if stage != "aperture" or s.scene.depth is not None]
+        return ReferencePairs(
+            used,
+            self.camera,
+            _PAIRS[stage],
+            seed=self.seed,
+            optics=self._optics,
+            progress=progress,
+        )
+
+
+def _titled(progress: TrainingProgress | None, title: str) -> Callable[[int, int], None] | None:
+    if progress is None:
+        return None
+    return lambda done, total: progress(title, done / max(total, 1), {})
+
+
+@torch.no_grad()
+def validate(
+    loss: nn.Module, pairs: ReferencePairs, crop: int, accelerator: Accelerator
+) -> dict[str, float]:
+    """Means of what `loss` gives on 64 fixed pairs."""
+    means: dict[str, float] = {}
+    loss.eval()
+    for step in range(_VALIDATION_STEPS):
+        batch = pairs.batch(step, _VALIDATION_BATCH, crop).to(accelerator.device)
+        with accelerator.autocast():
+            values = loss(batch)
+        for key, value in values.items():
+            means[key] = means.get(key, 0.0) + float(value) / _VALIDATION_STEPS
+    loss.train()
+    return {key: round(value, 5) for key, value in means.items() if math.isfinite(value)}
+
+
+def train_and_save(
+    config: SimulatorConfig,
+    make_scenes: SceneMaker,
+    path: Path,
+    *,
+    command: str,
+    device: str = "cpu",
+    tensorboard: bool = False,
+    progress: TrainingProgress | None = None,
+) -> Path:
+    """Trains, and writes the weights with their model card beside the checkpoints.
+
+    Args:
+        config: The training.
+        make_scenes: Gives the scenes of a split.
+        path: File name of the weights; checkpoints and logs go into its folder.
+        command: The command line that does it again, for the card.
+        device: See `train_simulator`.
+        tensorboard: See `train_simulator`.
+        progress: See `train_simulator`.
+
+    Returns:
+        The file of the weights.
+    """
+    trained = train_simulator(
+        config,
+        make_scenes,
+        path.parent,
+        device=device,
+        tensorboard=tensorboard,
+        progress=progress,
+    )
+    meta = result_meta(command, config.seed)
+    card = {
+        "training": config.card(),
+        "scenes": trained.scenes,
+        "stages": trained.stages,
+        **{k: meta[k] for k in ("command", "commit", "date", "machine", "versions")},
+    }
+    save_modules(path, trained.modules, config.preset, card)
+    return sibling(path, ".safetensors")
 
 
 def _loss(stage: str, modules: nn.ModuleDict) -> nn.Module:

@@ -10,6 +10,7 @@ from skimage.color import rgb2xyz
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scenes.colour import camera_from_srgb, temperature_tint
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
+from simulator.camera_simulator import CameraSimulator
 from simulator.raw_image import RawImage
 from simulator.settings import CameraSettings
 
@@ -121,6 +122,50 @@ def test_saturated_pixels_survive_resizing() -> None:
     assert Scene.from_raw(clean, scene_id="r").saturated is None
 
 
+def test_resized_averages_what_the_networks_found() -> None:
+    """Denoised light like light; blur by its second moment, in pixels of the new light."""
+    rng = np.random.default_rng(0)
+    light, denoised = (rng.uniform(0.0, 2.0, (4, 6, 9)).astype(np.float32) for _ in range(2))
+    diameter = rng.uniform(0.0, 5.0, (6, 9)).astype(np.float32)
+    scene = array_scene(
+        torch.from_numpy(light),
+        denoised=torch.from_numpy(denoised),
+        defocus_map=torch.from_numpy(diameter),
+    )
+    small = scene.resized(2)
+    assert small.denoised is not None
+    assert small.defocus_map is not None
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        rows, columns = slice(3 * i, 3 * i + 3), slice(1 + 3 * j, 4 + 3 * j)
+        mean = denoised[:, rows, columns].mean(axis=(1, 2))
+        np.testing.assert_allclose(small.denoised[:, i, j], mean, rtol=1e-5)
+        blur = math.sqrt((diameter[rows, columns] ** 2).mean()) / 3
+        assert float(small.defocus_map[i, j]) == pytest.approx(blur, rel=1e-5)
+    flat = array_scene(torch.ones(4, 8, 8), defocus_map=torch.full((8, 8), 6.0))
+    assert torch.equal(flat.resized(4).defocus_map, torch.full((4, 4), 3.0))  # type: ignore[arg-type]
+    assert torch.equal(flat.resized(4, "native").defocus_map, torch.full((4, 4), 6.0))  # type: ignore[arg-type]
+
+
+def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
+    diameter = torch.tensor([[1.0, 7.0], [5.0, 5.0]])  # mean square 25
+    scene = array_scene(torch.ones(4, 2, 2), defocus_map=diameter)  # at f/4
+    assert scene.own_blur(2.0) == pytest.approx(10.0)
+    assert scene.own_blur(4.0) == scene.own_blur(11.0) == pytest.approx(5.0)
+    assert array_scene(torch.ones(4, 2, 2)).own_blur(2.0) == 0.0
+
+
+def test_a_scene_can_be_photographed_by_the_simulator() -> None:
+    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
+    fields = {"denoised": torch.full((4, 8, 8), 0.2), "defocus_map": torch.ones(8, 8)}
+    scene = array_scene(torch.full((4, 8, 8), 0.1), nlf=nlf, box_factor=3, **fields)
+    latent = CameraSimulator(device="cpu").prepare(scene)
+    assert (latent.camera, latent.nlf, latent.box_factor) == (PLAIN, nlf, 3)
+    assert latent.denoised is scene.denoised
+    assert latent.opening is not None
+    assert latent.opening.f_number == 4.0
+    assert array_scene(torch.ones(4, 8, 8)).latent.opening is None
+
+
 def test_noise_free() -> None:
     assert array_scene(torch.ones(4, 2, 2)).noise_free
     nlf = NoiseLevelFunction((0.0,) * 4, (1e-9,) * 4)
@@ -141,6 +186,10 @@ def test_reference_settings_carry_the_ev() -> None:
         ({"box_factor": 0}, "`box_factor` (=0)"),
         ({"group": ""}, "`group` (='')"),
         ({"saturated": torch.zeros(2, 2)}, "`saturated`"),
+        ({"denoised": torch.zeros(4, 2, 3)}, "`denoised` (shape (4, 2, 3))"),
+        ({"defocus_map": torch.zeros(2, 3)}, "`defocus_map` (shape (2, 3))"),
+        ({"defocus_map": torch.full((2, 2), -1.0)}, "`defocus_map`"),
+        ({"defocus_map": torch.full((2, 2), math.inf)}, "`defocus_map`"),
     ],
 )
 def test_invalid_fields_are_named(fields: dict[str, object], words: str) -> None:

@@ -107,7 +107,7 @@ def test_plan_of_a_still_far_scene(simulator: CameraSimulator) -> None:
     plan = simulator.plan(raw, CameraSettings(1600, 1 / 64, 8))
     assert plan.exposure_ratio == pytest.approx(4.0)
     assert plan.modules == ("exposure", "noise", "clip_and_quantise")
-    assert set(plan.left_out) == {"defocus", "motion_blur"}
+    assert set(plan.left_out) == {"noise_reduction", "aperture", "defocus", "motion_blur"}
     assert "far or in focus" in plan.left_out["defocus"]
     assert "does not move" in plan.left_out["motion_blur"]
     assert plan.excess_noise == 0.0
@@ -122,7 +122,7 @@ def test_plan_names_what_a_moving_near_scene_needs(simulator: CameraSimulator) -
     target = CameraSettings(1600, 1 / 8, 11)  # 16 * 8 / 8 = 16 times the light
     near = simulator.plan(raw, target, image_speed=0.5, defocus=3.0)
     assert near.modules == ("exposure", "defocus", "motion_blur", "noise", "clip_and_quantise")
-    assert not near.left_out
+    assert set(near.left_out) == {"noise_reduction", "aperture"}
     assert near.operations > simulator.plan(raw, target).operations
     fast = simulator.plan(raw, CameraSettings(1600, 1 / 100_000, 4), image_speed=0.5)
     assert "less than 0.001 pixel" in fast.left_out["motion_blur"]

@@ -200,7 +200,8 @@ def test_gradients_of_a_black_image_are_finite(size: tuple[int, int]) -> None:
     assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
 
 
-def test_bfloat16_agrees_roughly() -> None:
+def test_autocast_keeps_statistics_in_float32() -> None:
+    """At this depth; the full one is too sensitive for bfloat16, as its documentation says."""
     net, image = small(), normal(1, 4, 16, 16)
     exact = net(image, PAIR)
     with torch.autocast("cpu", torch.bfloat16):

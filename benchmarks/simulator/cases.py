@@ -1,0 +1,155 @@
+"""The pairs of captures of the paper's table: which there are, and what each of them asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from simulator import CameraSettings, RawImage, exposure_ratio
+from simulator.noise import noise_variance
+from simulator.reference import ReferenceCamera, ReferenceCapture, ReferenceScene
+from simulator.sequences import Pair, select_pairs
+from simulator.sequences import Sequence as CaptureSequence
+
+#: Defocus that can be seen [packed pixel], and the share of white pixels from which a source counts
+#: as saturated.
+VISIBLE_BLUR, SATURATED = 1.5, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One pair, photographed.
+
+    Args:
+        scene: What was photographed.
+        source: The noisy input.
+        target: The noisy output and its mean.
+        blur: Largest circle of confusion of the source in the crop [pixel].
+    """
+
+    scene: ReferenceScene
+    source: RawImage
+    target: ReferenceCapture
+    blur: float
+
+    @property
+    def ratio(self) -> float:
+        """Exposure ratio from source to target."""
+        return exposure_ratio(self.source.settings, self.target.settings)
+
+    @property
+    def iso_ratio(self) -> float:
+        """ISO of the target over that of the source."""
+        return self.target.settings.iso / self.source.settings.iso
+
+    @property
+    def stops(self) -> int:
+        """By how many sixths of an octave the aperture opens."""
+        return self.source.settings.aperture_stop - self.target.settings.aperture_stop
+
+    @property
+    def opens_on_blur(self) -> bool:
+        """Whether the aperture opens on something that is visibly out of focus."""
+        return self.stops > 0 and self.blur >= VISIBLE_BLUR
+
+    @property
+    def cleaner(self) -> bool:
+        """Whether the target has less noise than the source brings, averaged over the crop."""
+        camera, mean = self.source.camera, self.target.mean
+        exposed = camera.nlf(self.source.settings.iso).exposed(self.ratio)
+        wanted = camera.nlf(self.target.settings.iso)
+        return bool(noise_variance(mean, wanted).mean() < noise_variance(mean, exposed).mean())
+
+
+#: What a pair asks for, in the order of the report.
+GROUPS: dict[str, Callable[[Case], bool]] = {
+    "all": lambda case: True,
+    "ISO up": lambda case: case.iso_ratio > 1,
+    "ISO down": lambda case: case.iso_ratio < 1,
+    "brighter": lambda case: case.ratio > 1,
+    "darker": lambda case: case.ratio < 1,
+    "target noisier than the source": lambda case: not case.cleaner,
+    "target cleaner than the source": lambda case: case.cleaner,
+    "aperture closes": lambda case: case.stops < 0,
+    "same aperture": lambda case: case.stops == 0,
+    "aperture opens": lambda case: case.stops > 0,
+    "opens, blur >= 1.5 px": lambda case: case.opens_on_blur,
+    "opens, blur < 1.5 px": lambda case: case.stops > 0 and not case.opens_on_blur,
+    "source saturated in > 1 %": lambda case: (
+        float(case.source.saturated.float().mean()) > SATURATED
+    ),
+}
+#: Groups of which every pair is in exactly one: where the average margin comes from.
+PARTITION: dict[str, Callable[[Case], bool]] = {
+    "cleaner target, opens on blur": lambda case: case.cleaner and case.opens_on_blur,
+    "cleaner target, else": lambda case: case.cleaner and not case.opens_on_blur,
+    "noisier target, opens on blur": lambda case: not case.cleaner and case.opens_on_blur,
+    "noisier target, else": lambda case: not case.cleaner and not case.opens_on_blur,
+}
+
+
+def pairs_of(mix: str, sequences: Sequence[CaptureSequence], camera: ReferenceCamera) -> list[Pair]:
+    """The pairs of a mix, in ascending order.
+
+    Args:
+        mix: ``"all"``: any two captures of a sequence. ``"opening"``: the aperture opens, or in a
+            tenth of them stays, and the scene has depth. ``"f/11 to f/4"``: these settings only.
+        sequences: Where to choose from.
+        camera: The body that takes the sequences.
+    """
+    if mix == "all":
+        return select_pairs(sequences, "all", camera.camera)
+    with_depth = {i for i, s in enumerate(sequences) if s.scene.depth is not None}
+    opening = select_pairs(sequences, "aperture", camera.camera)
+    pairs = [p for p in opening if p.sequence in with_depth]
+    if mix == "opening":
+        return pairs
+    wanted = tuple(CameraSettings(100, 1.0, n).aperture_stop for n in (11, 4))
+
+    def stops(pair: Pair) -> tuple[int, int]:
+        settings = sequences[pair.sequence].settings
+        return settings[pair.source].aperture_stop, settings[pair.target].aperture_stop
+
+    return [p for p in pairs if stops(p) == wanted]
+
+
+def drawn(pairs: list[Pair], count: int, seed: list[int]) -> list[Pair]:
+    """`count` of the pairs, or all, in ascending order."""
+    if count >= len(pairs):
+        return pairs
+    chosen = np.random.default_rng(seed).choice(len(pairs), count, replace=False)
+    return [pairs[i] for i in sorted(chosen)]
+
+
+def photographed(
+    pairs: list[Pair],
+    sequences: Sequence[CaptureSequence],
+    camera: ReferenceCamera,
+    crop: int,
+    seed: int,
+) -> Iterator[Case]:
+    """The captures of every pair, of the same crop, each with noise of its own."""
+    optics: dict[tuple[int, int], Tensor] = {}
+    for number, pair in enumerate(pairs):
+        sequence = sequences[pair.sequence]
+        scene = sequence.scene
+        for old in [key for key in optics if key[0] != pair.sequence]:
+            del optics[old]  # pairs come in order of their sequence
+        rng = np.random.default_rng([seed, number, pair.sequence, pair.source, pair.target])
+        top, left = (int(rng.integers(n - crop + 1)) for n in scene.light.shape[1:])
+        window = (..., slice(top, top + crop), slice(left, left + crop))
+        captures = []
+        for settings in (sequence.settings[pair.source], sequence.settings[pair.target]):
+            key = (pair.sequence, settings.aperture_stop)
+            if key not in optics:
+                optics[key] = camera.optics(scene, settings.f_number)
+            noise = int(rng.integers(2**31))
+            light = optics[key][window]
+            captures.append(camera.capture(scene, settings, noise, light=light))
+        source, target = captures
+        blur = camera.blur_diameter(scene, source.settings.effective_f_number)[window]
+        raw = RawImage(source.sample, source.settings, camera.camera)
+        yield Case(scene, raw, target, float(blur.max()))

@@ -1,0 +1,394 @@
+"""The environment with trained networks: scenes with noise, scenes of unknown depth."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.registration import EnvSpec
+
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.observation import decode_sensors
+from ae_env.options import EnvOptions
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.networks import SceneNetworks
+from ae_env.score_table import ScoreTables, describe_captures
+from ae_env.scorers import make_scorer
+from simulator import CameraSettings, get_camera
+from simulator.modules.aperture import DEAD_ZONE
+from simulator.modules.build import build_modules
+from simulator.weights import save_modules
+
+ID = "ae_env/AutoExposure-v0"
+CAMERA = get_camera("nikon_z6")
+#: Circle of confusion that the networks of these tests find everywhere [pixel].
+FOUND = 4.0
+#: What is left of it after the dead zone.
+DIAMETER = math.sqrt(FOUND**2 - DEAD_ZONE**2)
+NOISY = CameraSettings(6400, 1 / 1024, 8)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An untrained denoiser, and a defocus map that is the same everywhere."""
+    torch.manual_seed(0)
+    modules = build_modules("compact")
+    tail: Any = modules["aperture"].network.tail
+    with torch.no_grad():
+        tail.weight.zero_()
+        tail.bias.fill_(math.log(FOUND + 0.3))
+    path = tmp_path_factory.mktemp("weights") / "tiny"
+    save_modules(path, modules, "compact", {})
+    return str(path.with_suffix(".safetensors"))
+
+
+def noisy_scenes(resolution: int = 40, count: int = 2) -> list[Scene]:
+    """Photographs at ISO 6400, twice as many pixels a side as wanted."""
+    rng = np.random.default_rng(0)
+    nlf = CAMERA.nlf(NOISY.iso)
+    scenes = []
+    for i in range(count):
+        light = 0.1 + 0.3 * rng.random((4, 2 * resolution, 2 * resolution))
+        light += rng.normal(size=light.shape) * np.sqrt(nlf.read[0] + nlf.shot[0] * light)
+        data = torch.from_numpy(light.astype(np.float32))
+        scenes.append(Scene.from_array(data, NOISY, CAMERA, scene_id=f"noisy-{i}", nlf=nlf))
+    return scenes
+
+
+NOISY_SCENES = noisy_scenes()
+NAMED = f"{__name__}:NOISY_SCENES"
+
+
+def flat_scene(light: float, denoised: float | None = None, **fields: Any) -> Scene:
+    given = {"nlf": CAMERA.nlf(NOISY.iso)} if denoised is not None else {}
+    if denoised is not None:
+        fields["denoised"] = torch.full((4, 40, 40), denoised)
+    return Scene.from_array(
+        torch.full((4, 40, 40), light), NOISY, CAMERA, scene_id="flat", **given, **fields
+    )
+
+
+def _make(**arguments: Any) -> gym.Env:
+    return gym.make(ID, **{"scenes": NOISY_SCENES, "resolution": 40, **arguments})
+
+
+def _state(env: gym.Env, iso: float, time: float, f_number: float) -> int:
+    grid: Any = env.unwrapped.grid  # type: ignore[attr-defined]
+    wanted = (iso, time, f_number)
+    return next(i for i, s in enumerate(grid) if (s.iso, s.exposure_time, s.f_number) == wanted)
+
+
+def _rollout(make: Callable[[], gym.Env], seed: int = 1) -> list[np.ndarray]:
+    env, frames = make(), []
+    rng = np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    for _ in range(6):
+        numbers = [info[k] for k in ("clipped_high", "clipped_low", "excess_noise")]
+        frames += [*observation.values(), np.array([*numbers, info["rewards"]["score"]])]
+        observation, _, _, _, info = env.step(rng.integers(64))
+    return frames
+
+
+def _assert_equal(first: list[np.ndarray], second: list[np.ndarray]) -> None:
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# -- scenes without noise -------------------------------------------------------------------------
+
+
+def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
+    """The weights named here cannot be read: whoever loads them fails."""
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(b"no weights")
+    damaged.with_suffix(".json").write_text("{}")
+    arguments = {"scenes": "bundled:small", "resolution": 36, "with_oracle": True}
+    without = _rollout(lambda: _make(**arguments, simulator=None))
+    _assert_equal(_rollout(lambda: _make(**arguments, simulator=str(damaged))), without)
+    _assert_equal(_rollout(lambda: _make(**arguments)), without)
+    with pytest.raises(ValueError, match="damaged"):
+        _make(simulator=str(damaged))
+
+
+# -- denoising ------------------------------------------------------------------------------------
+
+
+def test_states_cleaner_than_the_source_are_denoised(weights: str) -> None:
+    for simulator, denoised in ((weights, True), (None, False)):
+        env = _make(simulator=simulator, motion="none", depth="far")
+        state = _state(env, 100, 1 / 15, 8)
+        _, info = env.reset(seed=0, options={"state": state})
+        assert ("noise_reduction" in info["modules"].split("+")) == denoised
+        # 68 times the light at a 64th of the ISO: nearly all noise is the source's.
+        assert (info["excess_noise"] < 0.01) == denoised
+        assert info["excess_noise"] > 1.0 or denoised
+
+
+def test_capture_of_denoised_light_has_the_cameras_noise(weights: str) -> None:
+    scene = replace(flat_scene(0.2, denoised=0.2), box_factor=2)
+    noise = torch.randn((4, 40, 40), generator=torch.Generator().manual_seed(1))
+    sigma = (scene.nlf.read[0] + scene.nlf.shot[0] * 0.2) ** 0.5
+    scene = replace(scene, light=scene.light + sigma * noise)
+    env = _make(scenes=[scene], simulator=weights, motion="none", depth="far", observation="linear")
+    observation, info = env.reset(seed=0, options={"state": _state(env, 100, 1 / 125, 4)})
+    assert "noise_reduction" in info["modules"]
+    signal = 0.2 * (1024 / 125) * (100 / 6400) * 4  # f/4 for f/8
+    nlf = CAMERA.nlf(100)
+    wanted = (nlf.read[1] + nlf.shot[1] * signal) / 4 + (1 / CAMERA.span[1]) ** 2 / 12
+    assert observation["raw"][1].var() == pytest.approx(wanted, rel=0.15)  # 1600 samples: 3.5 %
+    assert observation["raw"].mean() == pytest.approx(signal, rel=1e-3)
+
+
+def test_each_state_starts_from_its_own_light(weights: str) -> None:
+    """States of one aperture share their blurred light only if they start from the same."""
+    scene = flat_scene(0.2, denoised=0.1)
+    env = _make(scenes=[scene], simulator=weights, motion="none", depth=2.0, observation="linear")
+    clean, noisy = _state(env, 100, 1 / 125, 11), _state(env, 6400, 1 / 1000, 11)
+    levels = {clean: 0.1 * (1024 / 125) / 64 / 2, noisy: 0.2 * 1.024 / 2}  # f/11 for f/8
+    observation, _ = env.reset(seed=0, options={"state": noisy})
+    for state in (noisy, clean, noisy, clean, clean):
+        observation, _, _, _, info = env.step(state)
+        assert observation["raw"].mean() == pytest.approx(levels[state], rel=0.01)
+        assert ("noise_reduction" in info["modules"]) == (state == clean)
+
+
+def test_captures_without_noise_are_of_the_denoised_light(weights: str) -> None:
+    env = _make(scenes=[flat_scene(0.2, denoised=0.1)], simulator=weights, noise=False, depth="far")
+    _, info = env.reset(seed=0)
+    assert env.unwrapped.scenes[0].noise_free  # type: ignore[attr-defined]
+    assert torch.equal(env.unwrapped.scenes[0].light, torch.full((4, 40, 40), 0.1))  # type: ignore[attr-defined]
+    assert info["excess_noise"] == 0.0
+
+
+def test_closed_forms_are_those_of_the_denoised_light(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    noisy = flat_scene(0.2, denoised=0.1, illuminance=640.0)
+    tables = ScoreTables(EnvOptions().make_grid(), CAMERA, make_scorer("balanced"))
+    without, found = tables.table(flat_scene(0.1, illuminance=640.0)), tables.table(noisy)
+    np.testing.assert_array_equal(found.mean, without.mean)
+    raw = tables.table(replace(noisy, denoised=None))
+    assert np.abs(raw.mean - found.mean).max() > 0.01
+    mapped = replace(noisy, denoised=None, defocus_map=torch.ones(40, 40))
+    assert tables.table(mapped).parts["sharpness"][0] < raw.parts["sharpness"][0]
+    files = list((tmp_path / "score_tables").glob("*"))
+    assert len(files) == 4  # one each: none is taken for another
+
+
+# -- depth that is not known -----------------------------------------------------------------------
+
+
+def point_scene(size: int = 80, f_number: float = 8.0) -> Scene:
+    """A point of light, without noise, taken at `f_number`."""
+    light = torch.zeros(4, size, size)
+    light[:, size // 2 : size // 2 + 2, size // 2 : size // 2 + 2] = 0.9
+    reference = CameraSettings(100, 1 / 125, f_number)
+    return Scene.from_array(light, reference, CAMERA, scene_id="point", illuminance=640.0)
+
+
+def _spread(raw: np.ndarray) -> float:
+    """Variance along the columns of the light in (H, W) [pixel^2]."""
+    weights, columns = raw.sum(axis=0), np.arange(raw.shape[1])
+    mean = (weights * columns).sum() / weights.sum()
+    return float((weights * (columns - mean) ** 2).sum() / weights.sum())
+
+
+def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
+    """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
+    env = _make(
+        scenes=[point_scene()],
+        simulator=weights,
+        depth="unknown",
+        motion="none",
+        noise=False,
+        observation="linear",
+    )
+    spread, modules, raw = {}, {}, {}
+    for f_number in (4, 5.6, 8, 11):
+        state = _state(env, 100, 1 / 125, f_number)
+        observation, info = env.reset(seed=0, options={"state": state})
+        raw[f_number] = observation["raw"][0].astype(np.float64)
+        spread[f_number], modules[f_number] = _spread(raw[f_number]), info["modules"]
+    working = DIAMETER / 2.0
+    for f_number, growth in ((4, 4.0 - 1.0), (5.6, 2.0 - 1.0)):
+        assert spread[f_number] == pytest.approx(working**2 * growth / 16.0, rel=0.03)
+        assert modules[f_number] == "exposure+aperture"
+    for f_number in (8, 11):  # closing leaves the blur: not a digital number differs
+        sharp = np.zeros((40, 40))
+        sharp[20, 20] = 0.9 * 8.0 ** (2 * (f_number < 8)) / (1 if f_number == 8 else 2)
+        np.testing.assert_allclose(raw[f_number], sharp, atol=1 / CAMERA.span[0])
+        assert modules[f_number] == "exposure"
+
+
+def test_closing_leaves_a_scene_from_f4_exactly_as_it_is(weights: str) -> None:
+    scene = point_scene(40, f_number=4.0)
+    frames = [
+        _make(scenes=[scene], simulator=weights, depth=depth, motion="none", sensors=False)
+        for depth in ("unknown", "far")
+    ]
+    for f_number in (4, 11):
+        state = _state(frames[0], 100, 1 / 125, f_number)
+        found, far = (env.reset(seed=0, options={"state": state})[0]["raw"] for env in frames)
+        np.testing.assert_array_equal(found, far)
+
+
+def test_score_and_sensor_tell_the_same_blur(weights: str) -> None:
+    env = _make(scenes=[point_scene()], simulator=weights, depth="unknown", motion="none")
+    scene = env.unwrapped.scenes[0]  # type: ignore[attr-defined]
+    working = DIAMETER / 2.0
+    assert scene.own_blur(8.0) == pytest.approx(working, rel=1e-5)
+    none = np.zeros(4)
+    settings = [CameraSettings(100, 1 / 125, n) for n in (4, 5.6, 8, 11)]
+    captures = describe_captures(
+        [scene] * 4, settings, CAMERA, speed=none, defocus=none, gain=none + 1.0
+    )
+    blur = working * np.array([2.0, math.sqrt(2.0), 1.0, 1.0])
+    np.testing.assert_allclose(captures.blur_px, blur, rtol=1e-5)
+    readings = []
+    for seed in range(40):
+        observation, info = env.reset(seed=seed, options={"state": 0})  # f/4
+        readings.append(math.log2(decode_sensors(observation["sensors"])[1]))
+    sharpness = 1.0 / (1.0 + (2.0 * working * 64 / 40) ** 2)
+    assert info["rewards"]["sharpness"] == pytest.approx(sharpness, rel=1e-5)
+    # 15 % noise, 40 readings: 2.4 %.
+    assert 2.0 ** np.mean(readings) == pytest.approx(2.0 * working * 64 / 40, rel=0.08)
+
+
+def test_a_known_depth_ignores_the_map(weights: str) -> None:
+    scene = replace(point_scene(40), defocus_map=torch.full((40, 40), 3.0))
+    far = _make(scenes=[scene], simulator=weights, depth="far").unwrapped
+    assert far.scenes[0].defocus_map is None  # type: ignore[attr-defined]
+    unknown = _make(scenes=[scene], simulator=weights, depth="unknown").unwrapped
+    assert unknown.scenes[0].own_blur(8.0) == pytest.approx(3.0)  # type: ignore[attr-defined]
+
+
+def test_memory_spared_changes_nothing(weights: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = {"simulator": weights, "depth": "unknown", "lighting": "sine"}
+    kept = _rollout(lambda: _make(**arguments))
+    monkeypatch.setattr("ae_env.core.OPTICS_BYTES", 0)
+    _assert_equal(_rollout(lambda: _make(**arguments)), kept)
+
+
+# -- contracts -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("depth", ["random", "unknown"])
+def test_vector_environment_equals_single_ones(weights: str, depth: str) -> None:
+    arguments = {"scenes": NOISY_SCENES, "resolution": 40, "simulator": weights, "depth": depth}
+    envs = gym.make_vec(ID, num_envs=3, **arguments)
+    singles = [gym.make(ID, **arguments) for _ in range(3)]
+    observations, infos = envs.reset(seed=5)
+    rows = [env.reset(seed=5 + i) for i, env in enumerate(singles)]
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        for i, row in enumerate(rows):
+            for name, value in row[0].items():
+                np.testing.assert_array_equal(observations[name][i], value)
+            assert infos["modules"][i] == row[-1]["modules"]
+            assert infos["excess_noise"][i] == row[-1]["excess_noise"]
+        actions = rng.integers(64, size=3)
+        observations, _, _, _, infos = envs.step(actions)
+        rows = [env.step(a) for env, a in zip(singles, actions, strict=True)]
+
+
+@pytest.mark.parametrize("depth", ["far", "unknown"])
+def test_spec_survives_json(weights: str, depth: str) -> None:
+    env = gym.make(ID, scenes=NAMED, resolution=40, simulator=weights, depth=depth)
+    text = env.unwrapped.spec.to_json()  # type: ignore[union-attr]
+    assert json.loads(text)["kwargs"]["simulator"] == weights
+    again = gym.make(EnvSpec.from_json(text))
+    _assert_equal(_rollout(lambda: env), _rollout(lambda: again))
+
+
+def test_unknown_weights_and_missing_ones_are_refused() -> None:
+    for name, message in (
+        ("compcat", r"`simulator` \(='compcat'\).*did you mean 'compact'"),
+        ("", "`simulator`"),
+        (7, "`simulator`"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            EnvOptions.from_kwargs({"simulator": name})
+    with pytest.raises(ValueError, match="did you mean 'unknown'"):
+        EnvOptions.from_kwargs({"depth": "unknwon"})
+    with pytest.raises(ValueError, match=r"`depth` \(='unknown'\) needs.*`simulator`"):
+        EnvOptions.from_kwargs({"depth": "unknown", "simulator": None})
+
+
+# -- loading --------------------------------------------------------------------------------------
+
+
+def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:
+    """Only the middle of a large frame is looked at, with what the networks see around it."""
+    torch.manual_seed(3)
+    modules = build_modules("compact")
+    save_modules(tmp_path / "random", modules, "compact", {})
+    networks = SceneNetworks(str(tmp_path / "random.safetensors"))
+    light = 0.3 * torch.rand((4, 252, 244), generator=torch.Generator().manual_seed(1))
+    scene = Scene.from_array(light, CameraSettings(100, 0.01, 8), CAMERA, scene_id="large")
+    with torch.no_grad():
+        whole = modules.eval()["aperture"].defocus(light[None], torch.zeros_like(light)[None])[0]
+    native = networks.resized(scene, 16, "native")
+    torch.testing.assert_close(native.defocus_map, whole[118:134, 114:130], rtol=1e-3, atol=1e-4)
+    assert float(whole.std()) > 1e-3
+    corner = replace(scene, light=light[:, :40, :46])
+    box = networks.resized(corner, 20)
+    with torch.no_grad():
+        image = corner.light[None]
+        fine = modules["aperture"].defocus(image, torch.zeros_like(image))[0]
+    middle = fine[:, 3:43].square().reshape(20, 2, 20, 2).mean(dim=(1, 3)).sqrt() / 2.0
+    torch.testing.assert_close(box.defocus_map, middle, rtol=1e-3, atol=1e-4)
+    assert torch.equal(box.light, corner.resized(20).light)
+
+
+def test_maps_are_kept_and_made_again_where_damaged(
+    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    scene = NOISY_SCENES[0]
+    first = SceneNetworks(weights).resized(scene, 40)
+    assert first.defocus_map is not None
+    with caplog.at_level(logging.INFO, logger="ae_env"):
+        second = SceneNetworks(weights).resized(scene, 40)
+    assert not caplog.records
+    assert torch.equal(second.defocus_map, first.defocus_map)  # type: ignore[arg-type]
+    (file,) = (tmp_path / "defocus_maps").iterdir()
+    file.write_bytes(b"damaged")
+    with caplog.at_level(logging.WARNING, logger="ae_env"):
+        third = SceneNetworks(weights).resized(scene, 40)
+    assert "damaged" in caplog.text
+    assert torch.equal(third.defocus_map, first.defocus_map)  # type: ignore[arg-type]
+    SceneNetworks(weights).resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
+    assert len(list((tmp_path / "defocus_maps").iterdir())) == 2
+
+
+def test_every_source_of_scenes_is_seen_at_its_finest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    image = np.random.default_rng(0).uniform(0.1, 4.0, (96, 100, 3)).astype(np.float32)
+    (tmp_path / "map.hdr").write_bytes(cv2.imencode(".hdr", image)[1].tobytes())
+    bundled = [point_scene(256)]
+    monkeypatch.setattr(
+        "ae_env.scenes.loading.bundled_scenes",
+        lambda split, camera, resolution, **size: bundled if resolution is None else [],
+    )
+    seen = []
+
+    def resize(scene: Scene, resolution: int | None, crop: Any) -> Scene:
+        seen.append(scene.light.shape[-1])
+        return scene.resized(resolution, crop)
+
+    for spec in (tmp_path, str(tmp_path), {"path": str(tmp_path)}, "bundled", NAMED, NOISY_SCENES):
+        scenes = load_scenes(spec, "test", camera=CAMERA, resolution=40, resize=resize)
+        assert {s.light.shape for s in scenes} == {(4, 40, 40)}
+    assert seen == [80, 80, 80, 256, 80, 80, 80, 80]

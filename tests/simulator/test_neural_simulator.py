@@ -1,0 +1,233 @@
+"""The simulator with networks: what it prepares, its stages, and which weights it takes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+
+from simulator import CameraSettings, CameraSimulator, RawImage, camera_simulator, get_camera
+from simulator.modules.exposure import ExposureModule
+from simulator.opening import MapOpening, NetworkOpening
+from simulator.tiles import in_tiles
+from simulator.weights import save_modules
+
+Z6 = get_camera("nikon_z6")
+SOURCE = CameraSettings(6400, 1 / 64, 8)
+CLEANER = CameraSettings(100, 1, 8)
+OPENER = CameraSettings(6400, 1 / 256, 4)
+
+
+def raw(height: int = 18, width: int = 21) -> RawImage:
+    data = np.random.default_rng(0).uniform(0.02, 0.5, (4, height, width)).astype(np.float32)
+    return RawImage(torch.from_numpy(data), SOURCE, Z6)
+
+
+def simulator(preset: Literal["compact", "paper"] = "compact") -> CameraSimulator:
+    torch.manual_seed(0)
+    made = CameraSimulator(preset, device="cpu")
+    made.noise.network.tail.weight.mul_(3 if preset == "compact" else 1)
+    return made
+
+
+@pytest.fixture(scope="module")
+def compact() -> CameraSimulator:
+    return simulator()
+
+
+@pytest.fixture(scope="module")
+def paper() -> CameraSimulator:
+    return simulator("paper")
+
+
+# Preparation
+
+
+def test_preparing_denoises_once(compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    denoise = compact.denoise
+    monkeypatch.setattr(compact, "denoise", lambda latent: calls.append(1) or denoise(latent))
+    latent = compact.prepare(raw())
+    for settings in (CLEANER, SOURCE, OPENER):
+        compact.simulate(latent, settings)
+    assert len(calls) == 1
+    assert latent.denoised is not None
+    assert not torch.equal(latent.denoised, latent.light)
+
+
+def test_a_source_without_noise_needs_no_network(compact: CameraSimulator) -> None:
+    clean = replace(compact.prepare(raw()), nlf=Z6.nlf(100).zero(), denoised=None)
+    assert compact.prepare(clean).denoised is None
+
+
+def test_without_networks_nothing_is_denoised() -> None:
+    plain = CameraSimulator(device="cpu")
+    assert plain.prepare(raw()).denoised is None
+    with pytest.raises(ValueError, match="there is no noise module"):
+        plain.denoise(plain.prepare(raw()))
+    with pytest.raises(ValueError, match="there is no aperture module"):
+        plain.estimate_defocus(plain.prepare(raw()))
+    with pytest.raises(ValueError, match=r"`depth` \(='unknown'\) needs an aperture module"):
+        plain.prepare(raw(), depth="unknown")
+    with pytest.raises(ValueError, match="there are no modules to run"):
+        plain.stages(raw(), CLEANER)
+
+
+def test_depth_must_be_known(compact: CameraSimulator) -> None:
+    with pytest.raises(
+        ValueError, match=r"`depth` \(='near'\) must be one of \['far', 'unknown'\]"
+    ):
+        compact.prepare(raw(), depth="near")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("preset", "kind"), [("compact", MapOpening), ("paper", NetworkOpening)])
+def test_unknown_depth_prepares_an_opening(preset, kind, request) -> None:
+    made = request.getfixturevalue(preset)
+    assert made.prepare(raw()).opening is None
+    latent = made.prepare(raw(), depth="unknown")
+    assert isinstance(latent.opening, kind)
+    assert latent.opening.f_number == 8.0
+    assert made.prepare(latent).opening is latent.opening  # simulate() prepares again
+    assert made.simulate(latent, OPENER).data.isfinite().all()
+
+
+def test_frames_are_denoised_and_mapped_in_tiles(
+    compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than one tile gives what one gives, whatever the tile."""
+    latent = compact.prepare(raw(170, 131))
+    defocus = compact.estimate_defocus(latent)
+    assert defocus.shape == (170, 131)
+
+    def small(*arguments, halo: int) -> torch.Tensor:
+        return in_tiles(*arguments, halo=halo, tile=64)
+
+    monkeypatch.setattr(camera_simulator, "in_tiles", small)
+    assert latent.denoised is not None
+    torch.testing.assert_close(compact.denoise(latent), latent.denoised, atol=1e-4, rtol=0)
+    torch.testing.assert_close(compact.estimate_defocus(latent), defocus, atol=1e-3, rtol=0)
+
+
+def test_the_papers_aperture_has_no_map(paper: CameraSimulator) -> None:
+    with pytest.raises(ValueError, match="must be 'compact' to have a defocus map"):
+        paper.estimate_defocus(paper.prepare(raw()))
+
+
+def test_bfloat16_is_close_to_float32(compact: CameraSimulator) -> None:
+    half = CameraSimulator("compact", device="cpu", precision="bfloat16")
+    half.noise, half.aperture = compact.noise, compact.aperture
+    exact, rounded = (s.prepare(raw()).denoised for s in (compact, half))
+    assert exact is not None
+    assert rounded is not None
+    assert rounded.dtype == torch.float32
+    assert not torch.equal(exact, rounded)
+    assert (exact - rounded).abs().mean() < 0.02 * (exact - raw().data).abs().mean()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"precision": "float16"}, r"`precision` \(='float16'\)"),
+        ({"device": "tpu9"}, r"`device` \(='tpu9'\)"),
+        ({"preset": "tiny"}, r"`preset` \(='tiny'\)"),
+    ],
+)
+def test_bad_arguments(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CameraSimulator(**{"device": "cpu", **arguments})
+
+
+# Stages
+
+
+def test_stages_follow_one_another(compact: CameraSimulator) -> None:
+    source, target = raw(), CameraSettings(100, 1 / 4, 4)
+    stages = compact.stages(source, target, seed=5)
+    assert torch.equal(stages.exposed, source.data)  # 1/64 of the ISO, 16 x the time, 4 x the area
+    assert not torch.equal(stages.denoised, stages.exposed)
+    assert not torch.equal(stages.opened, stages.denoised)
+    # The output's noise: the target's around the last stage, whole digital numbers.
+    numbers = stages.capture.double() * 14512 + 1008
+    assert (numbers - numbers.round()).abs().max() < 1e-2
+    nlf = Z6.nlf(100)
+    read, shot = (torch.tensor(v)[:, None, None] for v in (nlf.read, nlf.shot))
+    error = (stages.capture - stages.opened) / (read + shot * stages.opened.clamp(min=0)).sqrt()
+    inside = (stages.opened < 0.95) & (stages.opened > 0)
+    assert float(error[inside].std()) == pytest.approx(1.0, abs=0.1)
+    assert torch.equal(stages.capture, compact.stages(source, target, seed=5).capture)
+    assert not torch.equal(stages.capture, compact.stages(source, target, seed=6).capture)
+
+
+def test_compact_stages_agree_with_the_prepared_latent(compact: CameraSimulator) -> None:
+    """Denoise, expose = expose, denoise: one preparation serves every target."""
+    source = raw()
+    latent = compact.prepare(source, depth="unknown")
+    for target in (CLEANER, CameraSettings(100, 1 / 16, 8), CameraSettings(100, 1 / 4, 4)):
+        stages = compact.stages(source, target)
+        expected = latent.expected(target)
+        scale = float(expected.abs().max())
+        torch.testing.assert_close(stages.opened, expected, rtol=0, atol=1e-4 * scale)
+
+
+def test_only_the_paper_clips_after_the_exposure(
+    compact: CameraSimulator, paper: CameraSimulator
+) -> None:
+    target = CameraSettings(6400, 1 / 8, 8)  # eight times the light
+    assert compact.stages(raw(), target).exposed.max() > 2
+    exposed = paper.stages(raw(), target).exposed
+    assert float(exposed.max()) == 1.0
+    torch.testing.assert_close(exposed, (raw().data * 8).clamp(0, 1))
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_a_smaller_aperture_leaves_the_picture_as_denoised(preset, request) -> None:
+    stages = request.getfixturevalue(preset).stages(raw(), CameraSettings(6400, 1 / 64, 11))
+    assert torch.equal(stages.opened, stages.denoised)
+
+
+# The body's correction
+
+
+def corrected() -> CameraSimulator:
+    made = simulator()
+    with torch.no_grad():
+        made.exposure.w.fill_(1.25)
+        made.exposure.b.fill_(0.01)
+    return made
+
+
+def test_the_correction_reaches_light_and_noise_once() -> None:
+    made, source = corrected(), raw()
+    latent = made.prepare(source)
+    torch.testing.assert_close(latent.light, 1.25 * (source.data + 0.01))
+    again = made.prepare(latent)
+    assert torch.equal(again.light, latent.light)
+    nlf = Z6.nlf(6400)
+    assert latent.nlf.shot == pytest.approx([1.25 * s for s in nlf.shot])
+    assert latent.nlf.read == pytest.approx([1.25**2 * r for r in nlf.read])
+    frames = [made.simulate(s, CLEANER, seed=1).data for s in (source, latent)]
+    assert torch.equal(*frames)
+
+
+def test_the_correction_in_the_stages() -> None:
+    stages = corrected().stages(raw(), SOURCE)
+    torch.testing.assert_close(stages.exposed, 1.25 * (raw().data + 0.01))
+
+
+def test_pretrained_weights_and_their_correction(tmp_path: Path) -> None:
+    made = corrected()
+    parts = {"exposure": made.exposure, "noise": made.noise, "aperture": made.aperture}
+    save_modules(tmp_path / "net", torch.nn.ModuleDict(parts), "compact", {})
+    plain = CameraSimulator.from_pretrained(tmp_path / "net", device="cpu")
+    assert plain.exposure.is_identity
+    assert torch.equal(plain.prepare(raw()).light, raw().data)
+    body = CameraSimulator.from_pretrained(tmp_path / "net", device="cpu", body_correction=True)
+    assert isinstance(body.exposure, ExposureModule)
+    for settings in (CLEANER, OPENER):
+        expected = made.simulate(raw(), settings, seed=2, depth="unknown").data
+        result = body.simulate(raw(), settings, seed=2, depth="unknown").data
+        assert torch.equal(result, expected)

@@ -1,0 +1,104 @@
+"""The weights that come with the package do what the model card and the documentation say."""
+
+import json
+import math
+from importlib import resources
+from pathlib import Path
+
+import pytest
+import torch
+
+from ae_env.scenes.reference import reference_scenes
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
+from simulator.modules.aperture import added_blur
+from simulator.reference import ReferenceCamera, ReferenceScene
+
+FOLDER = Path(str(resources.files("simulator").joinpath("pretrained")))
+
+
+@pytest.fixture(scope="module")
+def simulator() -> CameraSimulator:
+    return CameraSimulator.from_pretrained("compact", device="cpu")
+
+
+def right_exposure(scene: ReferenceScene, iso: float, f_number: float) -> CameraSettings:
+    """What an incident-light meter says: log2(N^2 / t) - log2(ISO / 100) = log2(E / 2.5)."""
+    assert scene.illuminance is not None
+    unit = CameraSettings(iso, 1.0, f_number)
+    return CameraSettings(iso, 2.0 ** (-unit.log2_exposure) * 2.5 / scene.illuminance, f_number)
+
+
+def gain_db(simulator: CameraSimulator, scene: ReferenceScene, camera_name: str) -> float:
+    """Error of exposing only over error after denoising, ISO 6400 to ISO 100, unclipped pixels."""
+    camera = get_camera(camera_name)
+    body = ReferenceCamera(camera)
+    source = right_exposure(scene, 6400, 8)
+    target = CameraSettings(100, source.exposure_time * 64, 8)
+    capture = body.capture(scene, source, seed=1)
+    truth = body.capture(scene, target, seed=2).mean
+    latent = simulator.prepare(RawImage(capture.sample, source, camera))
+    used = (truth < 0.99) & (capture.sample < 0.99)
+    before = (capture.sample - truth)[used].square().mean()
+    after = (latent.expected(target) - truth)[used].square().mean()
+    return 10.0 * math.log10(float(before / after))
+
+
+def test_weights_and_cards_fit_in_4_mb() -> None:
+    assert sum(f.stat().st_size for f in FOLDER.iterdir()) <= 4e6
+
+
+def test_card_says_how_the_weights_were_made() -> None:
+    card = json.loads((FOLDER / "compact.json").read_text(encoding="utf-8"))
+    for entry in ("training", "scenes", "stages", "command", "commit", "date", "sha256"):
+        assert card[entry], entry
+    assert set(card["stages"]) == {"exposure", "noise", "aperture"}
+
+
+@pytest.mark.parametrize("camera", ["nikon_z6", "canon_70d"])
+def test_denoising_on_procedural_scenes(simulator: CameraSimulator, camera: str) -> None:
+    """At least 3 dB on average: a network that does nothing, or blurs, would not reach it."""
+    scenes = reference_scenes("test", get_camera(camera), number=6, size=96)[:6]
+    gains = [gain_db(simulator, scene, camera) for scene in scenes]
+    assert sum(gains) / len(gains) > 3.0
+    assert min(gains) > 0.0
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize(("camera", "least"), [("nikon_z6", 4.0), ("canon_70d", 5.0)])
+def test_denoising_on_radiance_maps(
+    simulator: CameraSimulator, data_dir: Path, camera: str, least: float
+) -> None:
+    scenes = reference_scenes("test", get_camera(camera), number=0, size=128, radiance=data_dir)
+    gains = [gain_db(simulator, s, camera) for s in scenes if s.kind == "radiance"]
+    assert sum(gains) / len(gains) > least
+
+
+def test_opening_blurs_what_is_out_of_focus_and_only_that(simulator: CameraSimulator) -> None:
+    """Half of the error of exposing alone where the circle of confusion is 3 pixels or more."""
+    camera = get_camera("nikon_z6")
+    body = ReferenceCamera(camera)
+    scenes = [s for s in reference_scenes("test", camera, number=10, size=128) if s.kind == "depth"]
+    errors = {"before": 0.0, "after": 0.0}
+    for scene in scenes:
+        source = right_exposure(scene, 100, 11)
+        target = CameraSettings(100, source.exposure_time / 8, 4)
+        raw = RawImage(body.capture(scene, source, seed=1).sample, source, camera)
+        truth = body.capture(scene, target, seed=2).mean
+        opened = simulator.prepare(raw, depth="unknown").expected(target)
+        blurred = body.blur_diameter(scene, 11) >= 3.0
+        inner = torch.zeros_like(blurred)
+        inner[11:-11, 11:-11] = True
+        used = blurred & inner & (truth < 0.5).all(0) & (raw.data < 0.5).all(0)
+        errors["before"] += float((raw.data - truth)[:, used].square().sum())
+        errors["after"] += float((opened - truth)[:, used].square().sum())
+    assert math.sqrt(errors["after"] / errors["before"]) < 0.5
+
+
+def test_a_sharp_picture_stays_sharp(simulator: CameraSimulator) -> None:
+    """White noise of contrast 20 % has all of its detail at one pixel: nothing is defocused."""
+    generator = torch.Generator().manual_seed(0)
+    data = 0.2 + 0.04 * torch.randn(4, 64, 64, generator=generator)
+    raw = RawImage(data, CameraSettings(100, 1 / 64, 11), get_camera("nikon_z6"))
+    latent = simulator.prepare(raw, depth="unknown")
+    diameter = simulator.estimate_defocus(latent)
+    assert float(added_blur(diameter, 11.0, 4.0).median()) == 0.0

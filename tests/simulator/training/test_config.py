@@ -1,0 +1,93 @@
+"""What a training may be, and what is said about one that it may not be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from simulator.training.config import SimulatorConfig, load_config
+
+STAGES = "exposure: {steps: 2}\nnoise: {steps: 3}\naperture: {minutes: 0.5, crop: 128}\n"
+CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "simulator"
+
+
+def load(folder: Path, text: str) -> SimulatorConfig:
+    (folder / "a.yaml").write_text(text)
+    return load_config(folder / "a.yaml")
+
+
+def test_stages_in_order_with_their_defaults(tmp_path: Path) -> None:
+    config = load(tmp_path, "preset: compact\n" + STAGES)
+    assert list(config.stages()) == ["exposure", "noise", "aperture"]
+    assert (config.noise.steps, config.noise.minutes, config.noise.batch) == (3, None, 8)
+    assert (config.aperture.steps, config.aperture.minutes) == (None, 0.5)
+    assert list(load(tmp_path, "preset: pc\nbaseline: {steps: 1}").stages()) == ["baseline"]
+
+
+@pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda f: f.name)
+def test_shipped_configurations_are_valid(file: Path) -> None:
+    assert load_config(file).preset == file.stem
+
+
+def test_baselines_are_given_the_same_time_as_the_paper_modules_on_the_same_scenes() -> None:
+    """Issue: trained on the same pairs for the same time."""
+    configs = {name: load_config(CONFIGS / f"{name}.yaml") for name in ("paper", "pc", "dl")}
+    minutes = {n: sum(s.minutes or 0 for s in c.stages().values()) for n, c in configs.items()}
+    assert minutes["pc"] == minutes["dl"] == minutes["paper"]
+    assert configs["pc"].scenes == configs["dl"].scenes == configs["paper"].scenes
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("preset: compact\nnoize: {steps: 1}\n" + STAGES, "noize"),
+        ("preset: compact\n" + STAGES.replace("{steps: 3}", "{stesp: 3}"), "noise.stesp"),
+        ("preset: compact\n" + STAGES.replace("steps: 3", "steps: 3, minutes: 1"), "exactly one"),
+        ("preset: compact\n" + STAGES.replace("{steps: 3}", "{batch: 3}"), "exactly one"),
+        ("preset: compact\n" + STAGES.replace("128", "257"), "`aperture.crop` (=257) must not"),
+        ("preset: compact\n" + STAGES.replace("128", "8"), "aperture.crop (=8)"),
+        ("preset: compact\n" + STAGES.replace("steps: 3", "steps: 0"), "noise.steps (=0)"),
+        ("preset: compact\nscenes: {size: 64}\n" + STAGES, "`aperture.crop` (=128)"),
+        ("preset: pc\n" + STAGES, "`exposure` must be left out for preset 'pc'"),
+        ("preset: dl\nbaseline: {steps: 1}\nnoise: {steps: 1}", "`noise` must be left out"),
+        ("preset: pc", "`baseline` must be given for preset 'pc'"),
+        ("preset: paper\nexposure: {steps: 1}", "`noise` must be given for preset 'paper'"),
+        ("preset: compact\nbaseline: {steps: 1}\n" + STAGES, "`baseline` must be left out"),
+        ("preset: tiny\n" + STAGES, "preset (='tiny')"),
+        ("preset: compact\ncamera: nikon_z7\n" + STAGES, "nikon_z6"),
+        ("preset: compact\nprecision: float64\n" + STAGES, "precision (='float64')"),
+        ("preset: compact\nseed: -1\n" + STAGES, "seed (=-1)"),
+    ],
+)
+def test_errors_name_the_entry(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        load(tmp_path, text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def config(**changes: Any) -> SimulatorConfig:
+    stages = {name: {"steps": 2} for name in ("exposure", "noise", "aperture")}
+    return SimulatorConfig.model_validate({"preset": "compact", **stages, **changes})
+
+
+def test_a_later_stage_does_not_change_what_an_earlier_one_is() -> None:
+    """Else a checkpoint of the noise stage was lost when the aperture's budget is raised."""
+    plain, longer = config(), config(aperture={"steps": 9})
+    assert plain.card("noise") == longer.card("noise")
+    assert plain.card("aperture") != longer.card("aperture")
+    assert plain.card() != longer.card()
+
+
+@pytest.mark.parametrize(
+    "changes", [{"seed": 1}, {"body": 2}, {"scenes": {"size": 512}}, {"exposure": {"steps": 3}}]
+)
+def test_everything_else_does(changes: dict[str, Any]) -> None:
+    assert config(**changes).card("exposure") != config().card("exposure")
+
+
+def test_a_configuration_cannot_be_changed() -> None:
+    with pytest.raises(ValueError, match="frozen"):
+        config().seed = 2

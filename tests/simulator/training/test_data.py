@@ -1,0 +1,238 @@
+"""Batches: reproducible, aligned, and with the noise that they state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from simulator import CameraSettings, get_camera
+from simulator.reference import ReferenceCamera
+from simulator.sequences import Sequence
+from simulator.settings import exposure_ratio
+from simulator.training.data import Batch, ReferencePairs, draw_sequences
+from tests.simulator.training.scenes import REFERENCE, scene
+
+Z6 = get_camera("nikon_z6")
+DARK = CameraSettings(6400, 1 / 2048, 5.6)
+LIGHT = CameraSettings(100, 1 / 16, 4)
+
+
+def pairs(*settings: CameraSettings, seed: int = 0, **scene_changes: object) -> ReferencePairs:
+    sequence = Sequence(scene(**scene_changes), settings or (DARK, LIGHT))  # type: ignore[arg-type]
+    return ReferencePairs([sequence], ReferenceCamera(Z6), "exposure", seed=seed)
+
+
+def equal(a: Batch, b: Batch) -> bool:
+    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Batch))
+
+
+def test_shapes_and_types() -> None:
+    batch = pairs().batch(0, 3, 20)
+    shapes = {f.name: tuple(getattr(batch, f.name).shape) for f in fields(Batch)}
+    image = (3, 4, 20, 20)
+    assert shapes == {
+        "source": image,
+        "target": image,
+        "sample": image,
+        "ratio": (3,),
+        "shot": (3, 4),
+        "read": (3, 4),
+        "f_source": (3,),
+        "f_target": (3,),
+        "parameters": (3, 6),
+        "defocus": (3, 20, 20),
+    }
+    assert all(getattr(batch, f.name).dtype == torch.float32 for f in fields(Batch))
+    assert equal(batch.to(torch.device("cpu")), batch)
+
+
+def test_the_same_step_is_the_same_batch_whatever_came_before() -> None:
+    first, second = pairs(), pairs()
+    later = [first.batch(step, 2, 16) for step in range(4)][3]
+    assert equal(second.batch(3, 2, 16), later)
+    torch.manual_seed(77)
+    assert equal(second.batch(3, 2, 16), later)
+
+
+def test_steps_processes_and_seeds_differ() -> None:
+    made = pairs()
+    batches = [made.batch(0, 4, 16), made.batch(1, 4, 16), made.batch(0, 4, 16, process=1)]
+    batches.append(pairs(seed=1).batch(0, 4, 16))
+    for i, one in enumerate(batches):
+        for other in batches[i + 1 :]:
+            assert not torch.equal(one.source, other.source)
+            assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
+
+
+def test_a_pair_shown_twice_was_photographed_twice() -> None:
+    """Whole-frame crops of one pair: their noise is uncorrelated."""
+    made = pairs(depth=False)
+    made.pairs = made.pairs[:1]
+    batch = made.batch(0, 8, 32)
+    error = batch.sample - batch.target
+    assert not any(torch.equal(error[0], error[i]) for i in range(1, 8))
+
+
+def test_source_and_sample_have_the_noise_that_is_stated() -> None:
+    """Standardised by the noise level function, both have mean 0 and variance 1, and the target is
+    the mean: noise-free, not quantised, clipped to white."""
+    source, target = CameraSettings(1600, 1 / 512, 4), CameraSettings(400, 1 / 256, 4)
+    made = pairs(source, target, size=64, depth=False)
+    made.pairs = [p for p in made.pairs if p.source == 0]
+    batch = made.batch(0, 12, 64)
+    light = scene(size=64, depth=False).light
+    ratios = [exposure_ratio(REFERENCE, s) for s in (source, target)]
+    assert float(batch.ratio[0]) == pytest.approx(ratios[1] / ratios[0])
+    for item in range(12):  # the crop is the whole frame, turned and mirrored
+        turned = batch.target[item] / ratios[1]
+        assert float(turned.mean()) == pytest.approx(float(light.mean()), rel=1e-5)
+        assert float(turned.max()) == pytest.approx(float(light.max()), rel=1e-5)
+    means = {"source": batch.target / batch.ratio[:, None, None, None], "sample": batch.target}
+    levels = {"source": (batch.shot[0], batch.read[0])}
+    nlf = Z6.nlf(400)
+    levels["sample"] = (torch.tensor(nlf.shot), torch.tensor(nlf.read))
+    assert batch.shot[0].tolist() == pytest.approx(Z6.nlf(1600).shot)
+    assert batch.read[0].tolist() == pytest.approx(Z6.nlf(1600).read)
+    for name, mean in means.items():
+        shot, read = (v[:, None, None].double() for v in levels[name])
+        z = (getattr(batch, name).double() - mean) / (read + shot * mean).sqrt()
+        assert float(z.mean()) == pytest.approx(0.0, abs=5 / math.sqrt(z.numel()))
+        assert float(z.var()) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_target_is_clipped_as_the_camera_clips() -> None:
+    bright = CameraSettings(100, 1, 4)  # 16 x the light: most of it beyond white
+    made = pairs(LIGHT, bright, depth=False)
+    batch = made.batch(0, 8, 32)
+    assert float(batch.target.max()) == 1.0
+    assert float(batch.sample.max()) == 1.0
+    assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
+
+
+def test_box_averaged_captures_state_averaged_noise() -> None:
+    camera = ReferenceCamera(Z6, box_factor=3)
+    made = ReferencePairs([Sequence(scene(), (DARK, LIGHT))], camera, "exposure")
+    batch = made.batch(0, 8, 16)
+    dark = batch.ratio > 1
+    assert bool(dark.any())
+    for row in batch.shot[dark]:
+        assert row.tolist() == pytest.approx([s / 9 for s in Z6.nlf(6400).shot])
+
+
+def test_everything_of_a_pair_shows_the_same_crop() -> None:
+    """The light tells the depth of its pixel, so target, source and defocus must agree on it."""
+    near = scene(depth=True, size=48)
+    depth = torch.where(
+        torch.rand(48, 48, generator=torch.Generator().manual_seed(0)) < 0.5, 2.0, 8.0
+    )
+    light = torch.where(depth == 2.0, 0.2, 0.6).expand(4, -1, -1).contiguous()
+    made = ReferencePairs(
+        [
+            Sequence(
+                replace(near, light=light, depth=depth),
+                (LIGHT, replace(LIGHT, exposure_time=1 / 17)),
+            )
+        ],
+        ReferenceCamera(Z6),
+        "exposure",
+    )
+    made._optics = dict.fromkeys(made._optics, light)  # sharp: each pixel has its own light
+    batch = made.batch(0, 6, 24)
+    far = batch.target[:, 0] / batch.target.amax((1, 2, 3))[:, None, None] > 0.7
+    assert torch.equal(batch.defocus > 0, far)
+    bright = batch.source.mean(1) > batch.source.mean((1, 2, 3))[:, None, None]
+    assert torch.equal(bright, far)
+    assert not torch.equal(far[0], far[1])
+
+
+def test_crops_are_turned_and_mirrored_all_eight_ways() -> None:
+    ramp = torch.arange(32.0)[:, None] * 2 + torch.arange(32.0) + 10
+    light = (ramp / 400).expand(4, -1, -1).contiguous()
+    flat = replace(scene(depth=False), light=light)
+    made = ReferencePairs(
+        [Sequence(flat, (LIGHT, replace(LIGHT, iso=200)))], ReferenceCamera(Z6), "exposure"
+    )
+    target = made.batch(0, 64, 32).target[:, 0]
+    down = torch.sign(target[:, -1, 0] - target[:, 0, 0]).int()
+    right = torch.sign(target[:, 0, -1] - target[:, 0, 0]).int()
+    steep = (target[:, -1, 0] - target[:, 0, 0]).abs() > (target[:, 0, -1] - target[:, 0, 0]).abs()
+    seen = set(zip(down.tolist(), right.tolist(), steep.tolist(), strict=True))
+    assert len(seen) == 8
+
+
+def test_settings_of_a_pair() -> None:
+    made = pairs(DARK, LIGHT)
+    batch = made.batch(0, 8, 16)
+    stop = 2**2.5  # f/5.6
+    forward = [6, -11, 2.5, 0, -4, 2]
+    for i in range(8):
+        brightens = float(batch.ratio[i]) > 1
+        expected = forward if brightens else forward[3:] + forward[:3]
+        assert batch.parameters[i].tolist() == pytest.approx(expected)
+        assert float(batch.f_source[i]) == pytest.approx(stop if brightens else 4.0)
+        assert float(batch.f_target[i]) == pytest.approx(4.0 if brightens else stop)
+        assert float(batch.ratio[i]) == pytest.approx(4.0 if brightens else 0.25)
+
+
+def test_defocus_is_the_thin_lens_at_the_sources_aperture() -> None:
+    """f^2 / N (1/s - 1/z) / (1 - f/s), in packed pixels of 2 x 5.9 micrometres or so."""
+    batch = pairs(DARK, LIGHT).batch(0, 8, 32)
+    assert Z6.pixel_pitch_um is not None
+    for i in range(8):
+        blur = 0.035**2 / float(batch.f_source[i]) * (1 / 2 - 1 / 8) / (1 - 0.035 / 2)
+        expected = blur / (2e-6 * Z6.pixel_pitch_um)
+        assert float(batch.defocus[i].max()) == pytest.approx(expected, rel=1e-4)
+        assert float(batch.defocus[i].min()) == 0.0
+        assert float((batch.defocus[i] > 0).float().mean()) == 0.5
+
+
+def test_light_is_rendered_once_per_aperture_and_shared_between_stages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    camera = ReferenceCamera(Z6)
+    rendered: list[float] = []
+    optics = camera.optics
+
+    def spy(*arguments):
+        rendered.append(arguments[1])
+        return optics(*arguments)
+
+    object.__setattr__(camera, "optics", spy)
+    states = (LIGHT, replace(LIGHT, iso=800), DARK)
+    shared: dict = {}
+    calls: list[tuple[int, int]] = []
+    for stage in ("exposure", "all"):
+        made = ReferencePairs(
+            [Sequence(scene(), states)],
+            camera,
+            stage,  # type: ignore[arg-type]
+            optics=shared,
+            progress=lambda done, total: calls.append((done, total)),
+        )
+        made.batch(0, 4, 16)
+    assert sorted(rendered) == [4.0, 5.6]
+    assert calls == [(0, 1), (1, 1)] * 2
+
+
+def test_errors() -> None:
+    with pytest.raises(ValueError, match=r"scene 'a': `illuminance` must be known"):
+        draw_sequences([replace(scene(), illuminance=None)], Z6, 0)
+    with pytest.raises(ValueError, match=r"must hold a pair for stage 'aperture'"):
+        ReferencePairs([], ReferenceCamera(Z6), "aperture")
+    with pytest.raises(ValueError, match=r"`crop` \(=33\) must not exceed the 32 x 32 pixels"):
+        pairs().batch(0, 1, 33)
+
+
+def test_sequences_are_drawn_by_seed_and_place() -> None:
+    scenes = [scene("a"), scene("b")]
+    first, again, other = (draw_sequences(scenes, Z6, seed) for seed in (0, 0, 1))
+    assert [s.settings for s in first] == [s.settings for s in again]
+    assert first[0].settings != first[1].settings
+    assert first[0].settings != other[0].settings
+    assert all(20 <= len(s.settings) <= 25 for s in first)
+    assert [s.scene.scene_id for s in first] == ["a", "b"]
+    assert np.mean([s.settings[0].iso for s in first]) < 1600

@@ -1,0 +1,224 @@
+"""The losses in closed form, what they leave out, and what they train."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from simulator.modules.aperture import DEAD_ZONE, ApertureModule
+from simulator.modules.disc_bank import DiscBank
+from simulator.modules.exposure import ExposureModule
+from simulator.modules.noise import NoiseModule
+from simulator.training.data import Batch
+from simulator.training.losses import (
+    ApertureLoss,
+    BaselineLoss,
+    ExposureLoss,
+    NoiseLoss,
+    away_from_clipping,
+    expose,
+)
+
+SHOT, READ = 4e-4, 1e-6
+
+
+class Fixed(nn.Module):
+    """A network whose output is known; one parameter, so that it can be trained."""
+
+    def __init__(self, output: Callable[..., Tensor]) -> None:
+        super().__init__()
+        self.output, self.shift = output, nn.Parameter(torch.zeros(()))
+
+    def forward(self, *given: Tensor) -> Tensor:
+        return self.output(*given) + self.shift
+
+
+def batch(size: int = 32, level: float = 0.2, ratio: float = 2.0, noise: bool = True) -> Batch:
+    """A flat field whose noise is drawn by NumPy, and its noise-free target."""
+    deviation = math.sqrt(READ + SHOT * level) if noise else 0.0
+    drawn = np.random.default_rng(0).normal(level, deviation, (2, 4, size, size))
+    target = torch.full((2, 4, size, size), level * ratio)
+    return Batch(
+        source=torch.from_numpy(drawn.astype(np.float32)),
+        target=target,
+        sample=target + 0.01,
+        ratio=torch.full((2,), ratio),
+        shot=torch.full((2, 4), SHOT),
+        read=torch.full((2, 4), READ),
+        f_source=torch.full((2,), 8.0),
+        f_target=torch.full((2,), 4.0),
+        parameters=torch.zeros(2, 6),
+        defocus=torch.full((2, size, size), 2.0),
+    )
+
+
+def denoiser(output: Callable[..., Tensor]) -> NoiseModule:
+    made = NoiseModule("compact")
+    made.network = Fixed(output)
+    return made
+
+
+# Exposure
+
+
+def test_exposure_is_the_mean_error_of_what_is_not_over_exposed() -> None:
+    data = batch(noise=False)
+    data.source[:, :, :16] = 0.995  # half the pixels; their error would be large
+    assert float(ExposureLoss(ExposureModule())(data)["loss"].detach()) == pytest.approx(
+        0.01, rel=1e-4
+    )
+    data.source[:] = 1.0
+    assert float(ExposureLoss(ExposureModule())(data)["loss"].detach()) == 0.0  # not NaN
+
+
+def test_exposure_compares_what_a_capture_can_show() -> None:
+    """Exposed beyond white, a right module has no error against the clipped sample."""
+    data = replace(batch(noise=False, ratio=8.0), sample=torch.ones(2, 4, 32, 32))
+    assert float(ExposureLoss(ExposureModule())(data)["loss"].detach()) == 0.0
+
+
+def test_the_noise_goes_with_the_exposure() -> None:
+    module = ExposureModule()
+    with torch.no_grad():
+        module.w.fill_(1.5)
+        module.b.fill_(0.1)
+    data = batch()
+    exposed, shot, read = expose(module, data)
+    torch.testing.assert_close(exposed, (data.source + 0.1) * 3.0)
+    assert shot.flatten().tolist() == pytest.approx([3 * SHOT] * 8)
+    assert read.flatten().tolist() == pytest.approx([9 * READ] * 8)
+    assert not exposed.requires_grad
+    assert not shot.requires_grad
+
+
+# Noise
+
+
+@pytest.mark.parametrize("ratio", [2.0**-8, 0.5, 3.0])
+@pytest.mark.parametrize("level", [0.01, 0.3])
+def test_not_denoising_costs_the_mean_of_a_half_normal(level: float, ratio: float) -> None:
+    """In units of the noise: sqrt(2 / pi), at every signal and exposure. It gains 0 dB."""
+    loss = NoiseLoss(ExposureModule(), denoiser(lambda image, _: image))
+    values = loss(batch(level=level, ratio=ratio))
+    assert float(values["loss"].detach()) == pytest.approx(math.sqrt(2 / math.pi), rel=0.03)
+    assert float(values["gain_db"]) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_halving_the_error_gains_six_decibels() -> None:
+    data = batch()
+    loss = NoiseLoss(ExposureModule(), denoiser(lambda image, _: (image + data.target) / 2))
+    assert float(loss(data)["gain_db"]) == pytest.approx(20 * math.log10(2), abs=1e-4)
+
+
+def test_clipped_pixels_teach_no_denoising() -> None:
+    data = batch()
+    good = denoiser(lambda image, _: torch.where(data.target >= 1, 77.0, data.target))
+    data.target[:, :, :8] = 1.0
+    data.source[:, :, 8:16] = 1.0
+    loss = NoiseLoss(ExposureModule(), denoiser(lambda *_: data.target.clone()))
+    assert float(loss(data)["loss"].detach()) == 0.0
+    assert float(NoiseLoss(ExposureModule(), good)(data)["loss"].detach()) == 0.0
+    data.source[:] = 1.0
+    assert float(loss(data)["loss"].detach()) == 0.0  # no pixel at all: no NaN
+
+
+# Aperture
+
+
+def opened(data: Batch) -> Batch:
+    """The target is what the wider aperture makes of the source, by the true map."""
+    texture = torch.rand(2, 4, 32, 32, generator=torch.Generator().manual_seed(3)) * 0.4
+    diameter = (data.defocus.square() - DEAD_ZONE**2).sqrt() * math.sqrt(3)
+    target = DiscBank(texture).blurred(diameter[:, None])
+    return replace(data, source=texture, target=target, ratio=torch.ones(2))
+
+
+def aperture_loss(log_blur: Callable[..., Tensor]) -> ApertureLoss:
+    module = ApertureModule("compact")
+    network = Fixed(log_blur)
+    module.network.forward = network.forward
+    return ApertureLoss(ExposureModule(), denoiser(lambda image, _: image), module)
+
+
+def test_the_true_map_costs_nothing() -> None:
+    data = opened(batch())
+    values = aperture_loss(lambda *_: torch.log(data.defocus + 0.3))(data)
+    assert float(values["map"].detach()) == 0.0
+    assert float(values["relative"]) < 1e-5
+
+
+def test_not_opening_costs_all_of_the_change() -> None:
+    """A map of no blur: relative error 1, and the map is off by log(2.3 / 0.3)."""
+    data = opened(batch())
+    values = aperture_loss(lambda *_: torch.full((2, 32, 32), math.log(0.3)))(data)
+    assert float(values["relative"]) == pytest.approx(1.0)
+    assert float(values["map"].detach()) == pytest.approx(math.log(2.3 / 0.3), rel=1e-5)
+    picture = float(values["loss"].detach()) - 0.1 * math.log(2.3 / 0.3)
+    assert 0.8 < picture <= 1.0  # a little less: the unit includes a share of the noise
+
+
+def test_only_the_aperture_is_trained_and_its_gradient_is_finite() -> None:
+    torch.manual_seed(0)
+    parts = ExposureModule(), NoiseModule("compact"), ApertureModule("compact")
+    data = opened(batch())
+    ApertureLoss(*parts)(data)["loss"].backward()
+    assert all(p.grad is None for part in parts[:2] for p in part.parameters())
+    gradients = [p.grad for p in parts[2].parameters()]
+    assert all(g is not None and bool(g.isfinite().all()) for g in gradients)
+    assert any(bool(g.any()) for g in gradients if g is not None)
+
+
+def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble() -> None:
+    torch.manual_seed(0)
+    loss = ApertureLoss(ExposureModule(), NoiseModule("compact"), ApertureModule("compact"))
+    same = replace(opened(batch()), f_target=torch.full((2,), 8.0))
+    white = replace(opened(batch()), source=torch.ones(2, 4, 32, 32))
+    for data in (same, white):
+        loss.zero_grad()
+        value = loss(data)["loss"]
+        value.backward()
+        assert bool(value.isfinite())
+        assert all(p.grad is None or bool(p.grad.isfinite().all()) for p in loss.parameters())
+
+
+def test_the_papers_network_is_trained_without_a_map() -> None:
+    torch.manual_seed(0)
+    module = ApertureModule("paper")
+    values = ApertureLoss(ExposureModule(), NoiseModule("compact"), module)(opened(batch()))
+    assert set(values) == {"loss", "relative"}
+    values["loss"].backward()
+    assert any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
+
+
+def test_seven_pixels_around_clipping_are_left_out() -> None:
+    source, target = torch.zeros(1, 4, 40, 40), torch.zeros(1, 4, 40, 40)
+    source[0, 2, 10, 10] = 0.995
+    target[0, 0, 30, 39] = 1.0
+    used = away_from_clipping(source, target)
+    expected = torch.ones(40, 40, dtype=torch.bool)
+    expected[3:18, 3:18] = False
+    expected[23:38, 32:] = False
+    assert torch.equal(used[0, 0], expected)
+
+
+# Baselines
+
+
+def test_a_baseline_learns_the_sample_from_source_and_parameters() -> None:
+    data = batch()
+    seen: list[tuple[Tensor, ...]] = []
+
+    def network(*given: Tensor) -> Tensor:
+        seen.append(given)
+        return data.sample + 0.125
+
+    value = float(BaselineLoss(Fixed(network))(data)["loss"].detach())
+    assert value == pytest.approx(0.125, rel=1e-5)
+    assert seen[0][0] is data.source
+    assert seen[0][1] is data.parameters
