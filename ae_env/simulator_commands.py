@@ -171,6 +171,7 @@ def train_simulator(
 
 def training_scenes(config: SimulatorConfig, split: str) -> Sequence[ReferenceScene]:
     """The scenes of a split that a training's configuration names."""
+    from ae_env.scenes.draped import draped_scenes
     from ae_env.scenes.reference import reference_scenes
     from simulator import get_camera
 
@@ -178,14 +179,16 @@ def training_scenes(config: SimulatorConfig, split: str) -> Sequence[ReferenceSc
     if "$" in radiance:
         console.print(f"{config.scenes.radiance} is not set: training without radiance maps")
         radiance = ""
-    return reference_scenes(
+    camera = get_camera(config.camera)
+    scenes = reference_scenes(
         split,  # type: ignore[arg-type]
-        get_camera(config.camera),
+        camera,
         number=config.scenes.procedural if split == "train" else _VALIDATION_SCENES,
         size=config.scenes.size,
         radiance=Path(radiance) if radiance else None,
         seed=config.seed,
     )
+    return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
 
 
 def _simulator(weights: str, device: str) -> CameraSimulator:

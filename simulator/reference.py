@@ -27,6 +27,8 @@ from simulator.thin_lens import Lens, defocus
 WELL_MARGIN = 0.004
 #: Aperture stops (sixths of the f-number's octave) from f/1 to f/64.
 _STOPS = range(37)
+#: Kind of a scene whose picture is also there without the depth that it was given.
+DRAPED = "draped"
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,7 @@ MOST_GROUPS = 100_000
 #: Every fourth procedural group has no depth: one of the bundled kinds, for noise and exposure.
 _FLAT_EVERY = 4
 #: What is in focus in the groups with depth, in turn: everything in a third of them.
-_FOCUS_CYCLE = (
+FOCUS_CYCLE = (
     *("everything", "front", "back", "everything", "middle", "front", "everything", "back"),
     "middle",
 )
@@ -129,7 +129,7 @@ def _procedural(
     if flat:
         drawing = draw(kind, rng, 2 * size)  # halved below: as sharp as the scenes with depth
     else:
-        focus = _FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + place) % len(_FOCUS_CYCLE)]
+        focus = FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + place) % len(FOCUS_CYCLE)]
         drawn = draw_depth(rng, size, focus)
         drawing = drawn.drawing
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))

@@ -6,6 +6,8 @@ The three situations that the paper shows: low light, high light, and a close sh
 from __future__ import annotations
 
 import io
+import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,8 +30,8 @@ IMAGE = Path("docs/images/simulator_stages.png")
 #: The quick run leaves the published picture alone.
 QUICK_IMAGE = Path("runs/simulator/simulator_stages.png")
 #: Height and width of the crops [packed pixel].
-CROP = 64
-COLUMNS = ("ground truth", "input", "EXP", "NS", "Full", "ground truth")
+CROP = 72
+COLUMNS = ("whole picture", "input", "EXP", "NS", "Full", "ground truth")
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Case:
         name: What it shows.
         crops: Scenes that can show it, the first that is there is taken, and the middle of the
             crop as a share of height and width.
-        source: ISO, f-number and exposure relative to incident light [EV] of the input.
+        source: ISO, f-number and exposure of the input relative to incident light [EV]; its time
+            is rounded to a whole stop.
         target: The same of what is simulated.
     """
 
@@ -51,14 +54,16 @@ class Case:
 
 
 CASES = (
-    Case("low light", {"Desk": (0.5, 0.5), "chelsea-0": (0.4, 0.5)}, (6400, 4, -1.5), (200, 4, 0)),
+    Case(
+        "low light", {"Desk": (0.75, 0.45), "chelsea-0": (0.4, 0.5)}, (6400, 4, -1.5), (800, 4, 1.5)
+    ),
     Case(
         "high light",
-        {"warehouse-090": (0.5, 0.5), "grass-0": (0.5, 0.5)},
+        {"warehouse-090": (0.35, 0.7), "grass-0": (0.5, 0.5)},
         (1600, 8, -2.0),
         (100, 4, 0.0),
     ),
-    Case("close shot", {"motorcycle-front": (0.5, 0.5)}, (800, 11, 0.0), (100, 4, 0.0)),
+    Case("close shot", {"motorcycle-front": (0.25, 0.72)}, (800, 11, 0.0), (100, 4, 0.0)),
 )
 
 
@@ -95,7 +100,7 @@ def measure(
 def _photographed(
     case: Case, scene: ReferenceScene, models: Models, seed: int
 ) -> tuple[dict[str, Any], list[np.ndarray]]:
-    """The row of results, and the developed pictures (2H, 2W, 3) in the order of `COLUMNS`."""
+    """The row of results, and the developed pictures (H, W, 3) in the order of `COLUMNS`."""
     profile = get_camera(CAMERA)
     camera = ReferenceCamera(profile)
     settings = [_settings(scene, *wanted) for wanted in (case.source, case.target)]
@@ -119,13 +124,14 @@ def _photographed(
 
 
 def _settings(scene: ReferenceScene, iso: float, f_number: float, ev: float) -> CameraSettings:
-    right = equal_exposure(scene.reference, iso, f_number)
-    return CameraSettings(iso, right.exposure_time * 2.0**ev, f_number)
+    right = equal_exposure(scene.reference, iso, f_number).exposure_time
+    return CameraSettings(iso, 2.0 ** round(math.log2(right) + ev), f_number)
 
 
 def _developed(data: torch.Tensor, like: RawImage) -> np.ndarray:
     raw = RawImage(data, like.settings, like.camera, white_balance=like.white_balance)
-    return render_srgb(raw).permute(1, 2, 0).numpy()
+    # Light that lies at one place for all four planes: interpolation would colour its edges.
+    return render_srgb(raw, demosaic="half").permute(1, 2, 0).numpy()
 
 
 def _draw(strips: list[tuple[dict[str, Any], list[np.ndarray]]], path: Path) -> None:
@@ -136,20 +142,20 @@ def _draw(strips: list[tuple[dict[str, Any], list[np.ndarray]]], path: Path) -> 
     axes = figure.subplots(len(strips), len(COLUMNS), squeeze=False)
     for line, (row, pictures) in zip(axes, strips, strict=True):
         height, width = pictures[0].shape[:2]
-        side = 2 * CROP
         top, left = (
-            min(max(round(share * n - CROP), 0), n - side)
+            min(max(round(share * n - CROP / 2), 0), n - CROP)
             for share, n in zip(row["middle"], (height, width), strict=True)
         )
         for number, (axis, picture, title) in enumerate(zip(line, pictures, COLUMNS, strict=True)):
             axis.set_xticks([])
             axis.set_yticks([])
             if number == 0:
+                axis.set_title(title, fontsize=10)
                 axis.imshow(picture)
-                axis.add_patch(Rectangle((left, top), side, side, fill=False, color="red", lw=1.5))
+                axis.add_patch(Rectangle((left, top), CROP, CROP, fill=False, color="red", lw=1.5))
                 axis.set_ylabel(row["case"], fontsize=11)
                 continue
-            axis.imshow(picture[top : top + side, left : left + side], interpolation="nearest")
+            axis.imshow(picture[top : top + CROP, left : left + CROP], interpolation="nearest")
             psnr_db = row["psnr_db"].get(title)
             axis.set_title(title if psnr_db is None else f"{title}, {psnr_db:.1f} dB", fontsize=10)
             if title == "input":
@@ -164,13 +170,13 @@ def _draw(strips: list[tuple[dict[str, Any], list[np.ndarray]]], path: Path) -> 
 
 def section(rows: list[dict[str, Any]]) -> str:
     """The part as Markdown, beside the results."""
-    link = Path("..") / Path(rows[0]["image"]).relative_to("docs") if rows else ""
+    link = os.path.relpath(rows[0]["image"], "docs/results") if rows else ""
     lines = [
         f"![Input, EXP, NS, Full and ground truth]({link})",
         "",
-        "Crops of 64 x 64 packed pixels, developed alike and not corrected for exposure; Full with "
-        "the target's noise, the ground truth a noisy capture. PSNR of the whole picture before "
-        "output noise, against the noise-free mean.",
+        f"Crops of {CROP} x {CROP} packed pixels, developed alike and not corrected for exposure; "
+        "Full with the target's noise, the ground truth a noisy capture. PSNR of the whole picture "
+        "before output noise, against the noise-free mean.",
         "",
         "| situation | scene | light [lux] | input | simulated | EXP | NS | Full |",
         "|---|---|--:|---|---|--:|--:|--:|",

@@ -16,7 +16,7 @@ from torch import nn
 from simulator.camera import get_camera
 from simulator.files import sibling
 from simulator.modules.build import build_modules
-from simulator.reference import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference import DRAPED, BodyError, ReferenceCamera, ReferenceScene
 from simulator.results import result_meta
 from simulator.sequences import Stage
 from simulator.training.config import SimulatorConfig
@@ -147,8 +147,7 @@ class _Source:
         self._optics: dict[tuple[str, int], torch.Tensor] = {}
 
     def pairs(self, stage: str, progress: Callable[[int, int], None] | None) -> ReferencePairs:
-        # Only a scene of known depth tells what a wider aperture does to it.
-        used = [s for s in self.sequences if stage != "aperture" or s.scene.depth is not None]
+        used = [s for s in self.sequences if _teaches(s.scene, stage)]
         return ReferencePairs(
             used,
             self.camera,
@@ -157,6 +156,15 @@ class _Source:
             optics=self._optics,
             progress=progress,
         )
+
+
+def _teaches(scene: ReferenceScene, stage: str) -> bool:
+    """Whether a stage is trained on `scene`.
+
+    Only a scene of known depth tells what a wider aperture does to it. The other stages have seen
+    the picture that a draped scene shows.
+    """
+    return scene.depth is not None if stage == "aperture" else scene.kind != DRAPED
 
 
 def _titled(progress: TrainingProgress | None, title: str) -> Callable[[int, int], None] | None:
