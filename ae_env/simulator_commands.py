@@ -26,6 +26,7 @@ from ae_env.console import (
 )
 
 if TYPE_CHECKING:
+    from ae_env.scenes import Scene
     from simulator.camera_simulator import CameraSimulator
     from simulator.raw_image import RawImage
     from simulator.reference import ReferenceScene
@@ -41,6 +42,8 @@ Depth = Annotated[
 
 #: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
+#: Packed pixels a side of a picture on a contact sheet, at most.
+_SHEET_SIZE = 128
 
 
 def simulate(
@@ -101,11 +104,11 @@ def sweep(
     from ae_env.scenes import Scene
     from simulator import read_raw, write_dng
 
+    _check_depth(depth, weights)
     device = torch_device(device)
     source = read_raw(raw)
     make_folder(out)
-    scene = Scene.from_raw(source, scene_id=raw.stem)
-    scene = scene.resized(min(128, *scene.light.shape[1:]))
+    scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth)
     sheet = out / "contact_sheet.png"
     save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
     files = {"contact sheet": sheet}
@@ -189,6 +192,26 @@ def training_scenes(config: SimulatorConfig, split: str) -> Sequence[ReferenceSc
         seed=config.seed,
     )
     return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
+
+
+def _check_depth(depth: str, weights: str) -> None:
+    """Raises a `ValueError` if `depth` is unknown to us, or needs networks that are not there."""
+    if depth not in ("far", "unknown"):
+        raise ValueError(f"`depth` (={depth!r}) must be 'far' or 'unknown'")
+    if depth == "unknown" and weights == "none":
+        raise ValueError("`depth` (='unknown') needs networks: leave out `--weights none`")
+
+
+def _small_scene(scene: Scene, weights: str, depth: str) -> Scene:
+    """`scene` at the size of a contact sheet, with what the networks find out about it."""
+    from ae_env.scenes.networks import SceneNetworks
+
+    size = min(_SHEET_SIZE, *scene.light.shape[1:])
+    if weights == "none":
+        return scene.resized(size)
+    networks = SceneNetworks(weights)
+    small = networks.resized(scene, size) if depth == "unknown" else scene.resized(size)
+    return networks.denoised(small)
 
 
 def _simulator(weights: str, device: str) -> CameraSimulator:

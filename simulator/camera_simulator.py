@@ -183,12 +183,20 @@ class CameraSimulator:
                 latent = replace(latent, camera=camera)
             return latent
         if isinstance(source, Latent):
-            return replace(source, light=source.light.to(self.device))
+            return replace(
+                source,
+                light=source.light.to(self.device),
+                denoised=self._moved(source.denoised),
+                saturated=self._moved(source.saturated),
+            )
         if hasattr(source, "latent"):
             return self._latent(source.latent)
         raise ValueError(
             f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene"
         )
+
+    def _moved(self, tensor: torch.Tensor | None) -> torch.Tensor | None:
+        return None if tensor is None else tensor.to(self.device)
 
     @torch.no_grad()
     def denoise(self, latent: Latent) -> torch.Tensor:

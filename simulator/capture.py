@@ -38,7 +38,8 @@ class Exposure:
         denoised: Whether it starts from the noise-reduced light; `source` is zero then.
         opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
             None where it does not.
-        remaining: (H, W) share of the source's noise variance that this blur leaves; None for all.
+        remaining: (H, W) share that this blur leaves of the noise variance which the other blurs
+            have left; None for all.
     """
 
     ratio: float

@@ -10,6 +10,7 @@ from typing import Protocol
 
 import torch
 
+from simulator.blur import kernel_energy
 from simulator.camera import CameraProfile, NoiseLevelFunction
 from simulator.capture import Exposure, add_noise, clip_and_quantise, sensor_light
 from simulator.noise import noise_generator
@@ -88,21 +89,32 @@ class Latent:
         defocus_px = self.defocus * 4.0 / f_number
         ratio = self.gain * exposure_ratio(self.reference, settings)
         target = _averaged_nlf(self.camera, settings.iso, self.box_factor)
+        motion_px = motion_px if motion_px > NEGLIGIBLE_BLUR else 0.0
+        defocus_px = defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0
         opened_to = self._opened_to(f_number)
         denoised = self._needs_denoising(ratio, target, opened_to)
         remaining = None
-        if opened_to is not None and self.opening is not None and not denoised:
-            remaining = None if self.nlf.is_zero else self.opening.remaining(opened_to)
+        if self.opening is not None and opened_to is not None and not (denoised or self.noise_free):
+            # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
+            # it further. Both together leave about what the larger leaves alone.
+            energy = kernel_energy(motion_px, defocus_px)
+            share = self.opening.remaining(opened_to)
+            remaining = None if share is None else (share / energy).clamp(max=1.0)
         return Exposure(
             ratio=ratio,
             source=NoiseLevelFunction.zero() if denoised else self.nlf,
             target=target,
-            motion_px=motion_px if motion_px > NEGLIGIBLE_BLUR else 0.0,
-            defocus_px=defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0,
+            motion_px=motion_px,
+            defocus_px=defocus_px,
             denoised=denoised,
             opened_to=opened_to,
             remaining=remaining,
         )
+
+    @property
+    def noise_free(self) -> bool:
+        """Whether no noise is left in `light`."""
+        return self.nlf.is_zero
 
     def _opened_to(self, f_number: float) -> float | None:
         """`f_number` where it blurs more than the reference's aperture did, else None."""

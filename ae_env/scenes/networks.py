@@ -17,11 +17,14 @@ from ae_env.cache import cache_dir, cache_key
 from ae_env.scenes.scene import Crop, Scene
 from simulator.camera_simulator import CameraSimulator
 from simulator.files import sibling, write_atomically
+from simulator.modules.aperture import DEAD_ZONE
 
 logger = logging.getLogger(__name__)
 
 #: The weights that come with the package.
 DEFAULT_SIMULATOR = "compact"
+#: Bumped when the way that defocus maps are found changes.
+MAP_VERSION = 1
 #: Pixels around a crop that the networks see, too: at least as far as they look.
 _MARGIN = 112
 
@@ -103,6 +106,7 @@ class SceneNetworks:
 
     def _cache_path(self, scene: Scene, resolution: int | None, crop: Crop) -> Path:
         key = {
+            "version": [MAP_VERSION, DEAD_ZONE],
             "weights": self._fingerprint,
             "light": _digest([scene.light]),
             "nlf": [scene.nlf.shot, scene.nlf.read],

@@ -50,11 +50,13 @@ class Trained:
         modules: By name: ``exposure``, ``noise``, ``aperture``, or ``baseline``.
         stages: Per stage: pairs, steps, seconds, and the loss on validation scenes.
         scenes: Scenes of the training split by kind.
+        is_main: Whether this is the process that writes, of several.
     """
 
     modules: nn.ModuleDict
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
     scenes: dict[str, int] = field(default_factory=dict)
+    is_main: bool = True
 
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:
@@ -131,6 +133,7 @@ def train_simulator(
             "seconds": round(clock.seconds, 1),
             "validation": validate(loss, held_out, stage.crop, accelerator),
         }
+    trained.is_main = accelerator.is_main_process
     accelerator.end_training()
     trained.modules.to("cpu").eval()
     return trained
@@ -229,7 +232,8 @@ def train_and_save(
         "stages": trained.stages,
         **{k: meta[k] for k in ("command", "commit", "date", "machine", "versions")},
     }
-    save_modules(path, trained.modules, config.preset, card)
+    if trained.is_main:
+        save_modules(path, trained.modules, config.preset, card)
     return sibling(path, ".safetensors")
 
 
