@@ -177,13 +177,20 @@ def _averaged(scene: Scene, size: int) -> Scene:
     )
 
 
+def _focus(scene: Scene, defocus: float) -> str:
+    if defocus:
+        return f"defocus {defocus:.3g} px of 64 at f/4"
+    own = scene.own_blur(4.0) * 64.0 / scene.light.shape[-2]
+    return f"its own defocus, {own:.3g} px of 64 at f/4" if own else "all in focus"
+
+
 def _title(
     scene: Scene, speed: float, defocus: float, grid: ExposureGrid, table: ScoreTable
 ) -> tuple[str, str]:
     light = "light unknown" if scene.illuminance is None else f"{scene.illuminance:,.4g} lux"
     parts = [scene.scene_id, f"{light} (EV100 {scene.ev100:.1f})"]
     parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
-    parts.append(f"defocus {defocus:.3g} px of 64 at f/4" if defocus else "all in focus")
+    parts.append(_focus(scene, defocus))
     best = f"best state: {grid[table.oracle]}, expected score {table.mean[table.oracle]:.3f}"
     return "   ·   ".join(parts), best
 

@@ -15,7 +15,7 @@ import torch
 
 from simulator.capture import add_noise, clip_and_quantise
 from simulator.latent import HasLatent, Latent
-from simulator.modules.aperture import ApertureModule
+from simulator.modules.aperture import ApertureModule, usable_defocus
 from simulator.modules.exposure import ExposureModule
 from simulator.modules.noise import NoiseModule, Preset, smoothed, variance_map
 from simulator.noise import noise_generator
@@ -237,9 +237,10 @@ class CameraSimulator:
 
         def network(part: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
             with self._autocast():
-                return aperture.defocus(part, noise)
+                return aperture.estimate_defocus(part, noise)
 
-        return in_tiles(network, image[None], deviation, halo=_MAP_HALO)[0]
+        diameter = in_tiles(network, image[None], deviation, halo=_MAP_HALO)
+        return usable_defocus(diameter, image[None])[0]
 
     def _opening(self, latent: Latent) -> Opening:
         assert self.aperture is not None

@@ -1,10 +1,18 @@
-"""Writing files so that a reader, or a crash, finds either the old content or the new."""
+"""Files: which are raws, how weights are named, and writing so that nothing is lost."""
 
 from __future__ import annotations
 
 import os
 import tempfile
 from pathlib import Path
+
+#: Endings of raw files that LibRaw knows.
+RAW_SUFFIXES = (
+    *(".3fr", ".ari", ".arw", ".bay", ".cr2", ".cr3", ".crw", ".dcr", ".dcs", ".dng", ".erf"),
+    *(".fff", ".gpr", ".iiq", ".k25", ".kdc", ".mdc", ".mef", ".mos", ".mrw", ".nef", ".nrw"),
+    *(".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
+    ".x3f",
+)
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> Path:

@@ -16,17 +16,10 @@ from typing import overload
 
 from simulator.camera import CameraProfile
 from simulator.dng import write_dng
+from simulator.files import RAW_SUFFIXES
 from simulator.packed_table import PARAMETERS, PackedCapture, read_table, write_table
 from simulator.raw_file import read_raw
 from simulator.raw_image import RawImage
-
-#: Endings of raw files that LibRaw knows.
-RAW_SUFFIXES = (
-    *(".3fr", ".ari", ".arw", ".bay", ".cr2", ".cr3", ".crw", ".dcr", ".dcs", ".dng", ".erf"),
-    *(".fff", ".gpr", ".iiq", ".k25", ".kdc", ".mdc", ".mef", ".mos", ".mrw", ".nef", ".nrw"),
-    *(".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
-    ".x3f",
-)
 
 
 @dataclass(frozen=True, eq=False)

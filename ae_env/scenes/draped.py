@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ae_env.scenes.depth import FOCAL_LENGTH, draw_depth, lens_and_depth
-from ae_env.scenes.reference import FOCUS_CYCLE, packed_pitch
+from ae_env.scenes.reference import FOCUS_CYCLE, packed_pitch, sharpened
 from simulator.camera import CameraProfile
 from simulator.reference import DRAPED, Lens, ReferenceScene
 
@@ -34,9 +34,10 @@ def draped_scenes(
         seed: Of the depths.
     """
     number = 0
-    for scene in scenes:
-        if scene.depth is not None or scene.kind == "photograph":
+    for given in scenes:
+        if given.depth is not None or given.kind == "photograph":
             continue
+        scene = sharpened(given) if given.kind == "radiance" else given
         for copy in range(copies):
             focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
             number += 1

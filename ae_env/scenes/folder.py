@@ -22,17 +22,10 @@ from ae_env.scenes.grouping import (
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene
 from simulator.camera import CameraProfile
+from simulator.files import RAW_SUFFIXES
 from simulator.raw_file import read_raw
 
 logger = logging.getLogger(__name__)
-
-#: Endings of raw files that LibRaw knows.
-RAW_SUFFIXES = (
-    *(".3fr", ".ari", ".arw", ".bay", ".cr2", ".cr3", ".crw", ".dcr", ".dcs", ".dng", ".erf"),
-    *(".fff", ".gpr", ".iiq", ".k25", ".kdc", ".mdc", ".mef", ".mos", ".mrw", ".nef", ".nrw"),
-    *(".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
-    ".x3f",
-)
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,16 @@ class Case:
         return self.stops > 0 and self.blur >= VISIBLE_BLUR
 
     @property
+    def opens_on_focus(self) -> bool:
+        """Whether it opens on a scene with depth of which nothing visible is out of focus."""
+        return self.stops > 0 and self.blur < VISIBLE_BLUR and self.scene.depth is not None
+
+    @property
+    def opens_flat(self) -> bool:
+        """Whether it opens on a scene whose depth is not known, and which stays as it is."""
+        return self.stops > 0 and self.scene.depth is None
+
+    @property
     def cleaner(self) -> bool:
         """Whether the target has less noise than the source brings, averaged over the crop."""
         camera, mean = self.source.camera, self.target.mean
@@ -77,17 +87,19 @@ GROUPS: dict[str, Callable[[Case], bool]] = {
     "same aperture": lambda case: case.stops == 0,
     "aperture opens": lambda case: case.stops > 0,
     "opens, blur >= 1.5 px": lambda case: case.opens_on_blur,
-    "opens, blur < 1.5 px": lambda case: case.stops > 0 and not case.opens_on_blur,
+    "opens, blur < 1.5 px": lambda case: case.opens_on_focus,
+    "opens, no depth known": lambda case: case.opens_flat,
     "source saturated in > 1 %": lambda case: (
         float(case.source.saturated.float().mean()) > SATURATED
     ),
 }
 #: Groups of which every pair is in exactly one: where the average margin comes from.
 PARTITION: dict[str, Callable[[Case], bool]] = {
-    "cleaner target, opens on blur": lambda case: case.cleaner and case.opens_on_blur,
-    "cleaner target, else": lambda case: case.cleaner and not case.opens_on_blur,
-    "noisier target, opens on blur": lambda case: not case.cleaner and case.opens_on_blur,
-    "noisier target, else": lambda case: not case.cleaner and not case.opens_on_blur,
+    "opens, blur >= 1.5 px": lambda case: case.opens_on_blur,
+    "opens, blur < 1.5 px": lambda case: case.opens_on_focus,
+    "opens, no depth known": lambda case: case.opens_flat,
+    "does not open, cleaner target": lambda case: case.stops <= 0 and case.cleaner,
+    "does not open, noisier target": lambda case: case.stops <= 0 and not case.cleaner,
 }
 
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 CAMERA = "nikon_z6"
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].
-GROUPS, SIZE = 64, 256
+GROUPS, SIZE = 32, 256
 QUICK_GROUPS, QUICK_SIZE = 8, 128
 #: What counts by scene counts scenes with as many pixels of the class, or in focus.
 FEWEST_PIXELS = 500

@@ -75,9 +75,9 @@ def section(rows: list[dict]) -> str:
     offsets = ", ".join(f"{b:+.2f}" for b in truth["b_digital_numbers"])
     return "\n".join(
         [
-            "Pixels above 0.99 of the source are left out, as in training. A pair and its reverse ask "
-            "for w and 1 / w, so w has little to learn; b is the recorded black level's error, which "
-            f"this body has at {offsets} with the sign reversed (its shutter is "
+            "Pixels above 0.99 of the source are left out, as in training. A pair and its reverse "
+            "ask for w and 1 / w, so w has little to learn; b is the recorded black level's error, "
+            f"which this body has at {offsets} with the sign reversed (its shutter is "
             f"{truth['shutter_delay_us']:+.1f} us late).",
             "",
             *lines,

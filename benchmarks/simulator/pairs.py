@@ -201,7 +201,7 @@ def _ssim(image: Tensor, target: Tensor) -> float:
 def _rows(
     scored: list[tuple[Case, dict[Method, Score]]], *, camera: str, mix: str
 ) -> Iterator[dict[str, Any]]:
-    groups = GROUPS | PARTITION if mix == "all" else {name: GROUPS[name] for name in _OPENING}
+    groups = {**GROUPS, **PARTITION} if mix == "all" else {name: GROUPS[name] for name in _OPENING}
     for group, belongs in groups.items():
         chosen = [(case, scores) for case, scores in scored if belongs(case)]
         if not chosen:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from simulator.modules.attention_unet import AttentionUNet
@@ -12,6 +13,11 @@ from simulator.modules.noise import Preset, check_preset
 
 #: Blur below this diameter [pixel] is not told from sharpness, and left as it is.
 DEAD_ZONE = 1.0
+#: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
+#: on as defocused.
+IN_FOCUS = (1.4, 1.8)
+#: Variance over squared mean from which a neighbourhood counts fully as detail.
+_FULL_CONTRAST = 0.05
 
 
 class ApertureModule(nn.Module):
@@ -47,14 +53,22 @@ class ApertureModule(nn.Module):
         return DiscBank(image).blurred(added[:, None])
 
     def defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Circle of confusion of each pixel of the source (B, H, W) [pixel], after the dead zone.
+        """Circle of confusion of each pixel of the source (B, H, W) [pixel], as far as trusted.
+
+        Raises:
+            ValueError: If the preset has no such map.
+        """
+        return usable_defocus(self.estimate_defocus(image, deviation), image)
+
+    def estimate_defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """The network's map (B, H, W) [pixel]; each pixel depends on its neighbourhood alone.
 
         Raises:
             ValueError: If the preset has no such map.
         """
         if not isinstance(self.network, DefocusMap):
             raise ValueError(f"`preset` (={self.preset!r}) must be 'compact' to have a defocus map")
-        return dead_zone(self.network.diameter(image, deviation))
+        return self.network.diameter(image, deviation)
 
     def _residual(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
         # One scalar per image makes the network see every exposure alike: it then commutes with
@@ -69,6 +83,40 @@ class ApertureModule(nn.Module):
         residual = (residual - flat) * scale
         opens = (f_target < f_source)[:, None, None, None]
         return torch.where(opens, image + residual, image)
+
+
+def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:
+    """The part of an estimated map that is to be trusted: none of it where nothing is defocused.
+
+    Args:
+        diameter: (B, H, W) as `ApertureModule.estimate_defocus` gives it [pixel].
+        image: (B, 4, H, W) that it was estimated from.
+    """
+    return dead_zone(diameter) * is_defocused(diameter, image)[:, None, None]
+
+
+def is_defocused(diameter: Tensor, image: Tensor) -> Tensor:
+    """Whether a picture shows defocus at all, (B,) from 0 to 1.
+
+    Blur up to 1.5 pixels is hard to tell from softness, and a false map costs a sharp picture more
+    than a missed one costs a blurred picture. So a picture counts as in focus throughout unless a
+    twentieth of its detail (weighed by local contrast) is blurred by more than `IN_FOCUS`.
+
+    Args:
+        diameter: (B, H, W) estimated circle of confusion [pixel].
+        image: (B, 4, H, W).
+    """
+    grey = image.mean(dim=1, keepdim=True)
+    mean = F.avg_pool2d(F.pad(grey, (4,) * 4, mode="replicate"), 9, stride=1)
+    square = F.pad((grey - mean).square(), (4,) * 4, mode="replicate")
+    contrast = F.avg_pool2d(square, 9, stride=1) / mean.square().clamp(min=1e-12)
+    weight = contrast.clamp(max=_FULL_CONTRAST).flatten(1)
+    order = diameter.flatten(1).argsort(dim=1)
+    share = weight.gather(1, order).double().cumsum(dim=1)
+    place = (share < 0.95 * share[:, -1:]).sum(dim=1, keepdim=True).clamp(max=share.shape[1] - 1)
+    level = diameter.flatten(1).gather(1, order.gather(1, place))[:, 0]
+    low, high = IN_FOCUS
+    return ((level - low) / (high - low)).clamp(0.0, 1.0)
 
 
 def dead_zone(diameter: Tensor, size: float = DEAD_ZONE) -> Tensor:

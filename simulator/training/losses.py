@@ -91,7 +91,7 @@ class ApertureLoss(nn.Module):
         error = (output - batch.target).abs() * used
         before = (denoised - batch.target).abs() * used
         # Per pair, so that bright ones do not outweigh the others; not below the noise.
-        unit = before.sum(dim=(1, 2, 3)) + (0.3 * deviation * used).sum(dim=(1, 2, 3)) + 1e-9
+        unit = before.sum(dim=(1, 2, 3)) + (0.5 * deviation * used).sum(dim=(1, 2, 3)) + 1e-9
         picture = (error.sum(dim=(1, 2, 3)) / unit).mean()
         values["relative"] = error.detach().sum() / before.sum().clamp(min=1e-9)
         return {"loss": picture + _MAP_WEIGHT * values.get("map", 0.0), **values}

@@ -10,10 +10,10 @@ import torch
 from stable_baselines3 import PPO
 from torch import nn
 
-from simulator.checkpoint import Checkpoint
 from agents.policy import PolicyContext, make_policy
 from agents.ppo import ExposureExtractor, PPOPolicy, PPOTraining, save_ppo, train_ppo
 from agents.sb3_adapter import SB3VectorAdapter
+from simulator.checkpoint import Checkpoint
 
 TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
 

@@ -7,7 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from simulator.modules.aperture import DEAD_ZONE, ApertureModule, added_blur, dead_zone
+from simulator.modules.aperture import (
+    DEAD_ZONE,
+    ApertureModule,
+    added_blur,
+    dead_zone,
+    is_defocused,
+    usable_defocus,
+)
 from simulator.modules.noise import Preset
 from simulator.thin_lens import Lens
 
@@ -137,3 +144,27 @@ def test_added_blur_when_closing_or_staying_is_exactly_zero() -> None:
     diameter = torch.tensor([0.0, 3.0, 12.0])
     assert added_blur(diameter, 4.0, 4.0).tolist() == [0.0] * 3
     assert added_blur(diameter, 4.0, 11.0).tolist() == [0.0] * 3
+
+
+def test_a_picture_in_focus_is_not_touched_by_a_stray_estimate() -> None:
+    """A twentieth of the detail must be blurred: 4 % of the pixels do not count, 50 % do."""
+    generator = torch.Generator().manual_seed(0)
+    image = 0.5 + 0.1 * torch.rand(2, 4, 50, 50, generator=generator)
+    diameter = torch.full((2, 50, 50), 0.3)
+    diameter[0, :2] = 6.0  # 4 %
+    diameter[1, :25] = 6.0
+    assert is_defocused(diameter, image).tolist() == [0.0, 1.0]
+    trusted = usable_defocus(diameter, image)
+    assert float(trusted[0].max()) == 0.0
+    assert float(trusted[1].max()) == pytest.approx((6.0**2 - DEAD_ZONE**2) ** 0.5)
+
+
+def test_what_has_no_detail_does_not_count() -> None:
+    """Blur of a smooth surface is unknown, whatever the network says: the textured half decides."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.full((1, 4, 40, 80), 0.5)
+    image[..., 40:] += 0.2 * torch.rand(1, 4, 40, 40, generator=generator)
+    diameter = torch.full((1, 40, 80), 0.2)
+    diameter[..., :34] = 8.0  # the flat half, but for the window around its edge
+    assert float(is_defocused(diameter, image)) == 0.0
+    assert float(is_defocused(8.2 - diameter, image)) == 1.0
