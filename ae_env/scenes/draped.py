@@ -37,7 +37,7 @@ def draped_scenes(
     for given in scenes:
         if given.depth is not None or given.kind == "photograph":
             continue
-        scene = sharpened(given) if given.kind == "radiance" else given
+        scene = sharpened(given)
         for copy in range(copies):
             focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
             number += 1

@@ -112,16 +112,20 @@ def reference_scenes(
                 scenes.append(_from_scene(scene.resized(min(size, LARGEST_VIEW), "native")))
     if radiance is not None:
         for path in _maps(Path(radiance), RADIANCE_MAPS[split]):
-            views = _radiance_views(path, camera, min(size, LARGEST_VIEW))
-            scenes += map(sharpened, views) if split == "test" else views
-    return scenes
+            scenes += _radiance_views(path, camera, min(size, LARGEST_VIEW))
+    return [_as_tested(scene) for scene in scenes] if split == "test" else scenes
+
+
+def _as_tested(scene: ReferenceScene) -> ReferenceScene:
+    return scene if scene.depth is not None or scene.kind == "photograph" else sharpened(scene)
 
 
 def sharpened(scene: ReferenceScene) -> ReferenceScene:
-    """A view into a radiance map at half its size, box-averaged: sharp to the pixel.
+    """A scene without depth at half its size, box-averaged: sharp to the pixel.
 
-    The maps are softer than a lens in focus. Wherever defocus matters, in tests and under
-    `ae_env.scenes.draped`, "in focus" must mean sharp; elsewhere all pixels are of use.
+    Radiance maps and the bundled kinds are softer than a lens in focus. Wherever defocus matters,
+    in tests and under `ae_env.scenes.draped`, "in focus" must mean sharp; elsewhere all pixels are
+    of use.
     """
     height, width = (n // 2 * 2 for n in scene.light.shape[1:])
     tiles = scene.light[:, :height, :width].reshape(4, height // 2, 2, width // 2, 2)

@@ -42,7 +42,7 @@ class _Size:
 #: Pairs by mix: "all" is the paper's, any two captures of a sequence; the others are drawn from the
 #: scenes that have depth, because few pairs of the first open the aperture of something defocused.
 _FULL = _Size(64, 256, 128, {"all": 300, "opening": 100, "f/11 to f/4": 60})
-_QUICK = _Size(6, 96, 64, {"all": 8, "opening": 3, "f/11 to f/4": 2})
+_QUICK = _Size(6, 96, 64, {"all": 6, "opening": 2, "f/11 to f/4": 2})
 #: Groups of the mixes that only open the aperture.
 _OPENING = ("aperture opens", "opens, blur >= 1.5 px", "opens, blur < 1.5 px")
 

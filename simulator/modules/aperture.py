@@ -15,7 +15,7 @@ from simulator.modules.noise import Preset, check_preset
 DEAD_ZONE = 1.0
 #: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
 #: on as defocused.
-IN_FOCUS = (1.4, 1.8)
+IN_FOCUS = (1.7, 2.2)
 #: Variance over squared mean from which a neighbourhood counts fully as detail.
 _FULL_CONTRAST = 0.05
 
