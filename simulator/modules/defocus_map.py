@@ -83,6 +83,7 @@ class _Block(nn.Module):
             self.second.weight.mul_(0.3)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
         return x + self.second(F.relu(self.first(x)))
 
 

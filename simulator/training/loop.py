@@ -115,10 +115,8 @@ def train_stage(
         Steps and seconds that were used.
     """
     device = accelerator.device
-    for parameter in loss.parameters():
-        parameter.requires_grad_(False)
-    for parameter in trained.parameters():
-        parameter.requires_grad_(True)
+    loss.requires_grad_(False)
+    trained.requires_grad_(True)
     loss.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.Adam(trained.parameters(), lr=stage.learning_rate)
     clock = Clock(stage, on_cpu=device.type == "cpu")
@@ -131,11 +129,10 @@ def train_stage(
     whole = True  # no step is half done
     try:
         while clock.share < 1.0:
-            for group in optimiser.param_groups:
-                group["lr"] = learning_rate(clock.share, stage.learning_rate)
+            optimiser.param_groups[0]["lr"] = learning_rate(clock.share, stage.learning_rate)
             rank = accelerator.process_index
-            batch = pairs.batch(clock.step, stage.batch, stage.crop, process=rank).to(device)
-            values = wrapped(batch)
+            batch = pairs.batch(clock.step, stage.batch, stage.crop, process=rank)
+            values = wrapped(batch.to(device))
             _follow(means, values, name)
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)

@@ -150,6 +150,7 @@ class _Source:
         self._optics: dict[tuple[str, int], torch.Tensor] = {}
 
     def pairs(self, stage: str, progress: Callable[[int, int], None] | None) -> ReferencePairs:
+        """The pairs that `stage` is trained or validated on."""
         used = [s for s in self.sequences if _teaches(s.scene, stage)]
         return ReferencePairs(
             used,
