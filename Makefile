@@ -28,6 +28,7 @@ format: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/ae-env bench scorers
 	$(BIN)/ae-env bench throughput
+	@echo "the simulator against the reference camera (trains the networks to compare with: about 1.5 hours): $(BIN)/ae-env bench simulator"
 	@echo "the agents' long training (about an hour): $(BIN)/ae-env bench agents"
 
 $(VENV): $(STAMP)

@@ -39,8 +39,9 @@ SOURCE_ISO, TARGET_ISO = 6400, 100
 ASKED = {"nikon_z6": 4.0, "canon_70d": 5.0}
 #: Exposure ratios, in stops, at which the gain must be the same.
 STOPS = (-12, -9, -6, -3, -0.5, 0, 0.5, 3, 6, 9, 12)
-#: Strength of non-local means in units of the noise, and wavelet: the best on the validation maps.
-NLM_STRENGTH, WAVELET = 0.6, "db2"
+#: Non-local means' strength in units of the noise and patch size, and the wavelet: the best of a
+#: few on the validation maps, halved as the test maps are.
+NLM_STRENGTH, NLM_PATCH, WAVELET = 0.6, 3, "db2"
 #: What denoises a raw: takes it and its latent, returns (4, H, W).
 Denoiser = Callable[[Latent], Tensor]
 
@@ -55,7 +56,7 @@ def measure(
     Args:
         models: What is measured.
         seed: Of the noise.
-        quick: Two small crops.
+        quick: Two small views.
         progress: Called with the camera and the share that is done.
     """
     networks = {"NS `compact`": models.compact, "NS `paper`": models.paper}
@@ -83,29 +84,17 @@ def measure(
 
 
 def _captures(camera: str, seed: int, quick: bool) -> Iterator[tuple[RawImage, ReferenceCapture]]:
-    """Noisy sources and their targets: the quarters of every view, or two crops of `quick`."""
+    """Noisy sources and their targets: every view, or two if `quick`."""
     profile = get_camera(camera)
     reference = ReferenceCamera(profile)
-    number, size = (6, 96) if quick else (64, 256)  # those of the other parts: made once
-    known = held_out_scenes(camera, number=number, size=size)
+    known = held_out_scenes(camera, quick=quick)
     scenes = [s for s in known if s.kind == "radiance"]
     for scene in scenes[:2] if quick else scenes:
         target = scene.reference
         time = target.exposure_time * TARGET_ISO / SOURCE_ISO
         source = CameraSettings(SOURCE_ISO, time, target.f_number)
-        for number, light in enumerate(_quarters(scene.light)):
-            noise = seed + number
-            taken = reference.capture(scene, source, noise, light=light)
-            wanted = reference.capture(scene, target, noise, light=light)
-            yield RawImage(taken.sample, source, profile), wanted
-
-
-def _quarters(light: Tensor) -> Iterator[Tensor]:
-    """The quarters (4, 128, 128) of a view; a small one is one crop."""
-    side = min(128, light.shape[-1])
-    for top in range(0, light.shape[-2] - side + 1, side):
-        for left in range(0, light.shape[-1] - side + 1, side):
-            yield light[:, top : top + side, left : left + side]
+        taken = reference.capture(scene, source, seed)
+        yield RawImage(taken.sample, source, profile), reference.capture(scene, target, seed)
 
 
 def _gain(denoise: Denoiser, raw: RawImage, mean: Tensor) -> tuple[float, float]:
@@ -131,7 +120,7 @@ def _row(
         "part": "denoising",
         "camera": camera,
         "method": method,
-        "crops": len(captures),
+        "views": len(captures),
         "size": means[0].shape[-1],
         "gain_db": float(gains.mean()),
         "gain_db_10_percent": float(np.quantile(gains, 0.1)),
@@ -163,7 +152,7 @@ def _ratio_rows(
             "camera": camera,
             "method": method,
             "stops": stops,
-            "crops": len(captures),
+            "views": len(captures),
             "gain_db": float(np.mean(gains)),
         }
 
@@ -204,10 +193,10 @@ def inverse_anscombe(stable: Tensor, nlf: NoiseLevelFunction) -> Tensor:
 
 
 def non_local_means(stable: np.ndarray) -> np.ndarray:
-    """Non-local means (4, H, W), patches 5 x 5 within 6 pixels, planes compared together."""
+    """Non-local means (4, H, W), patches 3 x 3 within 6 pixels, planes compared together."""
     return denoise_nl_means(
         stable,
-        patch_size=5,
+        patch_size=NLM_PATCH,
         patch_distance=6,
         h=NLM_STRENGTH,
         sigma=1.0,
@@ -248,12 +237,12 @@ def section(rows: list[dict[str, Any]]) -> str:
     own = [r for r in rows if "stops" not in r]
     first = own[0]
     lines = [
-        f"{first['crops']} crops of {first['size']} x {first['size']} from held-out radiance maps, "
+        f"{first['views']} views of {first['size']} x {first['size']} into held-out radiance maps, "
         f"captured at ISO {SOURCE_ISO} and 1/{SOURCE_ISO // TARGET_ISO} of the target's exposure "
         f"time; the truth is the noise-free mean at ISO {TARGET_ISO}. Gain of PSNR over the noisy "
-        "source (EXP), mean over the crops and its 10 and 90 % quantiles. Non-local means and "
+        "source (EXP), mean over the views and its 10 and 90 % quantiles. Non-local means and "
         "wavelets are scikit-image's, behind the generalised Anscombe transform and its unbiased "
-        "inverse; their strength and wavelet are the best on the validation maps.",
+        "inverse; their strength, patch size and wavelet are the best on the validation maps.",
         "",
         "| method"
         + "".join(f" | {camera}: gain [dB] | 10 to 90 % | ms" for camera in CAMERAS)

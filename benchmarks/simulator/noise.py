@@ -8,6 +8,7 @@ compared with the reference camera's by the Kullback-Leibler divergence.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.simulator.models import Models
-from benchmarks.simulator.scenes import Progress, held_out_scenes
+from benchmarks.simulator.scenes import FULL, QUICK, Progress, cropped, held_out_scenes
 from simulator import (
     CameraProfile,
     CameraSettings,
@@ -96,8 +97,8 @@ def measure(
 
 def _scenes(camera: str, quick: bool) -> dict[str, list[ReferenceScene]]:
     """The chart, held-out scenes of natural statistics, and such with something out of focus."""
-    size = 96 if quick else 128
-    known = held_out_scenes(camera, number=6 if quick else 24, size=size)
+    crop = (QUICK if quick else FULL)[2]
+    known = [cropped(scene, crop) for scene in held_out_scenes(camera, quick=quick)]
     radiance = [s for s in known if s.kind == "radiance"]
     flat = radiance or [s for s in known if s.depth is None]
     profile = ReferenceCamera(get_camera(camera))
@@ -183,13 +184,18 @@ class _Photographer:
         return _at(scene, self.iso)
 
     def _signal(self, scene: ReferenceScene, settings: CameraSettings) -> Tensor:
-        light = self.camera.optics(scene, settings.f_number)
+        light = _optics(self.camera, scene, settings.f_number)
         return self.camera.expose(light, scene.reference, settings)
 
     def _recorded(self, signal: Tensor, iso: float, index: int, repeat: int, draw: int) -> Tensor:
         words = [self.seed, index, repeat, draw]
         state = np.random.SeedSequence(words).generate_state(1)[0]
         return self.camera.record(signal, iso, torch.Generator().manual_seed(int(state)))
+
+
+@functools.lru_cache(maxsize=32)
+def _optics(camera: ReferenceCamera, scene: ReferenceScene, f_number: float) -> Tensor:
+    return camera.optics(scene, f_number)
 
 
 def _at(scene: ReferenceScene, iso: float) -> CameraSettings:

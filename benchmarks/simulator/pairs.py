@@ -22,27 +22,17 @@ from torch import Tensor, nn
 from benchmarks.simulator.cases import GROUPS, PARTITION, Case, drawn, pairs_of, photographed
 from benchmarks.simulator.models import Models
 from benchmarks.simulator.pairs_report import section as section
-from benchmarks.simulator.scenes import Progress, clipped, held_out_scenes, psnr
+from benchmarks.simulator.scenes import FULL, QUICK, Progress, clipped, held_out_scenes, psnr
 from simulator import CameraSimulator, get_camera
 from simulator.reference import BodyError, ReferenceCamera
 from simulator.training.data import draw_sequences
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.
 CAMERAS = {"nikon_z6": 1, "canon_70d": 7}
-
-
-@dataclass(frozen=True)
-class _Size:
-    scenes: int
-    size: int
-    crop: int
-    pairs: dict[str, int]
-
-
 #: Pairs by mix: "all" is the paper's, any two captures of a sequence; the others are drawn from the
 #: scenes that have depth, because few pairs of the first open the aperture of something defocused.
-_FULL = _Size(64, 256, 128, {"all": 300, "opening": 100, "f/11 to f/4": 60})
-_QUICK = _Size(6, 96, 64, {"all": 6, "opening": 2, "f/11 to f/4": 2})
+PAIRS = {"all": 300, "opening": 100, "f/11 to f/4": 60}
+QUICK_PAIRS = {"all": 6, "opening": 2, "f/11 to f/4": 2}
 #: Groups of the mixes that only open the aperture.
 _OPENING = ("aperture opens", "opens, blur >= 1.5 px", "opens, blur < 1.5 px")
 
@@ -58,19 +48,19 @@ def measure(
         quick: A few small pairs.
         progress: Called with the camera and the share that is done.
     """
-    size = _QUICK if quick else _FULL
+    counts = QUICK_PAIRS if quick else PAIRS
+    crop = (QUICK if quick else FULL)[2]
     rows: list[dict[str, Any]] = []
     for number, (camera, body) in enumerate(CAMERAS.items()):
         profile = get_camera(camera)
         reference = ReferenceCamera(profile, body=BodyError.draw(profile, body))
-        scenes = held_out_scenes(camera, number=size.scenes, size=size.size)
-        sequences = draw_sequences(scenes, profile, seed)
-        for index, (mix, count) in enumerate(size.pairs.items()):
+        sequences = draw_sequences(held_out_scenes(camera, quick=quick), profile, seed)
+        for index, (mix, count) in enumerate(counts.items()):
             pairs = drawn(pairs_of(mix, sequences, reference), count, [seed, number, index])
             scored = []
-            for done, case in enumerate(photographed(pairs, sequences, reference, size.crop, seed)):
+            for done, case in enumerate(photographed(pairs, sequences, reference, crop, seed)):
                 if progress is not None:
-                    share = (index + done / count) / len(size.pairs)
+                    share = (index + done / count) / len(counts)
                     progress(f"{camera}, {mix}", (number + share) / len(CAMERAS))
                 scored.append((case, _scores(case, models)))
             rows += _rows(scored, camera=camera, mix=mix)

@@ -6,6 +6,7 @@ import functools
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -17,6 +18,9 @@ from simulator.reference import ReferenceScene
 
 #: Called with what is being measured and the share of the part that is done.
 Progress = Callable[[str, float], None]
+#: Procedural groups of the test split, size of its scenes and of crops of them [packed pixel];
+#: scenes without depth, photographs apart, are half the size.
+FULL, QUICK = (64, 256, 128), (6, 128, 64)
 #: PSNR of two images that are the same, or nearer than this [dB].
 LARGEST_PSNR = 80.0
 
@@ -28,10 +32,19 @@ def data_root() -> Path | None:
 
 
 @functools.cache
-def held_out_scenes(camera: str, *, number: int, size: int) -> tuple[ReferenceScene, ...]:
-    """The test split: `number` procedural groups, photographs and, where present, radiance maps."""
+def held_out_scenes(camera: str, *, quick: bool) -> tuple[ReferenceScene, ...]:
+    """The test split: procedural groups, photographs and, where present, radiance maps."""
     profile, folder = get_camera(camera), data_root()
+    number, size, _ = QUICK if quick else FULL
     return tuple(reference_scenes("test", profile, number=number, size=size, radiance=folder))
+
+
+def cropped(scene: ReferenceScene, size: int) -> ReferenceScene:
+    """The middle `size` x `size` pixels of a scene, or all of one that is smaller."""
+    top, left = (max(0, n - size) // 2 for n in scene.light.shape[1:])
+    window = (..., slice(top, top + size), slice(left, left + size))
+    depth = None if scene.depth is None else scene.depth[window]
+    return replace(scene, light=scene.light[window], depth=depth)
 
 
 def psnr(estimate: Tensor, truth: Tensor, peak: float = 1.0) -> float:

@@ -17,7 +17,7 @@ from ae_env import cli
 from agents.weights import sibling
 from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
 
-COMMANDS = sorted(command.callback.__name__ for command in cli.app.registered_commands)
+COMMANDS = sorted(c.callback.__name__.replace("_", "-") for c in cli.app.registered_commands)
 #: The design's columns of an evaluation, in their order.
 COLUMNS = [
     "policy",
@@ -78,7 +78,15 @@ def dng(raw: RawImage, tmp_path: Path) -> Path:
 
 
 def test_every_command_is_there() -> None:
-    assert COMMANDS == ["bench", "evaluate", "quickstart", "simulate", "sweep", "train"]
+    assert COMMANDS == [
+        "bench",
+        "evaluate",
+        "quickstart",
+        "simulate",
+        "sweep",
+        "train",
+        "train-simulator",
+    ]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
