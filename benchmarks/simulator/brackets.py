@@ -162,7 +162,7 @@ def transition_rows(
     ratio = exposure_ratio(pair.source.settings, target)
     own_noise = variance(real, pair.target.noise)
     limits = {"EXP": own_noise + exposed_variance(pair.source, ratio), "NS": own_noise}
-    used = np.broadcast_to(~pair.masked, real.shape)
+    linear = np.broadcast_to(~pair.masked, real.shape) & (pair.brighter < LINEAR_BELOW)
     # By one method's shift, so that all are compared on the same pixels.
     moved = _shift(pair, latents[0][0].expected(target).clamp(0.0, 1.0))
     rows = []
@@ -182,7 +182,7 @@ def transition_rows(
                 "correction": method.correction,
                 "denoised": latent.exposure(target).denoised,
                 **before,
-                "limit_db": decibel(float(limits[method.stage][used].mean())),
+                "limit_linear_range_db": decibel(float(limits[method.stage][linear].mean())),
                 "with_noise": {k: after[k] for k in ("psnr_db", "ssim", "texture_ratio")},
                 "prepare_ms": prepare_ms,
                 "ms": ms,
@@ -242,7 +242,7 @@ def _table(transitions: list[dict[str, Any]], scene: str) -> list[str]:
         group = [r for r in own if (r["source_ms"], r["target_ms"]) == step]
         plain = [next(r for r in group if r["stage"] == stage) for stage in ("EXP", "NS")]
         cells = [f"{r['psnr_linear_range_db']:.2f}" for r in group]
-        cells += [f"{r['limit_db']:.1f}" for r in plain]
+        cells += [f"{r['limit_linear_range_db']:.1f}" for r in plain]
         cells.append(", ".join(f"{r['ssim']:.3f}" for r in plain))
         cells.append(", ".join(f"{r['with_noise']['texture_ratio']:.2f}" for r in plain))
         lines.append(f"| {step[0]} to {step[1]} | {' | '.join(cells)} |")
