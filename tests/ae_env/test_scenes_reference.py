@@ -233,8 +233,9 @@ def test_real_maps_and_cones(data_dir: Path) -> None:
     assert len(radiance) == 25
     assert {s.group for s in radiance} == set(RADIANCE_MAPS["test"])
     for view in radiance:
-        assert view.light.shape == (4, 256, 256)
-        assert view.light[1].clamp(max=1.0).mean().item() == pytest.approx(0.12, abs=0.04)
+        assert view.light.shape == (4, 128, 128)  # halved: sharp to the pixel
+        # Averaging small lamps before they clip raises the clipped mean.
+        assert view.light[1].clamp(max=1.0).mean().item() == pytest.approx(0.14, abs=0.06)
     cones = depth_photographs(CAMERA, data=data_dir)[2:]
     assert [s.scene_id for s in cones] == ["cones-front", "cones-middle"]
     for scene in cones:

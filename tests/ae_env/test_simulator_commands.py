@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -146,11 +147,17 @@ def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
     splits = {s: training_scenes(config(procedural=4), s) for s in ("train", "validation")}
     groups = {split: {scene.group for scene in scenes} for split, scenes in splits.items()}
     assert not groups["train"] & groups["validation"]
-    # Three of four procedural scenes have depth, and nothing else has.
-    deep = {split: sum(s.depth is not None for s in scenes) for split, scenes in splits.items()}
-    assert deep == {"train": 3, "validation": 2}
+    # Three of four procedural scenes have depth; the fourth is draped over two depths.
+    deep = {
+        split: Counter(s.kind for s in scenes if s.depth is not None)
+        for split, scenes in splits.items()
+    }
+    assert deep == {"train": {"depth": 3, "draped": 2}, "validation": {"depth": 2}}
     for scenes in splits.values():
-        assert all(s.illuminance is not None and s.light.shape == (4, 32, 32) for s in scenes)
+        sizes = {s.kind == "draped": s.light.shape for s in scenes}
+        assert sizes[False] == (4, 32, 32)
+        assert sizes.get(True, (4, 16, 16)) == (4, 16, 16)
+        assert all(s.illuminance is not None for s in scenes)
 
 
 def test_an_unset_folder_of_radiance_maps_is_left_out_and_said(
