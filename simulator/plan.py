@@ -109,9 +109,7 @@ def _steps(
         ),
         "defocus": (
             taps * 2 * pixels * (exposure.defocus_px > 0),
-            "the scene is taken as far or in focus throughout"
-            if latent.defocus == 0
-            else f"the defocus disc is below {NEGLIGIBLE_BLUR} pixel",
+            _why_not_defocused(latent),
         ),
         "motion_blur": (
             _STREAK_OPERATIONS * pixels * (exposure.motion_px > 0),
@@ -133,6 +131,14 @@ def _why_not_denoised(latent: Latent) -> str:
     if latent.denoised is None:
         return "the simulator has no noise module"
     return "the target is at least as noisy: noise is added up to it"
+
+
+def _why_not_defocused(latent: Latent) -> str:
+    if latent.defocus:
+        return f"the defocus disc is below {NEGLIGIBLE_BLUR} pixel"
+    if latent.opening is not None:
+        return "none is given for the whole frame: each pixel's was estimated"
+    return "the scene is taken as far or in focus throughout"
 
 
 def _why_not_opened(latent: Latent) -> str:
