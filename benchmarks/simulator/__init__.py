@@ -9,6 +9,8 @@ real files that ``AE_ENV_DATA`` names are used where they are.
 
 from __future__ import annotations
 
+import json
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +69,13 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
                     def report(what: str, share: float, task: Any = task) -> None:
                         task(int(1000 * share), 1000, what)
 
-                    rows += part.measure(models, seed=seed, quick=quick, progress=report)
+                    kept = _kept(name, models, seed, quick)
+                    if kept.is_file():
+                        own = json.loads(kept.read_text(encoding="utf-8"))
+                    else:
+                        own = part.measure(models, seed=seed, quick=quick, progress=report)
+                        write_atomically(kept, json.dumps(own))
+                    rows += own
                     task(1, 1)
             meta = result_meta(f"ae-env bench simulator{' --quick' * quick}", seed)
         finally:
@@ -79,6 +87,16 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     }
     print_files(files)
     console.print("the pictures are meant to be looked at", highlight=False)
+
+
+def _kept(part: str, models: Models, seed: int, quick: bool) -> Path:
+    """Where the rows of a finished part are kept, so that a run that was stopped goes on.
+
+    They count for the same weights, commit and arguments alone.
+    """
+    words = [part, seed, quick, result_meta("", seed)["commit"]]
+    words += [card["sha256"] for card in models.cards.values()]
+    return FOLDER / "bench" / f"{part}-{zlib.crc32(json.dumps(words).encode()):08x}.json"
 
 
 def _markdown(models: Models, rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:

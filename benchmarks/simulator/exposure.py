@@ -87,7 +87,7 @@ def section(rows: list[dict]) -> str:
 
 def _batches(split: Any, body: int, number: int, steps: int, seed: int) -> Any:
     camera = get_camera(_CAMERA)
-    scenes = reference_scenes(split, camera, number=number, size=128)
+    scenes = reference_scenes(split, camera, number=number, size=256)
     sequences = draw_sequences(scenes, camera, seed)
     reference = ReferenceCamera(camera, body=BodyError.draw(camera, body))
     pairs = ReferencePairs(sequences, reference, "exposure", seed=seed)
