@@ -41,7 +41,7 @@ def measure(models: Models, *, seed: int, quick: bool, progress: Any = None) -> 
                     "part": "exposure",
                     "method": name,
                     "body": "trained" if body == _BODY else "another",
-                    "w": round(float(module.w), 5),
+                    "w": round(float(module.w.detach()), 5),
                     "b_digital_numbers": _digital_numbers(module.b),
                     "l1": _error(module, batches),
                 }
