@@ -79,6 +79,8 @@ class CameraSimulator:
             self.device = torch.device(device)
         except RuntimeError as error:
             raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
+        if self.device.type == "cuda" and not torch.cuda.is_available():
+            raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"`precision` (={precision!r}) must be 'float32' or 'bfloat16'")
         self.precision = precision

@@ -21,6 +21,8 @@ from simulator.settings import CameraSettings, exposure_ratio
 
 #: Noise variance in excess of the target's, relative to it, from which the source is denoised.
 TOLERATED_EXCESS = 0.01
+#: Noise below this share of the light is not worth denoising: the networks err as much.
+WORTH_DENOISING = 0.006
 #: Quantiles of the light at which a source's noise is compared with a target's.
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
@@ -129,7 +131,14 @@ class Latent:
             return False
         if opened_to is not None and self.opening is not None and self.opening.needs_denoised:
             return True
-        return self._excess(ratio, target) > TOLERATED_EXCESS
+        return self.is_noisy and self._excess(ratio, target) > TOLERATED_EXCESS
+
+    @cached_property
+    def is_noisy(self) -> bool:
+        """Whether the noise is more than `WORTH_DENOISING` of the light, at its median level."""
+        signal = self._levels[len(_LEVELS) // 2]
+        read, shot = (torch.tensor(v, dtype=torch.float64) for v in (self.nlf.read, self.nlf.shot))
+        return bool(((read + shot * signal).sqrt() > WORTH_DENOISING * signal).any())
 
     @cached_property
     def _levels(self) -> torch.Tensor:

@@ -59,6 +59,10 @@ class SimulationPlan:
             f"  runs      {' -> '.join(self.modules)}",
         ]
         lines += [f"  left out  {name}: {reason}" for name, reason in self.left_out.items()]
+        if "noise_reduction" in self.modules or "aperture" in self.modules:
+            lines.append(
+                "  networks  ran once for all settings; their error: docs/results/simulator.md"
+            )
         lines.append(
             f"  error     noise variance {self.excess_noise:.1%} above the target's "
             f"(RMSE {self.predicted_rmse:.2e} of white); "
@@ -79,7 +83,7 @@ def make_plan(latent: Latent, settings: CameraSettings) -> SimulationPlan:
         signal, exposure.source_noise, exposure.target, exposure.remaining
     )
     wanted = noise_variance(signal, exposure.target).clamp_(min=torch.finfo(torch.float32).tiny)
-    steps = _steps(latent, exposure, signal.numel(), bool((missing > 0).any()))
+    steps = _steps(latent, settings, exposure, signal.numel(), bool((missing > 0).any()))
     return SimulationPlan(
         settings=settings,
         exposure_ratio=exposure.ratio,
@@ -96,7 +100,7 @@ def make_plan(latent: Latent, settings: CameraSettings) -> SimulationPlan:
 
 
 def _steps(
-    latent: Latent, exposure: Exposure, pixels: int, lacks_noise: bool
+    latent: Latent, settings: CameraSettings, exposure: Exposure, pixels: int, lacks_noise: bool
 ) -> dict[str, tuple[int, str]]:
     """Operations of every step, and the reason why it is left out where they are 0."""
     taps = 1 + int(exposure.defocus_px) ** 2
@@ -105,7 +109,7 @@ def _steps(
         "noise_reduction": (pixels * exposure.denoised, _why_not_denoised(latent)),
         "aperture": (
             _GATHER_OPERATIONS * pixels * (exposure.opened_to is not None),
-            _why_not_opened(latent),
+            _why_not_opened(latent, settings),
         ),
         "defocus": (
             taps * 2 * pixels * (exposure.defocus_px > 0),
@@ -130,6 +134,8 @@ def _why_not_denoised(latent: Latent) -> str:
         return "the source carries no noise"
     if latent.denoised is None:
         return "the simulator has no noise module"
+    if not latent.is_noisy:
+        return "the source has so little noise that the network would err as much"
     return "the target is at least as noisy: noise is added up to it"
 
 
@@ -141,7 +147,9 @@ def _why_not_defocused(latent: Latent) -> str:
     return "the scene is taken as far or in focus throughout"
 
 
-def _why_not_opened(latent: Latent) -> str:
+def _why_not_opened(latent: Latent, settings: CameraSettings) -> str:
     if latent.opening is None:
         return "no defocus was estimated: `depth` is not 'unknown'"
-    return "the aperture does not open, or nothing is defocused enough to show it"
+    if settings.effective_f_number >= latent.opening.f_number:
+        return "the aperture does not open; what is blurred in the source stays so"
+    return "the picture was found to be in focus throughout"

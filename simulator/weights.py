@@ -61,6 +61,8 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
         ValueError: If there is no such file, its hash is not the card's, or its tensors are not
             those of the preset's networks.
     """
+    if not isinstance(name, str | Path) or not str(name):
+        raise ValueError(f"`weights` (={name!r}) must be a name or a path")
     folder = resources.files("simulator").joinpath("pretrained")
     known = list_pretrained()
     if str(name) in known:
@@ -72,18 +74,24 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
         if missing:
             near = difflib.get_close_matches(str(name), known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
+            if str(name) in PRESETS:
+                hint = f"; train it: ae-env train-simulator configs/simulator/{name}.yaml"
             raise ValueError(
                 f"`weights` (={str(name)!r}) must be one of {known} or the path of a .safetensors "
                 f"file with its .json; there is no {missing[0]}{hint}"
             )
-        card_text, content = files[0].read_text(encoding="utf-8"), files[1].read_bytes()
+        card_text = files[0].read_text(encoding="utf-8", errors="replace")
+        content = files[1].read_bytes()
     card = _checked_card(card_text, content, name)
     modules = build_modules(card["preset"])
     try:
-        modules.load_state_dict(load(content))
+        tensors = load(content)
+        modules.load_state_dict(tensors)
     except (RuntimeError, SafetensorError) as error:
         text = " ".join(str(error).split())
         raise ValueError(f"`weights` (={str(name)!r}) do not fit the networks: {text}") from error
+    if not all(bool(torch.isfinite(t).all()) for t in tensors.values()):
+        raise ValueError(f"`weights` (={str(name)!r}) must be finite: their training has failed")
     return modules.eval().requires_grad_(False).to(memory_format=torch.channels_last), card  # type: ignore[call-overload, return-value]
 
 

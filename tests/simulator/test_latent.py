@@ -95,6 +95,14 @@ def test_a_brighter_target_at_the_same_iso_is_denoised() -> None:
     assert not latent(0.05).exposure(CameraSettings(6400, 1 / 256, 8)).denoised
 
 
+def test_a_source_with_next_to_no_noise_keeps_it() -> None:
+    """ISO 100 at half of white: sigma is sqrt(7.5e-6 * 0.5) = 0.2 %, 0.4 % of the light."""
+    bright = latent(0.5, LOW).exposure(CameraSettings(100, 1 / 16, 8))
+    dark = latent(0.01, LOW).exposure(CameraSettings(100, 1 / 16, 8))  # 3 % of the light
+    assert (bright.denoised, dark.denoised) == (False, True)
+    assert bright.source_noise.shot == pytest.approx([4 * s for s in Z6.nlf(100).shot])
+
+
 def test_without_a_noise_module_the_excess_is_declared() -> None:
     target = CameraSettings(100, 1.0, 8)
     source = latent(denoised=None)
