@@ -96,7 +96,8 @@ class Latent:
         opened_to = self._opened_to(f_number)
         denoised = self._needs_denoising(ratio, target, opened_to)
         remaining = None
-        if self.opening is not None and opened_to is not None and not (denoised or self.noise_free):
+        known = denoised or self.nlf.is_zero
+        if self.opening is not None and opened_to is not None and not known:
             # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
             # it further. Both together leave about what the larger leaves alone.
             energy = kernel_energy(motion_px, defocus_px)
@@ -112,11 +113,6 @@ class Latent:
             opened_to=opened_to,
             remaining=remaining,
         )
-
-    @property
-    def noise_free(self) -> bool:
-        """Whether no noise is left in `light`."""
-        return self.nlf.is_zero
 
     def _opened_to(self, f_number: float) -> float | None:
         """`f_number` where it blurs more than the reference's aperture did, else None."""

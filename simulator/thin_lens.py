@@ -82,6 +82,7 @@ class _Layers(NamedTuple):
     diameters: np.ndarray  # (L,) signed [px], ascending
 
     def radius(self, layer: int) -> int:
+        """How far the blur of `layer` reaches [px]."""
         return disc_kernel(abs(float(self.diameters[layer]))).shape[0] // 2
 
 

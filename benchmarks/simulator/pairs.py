@@ -25,7 +25,7 @@ from benchmarks.simulator.pairs_report import section as section
 from benchmarks.simulator.scenes import FULL, QUICK, Progress, clipped, held_out_scenes, psnr
 from simulator import CameraSimulator, get_camera
 from simulator.reference import BodyError, ReferenceCamera
-from simulator.training.data import draw_sequences
+from simulator.training.data import draw_sequences, settings_parameters
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.
 CAMERAS = {"nikon_z6": 1, "canon_70d": 7}
@@ -139,15 +139,8 @@ def _estimates(case: Case, models: Models) -> Iterator[tuple[Method, Estimate]]:
 
 @torch.no_grad()
 def _baseline(case: Case, network: nn.Module) -> Estimate:
-    parameters = [
-        value
-        for s in (case.source.settings, case.target.settings)
-        for value in (
-            math.log2(s.iso / 100.0),
-            math.log2(s.exposure_time),
-            math.log2(s.effective_f_number),
-        )
-    ]
+    settings = case.source.settings, case.target.settings
+    parameters = [value for s in settings for value in settings_parameters(s)]
     began = time.perf_counter()
     image = network(case.source.data[None], torch.tensor([parameters]))[0]
     return Estimate(image, 1e3 * (time.perf_counter() - began))

@@ -69,6 +69,7 @@ class _Level(nn.Module):
         self.second = NormalisedConvolution(outputs, outputs)
 
     def forward(self, x: Tensor, aperture: Tensor) -> Tensor:
+        """(B, inputs, H, W) to (B, outputs, H, W)."""
         return F.relu(self.second(F.relu(self.first(x, aperture)), aperture))
 
 

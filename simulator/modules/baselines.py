@@ -187,6 +187,7 @@ class _NormalisedGenerated(nn.Module):
         self.shift = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, x: Tensor, parameters: Tensor) -> Tensor:
+        """(B, inputs, H, W) and scaled parameters (B, 6), to (B, outputs, H', W')."""
         batch = len(x)
         x = self.convolution(x, parameters)
         return instance_norm(x, self.scale.expand(batch, -1), self.shift.expand(batch, -1))
@@ -201,6 +202,7 @@ class _ResidualBlock(nn.Module):
         self.second = _NormalisedGenerated(width, width, dilation=dilation)
 
     def forward(self, x: Tensor, parameters: Tensor) -> Tensor:
+        """(B, C, H, W) and scaled parameters (B, 6), to the same shape."""
         return F.relu(x + self.second(F.relu(self.first(x, parameters)), parameters))
 
 

@@ -182,7 +182,9 @@ class ReferencePairs:
             "read": torch.tensor(nlf.read),
             "f_source": torch.tensor(source.effective_f_number),
             "f_target": torch.tensor(target.effective_f_number),
-            "parameters": torch.tensor([*_parameters(source), *_parameters(target)]),
+            "parameters": torch.tensor(
+                [*settings_parameters(source), *settings_parameters(target)]
+            ),
             "defocus": cut(self._blur(pair, source)),
         }
 
@@ -194,7 +196,8 @@ class ReferencePairs:
         return self._defocus[key]
 
 
-def _parameters(settings: CameraSettings) -> tuple[float, float, float]:
+def settings_parameters(settings: CameraSettings) -> tuple[float, float, float]:
+    """What the baselines are told: log2 of ISO / 100, exposure time [s] and f-number."""
     return (
         math.log2(settings.iso / 100.0),
         math.log2(settings.exposure_time),
