@@ -37,7 +37,10 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`.",
 )
-BENCHMARKS = ("agents", "brackets", "colour_checker", "scorers", "simulator", "throughput")
+BENCHMARKS = (
+    *("agents", "brackets", "colour_checker", "scorers", "simulator", "throughput"),
+    "work-precision",
+)
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
 #: Commands that go on where they were stopped.
@@ -223,11 +226,12 @@ def bench(
         near = difflib.get_close_matches(name, BENCHMARKS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"`name` (={name!r}) must be one of {list(BENCHMARKS)}{hint}")
+    package = f"benchmarks.{name.replace('-', '_')}"
     sys.path.insert(0, str(Path.cwd()))
     try:
-        module = importlib.import_module(f"benchmarks.{name}")
+        module = importlib.import_module(package)
     except ModuleNotFoundError as error:
-        if error.name not in ("benchmarks", f"benchmarks.{name}"):
+        if error.name not in ("benchmarks", package):
             raise
         raise ValueError(
             "the benchmarks are not part of the installed package: run this in a clone of the "
@@ -235,6 +239,32 @@ def bench(
         ) from None
     make_folder(out)
     module.run(out, seed=seed, quick=quick)
+
+
+@app.command()
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all of it.")] = False,
+) -> None:
+    """Show what is kept between runs (scenes, score tables, what networks found), or clear it.
+
+    Example: `ae-env cache --clear`; the folder is another one where AE_ENV_CACHE names it.
+    """
+    from rich.table import Table
+
+    from simulator.cache import DISK_BYTES, DiskCache
+
+    disk = DiskCache()
+    usage = disk.usage()
+    if clear:
+        disk.clear()
+    table = Table(title="removed" if clear else f"kept, at most {DISK_BYTES >> 30} GiB")
+    table.add_column("kind")
+    table.add_column("files", justify="right")
+    table.add_column("bytes", justify="right")
+    for kind, (files, size) in usage.items():
+        table.add_row(kind.replace("_", " "), f"{files:,}", f"{size:,}")
+    console.print(table)
+    console.print(f"folder: {disk.folder}", highlight=False, soft_wrap=True, markup=False)
 
 
 # -- what the commands share ------------------------------------------------------------------

@@ -17,18 +17,14 @@ import torch
 
 from ae_env.episode import Episode
 from ae_env.lighting import Lighting, make_lighting
-from ae_env.observation import PEDESTAL, encode_observation, encode_sensors, encode_settings
+from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
 from ae_env.options import COSTS, EnvOptions
+from ae_env.recorder import Recorder
 from ae_env.score_table import ScoreTable, ScoreTables, describe_captures
 from ae_env.scorers.protocol import DependsOn
-from simulator.capture import (
-    SIGNAL_LIMIT,
-    Exposure,
-    add_noise,
-    clip_and_quantise,
-)
+from simulator.cache import LruCache
 from simulator.modules.disc_bank import DIAMETERS
-from simulator.noise import noise_generator
+from simulator.noise_bank import single_normals
 
 #: Share of the episodes in which nothing moves.
 STATIC_SHARE = 1.0 / 3.0
@@ -36,13 +32,14 @@ STATIC_SHARE = 1.0 / 3.0
 SPEED_SIGMA = 1.3
 #: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
-#: A sample below this signal is counted as clipped low: ten stops below white.
-LOW_CLIP = 2.0**-10
-#: Samples that are processed together: a chunk this small stays in the processor's cache.
+#: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 4 * 64 * 64 * 8
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
 OPTICS_BYTES = 256 * 2**20
+#: Memory for the scores of scenes at rest that have a closed form [byte].
+STILL_BYTES = 2**25
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
+_OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
 
 
 @dataclass
@@ -75,14 +72,26 @@ class EpisodeCore:
         self.scorer = options.make_scorer()
         self.lighting = make_lighting(options.lighting)
         self.scenes = options.load_scenes()
-        self.tables = ScoreTables(self.grid, self.camera, self.scorer, noise=options.noise)
+        self.tables = ScoreTables(self.grid, self.camera, self.scorer, noise=bool(options.noise))
         self.episodes: list[Episode | None] = [None] * num_envs
         self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
         states = self.grid.states
         self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
         self._bounds = np.array([[s.iso, s.exposure_time, s.f_number, s.ev100] for s in states])
         frame_bytes = 16 * options.resolution**2
-        self._keep_defocused = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
+        self._still_parts: LruCache[dict[str, np.ndarray]] = LruCache(STILL_BYTES)
+        self._static = type(self.lighting) is Lighting
+        keep = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
+        self.recorder = Recorder(
+            options,
+            self.grid,
+            self.camera,
+            self.scenes,
+            num_envs,
+            keep=keep,
+            shares=self._static,
+        )
+        self._scores_images = not self.scorer.closed_form
 
     def _kept_frames(self) -> int:
         """Blurred frames that an episode keeps at most."""
@@ -131,6 +140,9 @@ class EpisodeCore:
         median = self.scenes[scene].median_speed
         drawn_speed = moves * median * np.exp(SPEED_SIGMA * speed)
         drawn_defocus = DEFOCUS_MEDIAN * np.exp(DEFOCUS_SIGMA * defocus)
+        ended = self.episodes[index]
+        if ended is not None:
+            self.recorder.end(ended)
         self.episodes[index] = Episode(
             scene=scene,
             state=self._chosen("state", options.get("state"), state, len(self.grid)),
@@ -144,6 +156,8 @@ class EpisodeCore:
         )
         episode = self.episode(index)
         episode.pending = [episode.state] * int(self.options.delay)
+        own = self.scenes[scene].own_blur(4.0) * 64.0 / self.options.resolution
+        episode.focus_drive = math.hypot(episode.defocus, own)
 
     def _chosen_scene(self, wanted: Any, drawn: int) -> int:
         if wanted is None:
@@ -174,7 +188,7 @@ class EpisodeCore:
 
     def act(self, index: int, action: Any) -> None:
         """Lets episode `index` go on by one frame with `action`, applied after the delay."""
-        if not (isinstance(action, int | np.integer) and 0 <= action < len(self.grid)):
+        if not (isinstance(action, int) and 0 <= action < len(self.grid)):
             number = np.asarray(action)
             if number.ndim or number.dtype.kind not in "iu" or not 0 <= number < len(self.grid):
                 raise ValueError(f"`action` (={action!r}) must be in [0, {len(self.grid)})")
@@ -185,6 +199,8 @@ class EpisodeCore:
 
     def gain(self, episode: Episode, exposure_time: float) -> float:
         """Light of an exposure in the current frame relative to the scene's own."""
+        if self._static:
+            return 1.0
         return self.lighting.gain(episode.frame, exposure_time, episode.phase)
 
     def expected_scores(self, index: int) -> ScoreTable:
@@ -203,10 +219,16 @@ class EpisodeCore:
 
     def _closed_parts(self, episode: Episode) -> dict[str, np.ndarray]:
         if episode.closed_parts is None:
-            scene = self.scenes[episode.scene]
-            episode.closed_parts = self.tables.closed_parts(
-                scene, speed=episode.speed, defocus=episode.defocus
-            )
+            at_rest = not episode.speed and not episode.defocus
+            parts = self._still_parts.get(episode.scene) if at_rest else None
+            if parts is None:
+                parts = self.tables.closed_parts(
+                    self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
+                )
+                if at_rest:
+                    size = sum(values.nbytes for values in parts.values())
+                    self._still_parts.put(episode.scene, parts, size)
+            episode.closed_parts = parts
         return episode.closed_parts
 
     # -- what the camera records --------------------------------------------------------------
@@ -230,7 +252,7 @@ class EpisodeCore:
         settings = encode_settings(self._apex[[e.state for e in episodes]])
         observation = {"raw": raw, "settings": settings}
         if self.options.sensors:
-            speed, defocus = np.array([(e.speed, self._focus_drive(e)) for e in episodes]).T
+            speed, defocus = np.array([(e.speed, e.focus_drive) for e in episodes]).T
             observation["sensors"] = encode_sensors(speed, defocus, columns.pop("sensor_noise"))
         info = self._info(episodes) | columns | {"rewards": rewards}
         if self.options.with_oracle:
@@ -240,11 +262,6 @@ class EpisodeCore:
             info["regret"] = best - [t.mean[e.state] for t, e in zip(tables, episodes, strict=True)]
         return Frames(observation, info, reward)
 
-    def _focus_drive(self, episode: Episode) -> float:
-        """Blur at f/4 [pixel of a 64-pixel frame]: what was drawn, or the scene's own."""
-        own = self.scenes[episode.scene].own_blur(4.0)
-        return math.hypot(episode.defocus, own * 64.0 / self.options.resolution)
-
     def _scores(self, parts: dict[str, np.ndarray], indices: Sequence[int]) -> np.ndarray:
         if self.options.reward == "expected":
             return np.array([self.expected_scores(i).mean[self.episode(i).state] for i in indices])
@@ -252,77 +269,55 @@ class EpisodeCore:
 
     def _capture_all(self, indices: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Observations of `raw` and the info columns, worked out chunk by chunk."""
-        shape = (len(indices), 4, self.options.resolution, self.options.resolution)
-        raw = np.empty(shape, _RAW_DTYPES[self.options.observation])
-        size = max(1, CHUNK_SAMPLES // (4 * self.options.resolution**2))
+        size = self.options.resolution
+        raw = np.empty((len(indices), 4, size, size), _RAW_DTYPES[self.options.observation])
+        episodes = [self.episode(i) for i in indices]
+        gains = [self.gain(e, self._bounds[e.state, 1]) for e in episodes]
+        planned = zip(indices, episodes, gains, strict=True)
+        blurs = [(i, e) for i, e, gain in planned if self.recorder.prepare(i, e, gain)]
+        self.recorder.blur(blurs)
+        # Only codes and digital numbers are made without a float of every sample.
+        few = self._scores_images or self.options.noise == "exact"
+        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(indices)
         chunks = []
-        for start in range(0, len(indices), size):
-            part = slice(start, start + size)
-            chunks.append(self._capture(indices[part], raw[part]))
+        for start in range(0, len(indices), step):
+            part = slice(start, start + step)
+            chunks.append(self._capture(indices[part], episodes[part], gains[part], raw[part]))
         columns = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
         return raw, columns
 
-    def _capture(self, indices: Sequence[int], raw: np.ndarray) -> dict[str, np.ndarray]:
+    def _capture(
+        self,
+        indices: Sequence[int],
+        episodes: Sequence[Episode],
+        gains: Sequence[float],
+        raw: np.ndarray,
+    ) -> dict[str, np.ndarray]:
         """Info columns of the episodes `indices`; their observations are written to `raw`."""
-        episodes = [self.episode(i) for i in indices]
-        light, exposures, gains = self._sensor_light(episodes)
-        excess = np.zeros(len(episodes))
-        generators = [noise_generator(e.noise_seed, e.frame) for e in episodes]
-        if self.options.noise:
-            light, excess = add_noise(light, exposures, generators)
-        frames = clip_and_quantise(light, self.camera)
-        columns: dict[str, np.ndarray] = {
-            "clipped_high": _share(frames.numpy() >= 1.0 - 1e-6),
-            "clipped_low": _share(frames.numpy() <= LOW_CLIP),
-            "excess_noise": excess,
-            "modules": np.array([_modules(e, self.options.noise) for e in exposures], object),
-        }
-        if self.options.sensors:  # drawn last: the frame is the same with and without them
-            columns["sensor_noise"] = np.stack([_normals(g) for g in generators])
-        columns |= self._part_scores(indices, frames, gains)
-        codes: torch.Tensor | None = None
-        if self.options.observation == "uint8":
-            codes = torch.from_numpy(raw)
-            encode_observation(frames, out=codes)
-        else:
-            raw[...] = self._encode(frames)
+        outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
+        if self._scores_images:
+            outputs.setdefault("signals", np.empty(raw.shape, np.float32))
         if "flicker" in self.options.costs:
-            codes = encode_observation(frames) if codes is None else codes
-            columns["image_mean"] = codes.sum(dim=(1, 2, 3)).numpy() / (255.0 * codes[0].numel())
+            outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
+        columns = self.recorder.record(indices, episodes, **outputs)
+        key = columns.pop("noise_key")
+        if self.options.sensors:
+            columns["sensor_noise"] = single_normals(key, 2)
+        columns |= self._part_scores(indices, outputs.get("signals"), gains)
+        if self.options.observation == "linear":
+            np.maximum(raw, np.float32(-PEDESTAL), out=raw)
+        if "flicker" in self.options.costs:
+            codes = outputs["codes"].reshape(len(raw), -1)
+            columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
         return columns
 
-    def _sensor_light(
-        self, episodes: Sequence[Episode]
-    ) -> tuple[torch.Tensor, list[Exposure], list[float]]:
-        """Light on the sensor (B, 4, H, W) of each episode in its current state."""
-        size = self.options.resolution
-        light = torch.empty(len(episodes), 4, size, size)
-        exposures, gains = [], []
-        for i, episode in enumerate(episodes):
-            state = self.grid[episode.state]
-            gain = self.gain(episode, state.exposure_time)
-            latent = episode.latent(self.scenes[episode.scene], self.camera, gain)
-            exposure = latent.exposure(state)
-            blurred = episode.blurred_light(latent, exposure, self._keep_defocused)
-            torch.mul(blurred, exposure.ratio, out=light[i])
-            exposures.append(exposure)
-            gains.append(gain)
-        return light.clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT), exposures, gains
-
-    def _encode(self, frames: torch.Tensor) -> np.ndarray:
-        if self.options.observation == "linear":
-            return frames.clamp(-PEDESTAL, 1.0).numpy()
-        span = np.array(self.camera.span)[:, None, None]
-        black = np.array(self.camera.black_level)[:, None, None]
-        return np.rint(frames.numpy() * span + black)
-
     def _part_scores(
-        self, indices: Sequence[int], frames: torch.Tensor, gains: Sequence[float]
+        self, indices: Sequence[int], frames: np.ndarray | None, gains: Sequence[float]
     ) -> dict[str, np.ndarray]:
         episodes = [self.episode(i) for i in indices]
         scores: dict[str, np.ndarray] = {}
         kinds: list[DependsOn] = [] if self.scorer.closed_form else ["image"]
-        if type(self.lighting) is Lighting:  # one table per scene serves every frame
+        if self._static:  # one table per scene serves every frame
             closed = [self._closed_parts(e) for e in episodes]
             for name in self.scorer.names("light", "blur"):
                 pairs = zip(closed, episodes, strict=True)
@@ -338,7 +333,7 @@ class EpisodeCore:
                 defocus=np.array([e.defocus for e in episodes]),
                 gain=np.array(gains),
             )
-            images = frames.clamp(0.0, 1.0)
+            images = None if frames is None else torch.from_numpy(frames).clamp(0.0, 1.0)
             for name, values in self.scorer.score_parts(images, captures, tuple(kinds)).items():
                 scores[f"score:{name}"] = values.numpy()
         return scores
@@ -372,26 +367,8 @@ class EpisodeCore:
         }
 
 
-def _normals(generator: torch.Generator) -> np.ndarray:
-    """Two standard normals."""
-    return torch.empty(2, dtype=torch.float64).normal_(generator=generator).numpy()
-
-
-def _share(mask: np.ndarray) -> np.ndarray:
-    """(B,) float64 share of True in each image of a mask (B, 4, H, W)."""
-    return np.array([np.count_nonzero(image) for image in mask]) / mask[0].size
-
-
 def _fixed_or_drawn(option: str | float, drawn: float) -> float:
     """`drawn` for ``"random"``, 0 for every other word, or the number itself."""
     if option == "random":
         return drawn
     return 0.0 if isinstance(option, str) else float(option)
-
-
-def _modules(exposure: Exposure, noise: bool) -> str:
-    names = ["exposure"]
-    names += ["noise_reduction"] * exposure.denoised
-    names += ["aperture"] * (exposure.opened_to is not None)
-    names += ["defocus"] * (exposure.defocus_px > 0) + ["motion_blur"] * (exposure.motion_px > 0)
-    return "+".join(names + ["noise"] * noise)

@@ -18,11 +18,13 @@ from ae_env.scenes.networks import (
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, make_scorer
 from simulator.camera import CameraProfile, get_camera
+from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
 
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36
 COSTS = ("flicker", "switch")
 DEPTHS = ("random", "far", "unknown")
+NOISES = ("bank", "exact")
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ class EnvOptions:
     delay: int = 0
     camera: Any = "nikon_z6"
     simulator: str | None = DEFAULT_SIMULATOR
-    noise: bool = True
+    noise: bool | str = True
+    tolerance: float = DEFAULT_TOLERANCE
     reward: str = "capture"
     with_oracle: bool = False
 
@@ -55,6 +58,9 @@ class EnvOptions:
         _one_of("observation", self.observation, ("uint8", "linear", "dn"))
         _one_of("crop", self.crop, ("box", "native"))
         _one_of("reward", self.reward, ("capture", "expected"))
+        if not isinstance(self.noise, bool):  # True is "bank"
+            _one_of("noise", self.noise, NOISES)
+        check_tolerance(self.tolerance)
         if not _is_integer(self.resolution):
             raise ValueError(f"`resolution` (={self.resolution!r}) must be an integer")
         if not MIN_RESOLUTION <= self.resolution <= 4096:

@@ -7,36 +7,33 @@ standard error.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import logging
-import zipfile
+import weakref
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from ae_env.cache import cache_dir
 from ae_env.grid import ExposureGrid
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures, DependsOn
 from ae_env.scorers.registry import scorer_fingerprint
+from simulator.cache import DiskCache, LruCache, cache_key
 from simulator.camera import CameraProfile
 from simulator.capture import clip_and_quantise
-from simulator.files import write_atomically
 from simulator.latent import Latent
 from simulator.settings import CameraSettings, exposure_ratio
 
-_LOGGER = logging.getLogger(__name__)
 #: Bumped when the way that scores are computed changes.
-TABLE_VERSION = 2
+TABLE_VERSION = 3
+#: What the scores that are kept in memory take at most: some 10,000 scenes at 64 states [byte].
+MEMORY_BYTES = 2**25
 #: States evaluated at once: more only spends time in memory paging. Where only the blur matters,
 #: which seldom looks at pixels, as many as this number of samples allows.
 _CHUNK = 16
 _BLUR_SAMPLES = 2**22
+#: What an entry takes in memory beside its numbers, about [byte].
+_ENTRY_BYTES = 1000
 #: Scores closer than this are equal: rounding moves them by 1e-8, noise seeds by 1e-5.
 TIE = 1e-7
 
@@ -82,13 +79,16 @@ def scene_latent(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
         gain: Light relative to the scene's own.
     """
-    return replace(
-        scene.latent,
-        camera=camera,
-        image_speed=speed,
-        defocus=defocus * scene.light.shape[-2] / 64.0,
-        gain=gain,
-    )
+    latent = replace(scene.latent, camera=camera)
+    return in_episode(latent, speed=speed, defocus=defocus, gain=gain)
+
+
+def in_episode(
+    latent: Latent, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+) -> Latent:
+    """A scene's `latent` in an episode; the arguments are those of `scene_latent`."""
+    pixels = defocus * latent.light.shape[-2] / 64.0
+    return replace(latent, image_speed=speed, defocus=pixels, gain=gain)
 
 
 def describe_captures(
@@ -132,6 +132,16 @@ def describe_captures(
     )
 
 
+@dataclass(frozen=True)
+class _AtRest:
+    """Captures of a scene at rest, without its light, and what their blur is worked out from."""
+
+    scene: weakref.ref[Scene]
+    captures: Captures
+    times: np.ndarray
+    openings: np.ndarray
+
+
 class ScoreTables:
     """Score tables of scenes under one scorer, camera and grid.
 
@@ -141,7 +151,7 @@ class ScoreTables:
         scorer: What rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
-        use_cache: Whether to keep the per-scene parts on disk.
+        use_cache: Whether to keep the per-scene parts on disk; in memory they are in any case.
     """
 
     def __init__(
@@ -160,8 +170,9 @@ class ScoreTables:
         self.noise, self.noise_seeds = noise, noise_seeds if noise else 1
         fingerprint = scorer_fingerprint(scorer) if use_cache else None
         self._fingerprint = fingerprint
-        self._light_parts: dict[tuple[int, float], dict[str, np.ndarray]] = {}
-        self._keep: dict[int, Scene] = {}  # keeps id(scene) valid as a key
+        self._disk = DiskCache()
+        self._light_parts: LruCache[_LightParts] = LruCache(MEMORY_BYTES)
+        self._at_rest: LruCache[_AtRest] = LruCache(MEMORY_BYTES)
 
     def table(
         self, scene: Scene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
@@ -193,20 +204,24 @@ class ScoreTables:
         return {**self._scene_parts(scene, gain), **blur_parts}
 
     def _scene_parts(self, scene: Scene, gain: float) -> dict[str, np.ndarray]:
-        key = (id(scene), gain)
-        if key not in self._light_parts:
-            self._keep[id(scene)] = scene
-            if len(self._light_parts) > 4096:  # changing light: keep memory flat
-                self._light_parts.clear()
-                self._keep = {id(scene): scene}
-            path = self._cache_path(scene) if gain == 1.0 else None
-            parts = _load_parts(path) if path is not None else None
-            if parts is None or set(parts) != set(self.scorer.names("light")):
-                parts = self._parts(scene, ("light",), speed=0.0, defocus=0.0, gain=gain)
-                if path is not None and parts:
-                    _save_parts(path, parts)
-            self._light_parts[key] = parts
-        return self._light_parts[key]
+        known = self._light_parts.get((id(scene), gain))
+        if known is not None and known.scene() is scene:  # an id may be given out again
+            return known.parts
+        names = self.scorer.names("light")
+        key = self._key(scene) if names and gain == 1.0 else None
+        stored = None if key is None else self._disk.get("score_tables", key)
+        if stored is not None and set(stored) == set(names):
+            parts = {name: stored[name].numpy() for name in names}
+        else:
+            parts = self._parts(scene, ("light",), speed=0.0, defocus=0.0, gain=gain)
+            if key is not None:
+                kept = {name: torch.from_numpy(values) for name, values in parts.items()}
+                self._disk.put("score_tables", key, kept)
+        size = sum(values.nbytes for values in parts.values())
+        self._light_parts.put(
+            (id(scene), gain), _LightParts(weakref.ref(scene), parts), size + _ENTRY_BYTES
+        )
+        return parts
 
     def _parts(
         self,
@@ -222,7 +237,10 @@ class ScoreTables:
         chunks = []
         size = max(_CHUNK, _BLUR_SAMPLES // scene.light.numel()) if kinds == ("blur",) else _CHUNK
         for states in _chunks(list(self.grid.states), size):
-            captures = self._captures(scene, states, speed, defocus, gain)
+            if kinds == ("blur",) and gain == 1.0:
+                captures = self._blurred_captures(scene, states, speed, defocus)
+            else:
+                captures = self._captures(scene, states, speed, defocus, gain)
             scores = self.scorer.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
@@ -239,6 +257,32 @@ class ScoreTables:
             defocus=np.full(count, defocus),
             gain=np.full(count, gain),
             light=scene.clean_light.expand(count, -1, -1, -1),
+        )
+
+    def _blurred_captures(
+        self, scene: Scene, states: list[CameraSettings], speed: float, defocus: float
+    ) -> Captures:
+        """`_captures` at a gain of 1: what does not depend on the blur is kept."""
+        key = (id(scene), states[0])
+        known = self._at_rest.get(key)
+        if known is None or known.scene() is not scene or len(known.times) != len(states):
+            known = self._described(scene, states)
+            self._at_rest.put(key, known, _ENTRY_BYTES * len(states))
+        height = scene.light.shape[-2]
+        blur = np.hypot(speed * known.times * height, defocus * known.openings * height / 64.0)
+        return replace(
+            known.captures,
+            scene_light=scene.clean_light.expand(len(states), -1, -1, -1),
+            blur_px=torch.from_numpy(np.hypot(blur, known.captures.blur_px.numpy())),
+        )
+
+    def _described(self, scene: Scene, states: list[CameraSettings]) -> _AtRest:
+        captures = self._captures(scene, states, 0.0, 0.0, 1.0)
+        return _AtRest(
+            weakref.ref(scene),
+            replace(captures, scene_light=torch.empty(0)),  # keeps no scene alive
+            np.array([s.exposure_time for s in states]),
+            np.array([4.0 / s.effective_f_number for s in states]),
         )
 
     def _samples(
@@ -263,49 +307,34 @@ class ScoreTables:
             start += len(states)
         return samples
 
-    def _cache_path(self, scene: Scene) -> Path | None:
-        if self._fingerprint is None or not self.scorer.names("light"):
+    def _key(self, scene: Scene) -> str | None:
+        """Key of everything that changes the scores; None where the scorer cannot be told."""
+        if self._fingerprint is None:
             return None
-        digest = hashlib.sha256(scene.light.numpy().tobytes())
-        description = [
-            TABLE_VERSION,
-            self._fingerprint,
-            self.grid.isos,
-            self.grid.exposure_times,
-            self.grid.f_numbers,
-            self.camera.name,
-            [(iso, n.shot, n.read) for iso, n in sorted(self.camera.nlf_by_iso.items())],
-            scene.reference.log2_exposure,
-            scene.ev100,
-            scene.scene_id,
-            scene.white_balance,
-            scene.camera.colour_matrix,
-        ]
-        for name in ("denoised", "defocus_map"):  # older tables of scenes without stay valid
-            found: torch.Tensor | None = getattr(scene, name)
-            if found is not None:
-                description += [name, hashlib.sha256(found.numpy().tobytes()).hexdigest()]
-        digest.update(json.dumps(description).encode())
-        return cache_dir() / "score_tables" / f"{digest.hexdigest()[:32]}.npz"
+        reference, noise = scene.reference, [self.camera.nlf(iso) for iso in self.grid.isos]
+        return cache_key(
+            {
+                "version": TABLE_VERSION,
+                "scorer": self._fingerprint,
+                "states": [self.grid.isos, self.grid.exposure_times, self.grid.f_numbers],
+                "camera": [self.camera.name, [(nlf.shot, nlf.read) for nlf in noise]],
+                "reference": [reference.iso, reference.exposure_time, reference.f_number],
+                "ev100": scene.ev100,
+                "scene": scene.scene_id,
+                "white_balance": scene.white_balance,
+                "colour_matrix": scene.camera.colour_matrix,
+                "content": scene.content,
+            }
+        )
+
+
+@dataclass(frozen=True)
+class _LightParts:
+    """Scores (S,) of a scene by part; the scene itself is not kept for them."""
+
+    scene: weakref.ref[Scene]
+    parts: dict[str, np.ndarray]
 
 
 def _chunks(states: list[CameraSettings], size: int = _CHUNK) -> list[list[CameraSettings]]:
     return [states[i : i + size] for i in range(0, len(states), size)]
-
-
-def _load_parts(path: Path) -> dict[str, np.ndarray] | None:
-    try:
-        content = path.read_bytes()  # given a path, numpy leaves a damaged file open
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        _LOGGER.warning("unreadable score table %s is made anew: %s", path, error)
-        return None
-
-
-def _save_parts(path: Path, parts: dict[str, np.ndarray]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, **parts)  # type: ignore[arg-type]
-    write_atomically(path, buffer.getvalue())

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,6 +24,7 @@ from ae_env.console import (
     save_picture,
     torch_device,
 )
+from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
@@ -38,6 +39,13 @@ Weights = Annotated[
 Depth = Annotated[
     str,
     typer.Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens."),
+]
+Cache = Annotated[
+    bool, typer.Option(help="Keep what the networks find out in the cache folder, and look there.")
+]
+Tolerance = Annotated[
+    float,
+    typer.Option(help="Error to accept for speed, in units of the target's noise; 0 for none."),
 ]
 
 #: Procedural scenes that a training validates on.
@@ -56,7 +64,9 @@ def simulate(
     seed: Seed = 0,
     weights: Weights = "compact",
     depth: Depth = "far",
+    tolerance: Tolerance = DEFAULT_TOLERANCE,
     device: Device = "auto",
+    cache: Cache = True,
 ) -> None:
     """Simulate one raw at other settings and write it as a DNG; prints the plan.
 
@@ -71,10 +81,11 @@ def simulate(
     source = read_raw(raw)
     if png is not None and png.suffix.lower() != ".png":
         raise ValueError(f"`png` (={str(png)!r}) must end in .png")
+    check_tolerance(tolerance)
     for path in (out, png or out):
         make_folder(path.parent)
-    simulator = _simulator(weights, device)
-    latent = simulator.prepare(source, depth=depth)  # type: ignore[arg-type]
+    simulator = _simulator(weights, device, cache)
+    latent = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
     console.print(str(latent.plan(settings)), highlight=False, soft_wrap=True)
     result = simulator.simulate(latent, settings, seed=seed)
@@ -93,7 +104,9 @@ def sweep(
     seed: Seed = 0,
     weights: Weights = "compact",
     depth: Depth = "far",
+    tolerance: Tolerance = DEFAULT_TOLERANCE,
     device: Device = "auto",
+    cache: Cache = True,
 ) -> None:
     """All 64 exposure states of one raw as a contact sheet, coloured by score.
 
@@ -105,16 +118,17 @@ def sweep(
     from simulator import read_raw, write_dng
 
     _check_depth(depth, weights)
+    check_tolerance(tolerance)
     device = torch_device(device)
     source = read_raw(raw)
     make_folder(out)
-    scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth)
+    scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth, cache)
     sheet = out / "contact_sheet.png"
     save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
     files = {"contact sheet": sheet}
     if dngs:
-        grid, simulator = ExposureGrid.default(), _simulator(weights, device)
-        latent = simulator.prepare(source, depth=depth)  # type: ignore[arg-type]
+        grid, simulator = ExposureGrid.default(), _simulator(weights, device, cache)
+        latent = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
         with progress_bars() as progress, progress("DNGs") as task:
             for i, settings in enumerate(grid):
                 path = out / f"{raw.stem}-{i:02d}.dng"
@@ -202,24 +216,25 @@ def _check_depth(depth: str, weights: str) -> None:
         raise ValueError("`depth` (='unknown') needs networks: leave out `--weights none`")
 
 
-def _small_scene(scene: Scene, weights: str, depth: str) -> Scene:
+def _small_scene(scene: Scene, weights: str, depth: str, cache: bool) -> Scene:
     """`scene` at the size of a contact sheet, with what the networks find out about it."""
     from ae_env.scenes.networks import SceneNetworks
 
     size = min(_SHEET_SIZE, *scene.light.shape[1:])
     if weights == "none":
         return scene.resized(size)
-    networks = SceneNetworks(weights)
+    networks = SceneNetworks(weights, cache=cache)
     small = networks.resized(scene, size) if depth == "unknown" else scene.resized(size)
     return networks.denoised(small)
 
 
-def _simulator(weights: str, device: str) -> CameraSimulator:
+def _simulator(weights: str, device: str, cache: bool) -> CameraSimulator:
     from simulator import CameraSimulator
 
     if weights == "none":
         return CameraSimulator(device=device)
-    return CameraSimulator.from_pretrained(weights, device=device)
+    where: Literal["disk"] | None = "disk" if cache else None
+    return CameraSimulator.from_pretrained(weights, device=device, cache=where)
 
 
 def _write_png(path: Path, raw: RawImage) -> Path:

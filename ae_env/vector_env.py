@@ -145,8 +145,9 @@ class AutoExposureVectorEnv(
             resetting = np.flatnonzero(self._done).tolist()
         running = [i for i in everyone if i not in set(resetting)]
         previous = {i: self.core.episode(i).state for i in running}
+        chosen = actions.tolist()
         for i in running:
-            self.core.act(i, actions[i])
+            self.core.act(i, chosen[i])
         self._steps[running] += 1
         if resetting:  # NEXT_STEP: this step begins their new episodes
             self._begin(resetting, [{}] * self.num_envs)

@@ -10,6 +10,7 @@ squared / 12) or disc (diameter squared / 16 per axis): small blurs are then rig
 
 from __future__ import annotations
 
+import bisect
 import functools
 import math
 
@@ -17,9 +18,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-_SUBROWS = 32  # rows per pixel in the numerical integration of a disc's coverage
 _SUM_TAPS = 13  # streaks longer than this are cheaper as a running sum
 _FFT_TAPS = 11  # kernels wider than this are applied in the Fourier domain
+_DIRECT_TAPS = 25  # the same where `simulator.blur_kernels` does the sum
 
 
 def _check_extent(name: str, value: float) -> float:
@@ -43,16 +44,26 @@ def motion_kernel(extent_px: float) -> np.ndarray:
     >>> motion_kernel(2.0).round(3).tolist()
     [0.167, 0.667, 0.167]
     """
+    n, end = streak_share(extent_px)
+    if not end:
+        return np.ones(1)
+    weights = np.ones(2 * n + 3)
+    weights[0] = weights[-1] = end
+    return weights / (2 * n + 1 + 2.0 * end)
+
+
+def streak_share(extent_px: float) -> tuple[int, float]:
+    """Pixels n that a streak covers whole on either side, and its share e of one more.
+
+    Both 0 where the extent is too small to blur anything.
+    """
     extent = _check_extent("extent_px", extent_px)
     target = extent * extent / 12.0
     if target < 1e-12:
-        return np.ones(1)
+        return 0, 0.0
     n = int((math.sqrt(1.0 + extent * extent) - 1.0) / 2.0)  # the moment is n (n + 1) / 3 at e = 0
-    whole = 2 * n + 1
-    end = (target * whole - n * (n + 1) * whole / 3.0) / (2.0 * ((n + 1) ** 2 - target))
-    weights = np.ones(whole + 2)
-    weights[[0, -1]] = max(end, 0.0)
-    return weights / (whole + 2.0 * max(end, 0.0))
+    end = (target - n * (n + 1) / 3.0) * (2 * n + 1) / (2.0 * ((n + 1) ** 2 - target))
+    return n, max(end, 0.0)
 
 
 def motion_blur(light: torch.Tensor, extent_px: float) -> torch.Tensor:
@@ -69,6 +80,10 @@ def motion_blur(light: torch.Tensor, extent_px: float) -> torch.Tensor:
     weights = motion_kernel(extent_px)
     if len(weights) == 1:
         return light
+    if _has_kernels(light):
+        from simulator.blur_kernels import streak  # numba: only where something is blurred
+
+        return streak(light, extent_px)
     width, radius = light.shape[-1], len(weights) // 2
     edge, full = float(weights[0]), float(weights[1])
     if radius >= width:  # the whole row and both borders: counted, as padding might not fit
@@ -88,22 +103,36 @@ def motion_blur(light: torch.Tensor, extent_px: float) -> torch.Tensor:
 
 def _disc_coverage(radius: float) -> np.ndarray:
     """Area of a disc of `radius` in each pixel, (K, K), K odd, sums to 1."""
-    reach = max(math.ceil(radius - 0.5), 0)
-    edges = np.arange(-reach, reach + 2) - 0.5
-    rows = (np.arange((2 * reach + 1) * _SUBROWS) + 0.5) / _SUBROWS - reach - 0.5
-    chord = np.sqrt(np.maximum(radius**2 - rows**2, 0.0))[:, None]
-    lengths = np.diff(np.clip(edges[None, :], -chord, chord), axis=1)
-    coverage = lengths.reshape(2 * reach + 1, _SUBROWS, -1).sum(1)
-    coverage = coverage + coverage.T  # the quadrature treats rows and columns alike
-    return coverage / coverage.sum()
+    from simulator.blur_kernels import coverage  # numba: only where something is blurred
+
+    rows = coverage(radius)
+    rows = np.concatenate([rows[:0:-1], rows])
+    return np.concatenate([rows[:, :0:-1], rows], axis=1)
 
 
 @functools.cache
-def _radius_table() -> tuple[np.ndarray, np.ndarray]:
+def _radius_table() -> tuple[list[float], list[float]]:
     """Second moments per axis of covered discs, and their radii: the inverse is interpolated."""
     radii = np.concatenate([[0.5], 0.5 + np.geomspace(1e-4, 7.5, 700)])
     moments = np.array([_second_moment(_disc_coverage(r).sum(0)) for r in radii])
-    return np.maximum.accumulate(moments), radii
+    return np.maximum.accumulate(moments).tolist(), radii.tolist()
+
+
+def disc_radius(diameter_px: float) -> float:
+    """Radius of the disc whose coverage has the second moment of one of `diameter_px`.
+
+    At most 0.5 where the diameter is too small to blur anything.
+    """
+    diameter = _check_extent("diameter_px", diameter_px)
+    target = diameter * diameter / 16.0
+    if target < 1e-6:
+        return 0.5
+    moments, radii = _radius_table()
+    if target >= moments[-1]:
+        return 2.0 * math.sqrt(target - 1.0 / 12.0)
+    i = bisect.bisect_right(moments, target)
+    share = (target - moments[i - 1]) / (moments[i] - moments[i - 1])
+    return radii[i - 1] + share * (radii[i] - radii[i - 1])
 
 
 @functools.lru_cache(maxsize=4096)
@@ -114,14 +143,7 @@ def disc_kernel(diameter_px: float) -> np.ndarray:
     >>> round(float((kernel.sum(0) * [1, 0, 1]).sum()), 2)  # 3**2 / 16
     0.56
     """
-    diameter = _check_extent("diameter_px", diameter_px)
-    target = diameter * diameter / 16.0
-    moments, radii = _radius_table()
-    if target < 1e-6:
-        return np.ones((1, 1))
-    if target < moments[-1]:
-        return _disc_coverage(float(np.interp(target, moments, radii)))
-    return _disc_coverage(2.0 * math.sqrt(target - 1.0 / 12.0))
+    return _disc_coverage(disc_radius(diameter_px))
 
 
 def disc_blur(light: torch.Tensor, diameter_px: float) -> torch.Tensor:
@@ -138,6 +160,10 @@ def disc_blur(light: torch.Tensor, diameter_px: float) -> torch.Tensor:
     taps = weights.shape[0]
     if taps == 1:
         return light
+    if taps <= _DIRECT_TAPS and _has_kernels(light):
+        from simulator.blur_kernels import disc
+
+        return disc(light, diameter_px)
     height, width = light.shape[-2:]
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
@@ -151,6 +177,10 @@ def disc_blur(light: torch.Tensor, diameter_px: float) -> torch.Tensor:
     spectrum = torch.fft.rfft2(padded.double()) * torch.fft.rfft2(kernel, s=size)
     blurred = torch.fft.irfft2(spectrum, s=size)[..., 2 * radius :, 2 * radius :]
     return blurred.to(light.dtype).reshape(light.shape)
+
+
+def _has_kernels(light: torch.Tensor) -> bool:
+    return light.device.type == "cpu" and light.dtype == torch.float32 and not light.requires_grad
 
 
 def _shifted_sum(padded: torch.Tensor, weights: np.ndarray) -> torch.Tensor:
@@ -176,6 +206,43 @@ def _shifted_sum(padded: torch.Tensor, weights: np.ndarray) -> torch.Tensor:
     return total
 
 
+def box_mean(x: torch.Tensor, window: int) -> torch.Tensor:
+    """Mean over `window` x `window` pixels, borders repeated.
+
+    Sums over 1, 2, 4, 8 ... pixels are doubled from one another: a few additions of whole images
+    where pooling would read every pixel `window` times.
+
+    Args:
+        x: (B, C, H, W).
+        window: Odd side of the window [pixel].
+
+    Returns:
+        (B, C, H, W).
+    """
+    height, width = x.shape[-2:]
+    padded = F.pad(x, (window // 2,) * 4, mode="replicate")
+    rows = _running_sum(padded, window, -2, height)
+    return _running_sum(rows, window, -1, width) / (window * window)
+
+
+def _running_sum(x: torch.Tensor, window: int, axis: int, size: int) -> torch.Tensor:
+    """Sums of `window` neighbours along `axis`, the first `size` of them."""
+    total: torch.Tensor | None = None
+    done, span = 0, 1
+    while True:
+        if window & span:
+            part = x.narrow(axis, done, size)
+            total = part if total is None else total + part
+            done += span
+        if 2 * span > window:
+            assert total is not None
+            return total
+        length = x.shape[axis] - span
+        x = x.narrow(axis, 0, length) + x.narrow(axis, span, length)
+        span *= 2
+
+
+@functools.lru_cache(maxsize=4096)
 def kernel_energy(motion_px: float, defocus_px: float) -> float:
     """Sum of squared weights of both blurs together: what they leave of white noise's variance."""
     streak, disc = motion_kernel(motion_px), disc_kernel(defocus_px)

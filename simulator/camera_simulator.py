@@ -7,44 +7,34 @@ a few element-wise steps.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import torch
+from torch import nn
 
-from simulator.capture import add_noise, clip_and_quantise
+from simulator.denoised import Denoised
+from simulator.full_run import FullRun, Stages
 from simulator.latent import HasLatent, Latent
 from simulator.modules.aperture import ApertureModule, usable_defocus
 from simulator.modules.exposure import ExposureModule
 from simulator.modules.noise import NoiseModule, Preset, smoothed, variance_map
-from simulator.noise import noise_generator
+from simulator.network_cache import NetworkCache, Where
 from simulator.opening import MapOpening, NetworkOpening, Opening
 from simulator.plan import SimulationPlan
 from simulator.raw_image import RawImage
-from simulator.settings import CameraSettings, exposure_ratio
-from simulator.tiles import in_tiles
+from simulator.settings import CameraSettings
+from simulator.sources import latent_of
+from simulator.tiles import in_tiles, varying
 
 Depth = Literal["far", "unknown"]
 #: What the compact networks see around a pixel [pixel]; tiles overlap by it.
-_NOISE_HALO, _MAP_HALO = 48, 64
-
-
-@dataclass(frozen=True, eq=False)
-class Stages:
-    """Every intermediate result of the full pipeline (paper, figure 2), each (4, H, W).
-
-    Args:
-        exposed: After the exposure module (EXP).
-        denoised: After the noise module (NS).
-        opened: After the aperture module, before the output's noise (Full).
-        capture: With the output settings' noise, clipped and quantised.
-    """
-
-    exposed: torch.Tensor
-    denoised: torch.Tensor
-    opened: torch.Tensor
-    capture: torch.Tensor
+_NOISE_HALO, _MAP_HALO = 36, 56
+#: How far the largest disc of `simulator.modules.disc_bank` reaches [pixel].
+_DISC_REACH = 16
 
 
 class CameraSimulator:
@@ -56,6 +46,9 @@ class CameraSimulator:
             is taken as far.
         device: ``"auto"`` (CUDA where there is one), or any torch device.
         precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32.
+        cache: Where `prepare` keeps what the networks find out about a source, for the next time
+            that it comes: ``"memory"`` (the last 256 MiB), ``"disk"`` (also in the cache folder,
+            for later runs), or None: nowhere.
 
     >>> import torch
     >>> from simulator import RawImage, get_camera
@@ -72,6 +65,7 @@ class CameraSimulator:
         *,
         device: str | torch.device = "auto",
         precision: Literal["float32", "bfloat16"] = "float32",
+        cache: Where | None = "memory",
     ) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -84,6 +78,7 @@ class CameraSimulator:
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"`precision` (={precision!r}) must be 'float32' or 'bfloat16'")
         self.precision = precision
+        self._results = NetworkCache(cache)
         self.exposure = ExposureModule().requires_grad_(False).to(self.device)
         self.noise = None if preset is None else self._ready(NoiseModule(preset))
         self.aperture = None if preset is None else self._ready(ApertureModule(preset))
@@ -95,6 +90,7 @@ class CameraSimulator:
         *,
         device: str | torch.device = "auto",
         precision: Literal["float32", "bfloat16"] = "float32",
+        cache: Where | None = "memory",
         body_correction: bool = False,
     ) -> CameraSimulator:
         """A simulator with trained networks.
@@ -103,6 +99,7 @@ class CameraSimulator:
             name: ``"compact"``, or the path of weights that `ae-env train-simulator` wrote.
             device: See `CameraSimulator`.
             precision: See `CameraSimulator`.
+            cache: See `CameraSimulator`.
             body_correction: Whether to apply the exposure module's w and b. They make up for the
                 errors of the one body that was trained on and are wrong for any other.
 
@@ -114,7 +111,7 @@ class CameraSimulator:
         modules, card = load_modules(name)
         if card["preset"] not in get_args(Preset):
             raise ValueError(f"`name` (={str(name)!r}) holds the baseline {card['preset']!r}")
-        simulator = cls(device=device, precision=precision)
+        simulator = cls(device=device, precision=precision, cache=cache)
         simulator.noise = simulator._ready(cast(NoiseModule, modules["noise"]))
         simulator.aperture = simulator._ready(cast(ApertureModule, modules["aperture"]))
         if body_correction:
@@ -132,6 +129,7 @@ class CameraSimulator:
         image_speed: float | None = None,
         defocus: float | None = None,
         depth: Depth = "far",
+        tolerance: float | Literal["source"] = "source",
     ) -> Latent:
         """Everything that does not depend on the target settings, done once.
 
@@ -143,62 +141,52 @@ class CameraSimulator:
                 takes the scene as far or in focus throughout, where every aperture is exact.
             depth: ``"unknown"`` lets the aperture module find what is out of focus, and blur that
                 more where the aperture opens; ``"far"`` takes the scene as in focus throughout.
+            tolerance: How far the distribution of a capture may move by what is left out, in units
+                of the target's noise; 0 leaves out only what changes nothing. By default what the
+                source was prepared with, `DEFAULT_TOLERANCE` for a raw or a scene.
 
         Raises:
             ValueError: If an argument is out of range, or `depth` needs networks that are not here.
         """
-        if depth not in get_args(Depth):
-            raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
+        if tolerance is None:
+            raise ValueError(
+                "`tolerance` (=None) must be a number here: what is prepared is shared between "
+                "transitions; ask `simulate` for the full run of one"
+            )
+        _check_depth(depth)
         if depth == "unknown" and self.aperture is None:
             raise ValueError(
                 "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
             )
-        latent = self._latent(source)
-        if image_speed is not None:
-            latent = replace(latent, image_speed=image_speed)
-        if defocus is not None:
-            latent = replace(latent, defocus=defocus)
+        latent = self._seen(source, image_speed, defocus)
+        if tolerance != "source":
+            latent = replace(latent, tolerance=tolerance)
         # A latent may come from here, corrected already; a scene is no recording of this body.
         if isinstance(source, RawImage) and not self.exposure.is_identity:
             noise = latent.nlf.exposed(float(self.exposure.w))
             latent = replace(latent, light=self.exposure(latent.light, 1.0), nlf=noise)
         if self.noise is not None and latent.denoised is None and not latent.nlf.is_zero:
-            latent = replace(latent, denoised=self.denoise(latent))
+            denoise = partial(
+                self._kept, "denoised", self.noise, latent, partial(self.denoise, latent)
+            )
+            latent = replace(latent, denoised=Denoised(denoise))
         if depth == "unknown":
             latent = replace(latent, opening=self._opening(latent))
         return latent
 
-    def _latent(self, source: RawImage | Latent | HasLatent) -> Latent:
-        if isinstance(source, RawImage):
-            saturated = source.saturated
-            latent = Latent(
-                light=source.data.to(self.device),
-                reference=source.settings,
-                camera=source.camera,
-                nlf=source.noise,
-                saturated=saturated.to(self.device) if bool(saturated.any()) else None,
-                white_balance=source.white_balance,
-                box_factor=source.box_factor,
-            )
-            if source.nlf is not None and not source.camera.nlf_by_iso:
-                camera = source.camera.with_nlf(source.settings.iso, source.nlf)
-                latent = replace(latent, camera=camera)
-            return latent
-        if isinstance(source, Latent):
-            return replace(
-                source,
-                light=source.light.to(self.device),
-                denoised=self._moved(source.denoised),
-                saturated=self._moved(source.saturated),
-            )
-        if hasattr(source, "latent"):
-            return self._latent(source.latent)
-        raise ValueError(
-            f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene"
-        )
+    def _seen(
+        self,
+        source: RawImage | Latent | HasLatent,
+        image_speed: float | None,
+        defocus: float | None,
+    ) -> Latent:
+        """The source's light, with its motion and blur where they are given."""
+        latent = self._latent(source)
+        given = {"image_speed": image_speed, "defocus": defocus}
+        return replace(latent, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
 
-    def _moved(self, tensor: torch.Tensor | None) -> torch.Tensor | None:
-        return None if tensor is None else tensor.to(self.device)
+    def _latent(self, source: RawImage | Latent | HasLatent) -> Latent:
+        return latent_of(source, self.device)
 
     @torch.no_grad()
     def denoise(self, latent: Latent) -> torch.Tensor:
@@ -220,7 +208,8 @@ class CameraSimulator:
                 return noise(part, shot, read)
 
         if noise.preset == "compact":
-            return in_tiles(network, image, halo=_NOISE_HALO)[0]
+            needed = varying(latent.light) if latent.tolerance > 0 else None
+            return in_tiles(network, image, halo=_NOISE_HALO, needed=needed, fallback=image)[0]
         return network(image)[0]
 
     @torch.no_grad()
@@ -234,23 +223,44 @@ class CameraSimulator:
             raise ValueError("there is no aperture module: use CameraSimulator.from_pretrained")
         aperture = self.aperture
         shot, read = self._noise_of(latent)
-        deviation = variance_map(smoothed(latent.light[None]), shot, read).sqrt()
-        image = latent.light if latent.denoised is None else latent.denoised
+        light = latent.light[None]
+        image = light if latent.denoised is None else latent.denoised.light[None]
 
-        def network(part: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        def network(part: torch.Tensor, noisy: torch.Tensor) -> torch.Tensor:
+            deviation = variance_map(smoothed(noisy), shot, read).sqrt()
             with self._autocast():
-                return aperture.estimate_defocus(part, noise)
+                return aperture.estimate_defocus(part, deviation)
 
-        diameter = in_tiles(network, image[None], deviation, halo=_MAP_HALO)
-        return usable_defocus(diameter, image[None])[0]
+        # No disc changes a pixel that sees a constant neighbourhood.
+        needed = varying(latent.light, _DISC_REACH) if latent.tolerance > 0 else None
+        sharp = light.new_zeros(light[:, 0].shape)
+        diameter = in_tiles(network, image, light, halo=_MAP_HALO, needed=needed, fallback=sharp)
+        return usable_defocus(diameter, image)[0]
 
     def _opening(self, latent: Latent) -> Opening:
         assert self.aperture is not None
         f_number = latent.reference.effective_f_number
-        denoised = latent.light if latent.denoised is None else latent.denoised
+        denoised = latent.denoised or Denoised(latent.light)
         if self.aperture.preset == "paper":
-            return NetworkOpening(denoised, self.aperture, f_number)
-        return MapOpening(latent.light, denoised, self.estimate_defocus(latent), f_number)
+            opened = partial(self._results.called, "opened", self.aperture)
+            return NetworkOpening(denoised, opened, f_number)
+        estimate = partial(self.estimate_defocus, latent)
+        find = partial(self._kept, "defocus_maps", self.aperture, latent, estimate)
+        return MapOpening(latent.light, denoised, find, f_number)
+
+    def _kept(
+        self, kind: str, module: nn.Module, latent: Latent, make: Callable[[], torch.Tensor]
+    ) -> torch.Tensor:
+        """What `make` finds out about the latent, or found when everything was the same."""
+        denoised = None if latent.denoised is None else latent.denoised.light
+        inputs = {"light": latent.light, "denoised": denoised, "saturated": latent.saturated}
+        nlf = [latent.nlf.shot, latent.nlf.read]
+        return self._results.result(
+            *(kind, [module], inputs, make),
+            nlf=nlf,
+            precision=self.precision,
+            everywhere=latent.tolerance == 0,
+        )
 
     def _noise_of(self, latent: Latent) -> tuple[torch.Tensor, torch.Tensor]:
         shot, read = (torch.tensor([v]) for v in (latent.nlf.shot, latent.nlf.read))
@@ -261,50 +271,64 @@ class CameraSimulator:
         return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
 
     def plan(
-        self, source: RawImage | Latent | HasLatent, settings: CameraSettings, **scene: Any
+        self,
+        source: RawImage | Latent | HasLatent,
+        settings: CameraSettings,
+        *,
+        noise: bool = True,
+        **scene: Any,
     ) -> SimulationPlan:
-        """Which steps the change to `settings` takes, why others are left out, error and cost."""
-        return self.prepare(source, **scene).plan(settings)
+        """Which steps the change to `settings` takes, why others are left out, error and cost.
 
-    @torch.no_grad()
-    def stages(self, source: RawImage, settings: CameraSettings, *, seed: int = 0) -> Stages:
-        """Runs the whole pipeline on one raw, every module for this very transition.
+        Args:
+            source: A raw, a latent, or a scene.
+            settings: Target settings.
+            noise: False plans the light on the sensor alone (`Latent.expected`).
+            scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``,
+                ``tolerance``.
+        """
+        return self.prepare(source, **scene).plan(settings, noise=noise)
+
+    def stages(
+        self,
+        source: RawImage | Latent | HasLatent,
+        settings: CameraSettings,
+        *,
+        seed: int = 0,
+        image_speed: float | None = None,
+        defocus: float | None = None,
+        depth: Depth = "unknown",
+    ) -> Stages:
+        """Runs the whole pipeline on one source, every module for this very transition.
 
         Nothing is left out and nothing shared: this is what `simulate` is an approximation of. The
         preset ``"paper"`` clips to [0, 1] after the exposure, as the paper does.
 
         Args:
-            source: The raw.
+            source: A raw, a latent, or a scene.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
+            image_speed: See `prepare`.
+            defocus: See `prepare`.
+            depth: See `prepare`; unknown to a latent that was prepared as such.
 
         Raises:
-            ValueError: If this simulator has no networks.
+            ValueError: If this simulator has no networks, or an argument is out of range.
         """
         if self.noise is None or self.aperture is None:
             raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
-        latent = self._latent(source)
-        ratio = exposure_ratio(latent.reference, settings)
-        exposed = self.exposure(latent.light[None], ratio)
-        if self.noise.preset == "paper":
-            exposed = exposed.clamp(0.0, 1.0)
-        shot, read = self._noise_of(latent)
-        scale = float(self.exposure.w) * ratio
-        shot, read = shot * scale, read * scale * scale
-        with self._autocast():
-            denoised = self.noise(exposed, shot, read)
-            deviation = variance_map(smoothed(exposed), shot, read).sqrt()
-            f_numbers = (
-                torch.tensor([s.effective_f_number], device=self.device)
-                for s in (latent.reference, settings)
-            )
-            opened = self.aperture(denoised, deviation, *f_numbers)
-        clean = replace(latent.exposure(settings), source=latent.nlf.zero(), remaining=None)
-        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
-        noisy, _ = add_noise(opened, [clean], [generator])
-        capture = clip_and_quantise(noisy[0], latent.camera)
-        return Stages(exposed[0], denoised[0], opened[0], capture)
+        _check_depth(depth)
+        latent = self._seen(source, image_speed, defocus)
+        opens = depth == "unknown" or latent.opening is not None
+        # A latent may come from `prepare`, corrected already; a scene is no recording of this body.
+        exposure = self.exposure
+        if not isinstance(source, RawImage):
+            exposure = ExposureModule().requires_grad_(False).to(self.device)
+        pipeline = FullRun(
+            exposure, self.noise, self.aperture if opens else None, self.precision == "bfloat16"
+        )
+        return pipeline.run(latent, settings, seed=seed)
 
     def simulate(
         self,
@@ -312,6 +336,7 @@ class CameraSimulator:
         settings: CameraSettings,
         *,
         seed: int = 0,
+        tolerance: float | Literal["source"] | None = "source",
         **scene: Any,
     ) -> RawImage:
         """The raw that the camera would have recorded at `settings`.
@@ -320,14 +345,25 @@ class CameraSimulator:
             source: A raw, a latent, or a scene.
             settings: Target ISO, exposure time and f-number.
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
+            tolerance: See `prepare`; None runs every module for this very transition (`stages`),
+                and shares and leaves out nothing.
             scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
             ``metadata["clipped_source"]`` declare what could not be made exact.
         """
-        latent = self.prepare(source, **scene)
-        data, excess_noise = latent.capture(settings, seed)
+        if tolerance is None and self.noise is not None:
+            scene = {"depth": "far", **scene}
+            data, excess_noise = self.stages(source, settings, seed=seed, **scene).capture, 0.0
+            latent = self._latent(source)
+            output_noise = replace(latent, nlf=latent.nlf.zero()).output_noise(settings)
+        else:  # without networks nothing is shared, and tolerance 0 is the full run
+            latent = self.prepare(
+                source, tolerance=0.0 if tolerance is None else tolerance, **scene
+            )
+            data, excess_noise = latent.capture(settings, seed)
+            output_noise = latent.output_noise(settings)
         clipped = 0.0 if latent.saturated is None else float(latent.saturated.float().mean())
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}
         metadata |= {
@@ -340,8 +376,13 @@ class CameraSimulator:
             data=data,
             settings=settings,
             camera=latent.camera,
-            nlf=latent.output_noise(settings),
+            nlf=output_noise,
             white_balance=latent.white_balance,
             box_factor=latent.box_factor,
             metadata=metadata,
         )
+
+
+def _check_depth(depth: str) -> None:
+    if depth not in get_args(Depth):
+        raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")

@@ -7,15 +7,18 @@ that unclipped light -> noise of the blurred signal -> clip -> quantise, each of
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 import torch
 
 from simulator.blur import disc_blur, kernel_energy, motion_blur
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.noise import noise_variance
+from simulator.noise import draw_normals, noise_variance
+from simulator.noise_bank import frame_noise
+from simulator.threads import in_shares
 
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
@@ -23,6 +26,9 @@ SIGNAL_LIMIT = 1e6
 #: Light beyond this many times the reference's white is clipped before it is blurred: it is white
 #: at every exposure, and sums of larger numbers would no longer resolve the shadows.
 LATENT_LIMIT = 1e9
+_TINY = torch.finfo(torch.float32).tiny
+#: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
+_BALANCED = 2**15
 
 
 @dataclass(frozen=True)
@@ -40,6 +46,8 @@ class Exposure:
             None where it does not.
         remaining: (H, W) share that this blur leaves of the noise variance which the other blurs
             have left; None for all.
+        errors: What leaving out each step that would do something errs or would err by, in units of
+            the target's noise (see `simulator.tolerance.Budget`).
     """
 
     ratio: float
@@ -50,6 +58,7 @@ class Exposure:
     denoised: bool = False
     opened_to: float | None = None
     remaining: torch.Tensor | None = None
+    errors: Mapping[str, float] = field(default_factory=dict, compare=False)
 
     @property
     def source_noise(self) -> NoiseLevelFunction:
@@ -66,6 +75,11 @@ def sensor_light(latent: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     light = latent
     if exposure.defocus_px or exposure.motion_px:  # else even the brightest light stays exact
         light = motion_blur(defocused_light(latent, exposure.defocus_px), exposure.motion_px)
+    return exposed_light(light, exposure)
+
+
+def exposed_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
+    """Light on the sensor, (4, H, W), of `light` that has the blur of `exposure` already."""
     return (light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
 
@@ -86,6 +100,20 @@ def add_noise(
     Each image draws from its own generator, so that it comes out the same alone or in a batch.
 
     Returns:
+        See `top_up`.
+    """
+    normals = torch.empty(light.shape, dtype=torch.float32)
+    for normal, generator in zip(normals, generators, strict=True):
+        draw_normals(normal, generator)
+    return top_up(light, exposures, normals.to(light.device))
+
+
+def top_up(
+    light: torch.Tensor, exposures: Sequence[Exposure], normals: torch.Tensor
+) -> tuple[torch.Tensor, np.ndarray]:
+    """`add_noise` with the standard normals given, (B, 4, H, W).
+
+    Returns:
         The noisy signal, and per image the excess noise (B,): mean over the pixels of the variance
         that the source brings beyond the target's, relative to the target's; 0 where the source is
         clean enough.
@@ -95,21 +123,151 @@ def add_noise(
     shot = _planes([t.shot for t in targets]) - _planes([s.shot for s in sources])
     read = _planes([t.read for t in targets]) - _planes([s.read for s in sources])
     missing = light.clamp(min=0.0).mul_(shot.to(light)).add_(read.to(light))
-    excess_noise = np.zeros(len(exposures))
+    excess = np.zeros(len(exposures))
     for i, (source, target) in enumerate(zip(sources, targets, strict=True)):
         remaining = exposures[i].remaining
         if remaining is not None:  # what the blur of the aperture took away is to be added again
             missing[i] += (1.0 - remaining) * noise_variance(light[i], source)
         if not source.is_zero:
-            wanted = noise_variance(light[i], target).clamp_(min=torch.finfo(torch.float32).tiny)
-            relative = (missing[i] / wanted).clamp_(max=0.0).mean(dtype=torch.float64)
-            excess_noise[i] = max(0.0, -float(relative))
-    normals = torch.empty(light.shape, dtype=torch.float32)
-    for normal, generator in zip(normals, generators, strict=True):
-        normal.normal_(generator=generator)
+            excess[i] = _relative_excess(missing[i], noise_variance(light[i], target))
     if not all(source.is_zero for source in sources):
         missing.clamp_(min=0.0)
-    return missing.sqrt_().mul_(normals.to(light.device)).add_(light), excess_noise
+    return missing.sqrt_().mul_(normals).add_(light), excess
+
+
+def record(
+    light: torch.Tensor,
+    exposure: Exposure,
+    camera: CameraProfile,
+    noise: torch.Generator | int,
+    *,
+    out: torch.Tensor,
+    threads: int | None = None,
+) -> None:
+    """One capture of light that is blurred already: exposed, noisy, clipped and quantised.
+
+    A fused kernel on the CPU; elsewhere the same steps one by one.
+
+    Args:
+        light: (4, H, W) with the blur of `exposure`, at the exposure of the latent.
+        exposure: What happens to it.
+        camera: The body.
+        noise: What draws it, or its key in the bank (`simulator.noise_bank.noise_keys`).
+        out: (4, H, W) float32, contiguous, that the frame in [-pedestal, 1] is written to.
+        threads: Of the kernel, at most; those of torch by default.
+    """
+    normals = None
+    if isinstance(noise, torch.Generator):
+        # A sample's normal is read before the sample is written: on the CPU they share memory.
+        place = out if out.device.type == "cpu" else torch.empty(light.shape)
+        draw_normals(place, noise, threads)
+        normals = place
+    if light.device.type == "cpu":
+        from simulator.kernels import record_capture  # numba: only where there is a capture
+
+        key = None if isinstance(noise, torch.Generator) else noise
+        record_capture(light, exposure, camera, key=key, normals=normals, out=out, threads=threads)
+        return
+    if normals is None:
+        normals = torch.from_numpy(frame_noise(cast(int, noise), tuple(light.shape)))  # type: ignore[arg-type]
+    signal = exposed_light(light, exposure)
+    noisy, _ = top_up(signal[None], [exposure], normals[None].to(light.device))
+    out.copy_(clip_and_quantise(noisy[0], camera))
+
+
+def record_batch(
+    lights: Sequence[torch.Tensor],
+    exposures: Sequence[Exposure],
+    camera: CameraProfile,
+    keys: np.ndarray,
+    *,
+    out: torch.Tensor,
+) -> None:
+    """`record` of B frames at once on the CPU, with noise from the bank.
+
+    Args:
+        lights: B of (4, H, W), blurred already; several may be the same.
+        exposures: What happens to each.
+        camera: The body.
+        keys: (B,) uint64 of the noise of each.
+        out: (B, 4, H, W) float32, contiguous.
+    """
+    from simulator.kernels import addresses, exposure_table, record_frames
+
+    lights = [light.contiguous() for light in lights]
+    shares = [None if e.remaining is None else e.remaining.float().contiguous() for e in exposures]
+    samples = out.shape[-2] * out.shape[-1]
+    record_frames(
+        addresses(lights),
+        samples,
+        exposure_table(exposures),
+        camera,
+        keys=keys,
+        remaining=addresses(shares),
+        signals=out.numpy().reshape(len(out), 4, samples),
+    )
+
+
+@dataclass(frozen=True)
+class NoiseBalance:
+    """The noise that a source brings against the noise that a capture should have.
+
+    Args:
+        relative_excess: Mean over the pixels of the variance beyond the target's, relative to it.
+        excess: Mean of that variance, 1 is sensor white squared.
+        is_short: Whether any pixel has less noise than the target.
+    """
+
+    relative_excess: float
+    excess: float
+    is_short: bool
+
+
+def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
+    """What the noise top-up of one image finds.
+
+    Args:
+        light: (4, H, W) at the exposure of the latent.
+        exposure: What happens to it; neither its ratio nor its noise are in `light` yet.
+    """
+    source, target = exposure.source_noise, exposure.target
+    if source.is_zero:
+        return NoiseBalance(0.0, 0.0, not target.is_zero)
+    height, width = light.shape[-2:]
+    rows = max(1, _BALANCED // width)
+    parts = [slice(top, top + rows) for top in range(0, height, rows)]
+    relative, excess, is_short = np.zeros(4), np.zeros(4), np.zeros(4, bool)
+
+    def balance(first: int, last: int) -> None:
+        for plane in range(first, last):
+            shot = target.shot[plane] - source.shot[plane]
+            read = target.read[plane] - source.read[plane]
+            if shot >= 0.0 and read > 0.0:
+                is_short[plane] = True  # at every pixel, whatever its light
+                continue
+            for part in parts:
+                signal = (light[plane, part] * exposure.ratio).clamp_(0.0, SIGNAL_LIMIT)
+                missing = signal * shot + read
+                if exposure.remaining is not None:  # what the aperture's blur took is added again
+                    missing += (1.0 - exposure.remaining[part]) * (
+                        signal * source.shot[plane] + source.read[plane]
+                    )
+                is_short[plane] |= bool((missing > 0).any())
+                wanted = signal.mul_(target.shot[plane]).add_(target.read[plane])
+                missing.clamp_(max=0.0)
+                excess[plane] -= float(missing.sum())
+                relative[plane] -= float((missing / wanted.clamp_(min=_TINY)).sum())
+
+    in_shares(balance, 4, threads=None if len(parts) > 4 else 1)
+    count = light.numel()
+    return NoiseBalance(
+        abs(float(relative.sum())) / count, abs(float(excess.sum())) / count, bool(is_short.any())
+    )
+
+
+def _relative_excess(missing: torch.Tensor, wanted: torch.Tensor) -> float:
+    relative = missing / wanted.clamp_(min=_TINY)
+    return max(0.0, -float(relative.clamp_(max=0.0).mean(dtype=torch.float64)))
 
 
 def _planes(values: list[tuple[float, float, float, float]]) -> torch.Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+from collections.abc import Iterator
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
@@ -23,8 +25,8 @@ from simulator.dng_tags import (
 )
 from simulator.exif import MAKE, MODEL, SOFTWARE
 from simulator.files import write_atomically
-from simulator.raw_image import RawImage
-from simulator.tiff import Tag, TiffType, pack_tiff
+from simulator.raw_image import RawImage, unpack_mosaic
+from simulator.tiff import Tag, TiffType, tiff_head
 
 #: Colour matrix of a raw whose camera has none: its R, G, B are taken as linear sRGB primaries
 #: (XYZ to sRGB, D65, IEC 61966-2-1).
@@ -36,6 +38,8 @@ DEFAULT_COLOUR_MATRIX = (
 #: What EXIF writes for a date that is not known.
 _NO_DATE = "    :  :     :  :  "
 _CFA_BYTE = {"R": 0, "G": 1, "B": 2}
+#: Packed rows that are converted and written at a time.
+_STRIP_ROWS = 256
 
 
 def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
@@ -60,8 +64,14 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
         raise ValueError(f"`path` (={str(path)!r}) must end in '.dng'")
     if not isinstance(raw, RawImage):
         raise ValueError(f"`raw` (={type(raw).__name__}) must be a RawImage")
-    content = pack_tiff(_image_tags(raw), _exif_tags(raw), raw.to_mosaic().astype("<u2").tobytes())
-    write_atomically(path, content)
+    head = tiff_head(_image_tags(raw), _exif_tags(raw), 8 * raw.data[0].numel())
+    write_atomically(path, itertools.chain([head], _strip(raw)))
+
+
+def _strip(raw: RawImage) -> Iterator[bytes | memoryview]:
+    """The mosaic as it stands in the file, a few rows at a time."""
+    for rows in raw.data.split(_STRIP_ROWS, dim=1):
+        yield unpack_mosaic(rows, raw.camera).astype("<u2", copy=False).data.cast("B")
 
 
 def _image_tags(raw: RawImage) -> dict[int, Tag]:

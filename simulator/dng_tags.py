@@ -183,4 +183,4 @@ def read_plain_mosaic(data: bytes, directories: list[Directory]) -> np.ndarray |
         return None
     order = "<u2" if data[:2] == b"II" else ">u2"
     strip = np.frombuffer(data, order, count=width * height, offset=start)
-    return strip.reshape(height, width).astype(np.uint16)
+    return strip.reshape(height, width).astype(np.uint16, copy=False)

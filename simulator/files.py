@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 #: Endings of raw files that LibRaw knows.
@@ -15,12 +16,14 @@ RAW_SUFFIXES = (
 )
 
 
-def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> Path:
+def write_atomically(
+    path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
+) -> Path:
     """Writes `content` under a temporary name beside `path`, then renames it; makes the folder.
 
     Args:
         path: File to write or replace.
-        content: Bytes, or text that is encoded as UTF-8.
+        content: Bytes, text that is encoded as UTF-8, or pieces of bytes, written as they come.
 
     Returns:
         `path`.
@@ -28,9 +31,11 @@ def write_atomically(path: str | os.PathLike[str], content: bytes | str) -> Path
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    content = content.encode() if isinstance(content, str) else content
+    pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
     try:
         with os.fdopen(descriptor, "wb") as stream:
-            stream.write(content.encode() if isinstance(content, str) else content)
+            stream.writelines(pieces)
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(name, 0o666 & ~umask)  # mkstemp's files are private

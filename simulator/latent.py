@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
+import numpy as np
 import torch
 
 from simulator.blur import kernel_energy
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture import Exposure, add_noise, clip_and_quantise, sensor_light
+from simulator.capture import Exposure, exposed_light, noise_balance, record, record_batch
+from simulator.denoised import Denoised
+from simulator.light_statistics import LightStatistics
 from simulator.noise import noise_generator
-from simulator.opening import NEGLIGIBLE_ADDED_BLUR, Opening
-from simulator.plan import NEGLIGIBLE_BLUR, SimulationPlan, make_plan
-from simulator.raw_image import check_packed
+from simulator.noise_bank import noise_keys
+from simulator.opening import Opening
+from simulator.optics import Optics, blur_key
+from simulator.plan import SimulationPlan, make_plan
+from simulator.raw_image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.threads import in_shares
+from simulator.tolerance import DEFAULT_TOLERANCE, Budget, check_tolerance
 
-#: Noise variance in excess of the target's, relative to it, from which the source is denoised.
-TOLERATED_EXCESS = 0.01
+#: How the noise of a capture is made: drawn, or looked up in a bank of normals.
+Noise = Literal["exact", "bank"]
 #: Noise below this share of the light is not worth denoising: the networks err as much.
 WORTH_DENOISING = 0.006
-#: Quantiles of the light at which a source's noise is compared with a target's.
-_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+#: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
+_TOGETHER_BYTES = 2**26
 
 
 class HasLatent(Protocol):
@@ -51,10 +60,14 @@ class Latent:
         defocus: Diameter of the defocus disc at f/4 [pixel of `light`]; 0 for a scene that is far
             or in focus throughout.
         gain: Light relative to `light`, where it changes over time.
-        denoised: (4, H, W) `light` with its noise removed by a noise module, for targets that are
-            cleaner than the source; None where there is no such module or no noise.
+        denoised: `light` with its noise removed by a noise module, for targets that are cleaner
+            than the source; None where there is no such module or no noise.
         opening: Adds the blur of apertures wider than the reference's to a scene whose depth is not
             known; None takes it as far.
+        tolerance: How far the distribution of a capture may move by what is left out, in units of
+            the target's noise; 0 leaves out only what changes nothing.
+        statistics: Of `light`; made here, and shared by copies with that light.
+        optics: Blurs the light and keeps what it has blurred; made here, and shared likewise.
     """
 
     light: torch.Tensor
@@ -67,42 +80,73 @@ class Latent:
     image_speed: float = 0.0
     defocus: float = 0.0
     gain: float = 1.0
-    denoised: torch.Tensor | None = None
+    denoised: Denoised | None = None
     opening: Opening | None = None
+    tolerance: float = DEFAULT_TOLERANCE
+    statistics: LightStatistics = None  # type: ignore[assignment]
+    optics: Optics = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "light", check_packed("light", self.light))
-        if self.denoised is not None and self.denoised.shape != self.light.shape:
+        known = self.optics is not None and self.optics.is_of(
+            self.light, self.denoised, self.opening
+        )
+        if not known:  # a copy's light was checked before
+            object.__setattr__(self, "light", check_packed("light", self.light))
+        denoised = self.denoised
+        if denoised is not None and not isinstance(denoised, Denoised):
+            raise ValueError(f"`denoised` (={type(denoised).__name__}) must be Denoised or None")
+        if denoised is not None and denoised.shape not in (None, self.light.shape):
             raise ValueError(
-                f"`denoised` (shape {tuple(self.denoised.shape)}) must have the shape of `light`, "
+                f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
                 f"{tuple(self.light.shape)}"
             )
         for name in ("image_speed", "defocus"):
             value = getattr(self, name)
             if not 0.0 <= value < float("inf"):
                 raise ValueError(f"`{name}` (={value!r}) must be finite and >= 0")
+        object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
+        if self.statistics is None or self.statistics.light is not self.light:
+            object.__setattr__(self, "statistics", LightStatistics(self.light))
+        if not known:
+            object.__setattr__(self, "optics", Optics(self.light, self.denoised, self.opening))
 
-    def exposure(self, settings: CameraSettings) -> Exposure:
-        """What a capture at `settings` does to this light."""
+    def exposure(self, settings: CameraSettings, *, noise: bool = True) -> Exposure:
+        """What a capture at `settings` does to this light, and what `tolerance` leaves out of it.
+
+        Tens of microseconds: what must be known of the light is in `statistics`, and kept.
+
+        Args:
+            settings: Settings to simulate.
+            noise: Whether the capture will be noisy; if not, noise of the source cannot count as
+                part of the target's.
+        """
         if not isinstance(settings, CameraSettings):
             raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
         f_number = settings.effective_f_number
-        motion_px = self.image_speed * settings.exposure_time * self.light.shape[-2]
-        defocus_px = self.defocus * 4.0 / f_number
         ratio = self.gain * exposure_ratio(self.reference, settings)
         target = _averaged_nlf(self.camera, settings.iso, self.box_factor)
-        motion_px = motion_px if motion_px > NEGLIGIBLE_BLUR else 0.0
-        defocus_px = defocus_px if defocus_px > NEGLIGIBLE_BLUR else 0.0
-        opened_to = self._opened_to(f_number)
-        denoised = self._needs_denoising(ratio, target, opened_to)
+        budget = Budget(self.tolerance)
+        added_px = self.optics.added_blur(f_number)
+        denoised = self._denoises(ratio, target, added_px, budget, noise=noise)
+
+        def kept(name: str, extent: float) -> float:
+            """`extent` of a disc or of a streak, 0 where it may be left out."""
+            if not extent:
+                return 0.0
+            error = self._blur_error(ratio, target, name, extent, denoised)
+            return 0.0 if budget.leaves_out_blur(name, error) else extent
+
+        opened_to = f_number if kept("aperture", added_px) else None
+        defocus_px = kept("defocus", self.defocus * 4.0 / f_number)
+        motion_px = kept(
+            "motion_blur", self.image_speed * settings.exposure_time * self.light.shape[-2]
+        )
         remaining = None
         known = denoised or self.nlf.is_zero
-        if self.opening is not None and opened_to is not None and not known:
+        if opened_to is not None and not known:
             # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
             # it further. Both together leave about what the larger leaves alone.
-            energy = kernel_energy(motion_px, defocus_px)
-            share = self.opening.remaining(opened_to)
-            remaining = None if share is None else (share / energy).clamp(max=1.0)
+            remaining = self.optics.remaining(opened_to, kernel_energy(motion_px, defocus_px))
         return Exposure(
             ratio=ratio,
             source=NoiseLevelFunction.zero() if denoised else self.nlf,
@@ -112,56 +156,55 @@ class Latent:
             denoised=denoised,
             opened_to=opened_to,
             remaining=remaining,
+            errors=budget.errors,
         )
 
-    def _opened_to(self, f_number: float) -> float | None:
-        """`f_number` where it blurs more than the reference's aperture did, else None."""
-        if self.opening is None or self.opening.extent(f_number) <= NEGLIGIBLE_ADDED_BLUR:
-            return None
-        return f_number
-
-    def _needs_denoising(
-        self, ratio: float, target: NoiseLevelFunction, opened_to: float | None
+    def _denoises(
+        self,
+        ratio: float,
+        target: NoiseLevelFunction,
+        added_px: float,
+        budget: Budget,
+        *,
+        noise: bool,
     ) -> bool:
-        if self.denoised is None:
+        """Whether the noise-reduced light is needed; `noise` as in `exposure`."""
+        if self.denoised is None or self.nlf.is_zero:
             return False
-        if opened_to is not None and self.opening is not None and self.opening.needs_denoised:
+        left = self.statistics.excess if noise else self.statistics.relative_noise
+        error = left(ratio, self.nlf, target)
+        # Blur averages noise, too. That is not counted on: it may be left out itself.
+        if self.opening is not None and self.opening.needs_denoised and added_px:
+            budget.errors["noise_reduction"] = error
             return True
-        return self.is_noisy and self._excess(ratio, target) > TOLERATED_EXCESS
+        return not budget.leaves_out_noise_reduction(error, pointless=not self.is_noisy)
+
+    def _blur_error(
+        self, ratio: float, target: NoiseLevelFunction, name: str, extent: float, denoised: bool
+    ) -> float:
+        if self.tolerance == 0.0 or extent == math.inf:  # it is applied in any case
+            return math.inf
+        streak = name == "motion_blur"
+        return float(
+            self.statistics_of(denoised).blur_error(
+                ratio, target, motion_px=extent * streak, disc_px=extent * (not streak)
+            )
+        )
+
+    def statistics_of(self, denoised: bool) -> LightStatistics:
+        """Of the light that a transition starts from, denoised or as it was recorded."""
+        return self.denoised.statistics if denoised and self.denoised else self.statistics
 
     @cached_property
     def is_noisy(self) -> bool:
         """Whether the noise is more than `WORTH_DENOISING` of the light, at its median level."""
-        signal = self._levels[len(_LEVELS) // 2]
-        read, shot = (torch.tensor(v, dtype=torch.float64) for v in (self.nlf.read, self.nlf.shot))
-        return bool(((read + shot * signal).sqrt() > WORTH_DENOISING * signal).any())
-
-    @cached_property
-    def _levels(self) -> torch.Tensor:
-        """(Q, 4) quantiles of the light of each plane, at least 0."""
-        planes = self.light.flatten(1)[:, :: max(1, self.light[0].numel() // 65_536)]
-        levels = torch.tensor(_LEVELS, device=planes.device)
-        return torch.quantile(planes.clamp(min=0.0), levels, dim=1).double().cpu()
-
-    def _excess(self, ratio: float, target: NoiseLevelFunction) -> float:
-        """Mean over light levels of the source's variance beyond the target's, relative to it."""
-        if self.nlf.is_zero:
-            return 0.0
-        source = self.nlf.exposed(ratio)
-        signal = self._levels * ratio
-        variances = [
-            torch.tensor(n.read, dtype=torch.float64)
-            + torch.tensor(n.shot, dtype=torch.float64) * signal
-            for n in (source, target)
-        ]
-        relative = variances[0] / variances[1].clamp(min=1e-30) - 1.0
-        return float(relative.clamp(min=0.0).mean())
+        signal = self.statistics.median
+        deviation = np.sqrt(np.array(self.nlf.read) + np.array(self.nlf.shot) * signal)
+        return bool((deviation > WORTH_DENOISING * signal).any())
 
     def source_light(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
-        if exposure.opened_to is not None and self.opening is not None:
-            return self.opening.opened(exposure.opened_to, denoised=exposure.denoised)
-        return self.denoised if exposure.denoised and self.denoised is not None else self.light
+        return self.optics.source(exposure)
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
@@ -173,38 +216,108 @@ class Latent:
         source = exposure.source_noise.scaled(float(self.box_factor**2))
         return self.camera.nlf(settings.iso).at_least(source)
 
-    def plan(self, settings: CameraSettings) -> SimulationPlan:
-        """Steps, reasons, predicted error and cost of a capture at `settings`."""
-        return make_plan(self, settings)
+    def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
+        """Steps, reasons, predicted error and cost of a capture at `settings`.
+
+        Args:
+            settings: Settings to simulate.
+            noise: False plans `expected`, the light without noise, instead of a capture.
+        """
+        return make_plan(self, settings, noise=noise)
 
     def expected(self, settings: CameraSettings) -> torch.Tensor:
         """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped."""
-        exposure = self.exposure(settings)
-        return sensor_light(self.source_light(exposure), exposure)
+        exposure = self.exposure(settings, noise=False)
+        return exposed_light(self.optics.blurred(exposure), exposure)
 
-    def capture(self, settings: CameraSettings, seed: int = 0) -> tuple[torch.Tensor, float]:
+    def capture(
+        self, settings: CameraSettings, seed: int = 0, *, noise: Noise = "exact"
+    ) -> tuple[torch.Tensor, float]:
         """One simulated capture.
 
         The noise is a function of `seed` and of `settings`: the same frame comes back alone or in
         a sweep, and the frames of a sweep are independent.
 
+        Args:
+            settings: Settings to simulate.
+            seed: Seed of the noise, >= 0.
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up (`simulator.noise_bank`).
+
         Returns:
             (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
         """
         exposure = self.exposure(settings)
-        light = sensor_light(self.source_light(exposure), exposure)
-        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
-        noisy, excess_noise = add_noise(light[None], [exposure], [generator])
-        return clip_and_quantise(noisy[0], self.camera), float(excess_noise[0])
+        frame = self._frame(exposure, _noise_of(noise, seed, settings))
+        return frame, noise_balance(self.optics.blurred(exposure), exposure).relative_excess
 
-    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> torch.Tensor:
-        """A sweep: one capture per state, (S, 4, H, W) float32."""
-        return torch.stack(list(self.stream(states, seed=seed)))
+    def _frame(self, exposure: Exposure, noise: torch.Generator | int) -> torch.Tensor:
+        light = self.optics.blurred(exposure)
+        frame = new_frame(light)
+        record(light, exposure, self.camera, noise, out=frame)
+        return frame
 
-    def stream(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Iterator[torch.Tensor]:
+    def expose(
+        self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
+    ) -> torch.Tensor:
+        """A sweep: one capture per state, (S, 4, H, W) float32.
+
+        States that share their blur follow each other, so that none is computed twice; the order
+        of `states` is kept in the result.
+
+        Args:
+            states: Settings to simulate.
+            seed: See `capture`.
+            noise: See `capture`.
+        """
+        states = list(states)
+        exposures = [self.exposure(settings) for settings in states]
+        frames = new_frame(self.light.expand(len(states), *self.light.shape))
+        groups: dict[tuple[object, ...], list[int]] = {}
+        for index, exposure in enumerate(exposures):
+            groups.setdefault(blur_key(exposure), []).append(index)
+
+        def record_one(i: int, threads: int | None = None) -> None:
+            drawn = _noise_of(noise, seed, states[i])
+            light = self.optics.blurred(exposures[i])
+            record(light, exposures[i], self.camera, drawn, out=frames[i], threads=threads)
+
+        def record_some(first: int, last: int) -> None:
+            for i in range(first, last):
+                record_one(i, threads=1)
+
+        if len(groups) * self.light.nbytes > _TOGETHER_BYTES or self.light.device.type != "cpu":
+            for i in itertools.chain.from_iterable(groups.values()):
+                record_one(i)
+            return frames
+        lights = [self.optics.blurred(exposure) for exposure in exposures]  # kept from here on
+        if noise == "bank":
+            keys = noise_keys(np.array([seed]), *np.array([_noise_key(s) for s in states]).T)
+            record_batch(lights, exposures, self.camera, keys, out=frames)
+        else:
+            in_shares(record_some, len(states))
+        return frames
+
+    def stream(
+        self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
+    ) -> Iterator[torch.Tensor]:
         """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once."""
         for settings in states:
-            yield self.capture(settings, seed)[0]
+            yield self._frame(self.exposure(settings), _noise_of(noise, seed, settings))
+
+
+def _noise_key(settings: CameraSettings) -> tuple[float, float, float]:
+    """What the noise of a sweep's frames differs by."""
+    return settings.iso, settings.exposure_time, settings.f_number
+
+
+def _noise_of(noise: Noise, seed: int, settings: CameraSettings) -> torch.Generator | int:
+    """What draws the noise of one frame, or its key in the bank."""
+    key = _noise_key(settings)
+    if noise == "bank":
+        return int(noise_keys(np.array([seed]), *key)[0])
+    if noise != "exact":
+        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
+    return noise_generator(seed, *key)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -99,21 +99,26 @@ def _pack_directory(tags: Mapping[int, Tag], offset: int) -> bytes:
     return struct.pack("<H", len(tags)) + b"".join(entries) + b"\0\0\0\0" + outside
 
 
-def pack_tiff(tags: Mapping[int, Tag], exif: Mapping[int, Tag], strip: bytes) -> bytes:
-    """A little-endian TIFF file: one directory, its EXIF directory and one strip of pixels.
+def tiff_head(tags: Mapping[int, Tag], exif: Mapping[int, Tag], size: int) -> bytes:
+    """A little-endian TIFF file of one strip of pixels, up to where the strip begins.
 
     The strip's offset and length (tags 273, 279) and the EXIF pointer (34665) are filled in.
+
+    Args:
+        tags: Its directory.
+        exif: Its EXIF directory.
+        size: Length of the strip [byte].
     """
     layout = dict(tags)
     layout[273] = layout[EXIF_DIRECTORY] = Tag(TiffType.LONG, [0])
-    layout[279] = Tag(TiffType.LONG, [len(strip)])
+    layout[279] = Tag(TiffType.LONG, [size])
     exif_at = 8 + len(_pack_directory(layout, 8))
     packed_exif = _pack_directory(exif, exif_at)
     strip_at = -(-(exif_at + len(packed_exif)) // 16) * 16
     layout[273] = Tag(TiffType.LONG, [strip_at])
     layout[EXIF_DIRECTORY] = Tag(TiffType.LONG, [exif_at])
     head = struct.pack("<2sHI", b"II", 42, 8) + _pack_directory(layout, 8) + packed_exif
-    return head.ljust(strip_at, b"\0") + strip
+    return head.ljust(strip_at, b"\0")
 
 
 def _decode(kind: int, data: bytes, order: str) -> tuple[Any, ...]:

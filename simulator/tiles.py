@@ -1,20 +1,173 @@
-"""Large frames through a network in tiles, exact to the last pixel, in bounded memory."""
+"""Large frames through a network in tiles, exact to the last pixel, in bounded memory.
+
+Where a network is needed for some pixels only, the tiles shrink to those: the frame is halved again
+and again, and a half without such a pixel costs nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from types import EllipsisType
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-#: Side of a tile without its halo [pixel].
-TILE = 512
+#: Side of a tile without its halo [pixel]: larger ones spend less on their halos, and more memory.
+TILE = 768
+#: Needed pixels are looked at in cells of this side, a multiple of 4 [pixel].
+_CELL = 16
+
+_Index = tuple[EllipsisType, slice, slice]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A rectangle of a frame, and what a network must see around it [pixel].
+
+    Args:
+        top, bottom, left, right: The rectangle; `bottom` and `right` are exclusive.
+        height, width: Of the frame.
+        halo: Pixels that are seen around it, as far as the frame goes.
+    """
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+    height: int
+    width: int
+    halo: int
+
+    @property
+    def inner(self) -> _Index:
+        """Indexes the rectangle in the frame."""
+        return ..., slice(self.top, self.bottom), slice(self.left, self.right)
+
+    @property
+    def outer(self) -> _Index:
+        """Indexes the rectangle with its halo in the frame."""
+        first_row, first_column = self._corner
+        rows = slice(first_row, min(self.bottom + self.halo, self.height))
+        return ..., rows, slice(first_column, min(self.right + self.halo, self.width))
+
+    @property
+    def core(self) -> _Index:
+        """Indexes the rectangle in the part that `outer` cuts out."""
+        row, column = self._corner
+        rows = slice(self.top - row, self.bottom - row)
+        return ..., rows, slice(self.left - column, self.right - column)
+
+    @property
+    def area(self) -> int:
+        """Pixels with the halo: what the tile costs."""
+        rows = min(self.bottom + self.halo, self.height) - max(self.top - self.halo, 0)
+        return rows * (min(self.right + self.halo, self.width) - max(self.left - self.halo, 0))
+
+    @property
+    def _corner(self) -> tuple[int, int]:
+        return max(self.top - self.halo, 0), max(self.left - self.halo, 0)
+
+
+def make_tiles(
+    height: int, width: int, *, halo: int, tile: int = TILE, needed: Tensor | None = None
+) -> list[Tile]:
+    """Rectangles that cover a frame, or all of it that is needed, at little cost.
+
+    Args:
+        height: Of the frame.
+        width: Of the frame.
+        halo: Multiple of 4 [pixel].
+        tile: Largest side of a tile, a multiple of 4 [pixel]; a frame that is no larger than one
+            tile and a halo is one tile.
+        needed: (H, W) bool, the pixels to cover; by default all.
+
+    Raises:
+        ValueError: If `halo` or `tile` is no multiple of 4, or `needed` is not of the frame's size.
+    """
+    if halo % 4 or tile % 4 or tile < 4:
+        raise ValueError(f"`halo` (={halo}) and `tile` (={tile}) must be multiples of 4")
+    if needed is not None and needed.shape != (height, width):
+        raise ValueError(
+            f"`needed` (shape {tuple(needed.shape)}) must be that of the frame, {(height, width)}"
+        )
+    if height <= tile + halo and width <= tile + halo:
+        tile = 4 * ((max(height, width) + 3) // 4)
+    tiles = []
+    for top in range(0, height, tile):
+        for left in range(0, width, tile):
+            bottom, right = min(top + tile, height), min(left + tile, width)
+            whole = Tile(top, bottom, left, right, height, width, halo)
+            tiles += [whole] if needed is None else _shrunk(whole, needed)
+    return tiles
+
+
+def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
+    """The cheapest halving of `tile` that covers its needed pixels."""
+    part = needed[tile.inner][None].float()
+    cells = F.max_pool2d(part, _CELL, ceil_mode=True)[0].bool().cpu().numpy()
+
+    def made(rows: tuple[int, int], columns: tuple[int, int]) -> Tile:
+        return Tile(
+            tile.top + _CELL * rows[0],
+            min(tile.top + _CELL * rows[1], tile.bottom),
+            tile.left + _CELL * columns[0],
+            min(tile.left + _CELL * columns[1], tile.right),
+            *(tile.height, tile.width, tile.halo),
+        )
+
+    def cover(row: int, column: int, cells: np.ndarray) -> list[Tile]:
+        rows, columns = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
+        if len(rows) == 0:
+            return []
+        cells = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        row, column = row + int(rows[0]), column + int(columns[0])
+        whole = made((row, row + cells.shape[0]), (column, column + cells.shape[1]))
+        axis = int(cells.shape[1] > cells.shape[0])
+        half = cells.shape[axis] // 2
+        if half == 0 or cells.all():
+            return [whole]
+        first, second = np.split(cells, [half], axis)
+        next_row, next_column = (row, column + half) if axis else (row + half, column)
+        parts = cover(row, column, first) + cover(next_row, next_column, second)
+        return parts if sum(p.area for p in parts) < whole.area else [whole]
+
+    return cover(0, 0, cells)
+
+
+def varying(image: Tensor, margin: int = 0) -> Tensor:
+    """Where a picture is not constant: saturated and black parts carry neither noise nor detail.
+
+    Args:
+        image: (C, H, W).
+        margin: Pixels around what varies that count as varying, a multiple of 16.
+
+    Returns:
+        (H, W) bool, in cells of 16 x 16 pixels.
+    """
+    if margin % _CELL:
+        raise ValueError(f"`margin` (={margin}) must be a multiple of {_CELL}")
+    height, width = image.shape[-2:]
+    high = F.max_pool2d(image, _CELL, ceil_mode=True)
+    low = -F.max_pool2d(-image, _CELL, ceil_mode=True)
+    cells = (high > low).any(dim=0, keepdim=True).float()
+    reach = margin // _CELL
+    cells = F.max_pool2d(cells, 2 * reach + 1, stride=1, padding=reach)[0].bool()
+    cells = cells.repeat_interleave(_CELL, 0).repeat_interleave(_CELL, 1)
+    return cells[:height, :width]
 
 
 def in_tiles(
-    function: Callable[..., Tensor], *images: Tensor, halo: int, tile: int = TILE
+    function: Callable[..., Tensor],
+    *images: Tensor,
+    halo: int,
+    tile: int = TILE,
+    needed: Tensor | None = None,
+    fallback: Tensor | None = None,
 ) -> Tensor:
-    """`function` of `images`, tile by tile.
+    """`function` of `images`, tile by tile, where it is needed.
 
     Args:
         function: Maps images (B, C, h, w) to one (B, D, h, w) or (B, h, w); an output pixel may
@@ -22,33 +175,29 @@ def in_tiles(
         *images: (B, C, H, W), all of one size.
         halo: Multiple of 4 [pixel].
         tile: Side of a tile, a multiple of 4 [pixel].
+        needed: (H, W) bool, the pixels that need the function; by default all.
+        fallback: What the other pixels get, of the result's shape.
 
     Returns:
-        What `function` gives on the whole images.
+        What `function` gives on the whole images, and `fallback` where it is not needed.
 
     Raises:
-        ValueError: If `halo` or `tile` is no multiple of 4.
+        ValueError: If `halo` or `tile` is no multiple of 4, or `needed` is not of the images' size
+            or comes without `fallback`.
     """
-    if halo % 4 or tile % 4 or tile < 4:
-        raise ValueError(f"`halo` (={halo}) and `tile` (={tile}) must be multiples of 4")
+    if needed is not None and fallback is None:
+        raise ValueError("`fallback` (=None) must say what pixels get that are not `needed`")
     height, width = images[0].shape[-2:]
-    if height <= tile + halo and width <= tile + halo:
+    tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)
+    if needed is None and len(tiles) == 1:
         return function(*images)
-    output: Tensor | None = None
-    for top in range(0, height, tile):
-        for left in range(0, width, tile):
-            bottom, right = min(top + tile, height), min(left + tile, width)
-            first_row, first_column = max(top - halo, 0), max(left - halo, 0)
-            rows = slice(first_row, min(bottom + halo, height))
-            columns = slice(first_column, min(right + halo, width))
-            part = function(*(image[..., rows, columns] for image in images))
-            if output is None:
-                shape = (*part.shape[:-2], height, width)
-                output = torch.empty(shape, dtype=part.dtype, device=part.device)
-            output[..., top:bottom, left:right] = part[
-                ...,
-                top - first_row : bottom - first_row,
-                left - first_column : right - first_column,
-            ]
+    output = None if needed is None or fallback is None else fallback.clone()
+    for each in tiles:
+        part = function(*(image[each.outer] for image in images))[each.core]
+        if output is None:
+            output = part.new_empty((*part.shape[:-2], height, width))
+        if needed is not None:
+            part = torch.where(needed[each.inner], part, output[each.inner])
+        output[each.inner] = part
     assert output is not None
     return output

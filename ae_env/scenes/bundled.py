@@ -15,7 +15,6 @@ import safetensors
 import safetensors.torch
 import torch
 
-from ae_env.cache import cache_dir, cache_key
 from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
 from ae_env.scenes.procedural import (
     GENERATOR_VERSION,
@@ -24,6 +23,7 @@ from ae_env.scenes.procedural import (
     draw,
 )
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
+from simulator.cache import cache_dir, cache_key
 from simulator.camera import CameraProfile, NoiseLevelFunction
 from simulator.files import write_atomically
 from simulator.settings import CameraSettings

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from simulator.camera import CameraProfile
 
@@ -56,3 +57,19 @@ def temperature_tint(log2_red_over_green: float) -> tuple[float, float, float]:
     """
     # Planck's locus in linear sRGB: illuminant A is (2.23, 1, 0.28), 4000 K (1.53, 1, 0.58).
     return (2.0**log2_red_over_green, 1.0, 2.0 ** (-1.5 * log2_red_over_green))
+
+
+def check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
+    """`rgb` as float32 (3, H, W).
+
+    Raises:
+        ValueError: Unless it is linear light, finite and at least 0.
+    """
+    image = torch.as_tensor(rgb)
+    if image.ndim != 3 or image.shape[0] != 3 or min(image.shape) < 1:
+        raise ValueError(f"`rgb` (shape {tuple(image.shape)}) must be (3, H, W)")
+    if not image.dtype.is_floating_point:
+        raise ValueError(f"`rgb` (dtype {image.dtype}) must be floating point and linear")
+    if not bool(torch.isfinite(image).all()) or bool((image < 0).any()):
+        raise ValueError("`rgb` must be finite and at least 0 everywhere")
+    return image.float()

@@ -11,10 +11,13 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from ae_env.scenes.colour import camera_from_srgb
+from ae_env.scenes.colour import camera_from_srgb, check_rgb
 from ae_env.scenes.light_scale import WHITE_SIGNAL, mean_anchor, reference_settings
+from simulator.cache import content_digest
 from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.denoised import Denoised
 from simulator.latent import Latent
+from simulator.light_statistics import LightStatistics
 from simulator.opening import MapOpening
 from simulator.raw_image import RawImage, check_packed
 from simulator.settings import CameraSettings, incident_ev100
@@ -139,10 +142,10 @@ class Scene:
     @property
     def latent(self) -> Latent:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        opening = None
+        denoised, opening = None if self.denoised is None else Denoised(self.denoised), None
         if self.defocus_map is not None:
-            f_number = self.reference.effective_f_number
-            opening = MapOpening(self.light, self.clean_light, self.defocus_map, f_number)
+            clean, f_number = denoised or Denoised(self.light), self.reference.effective_f_number
+            opening = MapOpening(self.light, clean, self.defocus_map, f_number)
         return Latent(
             light=self.light,
             reference=self.reference,
@@ -151,9 +154,21 @@ class Scene:
             saturated=self.saturated,
             white_balance=self.white_balance,
             box_factor=self.box_factor,
-            denoised=self.denoised,
+            denoised=denoised,
             opening=opening,
+            statistics=self._statistics,
         )
+
+    @cached_property
+    def content(self) -> str:
+        """Digest of the scene's light and of what networks found out about it."""
+        found = {"denoised": self.denoised, "defocus_map": self.defocus_map}
+        given = {name: tensor for name, tensor in found.items() if tensor is not None}
+        return content_digest({"light": self.light, **given})
+
+    @cached_property
+    def _statistics(self) -> LightStatistics:
+        return LightStatistics(self.light)  # computes nothing before it is asked
 
     def own_blur(self, f_number: float) -> float:
         """Root mean square of the scene's own circle of confusion at `f_number` [pixel].
@@ -164,9 +179,8 @@ class Scene:
         Args:
             f_number: Effective f-number.
         """
-        if self.defocus_map is None:
-            return 0.0
-        return self._own_blur * max(1.0, self.reference.effective_f_number / f_number)
+        growth = max(1.0, self.reference.effective_f_number / f_number)
+        return 0.0 if self.defocus_map is None else self._own_blur * growth
 
     @cached_property
     def _own_blur(self) -> float:
@@ -297,7 +311,7 @@ class Scene:
             kind: What sort of scene.
             **fields: Further fields of `Scene`.
         """
-        image = _check_rgb(rgb)
+        image = check_rgb(rgb)
         matrix, white = camera_from_srgb(camera, illuminant)
         planes = torch.from_numpy(matrix).float() @ image.reshape(3, -1)
         planes = planes.clamp_(min=0.0).reshape(image.shape)
@@ -376,14 +390,3 @@ class Scene:
         _, height, width = self.light.shape
         light = "unknown light" if self.illuminance is None else f"{self.illuminance:.4g} lux"
         return f"Scene({self.scene_id!r}, {self.kind}, {height} x {width} packed, {light})"
-
-
-def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
-    image = torch.as_tensor(rgb)
-    if image.ndim != 3 or image.shape[0] != 3 or min(image.shape) < 1:
-        raise ValueError(f"`rgb` (shape {tuple(image.shape)}) must be (3, H, W)")
-    if not image.dtype.is_floating_point:
-        raise ValueError(f"`rgb` (dtype {image.dtype}) must be floating point and linear")
-    if not bool(torch.isfinite(image).all()) or bool((image < 0).any()):
-        raise ValueError("`rgb` must be finite and at least 0 everywhere")
-    return image.float()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
+from simulator.blur import box_mean
 from simulator.modules.attention_unet import AttentionUNet
 from simulator.modules.defocus_map import DefocusMap
 from simulator.modules.disc_bank import DiscBank
@@ -18,6 +18,12 @@ DEAD_ZONE = 1.0
 IN_FOCUS = (1.7, 2.2)
 #: Variance over squared mean from which a neighbourhood counts fully as detail.
 _FULL_CONTRAST = 0.05
+#: Side of the window that contrast is measured in [pixel].
+_CONTRAST_WINDOW = 9
+#: Share of a picture's detail that may be no more than soft where it counts as in focus.
+_IN_FOCUS_SHARE = 0.95
+#: Equal parts of `IN_FOCUS` that the weight is summed in before any value is sorted.
+_STEPS = 512
 
 
 class ApertureModule(nn.Module):
@@ -107,16 +113,42 @@ def is_defocused(diameter: Tensor, image: Tensor) -> Tensor:
         image: (B, 4, H, W).
     """
     grey = image.mean(dim=1, keepdim=True)
-    mean = F.avg_pool2d(F.pad(grey, (4,) * 4, mode="replicate"), 9, stride=1)
-    square = F.pad((grey - mean).square(), (4,) * 4, mode="replicate")
-    contrast = F.avg_pool2d(square, 9, stride=1) / mean.square().clamp(min=1e-12)
-    weight = contrast.clamp(max=_FULL_CONTRAST).flatten(1)
-    order = diameter.flatten(1).argsort(dim=1)
-    share = weight.gather(1, order).double().cumsum(dim=1)
-    place = (share < 0.95 * share[:, -1:]).sum(dim=1, keepdim=True).clamp(max=share.shape[1] - 1)
-    level = diameter.flatten(1).gather(1, order.gather(1, place))[:, 0]
+    mean = box_mean(grey, _CONTRAST_WINDOW)
+    contrast = box_mean((grey - mean).square(), _CONTRAST_WINDOW) / mean.square().clamp(min=1e-24)
+    weights = contrast.clamp(max=_FULL_CONTRAST).flatten(1)
     low, high = IN_FOCUS
-    return ((level - low) / (high - low)).clamp(0.0, 1.0)
+    levels = [
+        _quantile(values, weight, low, high)
+        for values, weight in zip(diameter.flatten(1), weights, strict=True)
+    ]
+    return ((torch.stack(levels) - low) / (high - low)).clamp(0.0, 1.0)
+
+
+def _quantile(values: Tensor, weight: Tensor, low: float, high: float) -> Tensor:
+    """The value that `_IN_FOCUS_SHARE` of the weight does not exceed, told apart in [low, high].
+
+    Only values between matter, as whole frames are sharp or blurred far outside, and of these only
+    the ones near the answer are sorted.
+    """
+    wanted = _IN_FOCUS_SHARE * weight.sum(dtype=torch.float64)
+    below = torch.where(values < low, weight, 0.0).sum(dtype=torch.float64)
+    if bool(below >= wanted):
+        return values.new_tensor(low)
+    between = ((values >= low) & (values <= high)).nonzero()[:, 0]
+    chosen, share = values[between], weight[between].double()
+    step = ((chosen - low) * (_STEPS / (high - low))).long()  # ascends with the value
+    sums = torch.zeros(_STEPS + 2, dtype=torch.float64, device=values.device)
+    reached = below + sums.index_add_(0, step + 1, share).cumsum(dim=0)
+    place = int((reached < wanted).sum()) - 1
+    if place > _STEPS:
+        return values.new_tensor(high)
+    near = (step == place).nonzero()[:, 0]
+    chosen, order = chosen[near].sort()
+    reached = reached[place] + share[near][order].cumsum(dim=0)
+    last = min(
+        int((reached < wanted).sum()), len(chosen) - 1
+    )  # sums in another order may fall short
+    return chosen[last]
 
 
 def dead_zone(diameter: Tensor, size: float = DEAD_ZONE) -> Tensor:

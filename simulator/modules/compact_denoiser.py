@@ -17,7 +17,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape."""
-        return x + self.second(F.relu(self.first(x)))
+        # In place where autograd allows it: on large frames fresh memory costs as much as the sums.
+        return self.second(F.relu_(self.first(x))).add_(x)
 
 
 class CompactDenoiser(nn.Module):
@@ -76,6 +77,6 @@ class CompactDenoiser(nn.Module):
         fine = self.encode_fine(self.head(x))
         middle = self.encode_middle(self.to_middle(fine))
         coarse = self.coarse(self.to_coarse(middle))
-        middle = self.decode_middle(middle + self.from_coarse(coarse))
-        fine = self.decode_fine(fine + self.from_middle(middle))
+        middle = self.decode_middle(self.from_coarse(coarse).add_(middle))
+        fine = self.decode_fine(self.from_middle(middle).add_(fine))
         return image + self.tail(fine)[..., :height, :width]

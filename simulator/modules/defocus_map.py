@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.blur import disc_blur
+from simulator.blur import box_mean, disc_blur
 
 #: Discs whose differences are the bands [pixel of diameter]; 0 is the image itself.
 BAND_DIAMETERS = (0.0, 1.5, 3.0, 5.5, 10.0)
@@ -56,7 +56,7 @@ class DefocusMap(nn.Module):
         features = F.pad(
             band_features(image, deviation), (0, width % 2, 0, height % 2), "replicate"
         )
-        x = F.relu(self.head(F.pixel_unshuffle(features, 2)))
+        x = F.relu_(self.head(F.pixel_unshuffle(features, 2)))
         for block in self.blocks:
             x = block(x)
         coarse = self.tail(x).float()
@@ -84,7 +84,7 @@ class _Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape."""
-        return x + self.second(F.relu(self.first(x)))
+        return self.second(F.relu_(self.first(x))).add_(x)
 
 
 def band_features(image: Tensor, deviation: Tensor) -> Tensor:
@@ -95,19 +95,12 @@ def band_features(image: Tensor, deviation: Tensor) -> Tensor:
     """
     grey = image.float().mean(dim=1)
     # Noise of the mean of four planes.
-    floor = deviation.float().square().mean(dim=1) / 4.0 + 1e-6 * grey.square() + 1e-12
+    floor = deviation.float().square().mean(dim=1) / 4.0 + 1e-6 * grey.square() + 1e-24
     discs = [disc_blur(grey, diameter) for diameter in BAND_DIAMETERS]
     bands = torch.stack([a - b for a, b in itertools.pairwise(discs)], dim=1)
-    energy = _box(bands.square(), _ENERGY_WINDOW)
-    contrast = _box(bands.square().sum(dim=1, keepdim=True), _CONTRAST_WINDOW) + floor[:, None]
+    energy = box_mean(bands.square(), _ENERGY_WINDOW)
+    contrast = box_mean(bands.square().sum(dim=1, keepdim=True), _CONTRAST_WINDOW) + floor[:, None]
     signed = (bands / contrast.sqrt()).clamp(-8.0, 8.0)
     relative = torch.log(energy / contrast + 1e-5)
     noise = torch.log(floor[:, None] / contrast + 1e-5)
     return torch.cat([signed, 0.3 * relative + 1.0, 0.3 * noise + 1.0], dim=1)
-
-
-def _box(x: Tensor, window: int) -> Tensor:
-    radius = window // 2
-    padded = F.pad(x, (radius,) * 4, mode="replicate")
-    rows = F.avg_pool2d(padded, (window, 1), stride=1)
-    return F.avg_pool2d(rows, (1, window), stride=1)

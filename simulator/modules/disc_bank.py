@@ -8,6 +8,7 @@ diameters and any f-number for the cost of a gather.
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -18,6 +19,11 @@ from simulator.blur import disc_blur, disc_kernel
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
 #: discs is within 2 % of the disc between them.
 DIAMETERS = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.3, 16.0, 22.6, 32.0)
+
+_KNOTS = np.array(DIAMETERS) ** 2
+
+#: How far the largest disc reaches, as a multiple of 4 [pixel].
+HALO = 20
 
 
 class DiscBank:
@@ -43,7 +49,16 @@ class DiscBank:
             diameter: (..., H, W) blur diameter of each pixel [pixel], >= 0, broadcast against the
                 image; beyond the largest disc of the bank it stays there.
         """
-        squared = diameter.square().clamp(max=DIAMETERS[-1] ** 2)
+        image, frame = self._levels[0], _frame_of(diameter)
+        if frame is not None and frame.shape == image.shape[-2:] and _has_kernels(image):
+            from simulator.blend_kernels import blend, needed  # numba: only where it is needed
+
+            levels = {index: self.level(index) for index in needed(frame, _KNOTS)}
+            return blend(levels, frame, _KNOTS)
+        return self._blended(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
+
+    def _blended(self, squared: Tensor) -> Tensor:
+        """`blurred` on any device, by squared diameter."""
         total: Tensor | None = None
         for index, weight in _weights(squared):
             term = self.level(index) * weight
@@ -58,30 +73,57 @@ def remaining_variance(diameter: Tensor) -> Tensor:
     The sum of squared weights of the blended kernel,
     ``(1 - t)^2 E_aa + 2 t (1 - t) E_ab + t^2 E_bb`` between discs a and b.
     """
+    frame = _frame_of(diameter)
+    if frame is not None:
+        from simulator.blend_kernels import piecewise
+
+        return piecewise(frame, _KNOTS, _kernel_products()).reshape(diameter.shape)
+    return _remaining(diameter)
+
+
+def _remaining(diameter: Tensor) -> Tensor:
+    """`remaining_variance` on any device."""
+    energy = torch.from_numpy(_kernel_products()).to(diameter)
+    knots = torch.from_numpy(_KNOTS).to(diameter)
     squared = diameter.square().clamp(max=DIAMETERS[-1] ** 2)
-    energy = _kernel_products()
-    total = torch.zeros_like(squared)
-    weights = dict(_weights(squared))
-    for index, weight in weights.items():
-        total += weight.square() * energy[index, index]
-        if index + 1 in weights:
-            total += 2.0 * weight * weights[index + 1] * energy[index, index + 1]
-    return total
+    index = torch.searchsorted(knots[1:-1], squared, right=True)  # of the smaller disc
+    same, both = energy.diagonal(), energy.diagonal(1)
+    share = (squared - knots[index]) / knots.diff()[index]
+    rest = 1.0 - share
+    return rest.square() * same[index] + share * (
+        2.0 * rest * both[index] + share * same[index + 1]
+    )
 
 
-def _weights(squared: Tensor) -> list[tuple[int, Tensor]]:
+def _has_kernels(image: Tensor) -> bool:
+    return image.device.type == "cpu" and image.dtype == torch.float32
+
+
+def _frame_of(diameter: Tensor) -> Tensor | None:
+    """The diameters as one frame (H, W) that `simulator.blend_kernels` takes; None if they are not.
+
+    Nothing is learnt through the kernels: a gradient takes the other way.
+    """
+    learns = diameter.requires_grad and torch.is_grad_enabled()
+    if learns or not _has_kernels(diameter) or diameter.ndim < 2 or diameter.numel() == 0:
+        return None
+    frame = diameter.detach()
+    if frame.numel() != frame.shape[-2] * frame.shape[-1]:
+        return None
+    return frame.reshape(frame.shape[-2:])
+
+
+def _weights(squared: Tensor) -> Iterator[tuple[int, Tensor]]:
     """(index, weight) of every disc that some pixel needs: hat functions of squared diameter."""
-    knots = [d * d for d in DIAMETERS]
+    knots = _KNOTS.tolist()
     low, high = (float(v) for v in torch.aminmax(squared.detach()))
-    weights = []
     for index, knot in enumerate(knots):
         before = knots[index - 1] if index else -1.0
         after = knots[index + 1] if index + 1 < len(knots) else knot + 1.0
         if before < high and low < after and not (high <= before or low >= after):
             rising = (squared - before) / (knot - before)
             falling = (after - squared) / (after - knot)
-            weights.append((index, torch.minimum(rising, falling).clamp(min=0.0)))
-    return weights
+            yield index, torch.minimum(rising, falling).clamp(min=0.0)
 
 
 @functools.cache

@@ -7,11 +7,12 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from simulator.blur import box_mean
 from simulator.modules.compact_denoiser import CompactDenoiser
 from simulator.modules.unet import UNet
 
 Preset = Literal["compact", "paper"]
-#: Half size of the window that smooths the signal which the noise level is read from.
+#: Side of the window that smooths the signal which the noise level is read from.
 _SMOOTHING = 5
 
 
@@ -37,7 +38,7 @@ class NoiseModule(nn.Module):
         self.network: nn.Module = CompactDenoiser() if preset == "compact" else UNet()
 
     def forward(self, exposed: Tensor, shot: Tensor, read: Tensor) -> Tensor:
-        """The raw with little noise.
+        """The raw with little noise; one without noise (shot = read = 0) as it is.
 
         Args:
             exposed: (B, 4, H, W) raw on the scale of the target.
@@ -49,9 +50,12 @@ class NoiseModule(nn.Module):
         """
         if self.preset == "paper":
             level = variance_map(exposed, shot, read).sqrt()
-            return exposed + self.network(torch.cat([exposed, level], dim=1)).float()
-        deviation = variance_map(smoothed(exposed), shot, read).sqrt()
-        return self.network(exposed, deviation).float()
+            result = exposed + self.network(torch.cat([exposed, level], dim=1)).float()
+        else:
+            deviation = variance_map(smoothed(exposed), shot, read).sqrt()
+            result = self.network(exposed, deviation).float()
+        noisy = ((shot > 0) | (read > 0)).any(dim=1)
+        return torch.where(noisy[:, None, None, None], result, exposed.float())
 
 
 def variance_map(signal: Tensor, shot: Tensor, read: Tensor) -> Tensor:
@@ -63,5 +67,4 @@ def variance_map(signal: Tensor, shot: Tensor, read: Tensor) -> Tensor:
 def smoothed(image: Tensor) -> Tensor:
     """Mean over 5 x 5 pixels, borders repeated: a noise level read from single noisy pixels would
     be too low exactly where noise made them dark."""
-    padded = nn.functional.pad(image, (_SMOOTHING // 2,) * 4, mode="replicate")
-    return nn.functional.avg_pool2d(padded, _SMOOTHING, stride=1)
+    return box_mean(image, _SMOOTHING)

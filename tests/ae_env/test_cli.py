@@ -80,6 +80,7 @@ def dng(raw: RawImage, tmp_path: Path) -> Path:
 def test_every_command_is_there() -> None:
     assert COMMANDS == [
         "bench",
+        "cache",
         "evaluate",
         "quickstart",
         "simulate",
@@ -95,8 +96,9 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert result.exit_code == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", result.output)
     assert re.search(rf"Example: \W?ae-env {command} ", text)
-    assert "--out" in text
-    assert "--seed" in text
+    if command != "cache":
+        assert "--out" in text
+        assert "--seed" in text
 
 
 def test_help_of_the_program(ae_env) -> None:
@@ -139,6 +141,28 @@ def test_sweep(ae_env, dng: Path, tmp_path: Path) -> None:
     assert [path.name for path in files] == [f"IMG_1-{i:02d}.dng" for i in range(64)]
     assert read_raw(files[0]).settings == CameraSettings(100, 1 / 1000, 4)
     assert read_raw(files[63]).settings == CameraSettings(6400, 1 / 2, 11)
+
+
+def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:
+    folder = tmp_path / "kept [1]"
+    monkeypatch.setenv("AE_ENV_CACHE", str(folder))
+    (folder / "scenes").mkdir(parents=True)
+    for i in range(2):
+        (folder / "scenes" / f"bundled-train-64-{i:024d}.safetensors").write_bytes(b"x" * 1000)
+    (folder / "denoised").mkdir()
+    (folder / "denoised" / f"{5:024d}.safetensors").write_bytes(b"x" * 123)
+    (folder / "denoised" / "mine.safetensors").write_bytes(b"x")
+    expected = {"scenes": ["2", "2,000"], "denoised": ["1", "123"], "score tables": ["0", "0"]}
+    for arguments in ((), ("--clear",)):
+        code, out, _ = ae_env("cache", *arguments)
+        assert code == 0
+        for kind, numbers in expected.items():
+            (line,) = (text for text in out.splitlines() if f" {kind} " in text)
+            assert re.findall(r"[\d,]+", line) == numbers
+        assert str(folder) in out.replace("\n", "")
+    assert [p.name for p in folder.rglob("*.safetensors")] == ["mine.safetensors"]
+    code, out, _ = ae_env("cache")
+    assert "1 " not in out.replace("kept [1]", "")
 
 
 def test_evaluate(ae_env, tmp_path: Path) -> None:

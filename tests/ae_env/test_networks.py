@@ -23,7 +23,7 @@ from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.networks import SceneNetworks
 from ae_env.score_table import ScoreTables, describe_captures
 from ae_env.scorers import make_scorer
-from simulator import CameraSettings, get_camera
+from simulator import CameraSettings, CameraSimulator, Latent, get_camera
 from simulator.modules.aperture import DEAD_ZONE
 from simulator.modules.build import build_modules
 from simulator.weights import save_modules
@@ -372,6 +372,35 @@ def test_maps_are_kept_and_made_again_where_damaged(
     assert torch.equal(third.defocus_map, first.defocus_map)  # type: ignore[arg-type]
     SceneNetworks(weights).resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
     assert len(list((tmp_path / "defocus_maps").iterdir())) == 2
+
+
+def test_denoised_light_is_kept_between_runs(
+    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    scene, runs = NOISY_SCENES[0], []
+    denoise = CameraSimulator.denoise
+
+    def counted(self: CameraSimulator, latent: Latent) -> torch.Tensor:
+        runs.append(latent)
+        return denoise(self, latent)
+
+    monkeypatch.setattr(CameraSimulator, "denoise", counted)
+    made = SceneNetworks(weights, cache=False).denoised(scene).denoised
+    assert not any(tmp_path.iterdir())
+    first = SceneNetworks(weights).denoised(scene).denoised
+    assert len(runs) == 2
+    again = SceneNetworks(weights).denoised(scene).denoised
+    assert len(runs) == 2
+    for found in (first, again):
+        assert torch.equal(found, made)  # type: ignore[arg-type]
+    SceneNetworks(weights).denoised(replace(scene, nlf=scene.nlf.scaled(0.5)))
+    SceneNetworks(weights).denoised(replace(scene, light=scene.light * 0.5))
+    assert len(runs) == 4
+    modules = build_modules("compact")
+    save_modules(tmp_path / "other", modules, "compact", {})
+    SceneNetworks(str(tmp_path / "other.safetensors")).denoised(scene)
+    assert len(runs) == 5
 
 
 def test_every_source_of_scenes_is_seen_at_its_finest(

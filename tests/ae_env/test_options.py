@@ -29,6 +29,10 @@ from simulator import get_camera
         ({"depth": "none"}, "did you mean|must be one of"),
         ({"delay": -1}, "`delay`"),
         ({"delay": 17}, "`delay`"),
+        ({"noise": "bnak"}, "did you mean 'bank'"),
+        ({"noise": 1}, "`noise`"),
+        ({"tolerance": -0.1}, "`tolerance`"),
+        ({"tolerance": float("inf")}, "`tolerance`"),
         ({"costs": {"flicer": 1.0}}, "did you mean 'flicker'"),
         ({"costs": {"switch": -1.0}}, "costs"),
     ],
@@ -61,6 +65,7 @@ def test_defaults_are_the_documented_ones() -> None:
         *(True, True, False),
         0,
     )
+    assert options.tolerance == 0.1
     assert len(options.make_grid()) == 64
     assert options.make_camera() == get_camera("nikon_z6")
 

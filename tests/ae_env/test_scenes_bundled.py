@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.cache import cache_dir, cache_key
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.bundled import _entries
 from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
 from ae_env.scenes.photographs import PHOTOGRAPHS, unprocess
 from ae_env.scenes.procedural import HARD_KINDS, draw, list_kinds
+from simulator.cache import cache_dir
 from simulator.camera import get_camera
 
 CAMERA = get_camera("nikon_z6")
@@ -226,8 +226,3 @@ def test_a_read_only_cache_is_not_needed(
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "file"))
     assert load_scenes("bundled:small", "test", camera=CAMERA, resolution=32)
     assert "could not be cached" in caplog.text
-
-
-def test_cache_key_depends_on_names_and_values() -> None:
-    assert cache_key({"a": 1, "b": [2]}) == cache_key({"b": [2], "a": 1})
-    assert cache_key({"a": 1}) != cache_key({"a": 2})

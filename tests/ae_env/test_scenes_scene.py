@@ -1,6 +1,7 @@
 """Scene: normalisation, colours, resizing."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -160,7 +161,8 @@ def test_a_scene_can_be_photographed_by_the_simulator() -> None:
     scene = array_scene(torch.full((4, 8, 8), 0.1), nlf=nlf, box_factor=3, **fields)
     latent = CameraSimulator(device="cpu").prepare(scene)
     assert (latent.camera, latent.nlf, latent.box_factor) == (PLAIN, nlf, 3)
-    assert latent.denoised is scene.denoised
+    assert latent.denoised is not None
+    assert latent.denoised.light is scene.denoised
     assert latent.opening is not None
     assert latent.opening.f_number == 4.0
     assert array_scene(torch.ones(4, 8, 8)).latent.opening is None
@@ -213,3 +215,18 @@ def test_invalid_arrays_and_sizes_are_named() -> None:
         radiance_scene(np.zeros((3, 2, 2), np.float32))
     with pytest.raises(ValueError, match="`illuminant`"):
         radiance_scene(np.ones((3, 2, 2)), illuminance=1.0, illuminant=(1.0, 0.0, 1.0))
+
+
+def test_content_is_that_of_the_tensors() -> None:
+    light = torch.rand(4, 6, 8, generator=torch.Generator().manual_seed(0))
+    scene = array_scene(light)
+    same = [array_scene(light.clone()), replace(scene, scene_id="t", illuminance=5.0)]
+    assert {s.content for s in same} == {scene.content}
+    others = [
+        array_scene(light * 2.0),
+        array_scene(light.reshape(4, 8, 6)),
+        array_scene(light, denoised=light),
+        array_scene(light, denoised=light * 0.9),
+        array_scene(light, defocus_map=light[0]),
+    ]
+    assert len({s.content for s in [scene, *others]}) == 1 + len(others)

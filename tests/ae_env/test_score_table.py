@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -157,7 +159,7 @@ def test_a_damaged_file_is_made_anew(
     path.write_bytes(content)
     with caplog.at_level(logging.WARNING):
         np.testing.assert_array_equal(_tables().table(scene).mean, expected)
-    assert "made anew" in caplog.text
+    assert "made again" in caplog.text
     np.testing.assert_array_equal(_tables().table(scene).mean, expected)
     assert len(_files(cache)) == 1
 
@@ -195,7 +197,81 @@ def test_key_changes_with_everything_that_changes_the_scores(
     strict = Highlights()
     strict.scale = 0.05
     use(ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": strict})))
-    assert counts == [1, 1, *range(2, 11)]
+    use(_tables(), replace(scene, white_balance=(2.0, 1.0, 1.5)))
+    use(_tables(), replace(scene, scene_id="another"))
+    noisy = replace(scene, nlf=CAMERA.nlf(100))
+    use(_tables(), replace(noisy, denoised=scene.light * 0.9))
+    use(_tables(), replace(noisy, denoised=scene.light * 0.8))  # by other weights
+    use(_tables(), replace(scene, defocus_map=torch.full((40, 40), 2.0)))
+    calibrated = {100: CAMERA.nlf(100), 6400: CAMERA.nlf(6400)}
+    plain = replace(CAMERA, nlf_by_iso=calibrated, segments=())
+    use(ScoreTables(SMALL, plain, make_scorer("balanced")))
+    use(ScoreTables(SMALL, replace(plain, segments=(800,)), make_scorer("balanced")))
+    assert counts == [1, 1, *range(2, 18)]
+
+
+def test_a_scene_is_hashed_once_for_all_its_tables(cache: Path, monkeypatch) -> None:
+    from ae_env.scenes import scene as module
+
+    hashed = []
+
+    def counted(tensors: Any) -> str:
+        hashed.append(set(tensors))
+        return digest(tensors)
+
+    digest = module.content_digest
+    monkeypatch.setattr(module, "content_digest", counted)
+    scene = _scene()
+    for scorer in ("balanced", "highlights", "noise", "balanced"):
+        _tables(scorer).table(scene)
+    assert hashed == [{"light"}]
+    _tables("sharpness").table(_scene())  # nothing in it depends on the light alone
+    _tables(use_cache=False).table(_scene())
+    assert len(hashed) == 1
+
+
+def test_scores_in_memory_are_bounded_and_keep_no_scene_alive(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+
+    def counted(self: Highlights, images: Any, captures: Captures) -> torch.Tensor:
+        made.append(len(captures))
+        return score(self, images, captures)
+
+    score = Highlights.__call__
+    monkeypatch.setattr(Highlights, "__call__", counted)
+    each = 8 * len(SMALL) + 1000  # one part, and what an entry takes itself
+    monkeypatch.setattr("ae_env.score_table.MEMORY_BYTES", 3 * each)
+    tables, scene = _tables("highlights", use_cache=False), _scene()
+    for gain in (1.0, 2.0, 4.0, 1.0, 8.0):  # 8 takes the place of 2
+        tables.table(scene, gain=gain)
+        assert tables._light_parts.nbytes <= 3 * each
+    assert len(made) == 4
+    for gain in (1.0, 4.0, 8.0):
+        tables.table(scene, gain=gain)
+    assert len(made) == 4
+    tables.table(scene, gain=2.0)
+    assert len(made) == 5
+
+    gone = weakref.ref(scene)
+    del scene
+    gc.collect()
+    assert gone() is None
+    for seed in range(4):  # new scenes may get the old one's id, but never its scores
+        expected = _tables("highlights", use_cache=False).table(_scene(seed)).mean
+        np.testing.assert_array_equal(tables.table(_scene(seed)).mean, expected)
+
+
+def test_a_folder_that_cannot_be_written_is_not_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    expected = _tables(use_cache=False).table(_scene()).mean
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "file"))
+    with caplog.at_level(logging.WARNING):
+        np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
+    assert "could not be cached" in caplog.text
 
 
 def test_class_constants_enter_the_key(cache: Path) -> None:

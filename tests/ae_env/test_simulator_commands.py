@@ -188,6 +188,57 @@ def test_simulate_with_networks(ae_env, dng: Path, networks: Path, tmp_path: Pat
     torch.testing.assert_close(written, expected, atol=1e-6, rtol=0)
 
 
+def test_networks_run_once_for_a_raw(
+    ae_env, dng: Path, networks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "kept"))
+    target = ("--iso", 100, "--shutter", "1/8", "--aperture", 8, "--weights", networks)
+    simulate = ("simulate", dng, *target, "--depth", "unknown")
+    sweep = ("sweep", dng, "--weights", networks, "--depth", "unknown")
+    for command in (simulate, sweep):
+        assert ae_env(*command, "--no-cache")[0] == 0
+    assert not (tmp_path / "kept" / "denoised").exists()
+    assert not (tmp_path / "kept" / "defocus_maps").exists()
+    assert ae_env(*simulate, "-o", "first.dng")[0] == 0
+    assert ae_env(*sweep, "--out", "first")[0] == 0
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a network ran again")
+
+    monkeypatch.setattr(CameraSimulator, "denoise", refuse)
+    monkeypatch.setattr(CameraSimulator, "estimate_defocus", refuse)
+    assert ae_env(*simulate, "-o", "second.dng")[0] == 0
+    assert ae_env(*sweep, "--out", "second")[0] == 0
+    assert Path("first.dng").read_bytes() == Path("second.dng").read_bytes()
+    first, second = (Path(f, "contact_sheet.png").read_bytes() for f in ("first", "second"))
+    assert first == second
+
+
+def test_simulate_within_a_tolerance(ae_env, dng: Path, networks: Path, tmp_path: Path) -> None:
+    """A target as noisy as the source: denoised only where nothing is to be left in."""
+    written = {}
+    for tolerance in (0, 0.1):
+        options = ("--weights", networks, "--tolerance", tolerance, "--shutter", "1/100")
+        code, text, _ = simulate(ae_env, dng, *options, iso=6400)
+        assert code == 0
+        assert f"(tolerance {tolerance})" in text
+        assert ("runs      exposure -> noise_reduction" in text) == (tolerance == 0)
+        simulator = CameraSimulator.from_pretrained(networks, device="cpu")
+        settings = CameraSettings(6400, 1 / 100, 8)
+        expected = simulator.simulate(read_raw(dng), settings, tolerance=tolerance).data
+        written[tolerance] = read_raw(tmp_path / "out.dng").data
+        torch.testing.assert_close(written[tolerance], expected, atol=1e-6, rtol=0)
+    assert not torch.equal(written[0], written[0.1])
+
+
+@pytest.mark.parametrize("command", ["simulate", "sweep"])
+def test_bad_tolerances(ae_env, dng: Path, command: str) -> None:
+    target = ("--iso", 100, "--shutter", 1, "--aperture", 8) if command == "simulate" else ()
+    code, _, error = ae_env(command, dng, *target, "--tolerance", -1)
+    assert code == 2
+    assert "`tolerance` (=-1.0) must be a finite number >= 0" in error
+
+
 def test_simulate_without_networks(ae_env, dng: Path) -> None:
     code, text, _ = simulate(ae_env, dng, "--weights", "none")
     assert code == 0

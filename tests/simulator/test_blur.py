@@ -11,7 +11,14 @@ import scipy.optimize
 import scipy.special
 import torch
 
-from simulator.blur import disc_blur, disc_kernel, kernel_energy, motion_blur, motion_kernel
+from simulator.blur import (
+    box_mean,
+    disc_blur,
+    disc_kernel,
+    kernel_energy,
+    motion_blur,
+    motion_kernel,
+)
 
 EXTENTS = [0.1, 0.3, 0.5, 0.9, 1.0, 1.5, 2.0, 2.5, 3.0, 4.7, 8.0, 11.3, 12.5, 16.0, 21.4, 30.0]
 
@@ -211,3 +218,15 @@ def test_cuda_agrees(extent: float) -> None:
         np.testing.assert_allclose(
             blur(image.cuda(), extent).cpu().numpy(), blur(image, extent).numpy(), atol=2e-5
         )
+
+
+# The mean of a window
+
+
+@pytest.mark.parametrize("window", [1, 3, 5, 7, 9, 25])
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (1, 30), (23, 41)])
+def test_box_mean_is_scipys_uniform_filter(window: int, size: tuple[int, int]) -> None:
+    image = picture(2, 3, *size)
+    axes_sizes = (1, 1, window, window)
+    expected = scipy.ndimage.uniform_filter(image.double().numpy(), axes_sizes, mode="nearest")
+    np.testing.assert_allclose(box_mean(image, window).numpy(), expected, rtol=2e-6, atol=1e-6)

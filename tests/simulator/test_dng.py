@@ -253,3 +253,11 @@ def test_any_size_comes_back_number_for_number(tmp_path, name, size):
     back = read_raw(tmp_path / "small.dng")
     np.testing.assert_array_equal(back.to_mosaic(), numbers)
     assert back.settings == settings
+
+
+def test_a_frame_larger_than_what_is_written_at_a_time(tmp_path: Path) -> None:
+    mosaic = np.random.default_rng(0).integers(0, 4096, (1300, 10), dtype=np.uint16)
+    profile = CameraProfile("bench", "RGGB", 64, 4095, 12)  # type: ignore[arg-type]
+    write_dng(tmp_path / "a.dng", RawImage.from_mosaic(mosaic, CameraSettings(100, 1, 4), profile))
+    back = read_raw(tmp_path / "a.dng", nlf=NoiseLevelFunction.zero())
+    np.testing.assert_array_equal(back.to_mosaic(), mosaic)

@@ -53,3 +53,8 @@ def test_a_folder_in_the_way_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         write_atomically(tmp_path / "taken", "x")
     assert [p.name for p in tmp_path.iterdir()] == ["taken"]
+
+
+def test_pieces_are_written_as_they_come(tmp_path: Path) -> None:
+    path = write_atomically(tmp_path / "file", (memoryview(b"ab" * i) for i in range(3)))
+    assert path.read_bytes() == b"ababab"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -58,7 +59,7 @@ def test_preparing_denoises_once(compact: CameraSimulator, monkeypatch: pytest.M
         compact.simulate(latent, settings)
     assert len(calls) == 1
     assert latent.denoised is not None
-    assert not torch.equal(latent.denoised, latent.light)
+    assert not torch.equal(latent.denoised.light, latent.light)
 
 
 def test_a_source_without_noise_needs_no_network(compact: CameraSimulator) -> None:
@@ -105,13 +106,42 @@ def test_frames_are_denoised_and_mapped_in_tiles(
     defocus = compact.estimate_defocus(latent)
     assert defocus.shape == (170, 131)
 
-    def small(*arguments, halo: int) -> torch.Tensor:
-        return in_tiles(*arguments, halo=halo, tile=64)
+    small = partial(in_tiles, tile=64)
 
     monkeypatch.setattr(camera_simulator, "in_tiles", small)
     assert latent.denoised is not None
-    torch.testing.assert_close(compact.denoise(latent), latent.denoised, atol=1e-4, rtol=0)
+    torch.testing.assert_close(compact.denoise(latent), latent.denoised.light, atol=1e-4, rtol=0)
     torch.testing.assert_close(compact.estimate_defocus(latent), defocus, atol=1e-3, rtol=0)
+
+
+def test_saturated_and_black_parts_need_no_network(
+    compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was clipped stays as it is, all else is as with the whole frame through the networks."""
+    data = raw(320, 400).data.clone()
+    data[:, :192, :256], data[:, 256:, :] = 1.0, 0.0
+    source = RawImage(data, SOURCE, Z6)
+    everywhere, tolerant = (compact.prepare(source, tolerance=t) for t in (0.0, 0.1))
+    seen = []
+    forward = compact.noise.forward
+    monkeypatch.setattr(
+        compact.noise,
+        "forward",
+        lambda x, *noise: seen.append(x[0, 0].numel()) or forward(x, *noise),
+    )
+    expected, result = compact.denoise(everywhere), compact.denoise(tolerant)
+    assert seen[0] == 320 * 400
+    assert sum(seen[1:]) < 0.8 * seen[0]
+    clipped = torch.zeros(320, 400, dtype=torch.bool)
+    clipped[:192, :256] = clipped[256:] = True
+    assert torch.equal(result[:, clipped], data[:, clipped])
+    torch.testing.assert_close(result[:, ~clipped], expected[:, ~clipped], rtol=0, atol=1e-4)
+    assert not torch.equal(expected[:, clipped], data[:, clipped])
+    tolerant = replace(tolerant, denoised=everywhere.denoised)
+    found = [compact.estimate_defocus(latent) for latent in (everywhere, tolerant)]
+    assert float(found[1][:176, :240].max()) == 0.0  # no disc of 32 px reaches anything from here
+    near = ~clipped
+    torch.testing.assert_close(found[1][near], found[0][near], rtol=0, atol=1e-3)
 
 
 def test_the_papers_aperture_has_no_map(paper: CameraSimulator) -> None:
@@ -122,9 +152,7 @@ def test_the_papers_aperture_has_no_map(paper: CameraSimulator) -> None:
 def test_bfloat16_is_close_to_float32(compact: CameraSimulator) -> None:
     half = CameraSimulator("compact", device="cpu", precision="bfloat16")
     half.noise, half.aperture = compact.noise, compact.aperture
-    exact, rounded = (s.prepare(raw()).denoised for s in (compact, half))
-    assert exact is not None
-    assert rounded is not None
+    exact, rounded = (s.denoise(s.prepare(raw())) for s in (compact, half))
     assert rounded.dtype == torch.float32
     assert not torch.equal(exact, rounded)
     assert (exact - rounded).abs().mean() < 0.02 * (exact - raw().data).abs().mean()

@@ -149,3 +149,17 @@ def test_saturated_pixels_are_those_at_white_in_any_plane() -> None:
 def test_repr_says_what_it_is() -> None:
     text = repr(RawImage(torch.zeros(4, 6, 8), SETTINGS, camera()))
     assert text == "RawImage(6 x 8 packed, ISO 100, 1/64 s, f/4, bench)"
+
+
+@pytest.mark.parametrize("rows", [2, 62, 66, 514, 1030])
+def test_any_number_of_rows_is_packed_as_by_hand(rows: int) -> None:
+    """Frames are converted a few rows at a time, on several threads."""
+    mosaic = np.random.default_rng(1).integers(0, 4096, (rows, 6), dtype=np.uint16)
+    packed = pack_mosaic(mosaic, camera("GRBG"))
+    corners = {0: (0, 1), 1: (0, 0), 2: (1, 1), 3: (1, 0)}  # R, G1, G2, B of GRBG
+    for plane, (row, column) in corners.items():
+        expected = (mosaic[row::2, column::2].astype(np.float64) - BLACK[plane]) / (
+            4095 - BLACK[plane]
+        )
+        assert np.array_equal(packed[plane].numpy(), expected.astype(np.float32))
+    np.testing.assert_array_equal(unpack_mosaic(packed, camera("GRBG")), mosaic)

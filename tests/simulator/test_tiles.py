@@ -11,7 +11,7 @@ from simulator import camera_simulator
 from simulator.modules.compact_denoiser import CompactDenoiser
 from simulator.modules.defocus_map import DefocusMap
 from simulator.modules.noise import NoiseModule
-from simulator.tiles import in_tiles
+from simulator.tiles import in_tiles, make_tiles, varying
 
 
 def frame(*size: int, seed: int = 0) -> Tensor:
@@ -124,3 +124,77 @@ def test_defocus_map_in_tiles_with_the_simulators_halo() -> None:
     tiled = in_tiles(network, image, deviation, halo=camera_simulator._MAP_HALO, tile=48)
     assert float(whole.std()) > 0.05
     torch.testing.assert_close(tiled, whole, rtol=0, atol=1e-3 * float(whole.std()))
+
+
+# Where it is needed
+
+
+def patches(height: int, width: int) -> Tensor:
+    """Two corners and a pixel in between."""
+    needed = torch.zeros(height, width, dtype=torch.bool)
+    needed[:9, :21] = needed[-5:, -30:] = True
+    needed[height // 2, width // 3] = True
+    return needed
+
+
+@pytest.mark.parametrize("size", [(16, 16), (1, 90), (90, 1), (61, 203), (200, 130)])
+@pytest.mark.parametrize("tile", [16, 64, 512])
+def test_where_it_is_needed_it_is_what_it_is_without(size: tuple[int, int], tile: int) -> None:
+    image, needed = frame(*size), patches(*size)
+    expected = torch.where(needed, mean_of_neighbours(image), -image)
+    tiled = in_tiles(mean_of_neighbours, image, halo=4, tile=tile, needed=needed, fallback=-image)
+    torch.testing.assert_close(tiled, expected, rtol=0, atol=1e-6)
+
+
+def test_what_is_not_needed_is_not_computed() -> None:
+    seen: list[int] = []
+
+    def spy(image: Tensor) -> Tensor:
+        seen.append(image[0, 0].numel())
+        return image + 1
+
+    image = frame(320, 480)
+    for needed, most in ((patches(320, 480), 0.05), (torch.zeros(320, 480, dtype=torch.bool), 0)):
+        seen.clear()
+        result = in_tiles(spy, image, halo=8, needed=needed, fallback=image)
+        assert sum(seen) <= most * 320 * 480
+        assert torch.equal(result, image + needed)
+    everything = torch.ones(320, 480, dtype=torch.bool)
+    assert len(make_tiles(320, 480, halo=8, needed=everything)) == 1
+
+
+@pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
+def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density: float) -> None:
+    needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
+    tiles = make_tiles(333, 270, halo=12, tile=128, needed=needed)
+    count = torch.zeros(333, 270)
+    for each in tiles:
+        count[each.inner] += 1
+        assert each.top % 4 == each.left % 4 == 0
+        assert count[each.outer][each.core].shape == count[each.inner].shape
+    assert bool((count[needed] == 1).all())
+    assert bool((count <= 1).all())
+    whole = make_tiles(333, 270, halo=12, tile=128)
+    assert sum(t.area for t in tiles) <= sum(t.area for t in whole)
+
+
+def test_bad_needs_are_refused() -> None:
+    image, needed = frame(8, 12), torch.ones(8, 12, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"`fallback` \(=None\)"):
+        in_tiles(mean_of_neighbours, image, halo=4, needed=needed)
+    with pytest.raises(ValueError, match=r"`needed` \(shape \(12, 8\)\) must be that of the frame"):
+        in_tiles(mean_of_neighbours, image, halo=4, needed=needed.T, fallback=image)
+    with pytest.raises(ValueError, match=r"`margin` \(=8\) must be a multiple of 16"):
+        varying(image[0], 8)
+
+
+def test_constant_parts_do_not_vary() -> None:
+    image = frame(75, 100)[0]
+    image[:, 32:, :50] = 1.0  # saturated
+    image[:, :16, 64:] = 0.0  # black, but for one plane's pixel
+    image[2, 3, 70] = 1e-6
+    expected = torch.ones(75, 100, dtype=torch.bool)
+    expected[32:, :48] = expected[:16, 80:] = False
+    assert torch.equal(varying(image), expected)
+    expected[32:48] = expected[:, 48:] = expected[:, 32:48] = True
+    assert torch.equal(varying(image, 16), expected)

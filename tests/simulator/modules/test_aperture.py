@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.ndimage
 import torch
 from torch import Tensor
 
@@ -168,3 +169,31 @@ def test_what_has_no_detail_does_not_count() -> None:
     diameter[..., :34] = 8.0  # the flat half, but for the window around its edge
     assert float(is_defocused(diameter, image)) == 0.0
     assert float(is_defocused(8.2 - diameter, image)) == 1.0
+
+
+@pytest.mark.parametrize("spread", [0.2, 1.0, 3.0])
+def test_defocus_is_judged_at_the_weighted_quantile(spread: float) -> None:
+    """Against NumPy's sort of all pixels, weights from SciPy's windows."""
+    random = np.random.default_rng(3)
+    image = torch.from_numpy(random.uniform(0.2, 1.0, (3, 4, 30, 37)).astype(np.float32))
+    image[:, :, :, :20] = 0.5 + 0.05 * (image[:, :, :, :20] - 0.5)
+    centre = np.array([1.6, 1.9, 2.3]).reshape(3, 1, 1) - spread
+    diameter = (centre + spread * random.random((3, 30, 37))).clip(0).astype(np.float32)
+    expected = []
+    for picture, values in zip(image.double().numpy(), diameter, strict=True):
+        grey = picture.mean(axis=0)
+        mean = scipy.ndimage.uniform_filter(grey, 9, mode="nearest")
+        square = scipy.ndimage.uniform_filter((grey - mean) ** 2, 9, mode="nearest")
+        weight = np.minimum(square / mean**2, 0.05).ravel()
+        order = np.argsort(values.ravel())
+        share = np.cumsum(weight[order]) / weight.sum()
+        level = values.ravel()[order][np.searchsorted(share, 0.95)]
+        expected.append(float(np.clip((level - 1.7) / (2.2 - 1.7), 0, 1)))
+    found = is_defocused(torch.from_numpy(diameter), image)
+    np.testing.assert_allclose(found.numpy(), expected, atol=0.01)
+
+
+def test_a_picture_without_any_detail_counts_as_in_focus() -> None:
+    assert (
+        float(is_defocused(torch.full((1, 20, 20), 5.0), torch.full((1, 4, 20, 20), 0.25))) == 0.0
+    )

@@ -117,3 +117,44 @@ def test_compact_commutes_with_exposure(exponent: int) -> None:
     after = module(image, SHOT, READ) * c
     before = module(image * c, SHOT * c, READ * c * c)
     assert torch.equal(before, after)
+
+
+# The gate
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_a_raw_without_noise_comes_back_as_it_is(preset: Preset) -> None:
+    torch.manual_seed(0)
+    module = NoiseModule(preset).requires_grad_(False)
+    image, zero = noisy(), torch.zeros(1, 4)
+    assert torch.equal(module(image, zero, zero), image)
+    assert not torch.equal(module(image, SHOT, zero), image)
+    assert not torch.equal(module(image, zero, READ), image)
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> None:
+    torch.manual_seed(0)
+    module = NoiseModule(preset).requires_grad_(False)
+    image = noisy().expand(3, -1, -1, -1)
+    factor = torch.tensor([[1.0], [0.0], [2.0]])
+    together = module(image, factor * SHOT, factor * READ)
+    assert torch.equal(together[1], image[1])
+    for i in (0, 2):
+        inputs = image[i : i + 1], factor[i] * SHOT, factor[i] * READ
+        if preset == "compact":
+            deviation = variance_map(smoothed(inputs[0]), *inputs[1:]).sqrt()
+            expected = module.network(inputs[0], deviation)
+        else:
+            level = variance_map(*inputs).sqrt()
+            expected = inputs[0] + module.network(torch.cat([inputs[0], level], dim=1))
+        torch.testing.assert_close(together[i : i + 1], expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_no_gradient_comes_from_raws_without_noise(preset: Preset) -> None:
+    module = NoiseModule(preset)
+    zero = torch.zeros(1, 4)
+    module(noisy(), zero, zero).sum().backward()
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    assert all(bool(g.isfinite().all()) and not bool(g.any()) for g in gradients)

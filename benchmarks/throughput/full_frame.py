@@ -1,0 +1,186 @@
+"""A 24-megapixel raw through the simulator to a DNG, beside what LibRaw takes for the file.
+
+Every run is a process of its own. The frame is a DNG of this library's making whose private note
+has been blanked, so that it is read like any other camera's.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import rawpy
+
+from benchmarks.throughput.frames import noisy_raw
+from benchmarks.throughput.isolated import forget_peak, isolated, peak_memory, timed
+from benchmarks.throughput.keeping import Kept
+from simulator import CameraSettings, CameraSimulator, read_raw, write_dng
+from simulator.dng_tags import SOFTWARE_NAME
+
+#: Packed height and width of 24 megapixels, and of the quick run's 1.5.
+FULL, QUICK = (2000, 3000), (500, 750)
+#: The synthetic raw was taken so; the targets follow.
+SOURCE = CameraSettings(400, 1 / 64, 8.0)
+#: Name: weights, depth, target. The last two need the networks: cleaner, and the last opens too.
+CASES: dict[str, tuple[str | None, str, tuple[float, float, float]]] = {
+    "exposure + noise": (None, "far", (1600, 1 / 256, 8.0)),
+    "noise reduction": ("compact", "far", (100, 1 / 16, 8.0)),
+    "noise reduction + aperture": ("compact", "unknown", (100, 1 / 64, 4.0)),
+}
+STAGES = ("read", "prepare", "simulate", "write")
+
+
+def measure(
+    kept: Kept, data: Path | None, *, threads: int, quick: bool, progress: Callable[[], None]
+) -> list[dict[str, Any]]:
+    """One row per file and case: seconds and peak memory of all and of each stage.
+
+    Args:
+        kept: Where results are kept.
+        data: Folder of real files; None where there is none.
+        threads: Threads to use.
+        quick: A small frame, once.
+        progress: Called after every case.
+    """
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frame.dng"
+        write_foreign_dng(path, *(QUICK if quick else FULL))
+        files = {"synthetic": (path, "")}
+        photographs = [] if data is None else sorted((data / "canon_crw_cc0").glob("*.CRW"))
+        if photographs and not quick:
+            files["real"] = (photographs[0].absolute(), photographs[0].name)
+        for kind, (file, name) in files.items():
+            limits = kept(f"libraw {kind}", lambda f=file: _limits(f, threads, quick))
+            for case in CASES:
+                if quick and case == "noise reduction":
+                    continue
+                row = kept(
+                    f"full frame {kind} {case}", lambda f=file, c=case: _row(f, c, threads, quick)
+                )
+                rows.append({"file": kind, "name": name, "case": case, **row, "limits": limits})
+                progress()
+    return rows
+
+
+def write_foreign_dng(path: Path, height: int, width: int) -> None:
+    """Writes a DNG that does not say that it comes from this library."""
+    write_dng(path, noisy_raw(height, width, settings=SOURCE))
+    note = SOFTWARE_NAME.encode()
+    path.write_bytes(path.read_bytes().replace(note, b" " * len(note)))
+
+
+def _limits(file: Path, threads: int, quick: bool) -> dict[str, float]:
+    runs = [isolated(libraw, num_threads=threads, path=str(file)) for _ in range(1 if quick else 3)]
+    return {key: statistics.median(run[key] for run in runs) for key in runs[0]}
+
+
+def _row(file: Path, case: str, threads: int, quick: bool) -> dict[str, Any]:
+    once = quick or CASES[case][0] is not None  # networks take long
+
+    def repeated(task: Callable[..., Any], times: int) -> list[dict[str, Any]]:
+        arguments: dict[str, Any] = {"path": str(file), "case": case}
+        return [
+            isolated(task, num_threads=threads, fresh_cache=True, **arguments)
+            for _ in range(1 if once else times)
+        ]
+
+    whole, stages = repeated(end_to_end, 5), repeated(by_stage, 3)
+    seconds = [run["seconds"] for run in whole]
+    return {
+        "megapixels": whole[0]["megapixels"],
+        "seconds": statistics.median(seconds),
+        "spread": max(seconds) - min(seconds),
+        "peak_mib": max(run["peak_mib"] for run in whole),
+        "modules": stages[0]["modules"],
+        "networks": CASES[case][0] is not None,
+        "stages": {
+            name: {
+                key: statistics.median(run["stages"][name][key] for run in stages)
+                for key in ("seconds", "peak_mib")
+            }
+            for name in STAGES
+        },
+    }
+
+
+# -- run in processes of their own ----------------------------------------------------------------
+
+
+def end_to_end(path: str, case: str) -> dict[str, Any]:
+    """`read_raw`, `simulate`, `write_dng`, with networks loaded and all code warm."""
+    weights, depth, target = CASES[case]
+    settings, simulator = CameraSettings(*target), _warm(weights, depth)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        raw = read_raw(path)
+        result = simulator.simulate(raw, settings, depth=depth)
+        write_dng(Path(folder) / "out.dng", result)
+        seconds = time.perf_counter() - start
+    return {
+        "megapixels": 4e-6 * raw.data[0].numel(),
+        "seconds": seconds,
+        "peak_mib": peak_memory(),
+    }
+
+
+def by_stage(path: str, case: str) -> dict[str, Any]:
+    """The same step by step: seconds, and peak memory of the process during each."""
+    weights, depth, target = CASES[case]
+    settings, simulator = CameraSettings(*target), _warm(weights, depth)
+    found: dict[str, dict[str, float]] = {}
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        forget_peak()
+        start = time.perf_counter()
+        yield
+        found[name] = {"seconds": time.perf_counter() - start, "peak_mib": peak_memory()}
+
+    with tempfile.TemporaryDirectory() as folder:
+        with stage("read"):
+            raw = read_raw(path)
+        with stage("prepare"):
+            latent = simulator.prepare(raw, depth=depth)
+        del raw
+        with stage("simulate"):
+            result = simulator.simulate(latent, settings)
+        modules = list(latent.plan(settings).modules)
+        del latent
+        with stage("write"):
+            write_dng(Path(folder) / "out.dng", result)
+    return {"stages": found, "modules": modules}
+
+
+def libraw(path: str) -> dict[str, float]:
+    """Seconds of LibRaw for the file: unpacking, writing as many bytes, developing."""
+
+    def unpack() -> int:
+        with rawpy.imread(path) as raw:
+            return raw.raw_image_visible.copy().nbytes
+
+    def develop() -> None:
+        with rawpy.imread(path) as raw:
+            raw.postprocess(use_camera_wb=True, no_auto_bright=True)
+
+    content = os.urandom(unpack())  # also warms up
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "mosaic"
+        write = [timed(lambda: file.write_bytes(content)) for _ in range(3)]
+    return {
+        "unpack": statistics.median(timed(unpack) for _ in range(3)),
+        "write": statistics.median(write),
+        "develop": timed(develop),
+    }
+
+
+def _warm(weights: str | None, depth: str) -> CameraSimulator:
+    simulator = CameraSimulator() if weights is None else CameraSimulator.from_pretrained(weights)
+    simulator.simulate(noisy_raw(64, 64), CameraSettings(100, 1 / 16, 4.0), depth=depth)
+    return simulator

@@ -1,0 +1,107 @@
+"""Tasks in a process of their own: their peak memory is theirs, and so are their threads."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from simulator.cache import CACHE_VARIABLE
+
+ROOT = Path(__file__).absolute().parents[2]
+MIB = 2.0**20
+#: Threads of all that is not measured on one: the cores, of which two are what is aimed at.
+CORES = min(2, os.cpu_count() or 1)
+
+
+def isolated(
+    task: Callable[..., Any],
+    *,
+    num_threads: int,
+    fresh_cache: bool = False,
+    timeout: float = 1800.0,
+    **arguments: Any,
+) -> Any:
+    """What `task` returns, run by a fresh Python.
+
+    Args:
+        task: Function of a module of this package; takes and returns what JSON can hold.
+        num_threads: Threads that torch and the kernels may use.
+        fresh_cache: Whether it finds nothing on disk that earlier runs have worked out.
+        timeout: Seconds after which it is stopped.
+        arguments: Of `task`.
+
+    Raises:
+        RuntimeError: If it fails; with its last words.
+    """
+    command = [sys.executable, "-m", __name__, f"{task.__module__}:{task.__qualname__}"]
+    variables = {name: str(num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    with tempfile.TemporaryDirectory() as folder:
+        if fresh_cache:
+            variables[CACHE_VARIABLE] = folder
+        done = subprocess.run(
+            [*command, json.dumps(arguments)],
+            cwd=ROOT,
+            env=os.environ | variables,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            check=False,
+        )
+    if done.returncode:
+        words = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise RuntimeError(f"{task.__qualname__}({arguments}): {words[-1]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def peak_memory() -> float:
+    """Most memory that this process has held since it started or `forget_peak` [MiB]."""
+    try:  # the resource module counts what the parent held before it became this program
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        (kib,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
+        return int(kib) / 1024.0
+    except (OSError, ValueError):
+        unit = 1.0 if sys.platform == "darwin" else 1024.0
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
+
+
+def forget_peak() -> None:
+    """Lets `peak_memory` start anew from what is held now, where the system can."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return
+
+
+def timed(call: Callable[[], Any]) -> float:
+    """Seconds that one call takes; what it returns is dropped within that time."""
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
+
+
+def median_seconds(call: Callable[[], Any], *, least: float, calls: int = 3) -> float:
+    """Median time of a call: at least `calls` calls and `least` seconds."""
+    seconds: list[float] = []
+    while len(seconds) < calls or sum(seconds) < least:
+        seconds.append(timed(call))
+    return statistics.median(seconds)
+
+
+def _main() -> None:
+    module, _, name = sys.argv[1].partition(":")
+    task = getattr(importlib.import_module(module), name)
+    print(json.dumps(task(**json.loads(sys.argv[2]))))
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,54 @@
+"""A source's light without its noise, worked out when a transition first needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import torch
+
+from simulator.light_statistics import LightStatistics
+from simulator.raw_image import check_packed
+
+
+class Denoised:
+    """Light with its noise removed by a noise module.
+
+    A network is the most expensive step there is, and many transitions do without: nothing runs
+    before `light` is read, and then once.
+
+    Args:
+        light: (4, H, W) float32, or what works it out.
+    """
+
+    def __init__(self, light: torch.Tensor | Callable[[], torch.Tensor]) -> None:
+        if isinstance(light, torch.Tensor):
+            light = check_packed("denoised", light)
+        self._light = light
+
+    def __reduce__(self) -> tuple[type[Denoised], tuple[torch.Tensor]]:
+        return Denoised, (self.light,)
+
+    @property
+    def light(self) -> torch.Tensor:
+        """(4, H, W) at the exposure of the source."""
+        if not isinstance(self._light, torch.Tensor):
+            self._light = self._light()
+        return self._light
+
+    @property
+    def shape(self) -> torch.Size | None:
+        """Of `light`, where it is known already."""
+        return self._light.shape if isinstance(self._light, torch.Tensor) else None
+
+    @cached_property
+    def statistics(self) -> LightStatistics:
+        """Of `light`."""
+        return LightStatistics(self.light)
+
+    def to(self, device: torch.device) -> Denoised:
+        """The same on `device`; itself where it is there already, or nothing ran yet."""
+        light = self._light
+        if isinstance(light, torch.Tensor):
+            return self if light.device == device else Denoised(light.to(device))
+        return self

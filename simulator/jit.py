@@ -1,0 +1,51 @@
+"""How the kernels of this package are compiled: once per machine, without the interpreter's lock.
+
+What numba compiles is kept next to the source, or in the user's cache folder where that cannot be
+written (``NUMBA_CACHE_DIR`` names another); where neither can, each process compiles for itself.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba.core import event
+
+logger = logging.getLogger(__name__)
+_PACKAGE = __name__.partition(".")[0]
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator of a function that numba compiles when it is first called.
+
+    Args:
+        options: Of `numba.njit`, such as ``fastmath``.
+    """
+
+    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
+        try:
+            return numba.njit(cache=True, **given)(function)
+        except RuntimeError as error:
+            logger.info("%s; it is compiled anew in each process", error)
+            return numba.njit(**given)(function)
+
+    return compiled
+
+
+class _Announcer(event.Listener):  # type: ignore[misc]
+    """Logs each kernel of this package that is compiled: the first call of one takes seconds."""
+
+    def on_start(self, event: Any) -> None:
+        """Called before numba compiles a function, not when it loads one."""
+        function = event.data["dispatcher"].py_func
+        if function.__module__.partition(".")[0] == _PACKAGE:
+            logger.info("compiling %s.%s", function.__module__, function.__name__)
+
+    def on_end(self, event: Any) -> None:
+        """Called afterwards."""
+
+
+event.register("numba:compile", _Announcer())

@@ -1,0 +1,94 @@
+"""One capture by the fused kernel against the steps one by one, and the balance of its noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from simulator.camera import NoiseLevelFunction, get_camera
+from simulator.capture import (
+    Exposure,
+    add_noise,
+    clip_and_quantise,
+    exposed_light,
+    noise_balance,
+    record,
+    top_up,
+)
+from simulator.noise import noise_generator
+from simulator.noise_bank import frame_noise
+
+Z6 = get_camera("nikon_z6")
+SPAN = 14512
+
+
+@pytest.mark.parametrize("noisy_source", [False, True])
+@pytest.mark.parametrize("blurred_noise", [False, True])
+@pytest.mark.parametrize("iso", [100, 6400])
+def test_recording_equals_the_steps_one_by_one(
+    iso: float, noisy_source: bool, blurred_noise: bool
+) -> None:
+    """Within one digital number, where float32 decides a tie the other way."""
+    rng = np.random.default_rng(0)
+    light = torch.from_numpy(rng.normal(0.3, 0.4, (4, 96, 96)).astype(np.float32))
+    light[:, 0] = torch.tensor([-1e30, 1e30, 3e38, 0.0]).repeat(24)
+    source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
+    remaining = torch.rand(96, 96, generator=torch.Generator().manual_seed(1))
+    exposure = Exposure(
+        1.3, source, Z6.nlf(iso), motion_px=3.0, remaining=remaining if blurred_noise else None
+    )
+    frame = torch.empty_like(light)
+    record(light, exposure, Z6, noise_generator(3), out=frame)
+    signal = exposed_light(light, exposure)
+    noisy, _ = add_noise(signal[None], [exposure], [noise_generator(3)])
+    expected = clip_and_quantise(noisy[0], Z6)
+    difference = ((frame - expected).double() * SPAN).abs().round()
+    assert difference.max() <= 1
+    assert float((difference > 0).double().mean()) <= 1e-4
+
+
+def test_noise_from_the_bank_is_what_the_bank_reads() -> None:
+    light = torch.full((4, 40, 50), 0.2)
+    exposure = Exposure(1.0, NoiseLevelFunction.zero(), Z6.nlf(800))
+    frame = torch.empty_like(light)
+    record(light, exposure, Z6, 12345, out=frame)
+    normals = torch.from_numpy(frame_noise(12345, (4, 40, 50)))
+    noisy, _ = top_up(light[None], [exposure], normals[None])
+    difference = ((frame - clip_and_quantise(noisy[0], Z6)).double() * SPAN).abs().round()
+    assert difference.max() <= 1
+    assert float((difference > 0).double().mean()) <= 1e-4
+
+
+@pytest.mark.parametrize("iso", [100, 400, 6400])
+@pytest.mark.parametrize("blurred_noise", [False, True])
+def test_balance_of_noise_pixel_by_pixel(iso: float, blurred_noise: bool) -> None:
+    rng = np.random.default_rng(0)
+    light = rng.normal(0.2, 0.3, (4, 20, 20))
+    share = rng.random((20, 20)) if blurred_noise else np.ones((20, 20))
+    exposure = Exposure(
+        2.0,
+        Z6.nlf(800),
+        Z6.nlf(iso),
+        remaining=torch.from_numpy(share.astype(np.float32)) if blurred_noise else None,
+    )
+    balance = noise_balance(torch.from_numpy(light.astype(np.float32)), exposure)
+    first, second = Z6.nlf(800), Z6.nlf(iso)
+    (shot1, read1), (shot2, read2) = (
+        (np.array(n.shot)[:, None], np.array(n.read)[:, None]) for n in (first, second)
+    )
+    signal = 2.0 * np.maximum(light, 0.0)
+    given = share * (4 * read1[..., None] + 2 * shot1[..., None] * signal)
+    wanted = read2[..., None] + shot2[..., None] * signal
+    beyond = np.maximum(given - wanted, 0.0)
+    assert balance.relative_excess == pytest.approx((beyond / wanted).mean(), rel=1e-4, abs=1e-7)
+    assert balance.excess == pytest.approx(beyond.mean(), rel=1e-4, abs=1e-12)
+    assert balance.is_short == bool((wanted > given).any())
+
+
+def test_a_source_without_noise_lacks_all_of_it() -> None:
+    zero = NoiseLevelFunction.zero()
+    light = torch.full((4, 4, 4), 0.5)
+    balance = noise_balance(light, Exposure(1.0, zero, Z6.nlf(100)))
+    assert (balance.relative_excess, balance.excess, balance.is_short) == (0.0, 0.0, True)
+    assert not noise_balance(light, Exposure(1.0, zero, zero)).is_short
