@@ -47,6 +47,9 @@ Tolerance = Annotated[
     float,
     typer.Option(help="Error to accept for speed, in units of the target's noise; 0 for none."),
 ]
+Noise = Annotated[
+    str, typer.Option(help="exact: drawn; or bank: looked up in a bank of normals, faster.")
+]
 
 #: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
@@ -65,6 +68,7 @@ def simulate(
     weights: Weights = "compact",
     depth: Depth = "far",
     tolerance: Tolerance = DEFAULT_TOLERANCE,
+    noise: Noise = "exact",
     device: Device = "auto",
     cache: Cache = True,
 ) -> None:
@@ -73,7 +77,9 @@ def simulate(
     Example: `ae-env simulate IMG_0001.CRW --iso 800 --shutter 1/60 --aperture 4 -o out.dng`
     """
     from simulator import CameraSettings, read_raw, write_dng
+    from simulator.latent import check_noise
 
+    check_noise(noise)
     settings = CameraSettings(iso, parse_seconds(shutter), aperture)
     if out.suffix.lower() != ".dng":
         raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
@@ -88,7 +94,7 @@ def simulate(
     latent = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
     console.print(str(latent.plan(settings)), highlight=False, soft_wrap=True)
-    result = simulator.simulate(latent, settings, seed=seed)
+    result = simulator.simulate(latent, settings, seed=seed, noise=noise)  # type: ignore[arg-type]
     result = replace(result, metadata={**source.metadata, **result.metadata})
     write_dng(out, result)
     files = {"DNG": out}

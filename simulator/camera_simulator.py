@@ -18,7 +18,7 @@ from torch import nn
 
 from simulator.denoised import Denoised
 from simulator.full_run import FullRun, Stages
-from simulator.latent import HasLatent, Latent
+from simulator.latent import HasLatent, Latent, Noise, check_noise
 from simulator.modules.aperture import ApertureModule, usable_defocus
 from simulator.modules.exposure import ExposureModule
 from simulator.modules.noise import NoiseModule, Preset, smoothed, variance_map
@@ -337,6 +337,7 @@ class CameraSimulator:
         *,
         seed: int = 0,
         tolerance: float | Literal["source"] | None = "source",
+        noise: Noise = "exact",
         **scene: Any,
     ) -> RawImage:
         """The raw that the camera would have recorded at `settings`.
@@ -347,12 +348,15 @@ class CameraSimulator:
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
             tolerance: See `prepare`; None runs every module for this very transition (`stages`),
                 and shares and leaves out nothing.
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster (see `Latent.capture`); the
+                full run draws it.
             scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
             ``metadata["clipped_source"]`` declare what could not be made exact.
         """
+        check_noise(noise)
         if tolerance is None and self.noise is not None:
             scene = {"depth": "far", **scene}
             data, excess_noise = self.stages(source, settings, seed=seed, **scene).capture, 0.0
@@ -362,7 +366,7 @@ class CameraSimulator:
             latent = self.prepare(
                 source, tolerance=0.0 if tolerance is None else tolerance, **scene
             )
-            data, excess_noise = latent.capture(settings, seed)
+            data, excess_noise = latent.capture(settings, seed, noise=noise)
             output_noise = latent.output_noise(settings)
         clipped = 0.0 if latent.saturated is None else float(latent.saturated.float().mean())
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}

@@ -172,6 +172,16 @@ def _as_signals(numbers, black, span, out):  # type: ignore[no-untyped-def]
 
 
 @_jit()
+def _in_bank(key, block):  # type: ignore[no-untyped-def]
+    """Where in the bank a block of a frame starts, and its sign; see `simulator.noise_bank`."""
+    word = key + _STEP * np.uint64(block + 1)
+    word = (word ^ (word >> np.uint64(30))) * _MIX_1
+    word = (word ^ (word >> np.uint64(27))) * _MIX_2
+    word = word ^ (word >> np.uint64(31))
+    return np.int64(word & _START_BITS) * STRIDE, -_ONE if word >> np.uint64(63) else _ONE
+
+
+@_jit()
 def _record(  # type: ignore[no-untyped-def]
     first,
     last,
@@ -212,15 +222,9 @@ def _record(  # type: ignore[no-untyped-def]
             part = buffer[: end - start]
             _expose(plane_light[at : at + len(part)], ratio, most, part)
             if drawn != _OFF:
-                sign = _ONE
-                place = np.int64(keys[frame]) * 4 * samples + at
+                place, sign = np.int64(keys[frame]) * 4 * samples + at, _ONE
                 if drawn == _BANK:
-                    word = keys[frame] + _STEP * np.uint64(plane * blocks + block + 1)
-                    word = (word ^ (word >> np.uint64(30))) * _MIX_1
-                    word = (word ^ (word >> np.uint64(27))) * _MIX_2
-                    word = word ^ (word >> np.uint64(31))
-                    place = np.int64(word & _START_BITS) * STRIDE
-                    sign = -_ONE if word >> np.uint64(63) else _ONE
+                    place, sign = _in_bank(keys[frame], plane * blocks + block)
                 normals = bank[place : place + len(part)]
                 if remaining[frame] == 0:
                     _add_noise(part, normals, sign, shot, read)

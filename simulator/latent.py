@@ -313,11 +313,16 @@ def _noise_key(settings: CameraSettings) -> tuple[float, float, float]:
 def _noise_of(noise: Noise, seed: int, settings: CameraSettings) -> torch.Generator | int:
     """What draws the noise of one frame, or its key in the bank."""
     key = _noise_key(settings)
+    check_noise(noise)
     if noise == "bank":
         return int(noise_keys(np.array([seed]), *key)[0])
-    if noise != "exact":
-        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
     return noise_generator(seed, *key)
+
+
+def check_noise(noise: str) -> None:
+    """Raises a `ValueError` unless `noise` is a kind of noise."""
+    if noise not in get_args(Noise):
+        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
 
 
 @functools.lru_cache(maxsize=4096)

@@ -16,8 +16,6 @@ from simulator.settings import CameraSettings
 from simulator.threads import in_shares
 
 PLANES = ("R", "G1", "G2", "B")
-#: Packed rows converted at a time: their float64 copies stay in the processor's cache.
-_ROWS = 32
 #: Packed rows from which a second thread helps.
 _SHARE = 128
 
@@ -38,20 +36,20 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
         R  G1
         G2 B
     """
+    from simulator.mosaic_kernels import pack_rows  # numba: only where it is needed
+
     if mosaic.ndim != 2 or min(mosaic.shape) < 2:
         raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
     height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
     planes = np.empty((4, height, width), np.float32)
 
+    # One kernel for what files hold, and one for all else.
+    mosaic = np.ascontiguousarray(mosaic, None if mosaic.dtype == np.uint16 else np.float64)
+    black, span = (np.array(v, np.float64) for v in (camera.black_level, camera.span))
+    offsets = np.array(camera.cfa.offsets)
+
     def pack(first: int, last: int) -> None:
-        for top in range(first, last, _ROWS):
-            end = min(top + _ROWS, last)
-            for plane, (row, column) in enumerate(camera.cfa.offsets):
-                tile = mosaic[2 * top + row : 2 * end : 2, column : 2 * width : 2]
-                values = tile.astype(np.float64)
-                values -= camera.black_level[plane]
-                values /= camera.span[plane]
-                planes[plane, top:end] = values
+        pack_rows(mosaic, offsets, black, span, first, last, planes)
 
     in_shares(pack, height, least=_SHARE)
     return torch.from_numpy(planes)
@@ -59,19 +57,17 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
 
 def unpack_mosaic(data: torch.Tensor, camera: CameraProfile) -> np.ndarray:
     """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`."""
-    planes = data.detach().float().cpu().numpy()
+    from simulator.mosaic_kernels import unpack_rows
+
+    planes = data.detach().float().cpu().contiguous().numpy()
     _, height, width = planes.shape
     mosaic = np.empty((2 * height, 2 * width), np.uint16)
 
+    black, span = (np.array(v, np.float32) for v in (camera.black_level, camera.span))
+    offsets, white = np.array(camera.cfa.offsets), np.float32(camera.white_level)
+
     def unpack(first: int, last: int) -> None:
-        for top in range(first, last, _ROWS):
-            end = min(top + _ROWS, last)
-            for plane, (row, column) in enumerate(camera.cfa.offsets):
-                numbers = planes[plane, top:end] * np.float32(camera.span[plane])
-                numbers += np.float32(camera.black_level[plane])
-                np.rint(numbers, out=numbers)
-                np.clip(numbers, 0, camera.white_level, out=numbers)
-                mosaic[2 * top + row : 2 * end : 2, column::2] = numbers
+        unpack_rows(planes, offsets, black, span, white, first, last, mosaic)
 
     in_shares(unpack, height, least=_SHARE)
     return mosaic

@@ -71,7 +71,7 @@ def load_models(
     own = {
         corrected: {
             name: CameraSimulator.from_pretrained(
-                found[name], device="cpu", body_correction=corrected
+                found[name], device="cpu", body_correction=corrected, cache=None
             )
             for name in PRESETS
             if name in found

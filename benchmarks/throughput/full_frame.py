@@ -27,11 +27,12 @@ from simulator.dng_tags import SOFTWARE_NAME
 FULL, QUICK = (2000, 3000), (500, 750)
 #: The synthetic raw was taken so; the targets follow.
 SOURCE = CameraSettings(400, 1 / 64, 8.0)
-#: Name: weights, depth, target. The last two need the networks: cleaner, and the last opens too.
-CASES: dict[str, tuple[str | None, str, tuple[float, float, float]]] = {
-    "exposure + noise": (None, "far", (1600, 1 / 256, 8.0)),
-    "noise reduction": ("compact", "far", (100, 1 / 16, 8.0)),
-    "noise reduction + aperture": ("compact", "unknown", (100, 1 / 64, 4.0)),
+#: Name: weights, depth, target, noise. The last two need the networks: cleaner, and the last opens.
+CASES: dict[str, tuple[str | None, str, tuple[float, float, float], str]] = {
+    "exposure + noise": (None, "far", (1600, 1 / 256, 8.0), "exact"),
+    "exposure + noise from the bank": (None, "far", (1600, 1 / 256, 8.0), "bank"),
+    "noise reduction": ("compact", "far", (100, 1 / 16, 8.0), "exact"),
+    "noise reduction + aperture": ("compact", "unknown", (100, 1 / 64, 4.0), "exact"),
 }
 STAGES = ("read", "prepare", "simulate", "write")
 
@@ -115,12 +116,12 @@ def _row(file: Path, case: str, threads: int, quick: bool) -> dict[str, Any]:
 
 def end_to_end(path: str, case: str) -> dict[str, Any]:
     """`read_raw`, `simulate`, `write_dng`, with networks loaded and all code warm."""
-    weights, depth, target = CASES[case]
+    weights, depth, target, noise = CASES[case]
     settings, simulator = CameraSettings(*target), _warm(weights, depth)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         raw = read_raw(path)
-        result = simulator.simulate(raw, settings, depth=depth)
+        result = simulator.simulate(raw, settings, depth=depth, noise=noise)
         write_dng(Path(folder) / "out.dng", result)
         seconds = time.perf_counter() - start
     return {
@@ -132,7 +133,7 @@ def end_to_end(path: str, case: str) -> dict[str, Any]:
 
 def by_stage(path: str, case: str) -> dict[str, Any]:
     """The same step by step: seconds, and peak memory of the process during each."""
-    weights, depth, target = CASES[case]
+    weights, depth, target, noise = CASES[case]
     settings, simulator = CameraSettings(*target), _warm(weights, depth)
     found: dict[str, dict[str, float]] = {}
 
@@ -150,7 +151,7 @@ def by_stage(path: str, case: str) -> dict[str, Any]:
             latent = simulator.prepare(raw, depth=depth)
         del raw
         with stage("simulate"):
-            result = simulator.simulate(latent, settings)
+            result = simulator.simulate(latent, settings, noise=noise)
         modules = list(latent.plan(settings).modules)
         del latent
         with stage("write"):
@@ -181,6 +182,8 @@ def libraw(path: str) -> dict[str, float]:
 
 
 def _warm(weights: str | None, depth: str) -> CameraSimulator:
-    simulator = CameraSimulator() if weights is None else CameraSimulator.from_pretrained(weights)
+    simulator = CameraSimulator()
+    if weights is not None:
+        simulator = CameraSimulator.from_pretrained(weights, cache=None)
     simulator.simulate(noisy_raw(64, 64), CameraSettings(100, 1 / 16, 4.0), depth=depth)
     return simulator
