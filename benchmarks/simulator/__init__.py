@@ -9,14 +9,10 @@ real files that ``AE_ENV_DATA`` names are used where they are.
 
 from __future__ import annotations
 
-import json
-import zlib
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from ae_env.console import console, print_files, progress_bars
+from ae_env.console import console, print_files
 from benchmarks.simulator import (
     brackets,
     defocus,
@@ -26,7 +22,8 @@ from benchmarks.simulator import (
     pairs,
     pictures,
 )
-from benchmarks.simulator.models import FOLDER, Models, load_models
+from benchmarks.simulator.models import Models
+from benchmarks.simulator.parts import measure_parts
 from benchmarks.simulator.scenes import data_root
 from simulator.files import write_atomically
 from simulator.results import result_meta, write_results
@@ -41,6 +38,8 @@ PARTS = {
     "brackets": (brackets, "Real exposures"),
     "pictures": (pictures, "Pictures"),
 }
+#: What the numbers depend on.
+MEASURED = ("simulator", "ae_env/scenes", "benchmarks/simulator")
 
 
 def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
@@ -51,35 +50,12 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
         seed: Of pairs, settings, noise and crops.
         quick: A few small images, and only models that are there already.
     """
-    with progress_bars() as progress:
-        with progress("models") as task:
-
-            def trained(stage: str, share: float, values: dict[str, float]) -> None:
-                task(int(1000 * share), 1000, stage)
-
-            models = load_models(FOLDER, train=not quick, progress=trained)
-            task(1, 1)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # the methods compared with run on one
-        try:
-            rows: list[dict[str, Any]] = []
-            for name, (part, _) in PARTS.items():
-                with progress(name) as task:
-
-                    def report(what: str, share: float, task: Any = task) -> None:
-                        task(int(1000 * share), 1000, what)
-
-                    kept = _kept(name, models, seed, quick)
-                    if kept.is_file():
-                        own = json.loads(kept.read_text(encoding="utf-8"))
-                    else:
-                        own = part.measure(models, seed=seed, quick=quick, progress=report)
-                        write_atomically(kept, json.dumps(own))
-                    rows += own
-                    task(1, 1)
-            meta = result_meta(f"ae-env bench simulator{' --quick' * quick}", seed)
-        finally:
-            torch.set_num_threads(threads)
+    modules = {name: module for name, (module, _) in PARTS.items()}
+    # One thread: what it is compared with runs on one.
+    models, rows = measure_parts(
+        "simulator", modules, seed=seed, quick=quick, threads=1, code=MEASURED
+    )
+    meta = result_meta(f"ae-env bench simulator{' --quick' * quick}", seed)
     meta |= {"models": models.cards, "real_files": data_root() is not None}
     files = {
         "numbers": write_results(out / "simulator.json", rows, meta),
@@ -87,16 +63,6 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     }
     print_files(files)
     console.print("the pictures are meant to be looked at", highlight=False)
-
-
-def _kept(part: str, models: Models, seed: int, quick: bool) -> Path:
-    """Where the rows of a finished part are kept, so that a run that was stopped goes on.
-
-    They count for the same weights, commit and arguments alone.
-    """
-    words = [part, seed, quick, result_meta("", seed)["commit"]]
-    words += [card["sha256"] for card in models.cards.values()]
-    return FOLDER / "bench" / f"{part}-{zlib.crc32(json.dumps(words).encode()):08x}.json"
 
 
 def _markdown(models: Models, rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from ae_env.console import print_files, progress_bars
+from benchmarks.keeping import Kept
 from benchmarks.simulator.scenes import data_root
 from benchmarks.throughput import full_frame, growth
 from benchmarks.throughput.gpu import measure_gpu
 from benchmarks.throughput.isolated import CORES, isolated
-from benchmarks.throughput.keeping import Kept
 from benchmarks.throughput.noise_statistics import measure_noise
 from benchmarks.throughput.plots import draw
 from benchmarks.throughput.report import markdown
@@ -33,6 +33,8 @@ from simulator.results import result_meta, write_results
 
 #: Parts of a run that was stopped.
 FOLDER = Path("runs/throughput")
+#: The code that is measured.
+MEASURED = ("simulator", "ae_env", "benchmarks/throughput")
 #: Threads and frame sizes of the steps.
 STEPS = ((CORES, 128), (CORES, 64), (1, 128))
 
@@ -45,7 +47,7 @@ def run(out: Path, seed: int = 0, quick: bool = False) -> None:
         seed: Of episodes, actions and noise.
         quick: Fewer cases, points and repeats, about two minutes.
     """
-    kept = Kept(FOLDER / ("quick" if quick else "full"), seed)
+    kept = Kept(FOLDER / ("quick" if quick else "full"), seed, code=MEASURED)
     meta = result_meta(f"ae-env bench throughput{' --quick' * quick}", seed)
     meta["scenes"] = SCENES
     with progress_bars() as progress:

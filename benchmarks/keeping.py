@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from benchmarks.throughput.isolated import ROOT
 from simulator.files import write_atomically
 
 T = TypeVar("T")
-#: What a measurement depends on: kept parts count for the very same code alone.
-_CODE = ("simulator", "ae_env", "benchmarks/throughput")
+#: Folder of the repository.
+ROOT = Path(__file__).resolve().parents[1]
+#: Modules that only present what was measured.
+_PRESENTING = ("report", "report_parts", "plots", "targets")
 
 
 class Kept:
@@ -21,20 +22,21 @@ class Kept:
 
     Args:
         folder: Where to.
-        words: What they depend on besides the code: seed and arguments.
+        words: What they depend on besides the code: seed, arguments, weights.
+        code: Folders of the repository that they depend on; they count for the very same code.
     """
 
-    def __init__(self, folder: Path, *words: Any) -> None:
-        code = 0
-        for name in _CODE:
-            for path in sorted((ROOT / name).rglob("*.py")):
-                code = zlib.crc32(path.read_bytes(), code)
-        self._folder, self._words = folder, [code, *words]
+    def __init__(self, folder: Path, *words: Any, code: Sequence[str]) -> None:
+        found = (path for name in code for path in (ROOT / name).rglob("*.py"))
+        checksum = 0
+        for path in sorted(path for path in found if path.stem not in _PRESENTING):
+            checksum = zlib.crc32(path.read_bytes(), checksum)
+        self._folder, self._words = folder, [checksum, *words]
 
     def __call__(self, name: str, make: Callable[[], T]) -> T:
         """What `make` returns, or has returned to an earlier run; JSON values."""
         key = zlib.crc32(json.dumps([*self._words, name]).encode())
-        path = self._folder / f"{key:08x}.json"
+        path = self._folder / f"{name.replace(' ', '-').replace('/', '-')}-{key:08x}.json"
         if not path.is_file():
             write_atomically(path, json.dumps(make()))
         return json.loads(path.read_text(encoding="utf-8"))
