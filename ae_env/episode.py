@@ -10,7 +10,7 @@ import torch
 
 from ae_env.score_table import ScoreTable
 from simulator.blur_kernels import Blur
-from simulator.capture import Exposure
+from simulator.exposure import Exposure
 from simulator.latent import Latent
 
 

@@ -22,11 +22,13 @@ from ae_env.score_table import in_episode, scene_latent
 from simulator.blur_kernels import Blur, blur_many
 from simulator.cache import LruCache
 from simulator.camera import CameraProfile
-from simulator.capture import LATENT_LIMIT, Exposure, noise_balance
-from simulator.kernels import addresses, exposure_table, record_frames
+from simulator.capture import noise_balance
+from simulator.exposure import LATENT_LIMIT, Exposure
+from simulator.kernels import exposure_table, record_frames
 from simulator.latent import Latent
 from simulator.noise import noise_generator
 from simulator.noise_bank import noise_keys
+from simulator.pointers import addresses
 from simulator.threads import in_shares
 
 #: Memory for what is known of scenes, and what of it a scene and a plan take, about [byte].

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from simulator.jit import kernel
-from simulator.kernels import addresses, as_pointer
+from simulator.pointers import addresses, as_pointer
 from simulator.raw_image import new_frame
 from simulator.threads import in_shares
 

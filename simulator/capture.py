@@ -7,67 +7,23 @@ that unclipped light -> noise of the blurred signal -> clip -> quantise, each of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 import torch
 
-from simulator.blur import disc_blur, kernel_energy, motion_blur
-from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.blur import disc_blur, motion_blur
+from simulator.camera import CameraProfile
+from simulator.exposure import LATENT_LIMIT, SIGNAL_LIMIT, Exposure
 from simulator.noise import draw_normals, noise_variance
 from simulator.noise_bank import frame_noise
 from simulator.threads import in_shares
 
-#: Signals beyond this many times sensor white are clipped early: they end at white in any case,
-#: and an infinite variance times a zero draw would be NaN.
-SIGNAL_LIMIT = 1e6
-#: Light beyond this many times the reference's white is clipped before it is blurred: it is white
-#: at every exposure, and sums of larger numbers would no longer resolve the shadows.
-LATENT_LIMIT = 1e9
 _TINY = torch.finfo(torch.float32).tiny
 #: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
 _BALANCED = 2**15
-
-
-@dataclass(frozen=True)
-class Exposure:
-    """What happens to the light of a scene during one capture.
-
-    Args:
-        ratio: Exposure ratio from the latent's reference to the capture.
-        source: Noise in the latent at its reference settings.
-        target: Noise of the camera at the capture's settings.
-        motion_px: How far the image moves while the shutter is open [pixel].
-        defocus_px: Diameter of the defocus disc [pixel].
-        denoised: Whether it starts from the noise-reduced light; `source` is zero then.
-        opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
-            None where it does not.
-        remaining: (H, W) share that this blur leaves of the noise variance which the other blurs
-            have left; None for all.
-        errors: What leaving out each step that would do something errs or would err by, in units of
-            the target's noise (see `simulator.tolerance.Budget`).
-    """
-
-    ratio: float
-    source: NoiseLevelFunction
-    target: NoiseLevelFunction
-    motion_px: float = 0.0
-    defocus_px: float = 0.0
-    denoised: bool = False
-    opened_to: float | None = None
-    remaining: torch.Tensor | None = None
-    errors: Mapping[str, float] = field(default_factory=dict, compare=False)
-
-    @property
-    def source_noise(self) -> NoiseLevelFunction:
-        """Noise that reaches the sensor from the latent: exposed, and averaged by the blur."""
-        if self.source.is_zero:
-            return self.source
-        return self.source.exposed(self.ratio).scaled(
-            kernel_energy(self.motion_px, self.defocus_px)
-        )
 
 
 def sensor_light(latent: torch.Tensor, exposure: Exposure) -> torch.Tensor:
@@ -192,7 +148,8 @@ def record_batch(
         keys: (B,) uint64 of the noise of each.
         out: (B, 4, H, W) float32, contiguous.
     """
-    from simulator.kernels import addresses, exposure_table, record_frames
+    from simulator.kernels import exposure_table, record_frames
+    from simulator.pointers import addresses
 
     lights = [light.contiguous() for light in lights]
     shares = [None if e.remaining is None else e.remaining.float().contiguous() for e in exposures]

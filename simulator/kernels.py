@@ -16,12 +16,12 @@ from collections.abc import Sequence
 import numba
 import numpy as np
 import torch
-from numba import types
 
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture import SIGNAL_LIMIT, Exposure
+from simulator.exposure import SIGNAL_LIMIT, Exposure
 from simulator.jit import kernel
 from simulator.noise_bank import BANK_SIZE, BLOCK, STRIDE, noise_bank
+from simulator.pointers import addresses, as_pointer
 from simulator.threads import in_shares
 
 #: Most negative signal that a companded code shows; the offset under its square root.
@@ -77,27 +77,9 @@ def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
     return table.astype(np.float32)
 
 
-def addresses(images: Sequence[torch.Tensor | None]) -> np.ndarray:
-    """(B,) uintp addresses of contiguous float32 images, 0 for None.
-
-    To be taken anew for each call: sharing a tensor with another process moves its memory.
-    """
-    return np.array([0 if i is None else i.data_ptr() for i in images], np.uintp)
-
-
 @functools.lru_cache(maxsize=4096)
 def _noise_rows(nlf: NoiseLevelFunction) -> np.ndarray:
     return np.array([nlf.shot, nlf.read])
-
-
-@numba.extending.intrinsic
-def as_pointer(typing, address):  # type: ignore[no-untyped-def]
-    """An address as a pointer to float32."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
-
-    return types.CPointer(types.float32)(types.uintp), generate
 
 
 _jit = functools.partial(kernel, fastmath=_FAST, boundscheck=False)

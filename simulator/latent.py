@@ -13,10 +13,11 @@ from typing import Literal, Protocol, get_args
 import numpy as np
 import torch
 
-from simulator.blur import kernel_energy
+from simulator.blur_shapes import kernel_energy
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture import Exposure, exposed_light, noise_balance, record, record_batch
+from simulator.capture import exposed_light, noise_balance, record, record_batch
 from simulator.denoised import Denoised
+from simulator.exposure import Exposure
 from simulator.light_statistics import LightStatistics
 from simulator.noise import noise_generator
 from simulator.noise_bank import noise_keys

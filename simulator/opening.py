@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from simulator.cache import LruCache
-from simulator.capture import LATENT_LIMIT
 from simulator.denoised import Denoised
+from simulator.exposure import LATENT_LIMIT
 from simulator.modules.aperture import added_blur
 from simulator.modules.disc_bank import HALO, DiscBank, remaining_variance
 from simulator.tiles import TILE, Tile, make_tiles

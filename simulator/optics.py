@@ -8,8 +8,9 @@ import torch
 
 from simulator.blur import motion_blur
 from simulator.cache import LruCache
-from simulator.capture import Exposure, defocused_light
+from simulator.capture import defocused_light
 from simulator.denoised import Denoised
+from simulator.exposure import Exposure
 from simulator.opening import Opening
 
 #: Memory that the blurred light of one scene may take [byte].

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from simulator.capture import Exposure, noise_balance
+from simulator.capture import noise_balance
+from simulator.exposure import Exposure
 from simulator.settings import CameraSettings
 from simulator.tiles import varying
 

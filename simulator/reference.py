@@ -16,7 +16,8 @@ import torch
 
 from simulator.blur import motion_blur
 from simulator.camera import CameraProfile
-from simulator.capture import SIGNAL_LIMIT, clip_and_quantise
+from simulator.capture import clip_and_quantise
+from simulator.exposure import SIGNAL_LIMIT
 from simulator.noise import nlf_tensors, noise_generator
 from simulator.raw_image import check_packed
 from simulator.settings import CameraSettings, exposure_ratio

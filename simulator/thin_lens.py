@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 
-from simulator.blur import disc_blur, disc_kernel
+from simulator.blur import disc_blur
+from simulator.blur_shapes import disc_kernel
 
 _Length = TypeVar("_Length", float, np.ndarray, torch.Tensor)
 

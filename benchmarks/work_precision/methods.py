@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from benchmarks.simulator.denoising import behind_anscombe, non_local_means
 from benchmarks.simulator.models import FOLDER, Models
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, exposure_ratio
-from simulator.capture import Exposure, add_noise, clip_and_quantise
+from simulator.capture import add_noise, clip_and_quantise
+from simulator.exposure import Exposure
 from simulator.latent import Latent
 from simulator.noise import noise_generator
 from simulator.training.data import settings_parameters

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from simulator.blur import disc_blur, disc_kernel
+from simulator.blur import disc_blur
+from simulator.blur_shapes import disc_kernel
 
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
 #: discs is within 2 % of the disc between them.

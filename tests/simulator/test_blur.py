@@ -11,14 +11,8 @@ import scipy.optimize
 import scipy.special
 import torch
 
-from simulator.blur import (
-    box_mean,
-    disc_blur,
-    disc_kernel,
-    kernel_energy,
-    motion_blur,
-    motion_kernel,
-)
+from simulator.blur import box_mean, disc_blur, motion_blur
+from simulator.blur_shapes import disc_kernel, kernel_energy, motion_kernel
 
 EXTENTS = [0.1, 0.3, 0.5, 0.9, 1.0, 1.5, 2.0, 2.5, 3.0, 4.7, 8.0, 11.3, 12.5, 16.0, 21.4, 30.0]
 

@@ -9,8 +9,10 @@ import pytest
 import torch
 from scipy import ndimage
 
-from simulator.blur import disc_blur, disc_kernel, motion_blur, motion_kernel
-from simulator.blur_kernels import Blur, blur_many, coverage, disc, streak
+from simulator.blur import disc_blur, motion_blur
+from simulator.blur_kernels import Blur, blur_many, disc, streak
+from simulator.blur_shapes import disc_kernel, motion_kernel
+from simulator.coverage import coverage
 
 SHAPES = [(1, 1, 1), (1, 1, 5), (4, 5, 1), (4, 37, 53), (2, 3, 16, 24), (4, 128, 128)]
 EXTENTS = [0.02, 0.3, 1.0, 2.0, 2.9, 5.0, 8.0, 17.0, 31.0, 52.0, 130.0, 260.0, 5000.0]

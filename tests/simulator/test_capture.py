@@ -15,7 +15,8 @@ import torch
 from scipy.stats import norm
 
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
-from simulator.capture import Exposure, add_noise, clip_and_quantise, sensor_light
+from simulator.capture import add_noise, clip_and_quantise, sensor_light
+from simulator.exposure import Exposure
 from simulator.latent import Latent
 from simulator.noise import noise_generator
 from simulator.settings import CameraSettings

@@ -12,7 +12,8 @@ import torch
 
 from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera, list_cameras
-from simulator.capture import Exposure, clip_and_quantise
+from simulator.capture import clip_and_quantise
+from simulator.exposure import Exposure
 from simulator.kernels import exposure_table, record_capture, record_frames, sensor_table
 from simulator.noise_bank import frame_noise, noise_keys
 

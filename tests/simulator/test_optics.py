@@ -11,8 +11,8 @@ import torch
 from simulator import optics as optics_module
 from simulator.blur import disc_blur, motion_blur
 from simulator.camera import NoiseLevelFunction
-from simulator.capture import LATENT_LIMIT, Exposure
 from simulator.denoised import Denoised
+from simulator.exposure import LATENT_LIMIT, Exposure
 from simulator.opening import MapOpening
 from simulator.optics import Optics, blur_key
 

@@ -8,7 +8,6 @@ import torch
 
 from simulator.camera import NoiseLevelFunction, get_camera
 from simulator.capture import (
-    Exposure,
     add_noise,
     clip_and_quantise,
     exposed_light,
@@ -16,6 +15,7 @@ from simulator.capture import (
     record,
     top_up,
 )
+from simulator.exposure import Exposure
 from simulator.noise import noise_generator
 from simulator.noise_bank import frame_noise
 
