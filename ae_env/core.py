@@ -72,7 +72,13 @@ class EpisodeCore:
         self.scorer = options.make_scorer()
         self.lighting = make_lighting(options.lighting)
         self.scenes = options.load_scenes()
-        self.tables = ScoreTables(self.grid, self.camera, self.scorer, noise=bool(options.noise))
+        self.tables = ScoreTables(
+            self.grid,
+            self.camera,
+            self.scorer,
+            noise=bool(options.noise),
+            tolerance=options.tolerance,
+        )
         self.episodes: list[Episode | None] = [None] * num_envs
         self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
         states = self.grid.states
@@ -128,9 +134,23 @@ class EpisodeCore:
     # -- life of an episode -------------------------------------------------------------------
 
     def start(self, index: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
-        """Begins episode `index`: draws the scene, the start state, the motion and the defocus.
+        """Begins episode `index`; see `drawn`."""
+        self.begin(index, self.drawn(rng, options))
+
+    def begin(self, index: int, episode: Episode) -> None:
+        """Puts `episode` in place `index`, where another one may end."""
+        ended = self.episodes[index]
+        if ended is not None:
+            self.recorder.end(index, ended)
+        self.episodes[index] = episode
+
+    def drawn(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Episode:
+        """An episode: draws the scene, the start state, the motion and the defocus.
 
         The draws do not depend on `options`, which only replace what was drawn.
+
+        Raises:
+            ValueError: If there is no such scene, state or frame as `options` ask for.
         """
         scene = int(rng.integers(len(self.scenes)))
         state = int(rng.integers(len(self.grid)))
@@ -140,10 +160,7 @@ class EpisodeCore:
         median = self.scenes[scene].median_speed
         drawn_speed = moves * median * np.exp(SPEED_SIGMA * speed)
         drawn_defocus = DEFOCUS_MEDIAN * np.exp(DEFOCUS_SIGMA * defocus)
-        ended = self.episodes[index]
-        if ended is not None:
-            self.recorder.end(ended)
-        self.episodes[index] = Episode(
+        episode = Episode(
             scene=scene,
             state=self._chosen("state", options.get("state"), state, len(self.grid)),
             speed=_fixed_or_drawn(self.options.motion, float(drawn_speed)),
@@ -154,10 +171,10 @@ class EpisodeCore:
             noise_seed=noise_seed,
             frame=self._chosen("frame", options.get("frame"), 0, 2**31),
         )
-        episode = self.episode(index)
         episode.pending = [episode.state] * int(self.options.delay)
         own = self.scenes[scene].own_blur(4.0) * 64.0 / self.options.resolution
         episode.focus_drive = math.hypot(episode.defocus, own)
+        return episode
 
     def _chosen_scene(self, wanted: Any, drawn: int) -> int:
         if wanted is None:
@@ -188,14 +205,18 @@ class EpisodeCore:
 
     def act(self, index: int, action: Any) -> None:
         """Lets episode `index` go on by one frame with `action`, applied after the delay."""
-        if not (isinstance(action, int) and 0 <= action < len(self.grid)):
-            number = np.asarray(action)
-            if number.ndim or number.dtype.kind not in "iu" or not 0 <= number < len(self.grid):
-                raise ValueError(f"`action` (={action!r}) must be in [0, {len(self.grid)})")
+        self.check_action(action)
         episode = self.episode(index)
         episode.pending.append(int(action))
         episode.state = episode.pending.pop(0)
         episode.frame += 1
+
+    def check_action(self, action: Any) -> None:
+        """Raises a `ValueError` unless `action` is a state of the grid."""
+        if not (isinstance(action, int) and 0 <= action < len(self.grid)):
+            number = np.asarray(action)
+            if number.ndim or number.dtype.kind not in "iu" or not 0 <= number < len(self.grid):
+                raise ValueError(f"`action` (={action!r}) must be in [0, {len(self.grid)})")
 
     def gain(self, episode: Episode, exposure_time: float) -> float:
         """Light of an exposure in the current frame relative to the scene's own."""
@@ -276,8 +297,9 @@ class EpisodeCore:
         planned = zip(indices, episodes, gains, strict=True)
         blurs = [(i, e) for i, e, gain in planned if self.recorder.prepare(i, e, gain)]
         self.recorder.blur(blurs)
-        # Only codes and digital numbers are made without a float of every sample.
-        few = self._scores_images or self.options.noise == "exact"
+        # Only codes and digital numbers are made without a float of every sample, and only in
+        # static light scored without one.
+        few = self._scores_images or self.options.noise == "exact" or not self._static
         step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(indices)
         chunks = []
         for start in range(0, len(indices), step):
@@ -305,7 +327,7 @@ class EpisodeCore:
             columns["sensor_noise"] = single_normals(key, 2)
         columns |= self._part_scores(indices, outputs.get("signals"), gains)
         if self.options.observation == "linear":
-            np.maximum(raw, np.float32(-PEDESTAL), out=raw)
+            np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         if "flicker" in self.options.costs:
             codes = outputs["codes"].reshape(len(raw), -1)
             columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])

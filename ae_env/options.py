@@ -17,6 +17,7 @@ from ae_env.scenes.networks import (
 )
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, make_scorer
+from simulator.cache import LruCache
 from simulator.camera import CameraProfile, get_camera
 from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
 
@@ -120,7 +121,7 @@ class EnvOptions:
         key = (
             repr(self.scenes),
             self.split,
-            camera.name,
+            camera,  # its colours and levels, too
             self.resolution,
             self.crop,
             finds_defocus,
@@ -128,8 +129,9 @@ class EnvOptions:
         by_name = isinstance(self.scenes, str) and ":" not in self.scenes.removeprefix("bundled:")
         # Weights in a file of one's own may be others next time.
         kept = by_name and (not finds_defocus or self.simulator == DEFAULT_SIMULATOR)
-        if kept and key in _LOADED:
-            return _LOADED[key]
+        known = _LOADED.get(key) if kept else None
+        if known is not None:
+            return list(known)
         networks = None if self.simulator is None else SceneNetworks(self.simulator)
         resize: Resize = Scene.resized
         if networks is not None and finds_defocus:
@@ -146,7 +148,7 @@ class EnvOptions:
             raise ValueError(f"`scenes` (={self.scenes!r}) has none in split {self.split!r}")
         scenes = [self._prepared(scene, networks) for scene in scenes]
         if kept and self.scenes.startswith("bundled"):
-            _LOADED[key] = scenes
+            _LOADED.put(key, list(scenes), sum(scene.light.nbytes for scene in scenes))
         return scenes
 
     def _prepared(self, scene: Scene, networks: SceneNetworks | None) -> Scene:
@@ -157,7 +159,8 @@ class EnvOptions:
         return scene if self.noise else without_noise(scene)
 
 
-_LOADED: dict[tuple[Any, ...], list[Scene]] = {}
+#: Bundled scenes by what they were made for; at most so many bytes of light.
+_LOADED: LruCache[list[Scene]] = LruCache(2**30)
 
 
 def _is_integer(value: Any) -> bool:

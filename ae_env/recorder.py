@@ -20,6 +20,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
 from ae_env.score_table import in_episode, scene_latent
 from simulator.blur_kernels import Blur, blur_many
+from simulator.blur_shapes import disc_kernel
 from simulator.cache import LruCache
 from simulator.camera import CameraProfile
 from simulator.capture import noise_balance
@@ -33,6 +34,8 @@ from simulator.threads import in_shares
 
 #: Memory for what is known of scenes, and what of it a scene and a plan take, about [byte].
 _LATENTS_BYTES, _LATENT_BYTES, _SHOT_BYTES = 2**28, 2**16, 2000
+#: Discs wider than this are cheaper in the Fourier domain than as a sum [pixel].
+_WIDE_PX = 40.0
 
 
 class Recorder:
@@ -66,6 +69,7 @@ class Recorder:
         self._buffers = Buffers((4, size, size))
         # At rest, by scene: its latent and its plans.
         self._latents: LruCache[tuple[Latent, Shots]] = LruCache(_LATENTS_BYTES)
+        # Whose light is in `_lights`; None until that is made.
         self._shots: list[Shot | None] = [None] * num_envs
         self._lights: list[torch.Tensor] = [torch.empty(0)] * num_envs
         self._remaining: list[torch.Tensor | None] = [None] * num_envs
@@ -99,13 +103,14 @@ class Recorder:
         shot = known[1]
         if shot is self._shots[index]:
             return False
-        self._shots[index] = shot
+        self._shots[index] = None
         self._tables[index] = shot.table
         self._modules[index] = shot.modules
         if shot.light is None:
             return True
         self._lights[index], self._remaining[index] = shot.light, None
         self._excess[index] = shot.excess_noise
+        self._shots[index] = shot
         return False
 
     def blur(self, planned: Sequence[tuple[int, Episode]]) -> None:
@@ -114,25 +119,27 @@ class Recorder:
         Args:
             planned: Places of the episodes, and they.
         """
-        opened = [p for p in planned if self._exposure(p[0]).opened_to is not None]
-        _in_shares(self._open, opened)
-        blurs = [self._begin_blur(*pair) for pair in planned]
-        blur_many([blur for blur in blurs if blur is not None], limit=LATENT_LIMIT)
-        _in_shares(self._balance, opened)
-
-    def _exposure(self, index: int) -> Exposure:
-        shot = self._shots[index]
-        assert shot is not None
-        return shot.exposure
+        try:
+            opened = [p for p in planned if _planned(p[1]).exposure.opened_to is not None]
+            _in_shares(self._open, opened)
+            begun = [self._begin_blur(*pair) for pair in planned]
+            blurs = [blur for blur in begun if blur is not None]
+            blur_many(_without_wide_discs(blurs), limit=LATENT_LIMIT)
+            _in_shares(self._balance, opened)
+        except BaseException:  # what the episodes keep is not all made
+            for index, episode in planned:
+                self.end(index, episode)
+            raise
+        for index, episode in planned:
+            self._shots[index] = _planned(episode)
 
     def _open(self, index: int, episode: Episode) -> None:
         """Opens the aperture, which keeps its result."""
         assert episode.latent is not None
-        episode.latent.source_light(self._exposure(index))
+        episode.latent.source_light(_planned(episode).exposure)
 
     def _begin_blur(self, index: int, episode: Episode) -> Blur | None:
-        shot = self._shots[index]
-        assert shot is not None
+        shot = _planned(episode)
         self._lights[index], blur = episode.blurred_light(shot.exposure, self._buffers, self.keep)
         remaining = shot.exposure.remaining
         if remaining is not None:
@@ -144,16 +151,16 @@ class Recorder:
 
     def _balance(self, index: int, episode: Episode) -> None:
         """The noise that the source brings where pixels must tell."""
-        shot = self._shots[index]
-        assert shot is not None
+        shot = _planned(episode)
         if shot.excess_noise is None:
             balance = noise_balance(self._lights[index], shot.exposure)
             self._excess[index] = balance.relative_excess
         if not self.keep:  # an opening keeps the light of each f-number
             episode.latent = None
 
-    def end(self, episode: Episode) -> None:
-        """Lets the memory that an episode used be used again."""
+    def end(self, index: int, episode: Episode) -> None:
+        """Lets the memory that `episode`, at place `index`, used be used again."""
+        self._shots[index] = None
         episode.end(self._buffers)
 
     def _begin(self, episode: Episode) -> None:
@@ -165,13 +172,12 @@ class Recorder:
             if latent.opening is None:  # that keeps too much light to stay longer than an episode
                 size = _LATENT_BYTES + _SHOT_BYTES * len(self.grid)
                 self._latents.put(episode.scene, known, size)
-        episode.latent, shots = known
+        latent, shots = known
         if episode.speed or episode.defocus:
-            episode.latent = in_episode(
-                episode.latent, speed=episode.speed, defocus=episode.defocus
-            )
-        elif episode.latent.opening is None and self.shares:
+            latent = in_episode(latent, speed=episode.speed, defocus=episode.defocus)
+        elif latent.opening is None and self.shares:
             episode.shots = shots
+        episode.latent = latent
 
     def _shot(self, episode: Episode, gain: float) -> Shot:
         latent = episode.latent
@@ -251,6 +257,39 @@ class Recorder:
 
         in_shares(draw, len(episodes))
         return normals.numpy()
+
+
+def _planned(episode: Episode) -> Shot:
+    return episode.shots[episode.state][1]
+
+
+def _without_wide_discs(blurs: list[Blur]) -> list[Blur]:
+    """What is left of `blurs` once the discs that are wide are done."""
+    wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
+    if not wide:
+        return blurs
+
+    def run(first: int, last: int) -> None:
+        for blur in wide[first:last]:
+            _wide_disc(blur)
+
+    in_shares(run, len(wide))
+    left = [b for b in blurs if b.defocused is None or b.diameter_px <= _WIDE_PX]
+    moved = [b for b in wide if b.moved is not None]
+    return left + [Blur(b.defocused, extent_px=b.extent_px, moved=b.moved) for b in moved]  # type: ignore[arg-type]
+
+
+def _wide_disc(blur: Blur) -> None:
+    """`simulator.blur.disc_blur` by numpy, whose transforms are safe in a forked process."""
+    assert blur.defocused is not None
+    weights = disc_kernel(blur.diameter_px)
+    radius = len(weights) // 2
+    light = np.clip(blur.light.numpy(), -LATENT_LIMIT, LATENT_LIMIT).astype(np.float64)
+    padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
+    size = padded.shape[-2:]
+    spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
+    blurred = np.fft.irfft2(spectrum, s=size)
+    blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
 
 
 def _in_shares(

@@ -23,6 +23,7 @@ from simulator.camera import CameraProfile
 from simulator.capture import clip_and_quantise
 from simulator.latent import Latent
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
 
 #: Bumped when the way that scores are computed changes.
 TABLE_VERSION = 3
@@ -151,6 +152,7 @@ class ScoreTables:
         scorer: What rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
+        tolerance: How far the captures that are scored may be off, see `Latent.tolerance`.
         use_cache: Whether to keep the per-scene parts on disk; in memory they are in any case.
     """
 
@@ -162,12 +164,15 @@ class ScoreTables:
         *,
         noise_seeds: int = 2,
         noise: bool = True,
+        tolerance: float = DEFAULT_TOLERANCE,
         use_cache: bool = True,
     ) -> None:
         if noise_seeds < 1:
             raise ValueError(f"`noise_seeds` (={noise_seeds}) must be at least 1")
         self.grid, self.camera, self.scorer = grid, camera, scorer
         self.noise, self.noise_seeds = noise, noise_seeds if noise else 1
+        check_tolerance(tolerance)
+        self.tolerance = tolerance
         fingerprint = scorer_fingerprint(scorer) if use_cache else None
         self._fingerprint = fingerprint
         self._disk = DiskCache()
@@ -290,6 +295,7 @@ class ScoreTables:
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
         latent = scene_latent(scene, self.camera, speed=speed, defocus=defocus, gain=gain)
+        latent = replace(latent, tolerance=self.tolerance)
         names = self.scorer.names("image")
         samples = {name: np.zeros((self.noise_seeds, len(self.grid))) for name in names}
         start = 0

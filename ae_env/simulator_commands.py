@@ -80,6 +80,7 @@ def simulate(
     from simulator.latent import check_noise
 
     check_noise(noise)
+    check_tolerance(tolerance)
     settings = CameraSettings(iso, parse_seconds(shutter), aperture)
     if out.suffix.lower() != ".dng":
         raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
@@ -87,7 +88,6 @@ def simulate(
     source = read_raw(raw)
     if png is not None and png.suffix.lower() != ".png":
         raise ValueError(f"`png` (={str(png)!r}) must end in .png")
-    check_tolerance(tolerance)
     for path in (out, png or out):
         make_folder(path.parent)
     simulator = _simulator(weights, device, cache)
@@ -110,7 +110,9 @@ def sweep(
     seed: Seed = 0,
     weights: Weights = "compact",
     depth: Depth = "far",
-    tolerance: Tolerance = DEFAULT_TOLERANCE,
+    tolerance: Annotated[
+        float, typer.Option(help="Of the DNGs: error to accept for speed, see simulate.")
+    ] = DEFAULT_TOLERANCE,
     device: Device = "auto",
     cache: Cache = True,
 ) -> None:

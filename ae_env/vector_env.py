@@ -69,7 +69,7 @@ class AutoExposureVectorEnv(
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._done = np.zeros(num_envs, dtype=bool)
-        self._shown: Observation | None = None
+        self._shown: Observation | None = None  # a copy, where autoreset is off
         self._last: Frames | None = None
 
     @property
@@ -118,6 +118,8 @@ class AutoExposureVectorEnv(
         mask = self._reset_mask(options.pop("reset_mask", None))
         per_env = self._split_options(options)
         indices = np.flatnonzero(mask).tolist()
+        if any(self.core.episodes[i] is None for i in np.flatnonzero(~mask)):
+            raise gym.error.ResetNeeded("the first reset() must be of all environments")
         for i in indices:
             if seeds[i] is not None or self._rngs[i] is None:
                 self._rngs[i], _ = seeding.np_random(seeds[i])
@@ -146,6 +148,8 @@ class AutoExposureVectorEnv(
         running = [i for i in everyone if i not in set(resetting)]
         previous = {i: self.core.episode(i).state for i in running}
         chosen = actions.tolist()
+        for i in running:  # before any of them acts
+            self.core.check_action(chosen[i])
         for i in running:
             self.core.act(i, chosen[i])
         self._steps[running] += 1
@@ -171,7 +175,7 @@ class AutoExposureVectorEnv(
         else:
             self._done = truncated.copy()
             self._remember(frames)
-        self._shown = observation
+        self._keep(observation)
         return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
@@ -187,11 +191,14 @@ class AutoExposureVectorEnv(
     # -- helpers ------------------------------------------------------------------------------
 
     def _begin(self, indices: list[int], options: list[dict[str, Any]]) -> None:
+        drawn = []
         for i in indices:
             rng = self._rngs[i]
             if rng is None:
                 raise gym.error.ResetNeeded("call reset() before step()")
-            self.core.start(i, rng, options[i])
+            drawn.append(self.core.drawn(rng, options[i]))
+        for i, episode in zip(indices, drawn, strict=True):
+            self.core.begin(i, episode)
         self._steps[indices] = 0
         self._done[indices] = False
 
@@ -250,16 +257,18 @@ class AutoExposureVectorEnv(
         self._last = frames
 
     def _place(self, observation: Observation, indices: list[int]) -> Observation:
-        if len(indices) == self.num_envs:
-            self._shown = observation
-            return observation
-        if self._shown is None:
-            raise gym.error.ResetNeeded("the first reset() must be of all environments")
-        shown = {name: values.copy() for name, values in self._shown.items()}
-        for name, values in observation.items():
-            shown[name][indices] = values
-        self._shown = shown
-        return shown
+        """`observation` of `indices` among what the others show; it is theirs to change."""
+        if len(indices) < self.num_envs:
+            shown = self._shown
+            if shown is None:  # the same frames again
+                shown = self.core.observe(list(range(self.num_envs))).observation
+            observation = _overwrite(shown, observation, indices)
+        self._keep(observation)
+        return observation
+
+    def _keep(self, observation: Observation) -> None:
+        if self.autoreset_mode == AutoresetMode.DISABLED:
+            self._shown = {name: values.copy() for name, values in observation.items()}
 
     def _vector_info(self, columns: dict[str, Any], indices: list[int]) -> dict[str, Any]:
         if len(indices) < self.num_envs:

@@ -267,7 +267,7 @@ def streak(
         threads: At most so many; those of torch by default.
     """
     n, end = streak_share(extent_px)
-    if not end:
+    if not n and not end:
         return _unchanged(light, out)
     out = torch.empty(light.shape) if out is None else out
     rows, result = _rows(light), _rows(out)

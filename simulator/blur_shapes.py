@@ -25,7 +25,7 @@ def _second_moment(weights: np.ndarray) -> float:
     return float((weights * offsets**2).sum())
 
 
-@functools.lru_cache(maxsize=4096)
+@functools.lru_cache(maxsize=64)
 def motion_kernel(extent_px: float) -> np.ndarray:
     """Weights (K,), K odd, of a uniform streak of `extent_px` pixels.
 
@@ -36,7 +36,7 @@ def motion_kernel(extent_px: float) -> np.ndarray:
     [0.167, 0.667, 0.167]
     """
     n, end = streak_share(extent_px)
-    if not end:
+    if not n and not end:
         return np.ones(1)
     weights = np.ones(2 * n + 3)
     weights[0] = weights[-1] = end
@@ -91,7 +91,7 @@ def disc_radius(diameter_px: float) -> float:
     return radii[i - 1] + share * (radii[i] - radii[i - 1])
 
 
-@functools.lru_cache(maxsize=4096)
+@functools.lru_cache(maxsize=64)
 def disc_kernel(diameter_px: float) -> np.ndarray:
     """Weights (K, K), K odd, of a uniform disc of `diameter_px` pixels.
 

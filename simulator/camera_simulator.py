@@ -131,7 +131,9 @@ class CameraSimulator:
         depth: Depth = "far",
         tolerance: float | Literal["source"] = "source",
     ) -> Latent:
-        """Everything that does not depend on the target settings, done once.
+        """Everything that does not depend on the target settings, done once, when first needed.
+
+        The source's data must not be changed afterwards.
 
         Args:
             source: A raw, a latent, or a scene.
@@ -165,12 +167,13 @@ class CameraSimulator:
         if isinstance(source, RawImage) and not self.exposure.is_identity:
             noise = latent.nlf.exposed(float(self.exposure.w))
             latent = replace(latent, light=self.exposure(latent.light, 1.0), nlf=noise)
-        if self.noise is not None and latent.denoised is None and not latent.nlf.is_zero:
-            denoise = partial(
-                self._kept, "denoised", self.noise, latent, partial(self.denoise, latent)
-            )
-            latent = replace(latent, denoised=Denoised(denoise))
-        if depth == "unknown":
+        whole = latent.tolerance == 0.0  # what was found with another one may leave parts out
+        known, opening = latent.denoised, latent.opening
+        if self.noise is not None and not latent.nlf.is_zero and _lacks(known, whole):
+            every = whole or self.noise.preset == "paper"
+            light = partial(self._kept_light, replace(latent, denoised=None))
+            latent = replace(latent, denoised=Denoised(light, everywhere=every))
+        if depth == "unknown" or (opening is not None and self.aperture and _lacks(opening, whole)):
             latent = replace(latent, opening=self._opening(latent))
         return latent
 
@@ -244,19 +247,25 @@ class CameraSimulator:
         if self.aperture.preset == "paper":
             opened = partial(self._results.called, "opened", self.aperture)
             return NetworkOpening(denoised, opened, f_number)
+        find, every = partial(self._kept_map, latent), latent.tolerance == 0.0
+        return MapOpening(latent.light, denoised, find, f_number, everywhere=every)
+
+    def _kept_light(self, latent: Latent) -> torch.Tensor:
+        return self._kept("denoised", self.noise, latent, partial(self.denoise, latent))
+
+    def _kept_map(self, latent: Latent) -> torch.Tensor:
         estimate = partial(self.estimate_defocus, latent)
-        find = partial(self._kept, "defocus_maps", self.aperture, latent, estimate)
-        return MapOpening(latent.light, denoised, find, f_number)
+        return self._kept("defocus_maps", self.aperture, latent, estimate)
 
     def _kept(
-        self, kind: str, module: nn.Module, latent: Latent, make: Callable[[], torch.Tensor]
+        self, kind: str, module: nn.Module | None, latent: Latent, make: Callable[[], torch.Tensor]
     ) -> torch.Tensor:
         """What `make` finds out about the latent, or found when everything was the same."""
         denoised = None if latent.denoised is None else latent.denoised.light
         inputs = {"light": latent.light, "denoised": denoised, "saturated": latent.saturated}
         nlf = [latent.nlf.shot, latent.nlf.read]
         return self._results.result(
-            *(kind, [module], inputs, make),
+            *(kind, [] if module is None else [module], inputs, make),
             nlf=nlf,
             precision=self.precision,
             everywhere=latent.tolerance == 0,
@@ -361,7 +370,8 @@ class CameraSimulator:
             scene = {"depth": "far", **scene}
             data, excess_noise = self.stages(source, settings, seed=seed, **scene).capture, 0.0
             latent = self._latent(source)
-            output_noise = replace(latent, nlf=latent.nlf.zero()).output_noise(settings)
+            clean = replace(latent, nlf=latent.nlf.zero(), denoised=None, opening=None)
+            output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
             latent = self.prepare(
                 source, tolerance=0.0 if tolerance is None else tolerance, **scene
@@ -385,6 +395,11 @@ class CameraSimulator:
             box_factor=latent.box_factor,
             metadata=metadata,
         )
+
+
+def _lacks(known: Denoised | Opening | None, whole: bool) -> bool:
+    """Whether there is none, or one that leaves out parts of the frame where it must not."""
+    return known is None or (whole and not known.everywhere)
 
 
 def _check_depth(depth: str) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
@@ -95,7 +94,7 @@ def record(
     light: torch.Tensor,
     exposure: Exposure,
     camera: CameraProfile,
-    noise: torch.Generator | int,
+    noise: torch.Generator | int | None,
     *,
     out: torch.Tensor,
     threads: int | None = None,
@@ -108,11 +107,14 @@ def record(
         light: (4, H, W) with the blur of `exposure`, at the exposure of the latent.
         exposure: What happens to it.
         camera: The body.
-        noise: What draws it, or its key in the bank (`simulator.noise_bank.noise_keys`).
+        noise: What draws it, or its key in the bank (`simulator.noise_bank.noise_keys`); None for
+            none.
         out: (4, H, W) float32, contiguous, that the frame in [-pedestal, 1] is written to.
         threads: Of the kernel, at most; those of torch by default.
     """
     normals = None
+    if not lacks_noise(exposure):  # nothing to draw
+        noise = None
     if isinstance(noise, torch.Generator):
         # A sample's normal is read before the sample is written: on the CPU they share memory.
         place = out if out.device.type == "cpu" else torch.empty(light.shape)
@@ -121,14 +123,24 @@ def record(
     if light.device.type == "cpu":
         from simulator.kernels import record_capture  # numba: only where there is a capture
 
-        key = None if isinstance(noise, torch.Generator) else noise
+        key = noise if isinstance(noise, int) else None
         record_capture(light, exposure, camera, key=key, normals=normals, out=out, threads=threads)
         return
-    if normals is None:
-        normals = torch.from_numpy(frame_noise(cast(int, noise), tuple(light.shape)))  # type: ignore[arg-type]
+    if isinstance(noise, int):
+        normals = torch.from_numpy(frame_noise(noise, tuple(light.shape)))  # type: ignore[arg-type]
     signal = exposed_light(light, exposure)
+    if normals is None:
+        out.copy_(clip_and_quantise(signal, camera))
+        return
     noisy, _ = top_up(signal[None], [exposure], normals[None].to(light.device))
     out.copy_(clip_and_quantise(noisy[0], camera))
+
+
+def lacks_noise(exposure: Exposure) -> bool:
+    """Whether some signal could have less noise than the target; where not, none is drawn."""
+    source, target = exposure.source_noise, exposure.target
+    pairs = zip((*target.shot, *target.read), (*source.shot, *source.read), strict=True)
+    return exposure.remaining is not None or any(wanted > given for wanted, given in pairs)
 
 
 def record_batch(

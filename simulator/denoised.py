@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from functools import cached_property
 
@@ -19,22 +20,27 @@ class Denoised:
 
     Args:
         light: (4, H, W) float32, or what works it out.
+        everywhere: Whether it is so also where a positive tolerance needs no network.
     """
 
-    def __init__(self, light: torch.Tensor | Callable[[], torch.Tensor]) -> None:
+    def __init__(
+        self, light: torch.Tensor | Callable[[], torch.Tensor], *, everywhere: bool = True
+    ) -> None:
         if isinstance(light, torch.Tensor):
             light = check_packed("denoised", light)
-        self._light = light
+        self._light, self.everywhere = light, everywhere
+        self._lock = threading.RLock()
 
-    def __reduce__(self) -> tuple[type[Denoised], tuple[torch.Tensor]]:
-        return Denoised, (self.light,)
+    def __reduce__(self) -> tuple[Callable[..., Denoised], tuple[torch.Tensor, bool]]:
+        return _restored, (self.light, self.everywhere)
 
     @property
     def light(self) -> torch.Tensor:
         """(4, H, W) at the exposure of the source."""
-        if not isinstance(self._light, torch.Tensor):
-            self._light = self._light()
-        return self._light
+        with self._lock:
+            if not isinstance(self._light, torch.Tensor):
+                self._light = self._light()
+            return self._light
 
     @property
     def shape(self) -> torch.Size | None:
@@ -47,8 +53,12 @@ class Denoised:
         return LightStatistics(self.light)
 
     def to(self, device: torch.device) -> Denoised:
-        """The same on `device`; itself where it is there already, or nothing ran yet."""
+        """The same on `device`; itself where it is there already."""
         light = self._light
-        if isinstance(light, torch.Tensor):
-            return self if light.device == device else Denoised(light.to(device))
-        return self
+        if isinstance(light, torch.Tensor) and light.device == device:
+            return self
+        return Denoised(lambda: self.light.to(device), everywhere=self.everywhere)
+
+
+def _restored(light: torch.Tensor, everywhere: bool) -> Denoised:
+    return Denoised(light, everywhere=everywhere)

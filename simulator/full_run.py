@@ -64,6 +64,8 @@ class FullRun:
                 source's leaves its blur.
             seed: Seed of the output's noise.
         """
+        key = (settings.iso, settings.exposure_time, settings.f_number)
+        generator = noise_generator(seed, *key)  # a bad seed is told before any work
         bare = replace(latent, denoised=None, opening=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = self.exposure(latent.light[None], exposure.ratio)
@@ -84,6 +86,5 @@ class FullRun:
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
         light = sensor_light(opened[0], at_target)
         capture = torch.empty_like(light)
-        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
         record(light, at_target, latent.camera, generator, out=capture)
         return Stages(exposed[0], denoised[0], opened[0], light, capture)

@@ -6,8 +6,11 @@ written (``NUMBA_CACHE_DIR`` names another); where neither can, each process com
 
 from __future__ import annotations
 
+import functools
 import logging
+import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -27,12 +30,42 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
         try:
-            return numba.njit(cache=True, **given)(function)
+            dispatcher = numba.njit(cache=True, **given)(function)
         except RuntimeError as error:
             logger.info("%s; it is compiled anew in each process", error)
             return numba.njit(**given)(function)
+        _harden(dispatcher._cache)
+        return dispatcher
 
     return compiled
+
+
+def _harden(cache: Any) -> None:
+    """Makes numba's cache of one kernel count for all kernels' code, and a full disk no error.
+
+    Numba looks at the file of the kernel alone, which calls and names what stands in others.
+    """
+    index, save = cache._cache_file, cache.save_overload
+    index._source_stamp = (index._source_stamp, _sources())
+
+    def save_if_possible(*arguments: Any) -> None:
+        try:
+            save(*arguments)
+        except OSError as error:
+            logger.info("%s; it is compiled anew in each process", error)
+
+    cache.save_overload = save_if_possible
+
+
+@functools.cache
+def _sources() -> int:
+    """Checksum of every module that kernels stand in or take constants from."""
+    folder = Path(__file__).parent
+    files = [folder / f"{name}.py" for name in ("coverage", "kernels", "noise_bank", "pointers")]
+    files += folder.glob("*_kernels.py")
+    return functools.reduce(
+        lambda value, path: zlib.crc32(path.read_bytes(), value), sorted(files), 0
+    )
 
 
 class _Announcer(event.Listener):  # type: ignore[misc]

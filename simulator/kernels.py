@@ -264,7 +264,8 @@ def record_frames(
         (B, 2) int64: samples of each frame that are clipped low, and high.
     """
     count = len(light)
-    bound = np.minimum(SIGNAL_LIMIT / exposure[:, 0, 0].astype(np.float64), _LARGEST)
+    with np.errstate(divide="ignore"):  # no light at all: any bound will do
+        bound = np.minimum(SIGNAL_LIMIT / exposure[:, 0, 0].astype(np.float64), _LARGEST)
     blocks = -(-samples // BLOCK)
     pieces = -(-blocks // _UNIT_BLOCKS)
     counts = np.empty((count * 4 * pieces, 2), np.int64)

@@ -101,7 +101,7 @@ class Latent:
                 f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
                 f"{tuple(self.light.shape)}"
             )
-        for name in ("image_speed", "defocus"):
+        for name in ("image_speed", "defocus", "gain"):
             value = getattr(self, name)
             if not 0.0 <= value < float("inf"):
                 raise ValueError(f"`{name}` (={value!r}) must be finite and >= 0")
@@ -270,7 +270,11 @@ class Latent:
             seed: See `capture`.
             noise: See `capture`.
         """
+        check_noise(noise)
         states = list(states)
+        if not states:
+            return self.light.new_empty((0, *self.light.shape))
+        _noise_of(noise, seed, states[0])  # a bad seed is told before any work
         exposures = [self.exposure(settings) for settings in states]
         frames = new_frame(self.light.expand(len(states), *self.light.shape))
         groups: dict[tuple[object, ...], list[int]] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,8 @@ SAMPLES = 65_536
 _SORTED = 4096
 #: Pixels from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
+#: Answers of a kind that are kept.
+_KEPT = 256
 _FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
 
 
@@ -57,9 +60,9 @@ class LightStatistics:
 
     def __init__(self, light: torch.Tensor) -> None:
         self.light = light
-        # Kept per object: a cache on the method would keep every light alive.
-        self.curvature = functools.lru_cache(maxsize=1024)(self._curvature)
-        self.excess = functools.lru_cache(maxsize=1024)(self._excess)
+        # Plain dictionaries: a cache around a method would be a circle that keeps the light alive.
+        self._curvatures: dict[tuple[Any, ...], tuple[float, float]] = {}
+        self._excesses: dict[tuple[Any, ...], float] = {}
 
     def __reduce__(self) -> tuple[type[LightStatistics], tuple[torch.Tensor]]:
         return LightStatistics, (self.light,)
@@ -70,9 +73,7 @@ class LightStatistics:
         light, rows = self._rows
         return np.maximum(np.median(light[:, rows].reshape(4, -1), axis=1), 0.0)
 
-    def _excess(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
-    ) -> float:
+    def excess(self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction) -> float:
         """Error of a source's noise that is left where it exceeds the target's, rather too high.
 
         Args:
@@ -82,6 +83,15 @@ class LightStatistics:
         """
         if source.is_zero:
             return 0.0
+        key = (ratio, source, target)
+        if key not in self._excesses:
+            _make_room(self._excesses)
+            self._excesses[key] = self._excess(ratio, source, target)
+        return self._excesses[key]
+
+    def _excess(
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+    ) -> float:
         wanted = _variance(self._bins.edges * ratio, target)
         given = _variance(self._bins.edges, source) * (ratio * ratio)
         relative = np.sqrt(given / np.maximum(wanted, _FLOOR)) - 1.0
@@ -109,9 +119,16 @@ class LightStatistics:
         disc, row = self.curvature(ratio, target)
         return disc * disc_px * disc_px + row * motion_px * motion_px
 
-    def _curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
+    def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """`blur_error` of a disc of one pixel and of a streak of one pixel; others go with the
         square of their extent."""
+        key = (ratio, target)
+        if key not in self._curvatures:
+            _make_room(self._curvatures)
+            self._curvatures[key] = self._curvature(ratio, target)
+        return self._curvatures[key]
+
+    def _curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
         wanted = np.maximum(_variance(bins.edges[0] * ratio, target), _FLOOR)
@@ -185,6 +202,12 @@ class LightStatistics:
             disc=sums[2] / counts,
             row=sums[3] / counts,
         )
+
+
+def _make_room(kept: dict[Any, Any]) -> None:
+    """Lets go of what is kept where it has become much: changing light asks for ever more."""
+    if len(kept) >= _KEPT:
+        kept.clear()
 
 
 def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:

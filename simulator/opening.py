@@ -29,6 +29,9 @@ class Opening(Protocol):
     needs_denoised: bool
     """Whether it works on the noise-reduced light only."""
 
+    everywhere: bool
+    """Whether it opens also where a positive tolerance needs no network."""
+
     def extent(self, f_number: float) -> float:
         """Largest diameter of the blur that opening to `f_number` adds [pixel]."""
 
@@ -55,6 +58,7 @@ class MapOpening:
         diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or what estimates it,
             called when an aperture first opens.
         f_number: Effective f-number of the light.
+        everywhere: See `Opening`.
     """
 
     needs_denoised = False
@@ -65,8 +69,10 @@ class MapOpening:
         denoised: Denoised,
         diameter: Tensor | Callable[[], Tensor],
         f_number: float,
+        *,
+        everywhere: bool = True,
     ) -> None:
-        self.f_number, self._diameter = f_number, diameter
+        self.f_number, self._diameter, self.everywhere = f_number, diameter, everywhere
         self._recorded, self._denoised = light, denoised
         self._banks: dict[tuple[Tile, bool], DiscBank] = {}
         self._kept: LruCache[Tensor] = LruCache(KEPT_BYTES)
@@ -139,6 +145,7 @@ class NetworkOpening:
     """
 
     needs_denoised = True
+    everywhere = True
 
     def __init__(
         self,
@@ -147,7 +154,7 @@ class NetworkOpening:
         f_number: float,
     ) -> None:
         self.f_number, self._denoised, self._module = f_number, denoised, module
-        self._kept: dict[float, Tensor] = {}
+        self._kept: LruCache[Tensor] = LruCache(KEPT_BYTES)
 
     def extent(self, f_number: float) -> float:
         """Unknown before the network ran: taken as large wherever the aperture opens."""
@@ -156,11 +163,13 @@ class NetworkOpening:
     @torch.no_grad()
     def opened(self, f_number: float, *, denoised: bool = True) -> Tensor:
         """See `Opening`."""
-        if f_number not in self._kept:
+        result = self._kept.get(f_number)
+        if result is None:
             image = self._denoised.light[None]
             f_numbers = (torch.tensor([n], device=image.device) for n in (self.f_number, f_number))
-            self._kept[f_number] = self._module(image, torch.zeros_like(image), *f_numbers)[0]
-        return self._kept[f_number]
+            result = self._module(image, torch.zeros_like(image), *f_numbers)[0]
+            self._kept.put(f_number, result, result.nbytes)
+        return result
 
     def remaining(self, f_number: float) -> None:
         """The recorded noise is gone: there is nothing to account for."""

@@ -154,7 +154,9 @@ def make_plan(latent: Latent, settings: CameraSettings, *, noise: bool = True) -
         noise: Whether a capture is wanted, or the light on the sensor without noise.
     """
     exposure = latent.exposure(settings, noise=noise)
-    balance = noise_balance(latent.source_light(exposure), exposure)
+    # A clean source lacks all of the noise: its light need not be made to see that.
+    light = latent.light if exposure.source.is_zero else latent.source_light(exposure)
+    balance = noise_balance(light, exposure)
     pixels = latent.light.numel()
     steps = (
         PlannedStep("exposure", True, "", 0.0, _EXPOSE_OPERATIONS * pixels),
@@ -183,7 +185,7 @@ def make_plan(latent: Latent, settings: CameraSettings, *, noise: bool = True) -
 def _difference(latent: Latent, exposure: Exposure, steps: tuple[PlannedStep, ...]) -> float:
     """See `SimulationPlan.predicted_difference`."""
     ratio, target = exposure.ratio, exposure.target
-    found = latent.statistics_of(exposure.denoised)
+    found = latent.statistics  # of the light as recorded: a plan need not run the network
     errors = {step.name: step.error for step in steps}
     excess = errors.pop("noise_reduction")
     level = found.relative_level(ratio, target)

@@ -19,6 +19,8 @@ def latent_of(source: RawImage | Latent | HasLatent, device: torch.device) -> La
     if isinstance(source, RawImage):
         return _recorded(source, device)
     if isinstance(source, Latent):
+        if source.light.device == device:
+            return source
         given = {name: getattr(source, name) for name in ("light", "denoised", "saturated")}
         moved = {name: part.to(device) for name, part in given.items() if part is not None}
         return replace(source, **moved)

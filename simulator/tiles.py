@@ -153,6 +153,8 @@ def varying(image: Tensor, margin: int = 0) -> Tensor:
     high = F.max_pool2d(image, _CELL, ceil_mode=True)
     low = -F.max_pool2d(-image, _CELL, ceil_mode=True)
     cells = (high > low).any(dim=0, keepdim=True).float()
+    if height % _CELL == width % _CELL == 1:  # a single pixel, which tells nothing
+        cells[..., -1, -1] = 1.0
     reach = margin // _CELL
     cells = F.max_pool2d(cells, 2 * reach + 1, stride=1, padding=reach)[0].bool()
     cells = cells.repeat_interleave(_CELL, 0).repeat_interleave(_CELL, 1)

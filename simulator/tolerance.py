@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
 
 #: By default the distribution of a pixel may move by a tenth of its noise's standard deviation.
 DEFAULT_TOLERANCE = 0.1
@@ -16,7 +17,7 @@ def check_tolerance(tolerance: float) -> float:
     """
     if (
         isinstance(tolerance, bool)
-        or not isinstance(tolerance, int | float)
+        or not isinstance(tolerance, Real)
         or not (math.isfinite(tolerance) and tolerance >= 0)
     ):
         raise ValueError(f"`tolerance` (={tolerance!r}) must be a finite number >= 0")

@@ -66,9 +66,13 @@ class SceneNetworks:
         """The scene with `Scene.denoised`; a noise-free one as it is."""
         if scene.noise_free or scene.denoised is not None:
             return scene
+
+        def make() -> torch.Tensor:  # leaving nothing out: it serves every tolerance
+            return self._simulator.denoise(replace(scene.latent, tolerance=0.0))
+
         return replace(
             scene,
-            denoised=self._kept("denoised", scene, lambda: self._simulator.denoise(scene.latent)),
+            denoised=self._kept("denoised", scene, make, everywhere=True),
         )
 
     def resized(self, scene: Scene, resolution: int | None, crop: Crop = "box") -> Scene:

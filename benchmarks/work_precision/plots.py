@@ -135,7 +135,7 @@ def _scatter(axes: Any, rows: Sequence[Row], field: str, *, names: bool) -> None
         handles, labels = axes.get_legend_handles_labels()
         kept = [(h, text) for h, text in zip(handles, labels, strict=True) if " " in text]
         kept = [(h, text) for h, text in kept if text not in _COLOURS]
-        axes.legend(*zip(*kept, strict=True), frameon=False, fontsize=10, loc=(0.68, 0.3))
+        axes.legend(*zip(*kept, strict=True), frameon=False, fontsize=10, loc=(0.3, 0.1))
 
 
 def _focus(axes: Any, rows: Sequence[Row], field: str) -> None:

@@ -67,7 +67,7 @@ def verdicts(rows: Sequence[Row]) -> list[str]:
 
 def _sweep_verdicts(rows: Sequence[Row]) -> list[str]:
     lines = []
-    for name in ("compact 0", "compact 0.1"):
+    for name in ("compact 0", "compact 0, bank", "compact 0.1", "compact 0.1, bank"):
         for row in _ratio_rows([r for r in rows if r["part"] == "sweep"]):
             if row["method"] != name:
                 continue
@@ -140,9 +140,7 @@ def _precision_section(rows: Sequence[Row]) -> list[str]:
         "Methods take turns, in another order every round; ± is half the distance between "
         "quartiles.",
         "",
-        "PSNR and relative RMSE are of the expected value, before noise is added. Where the target "
-        "is noisier than the source, a tolerance above 0 leaves the source's noise in and only "
-        "adds what is missing: right for a capture, a loss by this measure. *Noise*: mean absolute "
+        "PSNR and relative RMSE are of the expected value, without noise. *Noise*: mean absolute "
         "deviation of the captures' variance from the noise level function, over 8 levels of "
         "signal. *Capture*: distance of the captures' distribution from the reference camera's, "
         "mean and spread together, in units of the target's noise. Of both the median over scenes "

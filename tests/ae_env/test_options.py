@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -73,11 +74,26 @@ def test_defaults_are_the_documented_ones() -> None:
 def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
     options = {"scenes": "bundled:small", "resolution": 36}
     train = EnvOptions(**options).load_scenes()
-    assert EnvOptions(**options).load_scenes() is train
+    again = EnvOptions(**options).load_scenes()
+    assert all(a is b for a, b in zip(again, train, strict=True))
+    again.clear()  # a list of one's own
+    assert len(EnvOptions(**options).load_scenes()) == len(train)
     test = EnvOptions(split="test", **options).load_scenes()
     assert {s.group for s in train}.isdisjoint({s.group for s in test})
     both = EnvOptions(split="all", **options).load_scenes()
     assert [s.scene_id for s in both] == [s.scene_id for s in train + test]
+
+
+def test_cameras_of_one_name_have_scenes_of_their_own() -> None:
+    camera = get_camera("nikon_z6")
+    assert camera.colour_matrix is not None
+    mixed = tuple(tuple(0.9 * v for v in row) for row in camera.colour_matrix[::-1])
+    other = replace(camera, colour_matrix=mixed)
+    first, second = (
+        EnvOptions(scenes="bundled:small", resolution=36, camera=c).load_scenes()[0]
+        for c in (camera, other)
+    )
+    assert (first.camera, second.camera) == (camera, other)
 
 
 def test_scenes_of_ones_own_and_another_camera() -> None:

@@ -13,9 +13,12 @@ import pytest
 import torch
 
 import ae_env  # noqa: F401  (registers the environment)
+from ae_env import core as core_module
+from ae_env import recorder as recorder_module
 from ae_env.observation import encode_observation
 from ae_env.options import EnvOptions
 from ae_env.score_table import scene_latent
+from simulator import get_camera
 from simulator.capture import exposed_light
 from simulator.noise import noise_generator
 from simulator.noise_bank import frame_noise, noise_keys
@@ -177,6 +180,92 @@ def test_memory_of_ended_episodes_is_used_again() -> None:
     envs = _vector(4, autoreset_mode="SAME_STEP", motion=0.5, depth=2.0, tolerance=0.0)
     _frames(envs, steps=40)
     assert len(envs.core.recorder._buffers._free) <= 4 * 5
+
+
+def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
+    arguments = {"motion": 0.5, "depth": 2.0, "tolerance": 0.0, "autoreset_mode": "DISABLED"}
+    envs, plain = _vector(3, **arguments), _vector(3, **arguments)
+    for env in (envs, plain):
+        env.reset(seed=0, options={"state": 10})
+    before = list(envs.core.episodes)
+    for wrong in ({"state": [1, 2, 64]}, {"frame": [0, 0, -1]}, {"scene": [0, 0, "none"]}):
+        with pytest.raises(ValueError, match="options"):
+            envs.reset(options=wrong)
+        assert [a is b for a, b in zip(envs.core.episodes, before, strict=True)] == [True] * 3
+    assert not envs.core.recorder._buffers._free
+    for actions in (np.full(3, 10), np.full(3, 21)):
+        np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
+    envs.core.recorder.end(1, envs.core.episode(1))
+    assert envs.core.recorder._shots[1] is None
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize("stage", ["blur_many", "_modules"])
+def test_an_interrupted_frame_is_made_again(
+    monkeypatch: pytest.MonkeyPatch, error: type[BaseException], stage: str
+) -> None:
+    """While the light is blurred, or while the plan of a later episode is made."""
+    arguments = {"motion": 0.5, "depth": 2.0, "tolerance": 0.0}
+    envs, plain = _vector(3, **arguments), _vector(3, **arguments)
+    for env in (envs, plain):
+        env.reset(seed=0, options={"state": 10})
+    calls: list[Any] = []
+    original = getattr(recorder_module, stage)
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args)
+        if stage == "_modules" and len(calls) < 3:
+            return original(*args, **kwargs)
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder_module, stage, fail)
+        with pytest.raises(error):
+            envs.step(np.full(3, 27))
+    plain.step(np.full(3, 27))
+    for state in (27, 10):
+        actions = np.full(3, state)
+        np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
+
+
+@pytest.mark.parametrize("motion", ["none", 0.5])
+def test_wide_discs_are_those_of_the_sum(monkeypatch: pytest.MonkeyPatch, motion: Any) -> None:
+    arguments = {"resolution": 64, "motion": motion, "depth": 48.0, "noise": False}
+    options = {"state": 0}  # f/4
+    fourier, direct = _vector(2, **arguments), _vector(2, **arguments)
+    fourier.reset(seed=0, options=options)
+    assert fourier.core.recorder._shots[0].exposure.defocus_px > recorder_module._WIDE_PX
+    monkeypatch.setattr(recorder_module, "_WIDE_PX", 1e9)
+    direct.reset(seed=0, options=options)
+    lights = zip(fourier.core.recorder._lights, direct.core.recorder._lights, strict=True)
+    for mine, wanted in lights:
+        torch.testing.assert_close(mine, wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_white_is_1_whatever_the_black_level() -> None:
+    """In float32 (1023 - 103.34) / (1023 - 103.34) is 1.0000001."""
+    camera = replace(get_camera("nikon_z6"), black_level=(103.34,) * 4, white_level=1023.0)
+    envs = _vector(camera=camera, observation="linear", depth="far", motion="none")
+    observation, info = envs.reset(seed=0, options={"state": 63})
+    assert info["clipped_high"].max() > 0
+    assert observation["raw"].max() == 1.0
+    assert envs.observation_space.contains(observation)
+
+
+def test_batches_in_changing_light_are_worked_out_in_chunks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(core_module, "CHUNK_SAMPLES", 2 * 4 * 40 * 40)
+    sizes: list[int] = []
+    describe = core_module.describe_captures
+
+    def described(scenes: list[Any], *args: Any, **kwargs: Any) -> Any:
+        sizes.append(len(scenes))
+        return describe(scenes, *args, **kwargs)
+
+    monkeypatch.setattr(core_module, "describe_captures", described)
+    _vector(lighting="sine").reset(seed=0)
+    assert sizes == [2, 2, 1]
 
 
 def test_environment_survives_pickling_before_and_after_steps() -> None:

@@ -13,13 +13,16 @@ import numpy as np
 import pytest
 import torch
 
+from ae_env.core import EpisodeCore
 from ae_env.grid import ExposureGrid
+from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.score_table import ScoreTables, scene_latent
 from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.protocol import Captures
 from ae_env.scorers.terms import Highlights
 from simulator import get_camera
+from simulator.latent import Latent
 
 CAMERA = get_camera("nikon_z6")
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
@@ -330,3 +333,24 @@ def test_without_noise_the_expected_score_is_that_of_the_noise_free_capture() ->
     assert clean.mean == pytest.approx(0.0, abs=1e-4)
     assert clean.standard_error == pytest.approx(0.0)
     assert noisy.mean > 1e-3
+
+
+def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = set()
+    expose = Latent.expose
+
+    def exposed(latent: Latent, *args: Any, **kwargs: Any) -> torch.Tensor:
+        seen.add(latent.tolerance)
+        return expose(latent, *args, **kwargs)
+
+    monkeypatch.setattr(Latent, "expose", exposed)
+    _tables(MeanSignal(), tolerance=0.025).table(_scene(), speed=0.2)
+    assert seen == {0.025}
+    with pytest.raises(ValueError, match="`tolerance`"):
+        _tables(tolerance=-1.0)
+    options = EnvOptions(
+        scenes="bundled:small", resolution=36, scorer=MeanSignal(), tolerance=0.375
+    )
+    assert EpisodeCore(options, 1).tables.tolerance == 0.375

@@ -248,10 +248,38 @@ def test_bad_actions_are_refused(actions: np.ndarray) -> None:
         envs.step(actions)
 
 
+def test_no_episode_goes_on_where_one_action_is_bad() -> None:
+    envs, plain = _native(), _native()
+    for env in (envs, plain):
+        env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"`action` \(=64\) must be in \[0, 64\)"):
+        envs.step(np.array([0, 1, 64]))
+    _assert_same(envs.step(np.array([5, 6, 7])), plain.step(np.array([5, 6, 7])))
+
+
+@pytest.mark.parametrize("mode", [mode.name for mode in AutoresetMode])
+def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
+    """Also where the caller has written to the arrays meanwhile."""
+    envs = _native(autoreset_mode=mode)
+    shown = [envs.reset(seed=0)[0]]
+    for mask in ([True, False, False], [False, True, False]):
+        shown.append(envs.step(np.array([1, 2, 3]))[0])
+        wanted = {name: values.copy() for name, values in shown[-1].items()}
+        for observation in shown:
+            for values in observation.values():
+                values[...] = 0
+        shown.append(envs.reset(options={"reset_mask": np.array(mask)})[0])
+        for name, values in wanted.items():
+            others = ~np.array(mask)
+            np.testing.assert_array_equal(shown[-1][name][others], values[others])
+
+
 def test_bad_resets_are_refused() -> None:
     envs = _native()
     with pytest.raises(gym.error.ResetNeeded):
         envs.step(np.zeros(3, np.int64))
+    with pytest.raises(gym.error.ResetNeeded, match="first reset"):
+        envs.reset(options={"reset_mask": np.array([True, False, True])})
     for options in ({"reset_mask": [True] * 3}, {"reset_mask": np.zeros(3, bool)}, {"states": 1}):
         with pytest.raises(ValueError, match="options"):
             envs.reset(options=options)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import pickle
+import weakref
 
 import numpy as np
 import pytest
@@ -224,3 +226,16 @@ def test_statistics_travel_to_other_processes() -> None:
     before = statistics.blur_error(2.0, Z6.nlf(100), 1.0, 0.0)
     copy = pickle.loads(pickle.dumps(statistics))
     assert copy.blur_error(2.0, Z6.nlf(100), 1.0, 0.0) == before
+
+
+def test_nothing_keeps_a_light_alive_that_is_not_used() -> None:
+    gc.disable()  # a circle would only go with the collector
+    try:
+        statistics = LightStatistics(tensor(LIGHTS["natural"]))
+        statistics.excess(1.0, Z6.nlf(6400), Z6.nlf(100))
+        statistics.blur_error(1.0, Z6.nlf(100), 1.0, 1.0)
+        light = weakref.ref(statistics.light)
+        del statistics
+        assert light() is None
+    finally:
+        gc.enable()

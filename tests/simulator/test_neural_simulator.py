@@ -261,3 +261,18 @@ def test_pretrained_weights_and_their_correction(tmp_path: Path) -> None:
         expected = made.simulate(raw(), settings, seed=2, depth="unknown").data
         result = body.simulate(raw(), settings, seed=2, depth="unknown").data
         assert torch.equal(result, expected)
+
+
+@pytest.mark.parametrize("depth", ["far", "unknown"])
+def test_tolerance_nought_forgets_what_another_one_left_out(
+    compact: CameraSimulator, depth: str
+) -> None:
+    """A saturated quarter needs no network at tolerance 0.1; the full run denoises it, too."""
+    data = raw(96, 96).data.clone()
+    data[:, :48, :48] = 1.0
+    source = RawImage(data, SOURCE, Z6)
+    latent = compact.prepare(source, depth=depth)  # type: ignore[arg-type]
+    latent.capture(CLEANER)
+    shared = compact.simulate(latent, CLEANER, tolerance=0.0)
+    full = compact.simulate(source, CLEANER, tolerance=None, depth=depth)
+    torch.testing.assert_close(shared.data, full.data, rtol=0, atol=1.01 / 14512)

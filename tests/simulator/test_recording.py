@@ -92,3 +92,17 @@ def test_a_source_without_noise_lacks_all_of_it() -> None:
     balance = noise_balance(light, Exposure(1.0, zero, Z6.nlf(100)))
     assert (balance.relative_excess, balance.excess, balance.is_short) == (0.0, 0.0, True)
     assert not noise_balance(light, Exposure(1.0, zero, zero)).is_short
+
+
+@pytest.mark.parametrize("source", [100, 6400])
+def test_no_noise_is_drawn_where_the_source_has_enough(
+    source: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr("simulator.capture.draw_normals", lambda out, *_: drawn.append(out.zero_()))
+    light = torch.full((4, 8, 8), 0.2)
+    exposure = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
+    record(light, exposure, Z6, noise_generator(3), out=torch.empty_like(light))
+    assert not drawn
+    record(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), Z6, noise_generator(3), out=light)
+    assert drawn

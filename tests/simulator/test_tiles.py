@@ -198,3 +198,8 @@ def test_constant_parts_do_not_vary() -> None:
     assert torch.equal(varying(image), expected)
     expected[32:48] = expected[:, 48:] = expected[:, 32:48] = True
     assert torch.equal(varying(image, 16), expected)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (1, 33)])
+def test_a_cell_of_one_pixel_counts_as_varying(size: tuple[int, int]) -> None:
+    assert varying(torch.zeros(4, *size))[-1, -1]
