@@ -27,12 +27,11 @@ from simulator.dng_tags import SOFTWARE_NAME
 FULL, QUICK = (2000, 3000), (500, 750)
 #: The synthetic raw was taken so; the targets follow.
 SOURCE = CameraSettings(400, 1 / 64, 8.0)
-#: Name: weights, depth, target, noise. The last two need the networks: cleaner, and the last opens.
+#: Name: weights, depth, target, noise. The last needs both networks: it is cleaner, and opens.
 CASES: dict[str, tuple[str | None, str, tuple[float, float, float], str]] = {
     "exposure + noise": (None, "far", (1600, 1 / 256, 8.0), "exact"),
     "exposure + noise from the bank": (None, "far", (1600, 1 / 256, 8.0), "bank"),
-    "noise reduction": ("compact", "far", (100, 1 / 16, 8.0), "exact"),
-    "noise reduction + aperture": ("compact", "unknown", (100, 1 / 64, 4.0), "exact"),
+    "full model": ("compact", "unknown", (100, 1 / 64, 4.0), "exact"),
 }
 STAGES = ("read", "prepare", "simulate", "write")
 
@@ -60,8 +59,6 @@ def measure(
         for kind, (file, name) in files.items():
             limits = kept(f"libraw {kind}", lambda f=file: _limits(f, threads, quick))
             for case in CASES:
-                if quick and case == "noise reduction":
-                    continue
                 row = kept(
                     f"full frame {kind} {case}", lambda f=file, c=case: _row(f, c, threads, quick)
                 )

@@ -65,8 +65,7 @@ def all_series(quick: bool) -> Iterator[Series]:
     sizes = [{"height": h, "width": w} for h, w in (PIXELS[1:4] if quick else PIXELS)]
     for name, fixed in (
         ("exposure + noise", {"weights": None}),
-        ("noise reduction", {"weights": "compact"}),
-        ("noise reduction + aperture", {"weights": "compact", "depth": "unknown"}),
+        ("full model", {"weights": "compact", "depth": "unknown"}),
     ):
         curves.append((name, "pixels", "measure_pixels", sizes, fixed))
     counts = [{"count": n} for n in (STATES[:7:3] if quick else STATES)]
@@ -79,7 +78,7 @@ def all_series(quick: bool) -> Iterator[Series]:
         curves.append((f"step, {name}", "environments", "measure_environments", counts, fixed))
     counts = [{"count": n} for n in (SCENES[2:5] if quick else SCENES)]
     curves.append(("step", "scenes", "measure_scenes", counts, {}))
-    skipped = ("noise reduction", "sweep, exact noise", "step, motion and defocus") * quick
+    skipped = ("sweep, exact noise", "step, motion and defocus") * quick
     for name, against, task, points, fixed in curves:
         if name not in skipped:
             yield Series(name, against, task, tuple(points), fixed)
