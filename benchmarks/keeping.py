@@ -36,7 +36,7 @@ class Kept:
     def __call__(self, name: str, make: Callable[[], T]) -> T:
         """What `make` returns, or has returned to an earlier run; JSON values."""
         key = zlib.crc32(json.dumps([*self._words, name]).encode())
-        path = self._folder / f"{name.replace(' ', '-').replace('/', '-')}-{key:08x}.json"
+        path = self._folder / f"{name.split()[0]}-{key:08x}.json"
         if not path.is_file():
             write_atomically(path, json.dumps(make()))
         return json.loads(path.read_text(encoding="utf-8"))
