@@ -34,6 +34,8 @@ SPEED_SIGMA = 1.3
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 4 * 64 * 64 * 8
+#: Samples whose noise is drawn together: enough for several threads, in bounded memory.
+DRAWN_SAMPLES = 16 * CHUNK_SAMPLES
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
 OPTICS_BYTES = 256 * 2**20
 #: Memory for the scores of scenes at rest that have a closed form [byte].
@@ -299,8 +301,10 @@ class EpisodeCore:
         self.recorder.blur(blurs)
         # Only codes and digital numbers are made without a float of every sample, and only in
         # static light scored without one.
-        few = self._scores_images or self.options.noise == "exact" or not self._static
-        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(indices)
+        few = self._scores_images or not self._static
+        samples = CHUNK_SAMPLES if few else DRAWN_SAMPLES
+        every = not few and self.options.noise != "exact"
+        step = len(indices) if every else max(1, samples // (4 * size**2))
         chunks = []
         for start in range(0, len(indices), step):
             part = slice(start, start + step)
