@@ -27,10 +27,9 @@ from simulator.opening import MapOpening, NetworkOpening, Opening
 from simulator.plan import SimulationPlan
 from simulator.raw_image import RawImage
 from simulator.settings import CameraSettings
-from simulator.sources import latent_of
+from simulator.sources import Depth, check_depth, latent_of
 from simulator.tiles import in_tiles, varying
 
-Depth = Literal["far", "unknown"]
 #: What the compact networks see around a pixel [pixel]; tiles overlap by it.
 _NOISE_HALO, _MAP_HALO = 36, 56
 #: How far the largest disc of `simulator.modules.disc_bank` reaches [pixel].
@@ -155,7 +154,7 @@ class CameraSimulator:
                 "`tolerance` (=None) must be a number here: what is prepared is shared between "
                 "transitions; ask `simulate` for the full run of one"
             )
-        _check_depth(depth)
+        check_depth(depth)
         if depth == "unknown" and self.aperture is None:
             raise ValueError(
                 "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
@@ -327,17 +326,15 @@ class CameraSimulator:
         """
         if self.noise is None or self.aperture is None:
             raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
-        _check_depth(depth)
+        check_depth(depth)
         latent = self._seen(source, image_speed, defocus)
         opens = depth == "unknown" or latent.opening is not None
         # A latent may come from `prepare`, corrected already; a scene is no recording of this body.
         exposure = self.exposure
         if not isinstance(source, RawImage):
             exposure = ExposureModule().requires_grad_(False).to(self.device)
-        pipeline = FullRun(
-            exposure, self.noise, self.aperture if opens else None, self.precision == "bfloat16"
-        )
-        return pipeline.run(latent, settings, seed=seed)
+        aperture, half = self.aperture if opens else None, self.precision == "bfloat16"
+        return FullRun(exposure, self.noise, aperture, half).run(latent, settings, seed=seed)
 
     def simulate(
         self,
@@ -400,8 +397,3 @@ class CameraSimulator:
 def _lacks(known: Denoised | Opening | None, whole: bool) -> bool:
     """Whether there is none, or one that leaves out parts of the frame where it must not."""
     return known is None or (whole and not known.everywhere)
-
-
-def _check_depth(depth: str) -> None:
-    if depth not in get_args(Depth):
-        raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")

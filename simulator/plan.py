@@ -17,8 +17,6 @@ from simulator.tiles import varying
 if TYPE_CHECKING:
     from simulator.latent import Latent
 
-#: Blur below this extent [pixel] changes nothing that a digital number could show.
-NEGLIGIBLE_BLUR = 1e-3
 #: What the compact noise module errs by itself: a share of the standard deviation of the noise that
 #: it removes, and a share of the light. Calibrated on 41 scenes of the validation split
 #: (procedural, photographs, radiance maps, draped ones) at ISO 100 to 6400, 8 noisy captures each:
@@ -288,9 +286,7 @@ def _defocus(
         disc = latent.defocus * 4.0 / settings.effective_f_number
         taps = 1 + int(disc) ** 2
         reasons = (
-            f"the defocus disc is below {NEGLIGIBLE_BLUR} pixel"
-            if disc <= NEGLIGIBLE_BLUR
-            else f"the defocus disc is {disc:.2g} pixel wide, which would hardly show",
+            f"the defocus disc is {disc:.2g} pixel wide, which would hardly show",
             f"the defocus disc is {disc:.3g} pixel wide",
         )
         return _step(exposure, name, exposure.defocus_px > 0, reasons, taps * 2 * pixels)
@@ -306,14 +302,11 @@ def _motion_blur(
     if latent.image_speed == 0:
         return _unneeded(name, "the image does not move")
     streak = latent.image_speed * settings.exposure_time * latent.light.shape[-2]
-    left_out = (
-        f"the image moves less than {NEGLIGIBLE_BLUR} pixel during the exposure"
-        if streak <= NEGLIGIBLE_BLUR
-        else f"the image moves by {streak:.2g} pixel during the exposure, which would hardly show"
+    reasons = (
+        f"the image moves by {streak:.2g} pixel during the exposure, which would hardly show",
+        f"the image moves by {streak:.3g} pixel during the exposure",
     )
-    needed = f"the image moves by {streak:.3g} pixel during the exposure"
-    runs = exposure.motion_px > 0
-    return _step(exposure, name, runs, (left_out, needed), _STREAK_OPERATIONS * pixels)
+    return _step(exposure, name, exposure.motion_px > 0, reasons, _STREAK_OPERATIONS * pixels)
 
 
 def _noise(wanted: bool, is_short: bool, pixels: int) -> PlannedStep:

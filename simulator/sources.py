@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal, get_args
 
 import torch
 
 from simulator.latent import HasLatent, Latent
 from simulator.raw_image import RawImage
+
+#: What is known of a scene's depth: it is far or in focus throughout, or not known.
+Depth = Literal["far", "unknown"]
+
+
+def check_depth(depth: str) -> None:
+    """Raises a `ValueError` unless `depth` says what is known of the scene's."""
+    if depth not in get_args(Depth):
+        raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
 
 
 def latent_of(source: RawImage | Latent | HasLatent, device: torch.device) -> Latent:
