@@ -15,14 +15,13 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from ae_env.episode import Episode
+from ae_env.episode import Episode, Episodes
 from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
 from ae_env.options import COSTS, EnvOptions
 from ae_env.recorder import Recorder
 from ae_env.score_table import ScoreTable, ScoreTables, describe_captures
 from ae_env.scorers.protocol import DependsOn
-from simulator.cache import LruCache
 from simulator.modules.disc_bank import DIAMETERS
 from simulator.noise_bank import single_normals
 
@@ -34,13 +33,10 @@ SPEED_SIGMA = 1.3
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 4 * 64 * 64 * 8
-#: Samples whose noise is drawn together: enough for several threads, in bounded memory.
-DRAWN_SAMPLES = 16 * CHUNK_SAMPLES
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
 OPTICS_BYTES = 256 * 2**20
-#: Memory for the scores of scenes at rest that have a closed form [byte].
-STILL_BYTES = 2**25
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
+_STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 _OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
 
 
@@ -81,32 +77,34 @@ class EpisodeCore:
             noise=bool(options.noise),
             tolerance=options.tolerance,
         )
-        self.episodes: list[Episode | None] = [None] * num_envs
+        self.episodes = Episodes(num_envs, int(options.delay))
         self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
+        self._own_blur = [s.own_blur(4.0) * 64.0 / options.resolution for s in self.scenes]
+        self._scene_ids = np.array([scene.scene_id for scene in self.scenes], object)
         states = self.grid.states
-        self._apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
-        self._bounds = np.array([[s.iso, s.exposure_time, s.f_number, s.ev100] for s in states])
-        frame_bytes = 16 * options.resolution**2
-        self._still_parts: LruCache[dict[str, np.ndarray]] = LruCache(STILL_BYTES)
+        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
+        self._settings = encode_settings(apex)
+        # (4, S), see `_STATE_INFO`
+        self._bounds = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._static = type(self.lighting) is Lighting
+        # In static light, by slot and state: scores of the parts that have a closed form, the last
+        # column those of the whole where it has one; and which slots have them.
+        slots = len(self.scenes) + num_envs
+        self._closed = self.scorer.names("light", "blur") if self._static else []
+        self._scores = np.zeros((slots, len(states), len(self._closed) + 1))
+        self._scored = np.zeros(slots, bool)
+        self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
+        frame_bytes = 16 * options.resolution**2
         keep = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
         self.recorder = Recorder(
-            options,
-            self.grid,
-            self.camera,
-            self.scenes,
-            num_envs,
-            keep=keep,
-            shares=self._static,
+            options, self.grid, self.camera, self.scenes, self.episodes, keep=keep
         )
         self._scores_images = not self.scorer.closed_form
 
     def _kept_frames(self) -> int:
         """Blurred frames that an episode keeps at most."""
         apertures = len(self.grid.f_numbers)
-        if (
-            self.options.depth == "unknown"
-        ):  # also what opens them: a bank of blurs, and its results
+        if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results
             apertures += len(DIAMETERS) + apertures
         as_recorded_and_denoised = 1 + any(s.denoised is not None for s in self.scenes)
         return as_recorded_and_denoised * apertures + 1
@@ -135,16 +133,24 @@ class EpisodeCore:
 
     # -- life of an episode -------------------------------------------------------------------
 
-    def start(self, index: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
-        """Begins episode `index`; see `drawn`."""
-        self.begin(index, self.drawn(rng, options))
+    def start(self, place: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        """Begins an episode at `place`; see `drawn`."""
+        self.begin(np.array([place]), [self.drawn(rng, options)])
 
-    def begin(self, index: int, episode: Episode) -> None:
-        """Puts `episode` in place `index`, where another one may end."""
-        ended = self.episodes[index]
-        if ended is not None:
-            self.recorder.end(index, ended)
-        self.episodes[index] = episode
+    def begin(self, places: np.ndarray, drawn: Sequence[Episode]) -> None:
+        """Puts the episodes `drawn` into `places` (K,), where others may end."""
+        self.recorder.end(places)
+        own = len(self.scenes) + places
+        slots = [e.scene if self._is_shared(e) else i for e, i in zip(drawn, own, strict=True)]
+        self.episodes.begin(places, drawn, np.array(slots))
+        self._scored[own] = False
+        for place in places.tolist():
+            self._tables[place] = None
+
+    def _is_shared(self, episode: Episode) -> bool:
+        """Whether its light and its scores are those of every episode that shows its scene."""
+        at_rest = not (episode.speed or episode.defocus)
+        return at_rest and self._static and self.scenes[episode.scene].defocus_map is None
 
     def drawn(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Episode:
         """An episode: draws the scene, the start state, the motion and the defocus.
@@ -162,21 +168,20 @@ class EpisodeCore:
         median = self.scenes[scene].median_speed
         drawn_speed = moves * median * np.exp(SPEED_SIGMA * speed)
         drawn_defocus = DEFOCUS_MEDIAN * np.exp(DEFOCUS_SIGMA * defocus)
-        episode = Episode(
+        shown = _fixed_or_drawn(
+            self.options.depth, float(min(max(drawn_defocus, DEFOCUS_MIN), DEFOCUS_MAX))
+        )
+        own = self._own_blur[scene]
+        return Episode(
             scene=scene,
             state=self._chosen("state", options.get("state"), state, len(self.grid)),
             speed=_fixed_or_drawn(self.options.motion, float(drawn_speed)),
-            defocus=_fixed_or_drawn(
-                self.options.depth, float(np.clip(drawn_defocus, DEFOCUS_MIN, DEFOCUS_MAX))
-            ),
+            defocus=shown,
+            focus_drive=math.hypot(shown, own),
             phase=float(phase),
             noise_seed=noise_seed,
             frame=self._chosen("frame", options.get("frame"), 0, 2**31),
         )
-        episode.pending = [episode.state] * int(self.options.delay)
-        own = self.scenes[scene].own_blur(4.0) * 64.0 / self.options.resolution
-        episode.focus_drive = math.hypot(episode.defocus, own)
-        return episode
 
     def _chosen_scene(self, wanted: Any, drawn: int) -> int:
         if wanted is None:
@@ -198,138 +203,124 @@ class EpisodeCore:
             return int(wanted)
         raise ValueError(f"`options[{name!r}]` (={wanted!r}) must be an integer in [0, {limit})")
 
-    def episode(self, index: int) -> Episode:
-        """Running episode `index`."""
-        episode = self.episodes[index]
-        if episode is None:
+    def episode(self, place: int) -> Episode:
+        """The episode at `place` as it is now."""
+        self._check_begun(place)
+        return self.episodes[place]
+
+    def _check_begun(self, places: np.ndarray | int) -> None:
+        if not self.episodes.begun[places].all():
             raise gym.error.ResetNeeded("call reset() before step(), render() or scores")
-        return episode
 
-    def act(self, index: int, action: Any) -> None:
-        """Lets episode `index` go on by one frame with `action`, applied after the delay."""
-        self.check_action(action)
-        episode = self.episode(index)
-        episode.pending.append(int(action))
-        episode.state = episode.pending.pop(0)
-        episode.frame += 1
+    def act(self, places: np.ndarray, actions: np.ndarray) -> None:
+        """Lets the episodes at `places` (K,) go on by one frame.
 
-    def check_action(self, action: Any) -> None:
-        """Raises a `ValueError` unless `action` is a state of the grid."""
-        if not (isinstance(action, int) and 0 <= action < len(self.grid)):
-            number = np.asarray(action)
-            if number.ndim or number.dtype.kind not in "iu" or not 0 <= number < len(self.grid):
-                raise ValueError(f"`action` (={action!r}) must be in [0, {len(self.grid)})")
+        Args:
+            places: Whose turn it is.
+            actions: (K,) their actions, integers; applied after the delay.
+
+        Raises:
+            ValueError: If an action is not a state of the grid; no episode goes on then.
+        """
+        self._check_begun(places)
+        wrong = (actions < 0) | (actions >= len(self.grid))
+        if wrong.any():
+            raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {len(self.grid)})")
+        self.episodes.act(places, actions)
 
     def gain(self, episode: Episode, exposure_time: float) -> float:
         """Light of an exposure in the current frame relative to the scene's own."""
-        if self._static:
-            return 1.0
         return self.lighting.gain(episode.frame, exposure_time, episode.phase)
 
-    def expected_scores(self, index: int) -> ScoreTable:
-        """Scores of all states in the current frame of episode `index`."""
-        episode = self.episode(index)
-        gain = self.gain(episode, 0.0)
-        if episode.table is None or episode.table[0] != gain:
-            table = self.tables.table(
-                self.scenes[episode.scene],
-                speed=episode.speed,
-                defocus=episode.defocus,
-                gain=gain,
-            )
-            episode.table = (gain, table)
-        return episode.table[1]
+    def _gains(self, places: np.ndarray) -> np.ndarray:
+        """(B,) `gain` of the current exposures."""
+        if self._static:
+            return np.ones(len(places))
+        times = self._bounds[1, self.episodes.state[places]]
+        pairs = zip(places.tolist(), times.tolist(), strict=True)
+        return np.array([self.gain(self.episodes[place], time) for place, time in pairs])
 
-    def _closed_parts(self, episode: Episode) -> dict[str, np.ndarray]:
-        if episode.closed_parts is None:
-            at_rest = not episode.speed and not episode.defocus
-            parts = self._still_parts.get(episode.scene) if at_rest else None
-            if parts is None:
-                parts = self.tables.closed_parts(
-                    self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
-                )
-                if at_rest:
-                    size = sum(values.nbytes for values in parts.values())
-                    self._still_parts.put(episode.scene, parts, size)
-            episode.closed_parts = parts
-        return episode.closed_parts
+    def expected_scores(self, place: int) -> ScoreTable:
+        """Scores of all states in the current frame of the episode at `place`."""
+        episode = self.episode(place)
+        gain = self.gain(episode, 0.0)
+        known = self._tables[place]
+        if known is None or known[0] != gain:
+            table = self.tables.table(
+                self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus, gain=gain
+            )
+            known = self._tables[place] = (gain, table)
+        return known[1]
 
     # -- what the camera records --------------------------------------------------------------
 
-    def observe(self, indices: Sequence[int], previous: Sequence[int] | None = None) -> Frames:
-        """Photographs the episodes `indices`, each in its current state.
-
-        Args:
-            indices: Episodes.
-            previous: State of each before this step, for the costs; None after a reset.
-        """
-        raw, columns = self._capture_all(indices)
-        episodes = [self.episode(i) for i in indices]
+    def observe(self, places: np.ndarray) -> Frames:
+        """Photographs the episodes at `places` (B,), each in its current state."""
+        raw, columns = self._capture_all(places)
+        episodes = self.episodes
+        scenes, states = episodes.scene[places], episodes.state[places]
+        observation = {"raw": raw, "settings": self._settings[states]}
+        if self.options.sensors:
+            observation["sensors"] = encode_sensors(
+                episodes.speed[places], episodes.focus_drive[places], columns.pop("sensor_noise")
+            )
         rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
-        rewards["score"] = self._scores(rewards, indices)
-        costs = self._costs(episodes, columns.pop("image_mean", None), previous)
+        rewards["score"] = self._totals(rewards, places)
         reward = rewards["score"].copy()
-        for name, cost in costs.items():
+        for name, cost in self._costs(places, columns.pop("image_mean", None)).items():
             rewards[name] = cost
             reward -= self.options.costs[name] * cost
-        settings = encode_settings(self._apex[[e.state for e in episodes]])
-        observation = {"raw": raw, "settings": settings}
-        if self.options.sensors:
-            speed, defocus = np.array([(e.speed, e.focus_drive) for e in episodes]).T
-            observation["sensors"] = encode_sensors(speed, defocus, columns.pop("sensor_noise"))
-        info = self._info(episodes) | columns | {"rewards": rewards}
+        info = {"scene_id": self._scene_ids[scenes], "state": states}
+        info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
+        info |= columns | {"rewards": rewards}
         if self.options.with_oracle:
-            tables = [self.expected_scores(i) for i in indices]
+            tables = [self.expected_scores(place) for place in places.tolist()]
             best = np.array([t.mean[t.oracle] for t in tables])
             info["oracle_state"] = np.array([t.oracle for t in tables])
-            info["regret"] = best - [t.mean[e.state] for t, e in zip(tables, episodes, strict=True)]
+            info["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
         return Frames(observation, info, reward)
 
-    def _scores(self, parts: dict[str, np.ndarray], indices: Sequence[int]) -> np.ndarray:
+    def _totals(self, parts: dict[str, np.ndarray], places: np.ndarray) -> np.ndarray:
+        """(B,) float64 scores before costs."""
+        states = self.episodes.state[places]
+        if self._static and self.scorer.closed_form:
+            return self._scores[self.episodes.slot[places], states, -1]
         if self.options.reward == "expected":
-            return np.array([self.expected_scores(i).mean[self.episode(i).state] for i in indices])
+            pairs = zip(places.tolist(), states.tolist(), strict=True)
+            return np.array([self.expected_scores(place).mean[state] for place, state in pairs])
         return np.asarray(self.scorer.combine(parts), dtype=np.float64)
 
-    def _capture_all(self, indices: Sequence[int]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def _capture_all(self, places: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Observations of `raw` and the info columns, worked out chunk by chunk."""
         size = self.options.resolution
-        raw = np.empty((len(indices), 4, size, size), _RAW_DTYPES[self.options.observation])
-        episodes = [self.episode(i) for i in indices]
-        gains = [self.gain(e, self._bounds[e.state, 1]) for e in episodes]
-        planned = zip(indices, episodes, gains, strict=True)
-        blurs = [(i, e) for i, e, gain in planned if self.recorder.prepare(i, e, gain)]
-        self.recorder.blur(blurs)
-        # Only codes and digital numbers are made without a float of every sample, and only in
-        # static light scored without one.
+        raw = np.empty((len(places), 4, size, size), _RAW_DTYPES[self.options.observation])
+        gains = self._gains(places)
+        self.recorder.prepare(places, gains)
+        # Only in static light, scored without its pixels, is no float of every sample made.
         few = self._scores_images or not self._static
-        samples = CHUNK_SAMPLES if few else DRAWN_SAMPLES
-        every = not few and self.options.noise != "exact"
-        step = len(indices) if every else max(1, samples // (4 * size**2))
+        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(places)
+        if step >= len(places):
+            return raw, self._capture(places, gains, raw)
         chunks = []
-        for start in range(0, len(indices), step):
+        for start in range(0, len(places), step):
             part = slice(start, start + step)
-            chunks.append(self._capture(indices[part], episodes[part], gains[part], raw[part]))
-        columns = {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
-        return raw, columns
+            chunks.append(self._capture(places[part], gains[part], raw[part]))
+        return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
 
     def _capture(
-        self,
-        indices: Sequence[int],
-        episodes: Sequence[Episode],
-        gains: Sequence[float],
-        raw: np.ndarray,
+        self, places: np.ndarray, gains: np.ndarray, raw: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Info columns of the episodes `indices`; their observations are written to `raw`."""
+        """Info columns of the episodes at `places`; their observations are written to `raw`."""
         outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
         if self._scores_images:
             outputs.setdefault("signals", np.empty(raw.shape, np.float32))
         if "flicker" in self.options.costs:
             outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
-        columns = self.recorder.record(indices, episodes, **outputs)
+        columns = self.recorder.record(places, **outputs)
         key = columns.pop("noise_key")
         if self.options.sensors:
             columns["sensor_noise"] = single_normals(key, 2)
-        columns |= self._part_scores(indices, outputs.get("signals"), gains)
+        columns |= self._part_scores(places, outputs.get("signals"), gains)
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         if "flicker" in self.options.costs:
@@ -338,59 +329,66 @@ class EpisodeCore:
         return columns
 
     def _part_scores(
-        self, indices: Sequence[int], frames: np.ndarray | None, gains: Sequence[float]
+        self, places: np.ndarray, frames: np.ndarray | None, gains: np.ndarray
     ) -> dict[str, np.ndarray]:
-        episodes = [self.episode(i) for i in indices]
-        scores: dict[str, np.ndarray] = {}
+        episodes, scores = self.episodes, {}
+        slots, states = episodes.slot[places], episodes.state[places]
+        if self._static:
+            if not self._scored[slots].all():
+                self._score(places)
+            names = [f"score:{name}" for name in self._closed]
+            scores = dict(zip(names, self._scores[slots, states].T, strict=False))
         kinds: list[DependsOn] = [] if self.scorer.closed_form else ["image"]
-        if self._static:  # one table per scene serves every frame
-            closed = [self._closed_parts(e) for e in episodes]
-            for name in self.scorer.names("light", "blur"):
-                pairs = zip(closed, episodes, strict=True)
-                scores[f"score:{name}"] = np.array([parts[name][e.state] for parts, e in pairs])
-        else:
+        if not self._static:
             kinds += ["light", "blur"]
         if kinds:
             captures = describe_captures(
-                [self.scenes[e.scene] for e in episodes],
-                [self.grid[e.state] for e in episodes],
+                [self.scenes[scene] for scene in episodes.scene[places].tolist()],
+                [self.grid[state] for state in states.tolist()],
                 self.camera,
-                speed=np.array([e.speed for e in episodes]),
-                defocus=np.array([e.defocus for e in episodes]),
-                gain=np.array(gains),
+                speed=episodes.speed[places],
+                defocus=episodes.defocus[places],
+                gain=gains,
             )
             images = None if frames is None else torch.from_numpy(frames).clamp(0.0, 1.0)
             for name, values in self.scorer.score_parts(images, captures, tuple(kinds)).items():
                 scores[f"score:{name}"] = values.numpy()
         return scores
 
-    def _costs(
-        self, episodes: list[Episode], means: np.ndarray | None, previous: Sequence[int] | None
-    ) -> dict[str, np.ndarray]:
-        costs = {name: np.zeros(len(episodes)) for name in COSTS if name in self.options.costs}
-        if means is not None:
-            before = np.array([e.image_mean for e in episodes])
-            for episode, mean in zip(episodes, means, strict=True):
-                episode.image_mean = float(mean)
-            if previous is not None:
-                costs["flicker"] = np.abs(means - before)
-        if "switch" in costs and previous is not None:
-            now = np.array([e.state for e in episodes])
-            changed = self.grid.controls(np.array(previous)) != self.grid.controls(now)
-            costs["switch"] = changed.mean(axis=-1)
-        return costs
+    def _score(self, places: np.ndarray) -> None:
+        """Works out all scores that have a closed form, in the slots of `places` that lack them."""
+        slots, first = np.unique(self.episodes.slot[places], return_index=True)
+        missing = ~self._scored[slots]
+        slots, first = slots[missing], first[missing]
+        for slot, place in zip(slots.tolist(), places[first].tolist(), strict=True):
+            episode = self.episodes[place]
+            parts = self.tables.closed_parts(
+                self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
+            )
+            for column, name in enumerate(self._closed):
+                self._scores[slot, :, column] = parts[name]
+        if self.scorer.closed_form:
+            columns = np.moveaxis(self._scores[slots], -1, 0).copy()
+            totals = self.scorer.combine(dict(zip(self._closed, columns, strict=False)))
+            self._scores[slots, :, -1] = totals
+        self._scored[slots] = True
 
-    def _info(self, episodes: list[Episode]) -> dict[str, Any]:
-        states = np.array([e.state for e in episodes])
-        bounds = self._bounds[states]
-        return {
-            "scene_id": np.array([self.scenes[e.scene].scene_id for e in episodes], object),
-            "state": states,
-            "iso": bounds[:, 0],
-            "exposure_time": bounds[:, 1],
-            "f_number": bounds[:, 2],
-            "ev100": bounds[:, 3],
-        }
+    def _costs(self, places: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
+        """(B,) each; 0 in the first frame of an episode."""
+        if not self.options.costs:
+            return {}
+        episodes = self.episodes
+        first = episodes.previous[places] < 0
+        costs = {name: np.zeros(len(places)) for name in COSTS if name in self.options.costs}
+        if means is not None:
+            change = np.abs(means - episodes.image_mean[places])
+            costs["flicker"] = np.where(first, 0.0, change)
+            episodes.image_mean[places] = means
+        if "switch" in costs:
+            now = self.grid.controls(episodes.state[places])
+            before = self.grid.controls(np.where(first, 0, episodes.previous[places]))
+            costs["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
+        return costs
 
 
 def _fixed_or_drawn(option: str | float, drawn: float) -> float:

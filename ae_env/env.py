@@ -15,6 +15,7 @@ from ae_env.scenes import Scene
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]
+_PLACE = np.array([0])
 
 
 class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
@@ -86,7 +87,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | `delay` | 0 | frames between an action and the first capture that has it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
-    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise_bank`), `"exact"` draws it, at a fifth of the speed |
+    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise_bank`), `"exact"` draws it, which takes longer |
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
@@ -133,14 +134,16 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         """Begins an episode; see the class for `options`."""
         super().reset(seed=seed)
         self.core.start(0, self.np_random, _checked_options(options))
-        self._last = self.core.observe([0])
+        self._last = self.core.observe(_PLACE)
         return _first(self._last.observation), single_info(self._last.info, 0)
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
-        before = self.state
-        self.core.act(0, action)
-        self._last = self.core.observe([0], previous=[before])
+        number = np.asarray(action)
+        if number.ndim or number.dtype.kind not in "iub":
+            raise ValueError(f"`action` (={action!r}) must be an integer")
+        self.core.act(_PLACE, number[None])
+        self._last = self.core.observe(_PLACE)
         info = single_info(self._last.info, 0)
         return _first(self._last.observation), float(self._last.reward[0]), False, False, info
 
@@ -180,5 +183,5 @@ def single_info(columns: dict[str, Any], row: int) -> dict[str, Any]:
         if isinstance(values, dict):
             info[name] = single_info(values, row)
         else:
-            info[name] = values[row].item() if values.dtype != object else values[row]
+            info[name] = values.item(row)
     return info

@@ -1,148 +1,84 @@
-"""One running episode: what was drawn for it, and the light that it keeps for its next frames."""
+"""Running episodes: what was drawn for each of them, and where it is now."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
-import torch
-
-from ae_env.score_table import ScoreTable
-from simulator.blur_kernels import Blur
-from simulator.exposure import Exposure
-from simulator.latent import Latent
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """A capture that was planned: all that a frame depends on, but for its light and its noise.
-
-    Args:
-        exposure: What happens to the light.
-        table: (5, 4) float32, the exposure as `simulator.kernels.record_frames` takes it.
-        excess_noise: As in `info`; None where it takes the blurred light to tell.
-        modules: Names of the steps, joined by ``"+"``.
-        light: (4, H, W) what is exposed, where that is the scene's own; None if it is blurred.
-    """
-
-    exposure: Exposure
-    table: np.ndarray
-    excess_noise: float | None
-    modules: str
-    light: torch.Tensor | None
-
-
-#: Plans by state, each with the gain of the light that it was made for.
-Shots = dict[int, tuple[float, Shot]]
-
-
-class Buffers:
-    """Images to write to that are used again: new memory costs more than what is written to it.
-
-    Args:
-        shape: Of each image.
-    """
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
-        self._free: list[torch.Tensor] = []
-
-    def take(self) -> torch.Tensor:
-        """A float32 image with any content."""
-        try:
-            return self._free.pop()  # atomic: threads share the list
-        except IndexError:
-            return torch.empty(self.shape)
-
-    def give_back(self, image: torch.Tensor) -> None:
-        """Lets `image` be taken again."""
-        self._free.append(image)
-
-
-@dataclass
+@dataclass(frozen=True)
 class Episode:
-    """One scene being photographed.
+    """One scene being photographed, at one moment.
 
     Args:
         scene: Index of the scene.
         state: Current exposure state.
         speed: Image speed [frame heights per second].
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        focus_drive: Blur at f/4 that the focus drive tells of [pixel of a 64-pixel frame].
         phase: Phase of a periodic lighting, in [0, 1).
         noise_seed: Seed of the noise; the frame number is added to it.
         frame: Number of the current frame.
-        pending: States on their way to the camera, the next first.
-        image_mean: Mean code of the latest frame / 255, where a cost needs it.
-        table: Score table of the current frame, with its gain.
-        closed_parts: Scores of all states that have a closed form, in static light.
-        latent: What the camera sees of the scene in its own light, once it was asked for.
-        shots: Captures that were planned.
-        focus_drive: Blur at f/4 that the focus drive tells of [pixel of a 64-pixel frame].
     """
 
     scene: int
     state: int
     speed: float
     defocus: float
+    focus_drive: float
     phase: float
     noise_seed: int
     frame: int = 0
-    pending: list[int] = field(default_factory=list)
-    image_mean: float = float("nan")
-    table: tuple[float, ScoreTable] | None = None
-    closed_parts: dict[str, np.ndarray] | None = None
-    latent: Latent | None = None
-    shots: Shots = field(default_factory=dict)
-    focus_drive: float = 0.0
-    _defocused: dict[tuple[Any, ...], torch.Tensor] = field(default_factory=dict)  # by aperture
-    _blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
-    _streak: torch.Tensor | None = None  # of the buffers
 
-    def blurred_light(
-        self, exposure: Exposure, buffers: Buffers, keep: bool
-    ) -> tuple[torch.Tensor, Blur | None]:
-        """The light (4, H, W) of `latent` with the blur of `exposure`, valid until the next call.
 
-        The latest one is kept, because an agent that has settled repeats it, and with `keep` also
-        the defocused light of each f-number.
+class Episodes:
+    """The episodes at n places, as columns: a batch takes what it needs of them at once.
 
-        Returns:
-            The light, and what must be done (`simulator.blur_kernels.blur_many`) to fill it; None
-            where that was done before.
-        """
-        lens = (exposure.denoised, exposure.opened_to, exposure.defocus_px)
-        key = (*lens, exposure.motion_px)
-        if self._blurred is not None and self._blurred[0] == key:
-            return self._blurred[1], None
-        light = self._defocused.get(lens)
-        source = defocused = moved = None
-        if light is None:
-            assert self.latent is not None
-            light = source = self.latent.source_light(exposure).contiguous()
-            if exposure.defocus_px:
-                self._drop_defocused(buffers, keep)
-                light = defocused = self._defocused[lens] = buffers.take()
-        if exposure.motion_px:
-            source = light if source is None else source
-            if self._streak is None:
-                self._streak = buffers.take()
-            light = moved = self._streak
-        self._blurred = (key, light)
-        if defocused is None and moved is None:
-            return light, None
-        assert source is not None
-        return light, Blur(source, exposure.defocus_px, defocused, exposure.motion_px, moved)
+    Args:
+        count: Number of places, n.
+        delay: Frames between an action and the first capture that has it.
 
-    def _drop_defocused(self, buffers: Buffers, keep: bool) -> None:
-        if not keep:
-            for image in self._defocused.values():
-                buffers.give_back(image)
-            self._defocused.clear()
+    Attributes:
+        begun: (n,) bool, whether there is an episode.
+        slot: (n,) int64, under which number what is worked out for its frames is looked up: that of
+            its scene where all episodes that show it at rest share this, else one of its own.
+        previous: (n,) int64, state in the frame before; -1 in the first.
+        pending: (n, delay + 1) int64, the current state and those on their way to the camera.
+        image_mean: (n,) float64, mean code of the latest frame / 255, where a cost needs it.
 
-    def end(self, buffers: Buffers) -> None:
-        """Gives back what the episode keeps."""
-        self._drop_defocused(buffers, keep=False)
-        if self._streak is not None:
-            buffers.give_back(self._streak)
-        self._streak = self._blurred = None
+    The others, (n,) each, are those of `Episode`.
+    """
+
+    def __init__(self, count: int, delay: int) -> None:
+        self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
+        self.speed, self.defocus, self.focus_drive, self.phase = np.zeros((4, count))
+        self.begun = np.zeros(count, bool)
+        self.slot, self.previous = np.zeros((2, count), np.int64)
+        self.pending = np.zeros((count, delay + 1), np.int64)
+        self.image_mean = np.full(count, np.nan)
+
+    def begin(self, places: np.ndarray, drawn: Sequence[Episode], slots: np.ndarray) -> None:
+        """Puts the episodes `drawn` into `places`, with their `slots`."""
+        for name in _FIELDS:
+            getattr(self, name)[places] = [getattr(episode, name) for episode in drawn]
+        self.slot[places] = slots
+        self.previous[places] = -1
+        self.pending[places] = self.state[places, None]
+        self.image_mean[places] = np.nan
+        self.begun[places] = True
+
+    def act(self, places: np.ndarray, actions: np.ndarray) -> None:
+        """Lets the episodes at `places` go on by one frame, each with its action."""
+        self.previous[places] = self.state[places]
+        self.pending[places, :-1] = self.pending[places, 1:]
+        self.pending[places, -1] = actions
+        self.state[places] = self.pending[places, 0]
+        self.frame[places] += 1
+
+    def __getitem__(self, place: int) -> Episode:
+        return Episode(**{name: getattr(self, name).item(place) for name in _FIELDS})
+
+
+_FIELDS = tuple(field.name for field in fields(Episode))

@@ -21,6 +21,8 @@ SETTINGS_RANGES = np.array([[0.0, 10.0], [-5.0, 15.0], [4.0, 17.0]])
 SENSOR_RANGES = np.array([[-9.0, 3.0], [-4.0, 4.0]])
 #: Relative standard deviation of both sensors.
 SENSOR_NOISE = 0.15
+_LOG2_NOISE = SENSOR_NOISE / np.log(2.0)
+_TINY = np.finfo(np.float64).tiny
 #: Frame height that the defocus spread is stated for [pixel].
 DEFOCUS_FRAME = 64
 
@@ -52,7 +54,8 @@ def decode_observation(raw: np.ndarray) -> np.ndarray:
 
 def _to_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:
     low, high = ranges[:, 0], ranges[:, 1]
-    return np.clip(2.0 * (values - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
+    unit = 2.0 * (values - low) / (high - low) - 1.0
+    return np.minimum(np.maximum(unit, -1.0), 1.0).astype(np.float32)
 
 
 def _from_unit(values: np.ndarray, ranges: np.ndarray) -> np.ndarray:
@@ -82,9 +85,8 @@ def encode_sensors(speed: np.ndarray, defocus: np.ndarray, noise: np.ndarray) ->
     Returns:
         (..., 2) float32 in [-1, 1]; no motion reads -1.
     """
-    tiny = np.finfo(np.float64).tiny
-    values = np.log2(np.maximum(np.stack([speed, defocus], axis=-1), tiny))
-    return _to_unit(values + SENSOR_NOISE / np.log(2.0) * noise, SENSOR_RANGES)
+    values = np.log2(np.maximum(np.stack([speed, defocus], axis=-1), _TINY))
+    return _to_unit(values + _LOG2_NOISE * noise, SENSOR_RANGES)
 
 
 def decode_sensors(sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

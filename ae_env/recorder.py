@@ -1,21 +1,21 @@
 """What the cameras of n episodes record.
 
 All that a frame depends on but for its noise is worked out when a state is first asked for and kept
-(`ae_env.episode.Shot`, `Episode.blurred_light`); photographing a batch then is one call of a fused
-kernel (`simulator.kernels`), on as many threads as torch may use.
+(`ae_env.kept_light`); photographing a batch then is one call of a fused kernel
+(`simulator.kernels`), on as many threads as torch may use.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import torch
 
-from ae_env.episode import Buffers, Episode, Shot, Shots
+from ae_env.episode import Episodes
 from ae_env.grid import ExposureGrid
+from ae_env.kept_light import Buffers, KeptLight, Plans
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
 from ae_env.score_table import in_episode, scene_latent
@@ -27,28 +27,26 @@ from simulator.capture import noise_balance
 from simulator.exposure import LATENT_LIMIT, Exposure
 from simulator.kernels import exposure_table, record_frames
 from simulator.latent import Latent
-from simulator.noise import noise_generator
-from simulator.noise_bank import noise_keys
+from simulator.noise_keys import noise_keys
 from simulator.pointers import addresses
 from simulator.threads import in_shares
 
-#: Memory for what is known of scenes, and what of it a scene and a plan take, about [byte].
-_LATENTS_BYTES, _LATENT_BYTES, _SHOT_BYTES = 2**28, 2**16, 2000
+#: Memory for what is known of scenes, and what of it a scene takes, about [byte].
+_LATENTS_BYTES, _LATENT_BYTES = 2**28, 2**16
 #: Discs wider than this are cheaper in the Fourier domain than as a sum [pixel].
 _WIDE_PX = 40.0
 
 
 class Recorder:
-    """Photographs n episodes.
+    """Photographs episodes.
 
     Args:
         options: The environment's arguments.
         grid: Exposure states.
         camera: The body.
-        scenes: What is photographed.
-        num_envs: Number of episodes side by side.
+        scenes: What is photographed; the first slots are theirs, then there is one per place.
+        episodes: Who photographs it.
         keep: Whether the defocused light of every f-number is kept while an episode lasts.
-        shares: Whether episodes of a scene at rest have the same light, and so share their plans.
     """
 
     def __init__(
@@ -57,153 +55,127 @@ class Recorder:
         grid: ExposureGrid,
         camera: CameraProfile,
         scenes: Sequence[Scene],
-        num_envs: int,
+        episodes: Episodes,
         *,
         keep: bool,
-        shares: bool,
     ) -> None:
         self.options, self.grid, self.camera, self.scenes = options, grid, camera, scenes
-        self.keep, self.shares = keep, shares
-        size = options.resolution
+        self.episodes, self.keep = episodes, keep
+        size, places = options.resolution, len(episodes.slot)
         self._samples = size * size
+        self._latents: LruCache[Latent] = LruCache(_LATENTS_BYTES)  # at rest, by scene
+        self._plans = Plans(len(scenes) + places, len(grid))
         self._buffers = Buffers((4, size, size))
-        # At rest, by scene: its latent and its plans.
-        self._latents: LruCache[tuple[Latent, Shots]] = LruCache(_LATENTS_BYTES)
-        # Whose light is in `_lights`; None until that is made.
-        self._shots: list[Shot | None] = [None] * num_envs
-        self._lights: list[torch.Tensor] = [torch.empty(0)] * num_envs
-        self._remaining: list[torch.Tensor | None] = [None] * num_envs
-        self._tables = np.zeros((num_envs, 5, 4), np.float32)
-        self._excess = np.zeros(num_envs)
-        self._modules = np.full(num_envs, "", object)
+        self._kept = [KeptLight(self._buffers, keep) for _ in range(places)]
+        # Row of the plans whose blurred light each place has.
+        self._shown = np.full(places, -1)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Without what the next frame of every episode makes again."""
-        return self.__dict__ | {
-            "_shots": [None] * len(self._shots),
-            "_latents": LruCache(_LATENTS_BYTES),
-            "_buffers": Buffers(self._buffers.shape),
-        }
+    def end(self, places: np.ndarray) -> None:
+        """Lets the memory that the episodes at `places` used be used again."""
+        own = self.episodes.slot[places] >= len(self.scenes)  # the others keep nothing of theirs
+        for place in places[own].tolist():
+            self._plans.forget(len(self.scenes) + place)
+            self._kept[place].end()
+            self._shown[place] = -1
 
     # -- plans ----------------------------------------------------------------------------------
 
-    def prepare(self, index: int, episode: Episode, gain: float) -> bool:
-        """Plans the next frame of episode `index`; whether `blur` must be called before `record`.
+    def prepare(self, places: np.ndarray, gains: np.ndarray) -> None:
+        """Plans the next frames, and makes their light; to be called before `record`.
 
         Args:
-            index: Place of the episode.
-            episode: It, in its current state.
-            gain: Light of the exposure relative to the scene's own.
+            places: (B,) of the episodes, in their current states.
+            gains: (B,) light of each exposure relative to the scene's own.
         """
-        if episode.latent is None:
-            self._begin(episode)
-        known = episode.shots.get(episode.state)
-        if known is None or known[0] != gain:
-            known = episode.shots[episode.state] = (gain, self._shot(episode, gain))
-        shot = known[1]
-        if shot is self._shots[index]:
-            return False
-        self._shots[index] = None
-        self._tables[index] = shot.table
-        self._modules[index] = shot.modules
-        if shot.light is None:
-            return True
-        self._lights[index], self._remaining[index] = shot.light, None
-        self._excess[index] = shot.excess_noise
-        self._shots[index] = shot
-        return False
+        rows = self._rows(places)
+        stale = self._plans.gain[rows] != gains
+        if stale.any():
+            self._plan(places[stale], rows[stale], gains[stale])
+        todo = self._plans.blurs[rows] & (self._shown[places] != rows)
+        if todo.any():
+            self._blur(places[todo], rows[todo])
 
-    def blur(self, planned: Sequence[tuple[int, Episode]]) -> None:
-        """Makes the light of the frames that were planned, on as many threads as torch may use.
+    def _rows(self, places: np.ndarray) -> np.ndarray:
+        """(B,) rows of the plans."""
+        return self.episodes.slot[places] * len(self.grid) + self.episodes.state[places]
 
-        Args:
-            planned: Places of the episodes, and they.
-        """
+    def _plan(self, places: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
+        """Works out `rows` (K,) of the plans, for the next frames of `places` in light `gains`."""
+        plans, noisy, exposures = self._plans, self.options.noise is not False, []
+        for place, row, gain in zip(places.tolist(), rows.tolist(), gains.tolist(), strict=True):
+            latent = self._latent(place)
+            if gain != latent.gain:
+                latent = replace(latent, gain=gain)
+            exposure = latent.exposure(self.grid[row % len(self.grid)])
+            blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
+            plans.blurs[row], plans.exposure[row] = blurs, exposure if blurs else None
+            if not blurs:
+                plans.light[row] = latent.source_light(exposure).contiguous()
+            plans.excess[row] = _excess_noise(latent, exposure) if noisy else 0.0
+            plans.modules[row] = _modules(exposure, noisy)
+            exposures.append(exposure)
+        plans.table[rows] = exposure_table(exposures)
+        plans.gain[rows] = gains  # last: what is interrupted stays unknown
+        self._shown[places] = -1
+
+    def _latent(self, place: int) -> Latent:
+        """What the camera sees of the scene in its own light."""
+        kept, episodes = self._kept[place], self.episodes
+        if kept.latent is not None:
+            return kept.latent
+        scene = int(episodes.scene[place])
+        latent = self._latents.get(scene)
+        if latent is None:
+            latent = scene_latent(self.scenes[scene], self.camera)
+            latent = replace(latent, tolerance=self.options.tolerance)
+            if latent.opening is None:  # that keeps too much light to stay longer than an episode
+                self._latents.put(scene, latent, _LATENT_BYTES)
+        if episodes.slot[place] != scene:
+            speed, defocus = float(episodes.speed[place]), float(episodes.defocus[place])
+            kept.latent = latent = in_episode(latent, speed=speed, defocus=defocus)
+        return latent
+
+    def _blur(self, places: np.ndarray, rows: np.ndarray) -> None:
+        """Makes the light of `rows`, on as many threads as torch may use."""
+        planned = list(zip(places.tolist(), rows.tolist(), strict=True))
         try:
-            opened = [p for p in planned if _planned(p[1]).exposure.opened_to is not None]
+            opened = [p for p in planned if self._plans.exposure[p[1]].opened_to is not None]
             _in_shares(self._open, opened)
             begun = [self._begin_blur(*pair) for pair in planned]
             blurs = [blur for blur in begun if blur is not None]
             blur_many(_without_wide_discs(blurs), limit=LATENT_LIMIT)
             _in_shares(self._balance, opened)
         except BaseException:  # what the episodes keep is not all made
-            for index, episode in planned:
-                self.end(index, episode)
+            self.end(places)
             raise
-        for index, episode in planned:
-            self._shots[index] = _planned(episode)
+        self._shown[places] = rows
 
-    def _open(self, index: int, episode: Episode) -> None:
+    def _open(self, place: int, row: int) -> None:
         """Opens the aperture, which keeps its result."""
-        assert episode.latent is not None
-        episode.latent.source_light(_planned(episode).exposure)
+        self._latent(place).source_light(self._plans.exposure[row])
 
-    def _begin_blur(self, index: int, episode: Episode) -> Blur | None:
-        shot = _planned(episode)
-        self._lights[index], blur = episode.blurred_light(shot.exposure, self._buffers, self.keep)
-        remaining = shot.exposure.remaining
+    def _begin_blur(self, place: int, row: int) -> Blur | None:
+        exposure = self._plans.exposure[row]
+        self._plans.light[row], blur = self._kept[place].blurred(exposure)
+        remaining = exposure.remaining
         if remaining is not None:
             remaining = remaining.float().contiguous()
-        self._remaining[index] = remaining
-        if shot.excess_noise is not None:
-            self._excess[index] = shot.excess_noise
+        self._plans.remaining[row] = remaining
         return blur
 
-    def _balance(self, index: int, episode: Episode) -> None:
+    def _balance(self, place: int, row: int) -> None:
         """The noise that the source brings where pixels must tell."""
-        shot = _planned(episode)
-        if shot.excess_noise is None:
-            balance = noise_balance(self._lights[index], shot.exposure)
-            self._excess[index] = balance.relative_excess
+        if np.isnan(self._plans.excess[row]):
+            balance = noise_balance(self._plans.light[row], self._plans.exposure[row])
+            self._plans.excess[row] = balance.relative_excess
         if not self.keep:  # an opening keeps the light of each f-number
-            episode.latent = None
-
-    def end(self, index: int, episode: Episode) -> None:
-        """Lets the memory that `episode`, at place `index`, used be used again."""
-        self._shots[index] = None
-        episode.end(self._buffers)
-
-    def _begin(self, episode: Episode) -> None:
-        """Finds the episode's latent, and the plans that it shares with others of the scene."""
-        known = self._latents.get(episode.scene)
-        if known is None:
-            latent = scene_latent(self.scenes[episode.scene], self.camera)
-            known = (replace(latent, tolerance=self.options.tolerance), {})
-            if latent.opening is None:  # that keeps too much light to stay longer than an episode
-                size = _LATENT_BYTES + _SHOT_BYTES * len(self.grid)
-                self._latents.put(episode.scene, known, size)
-        latent, shots = known
-        if episode.speed or episode.defocus:
-            latent = in_episode(latent, speed=episode.speed, defocus=episode.defocus)
-        elif latent.opening is None and self.shares:
-            episode.shots = shots
-        episode.latent = latent
-
-    def _shot(self, episode: Episode, gain: float) -> Shot:
-        latent = episode.latent
-        assert latent is not None
-        if gain != latent.gain:
-            latent = replace(latent, gain=gain)
-        exposure = latent.exposure(self.grid[episode.state])
-        noisy = self.options.noise is not False
-        excess = _excess_noise(latent, exposure) if noisy else 0.0
-        light = None
-        if not (exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None):
-            light = latent.source_light(exposure).contiguous()
-        return Shot(
-            exposure=exposure,
-            table=exposure_table([exposure])[0],
-            excess_noise=excess,
-            modules=_modules(exposure, noisy),
-            light=light,
-        )
+            self._kept[place].latent = None
 
     # -- frames ---------------------------------------------------------------------------------
 
     def record(
         self,
-        indices: Sequence[int],
-        episodes: Sequence[Episode],
+        places: np.ndarray,
         *,
         codes: np.ndarray | None = None,
         numbers: np.ndarray | None = None,
@@ -212,8 +184,7 @@ class Recorder:
         """Photographs episodes that are prepared, and fills every output that is given.
 
         Args:
-            indices: Places of the episodes.
-            episodes: They.
+            places: (B,) of the episodes.
             codes: (B, 4, R, R) uint8, as observed.
             numbers: (B, 4, R, R) uint16, digital numbers.
             signals: (B, 4, R, R) float32, on the scale where white is 1.
@@ -221,20 +192,18 @@ class Recorder:
         Returns:
             Columns of `info`, and ``noise_key`` (B,) uint64.
         """
-        rows = np.asarray(indices)
-        keys = noise_keys(
-            np.array([e.noise_seed for e in episodes]), np.array([e.frame for e in episodes], float)
-        )
-        exact = self.options.noise == "exact"
+        rows, plans = self._rows(places), self._plans
+        seeds, frames = self.episodes.noise_seed[places], self.episodes.frame[places]
+        keys = noise_keys(seeds, frames.astype(np.float64))
         flat = (len(rows), 4, self._samples)
         counts = record_frames(
-            addresses([self._lights[i] for i in indices]),
+            addresses(plans.light[rows]),
             self._samples,
-            self._tables[rows],
+            plans.table[rows],
             self.camera,
             keys=None if self.options.noise is False else keys,
-            normals=self._normals(episodes) if exact else None,
-            remaining=addresses([self._remaining[i] for i in indices]),
+            noise="exact" if self.options.noise == "exact" else "bank",
+            remaining=addresses(plans.remaining[rows]),
             codes=None if codes is None else codes.reshape(flat),
             numbers=None if numbers is None else numbers.reshape(flat),
             signals=None if signals is None else signals.reshape(flat),
@@ -242,25 +211,10 @@ class Recorder:
         return {
             "clipped_high": counts[:, 1] / (4 * self._samples),
             "clipped_low": counts[:, 0] / (4 * self._samples),
-            "excess_noise": self._excess[rows],
-            "modules": self._modules[rows],
+            "excess_noise": plans.excess[rows],
+            "modules": plans.modules[rows],
             "noise_key": keys,
         }
-
-    def _normals(self, episodes: Sequence[Episode]) -> np.ndarray:
-        """(B, 4 R R) float32, each row from its own generator."""
-        normals = torch.empty(len(episodes), 4 * self._samples)
-
-        def draw(first: int, last: int) -> None:
-            for row, episode in zip(normals[first:last], episodes[first:last], strict=True):
-                row.normal_(generator=noise_generator(episode.noise_seed, episode.frame))
-
-        in_shares(draw, len(episodes))
-        return normals.numpy()
-
-
-def _planned(episode: Episode) -> Shot:
-    return episode.shots[episode.state][1]
 
 
 def _without_wide_discs(blurs: list[Blur]) -> list[Blur]:
@@ -292,18 +246,16 @@ def _wide_disc(blur: Blur) -> None:
     blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
 
 
-def _in_shares(
-    task: Callable[[int, Episode], None], planned: Sequence[tuple[int, Episode]]
-) -> None:
+def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, int]]) -> None:
     def run(first: int, last: int) -> None:
-        for index, episode in planned[first:last]:
-            task(index, episode)
+        for place, row in planned[first:last]:
+            task(place, row)
 
     in_shares(run, len(planned))
 
 
-def _excess_noise(latent: Latent, exposure: Exposure) -> float | None:
-    """Mean variance that the source brings beyond the target's; None where pixels must tell."""
+def _excess_noise(latent: Latent, exposure: Exposure) -> float:
+    """Mean variance that the source brings beyond the target's; NaN where pixels must tell."""
     if exposure.source.is_zero:
         return 0.0
     source, target = exposure.source_noise, exposure.target
@@ -311,7 +263,7 @@ def _excess_noise(latent: Latent, exposure: Exposure) -> float | None:
     if all(brought <= wanted for brought, wanted in pairs):
         return 0.0
     if exposure.remaining is not None:
-        return None
+        return math.nan
     return latent.statistics.relative_excess(exposure.ratio, source, target)
 
 

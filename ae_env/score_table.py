@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import weakref
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -53,7 +54,7 @@ class ScoreTable:
     standard_error: np.ndarray
     parts: dict[str, np.ndarray]
 
-    @property
+    @cached_property
     def oracle(self) -> int:
         """The best state; ties go to the lower index, that is the lower ISO.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ae_env.core import EpisodeCore, Frames
-from ae_env.env import single_info
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
@@ -66,6 +66,7 @@ class AutoExposureVectorEnv(
         self.single_observation_space = self.core.observation_space()
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._everyone = np.arange(num_envs)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._done = np.zeros(num_envs, dtype=bool)
@@ -90,7 +91,8 @@ class AutoExposureVectorEnv(
     @property
     def states(self) -> np.ndarray:
         """(N,) int64: current exposure state of each episode."""
-        return np.array([self.core.episode(i).state for i in range(self.num_envs)])
+        self.core.episode(0)
+        return self.core.episodes.state.copy()
 
     def action_masks(self) -> np.ndarray:
         """(N, S) bool: states that may be chosen."""
@@ -117,17 +119,16 @@ class AutoExposureVectorEnv(
         options = dict(options or {})
         mask = self._reset_mask(options.pop("reset_mask", None))
         per_env = self._split_options(options)
-        indices = np.flatnonzero(mask).tolist()
-        if any(self.core.episodes[i] is None for i in np.flatnonzero(~mask)):
+        places = np.flatnonzero(mask)
+        if not self.core.episodes.begun[~mask].all():
             raise gym.error.ResetNeeded("the first reset() must be of all environments")
-        for i in indices:
+        for i in places.tolist():
             if seeds[i] is not None or self._rngs[i] is None:
                 self._rngs[i], _ = seeding.np_random(seeds[i])
-        self._begin(indices, per_env)
-        frames = self.core.observe(indices)
-        self._remember(frames, indices)
-        shown = self._place(frames.observation, indices)
-        return shown, self._vector_info(frames.info, indices)
+        self._begin(places, per_env)
+        frames = self.core.observe(places)
+        self._remember(frames, places)
+        return self._place(frames.observation, places), self._vector_info(frames.info, places)
 
     def step(
         self, actions: np.ndarray
@@ -139,44 +140,28 @@ class AutoExposureVectorEnv(
                 f"`actions` ({actions.dtype}, shape {actions.shape}) must be integers "
                 f"({self.num_envs},)"
             )
-        everyone = list(range(self.num_envs))
-        resetting: list[int] = []
-        if self._done.any():
-            if self.autoreset_mode == AutoresetMode.DISABLED:
-                raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
-            resetting = np.flatnonzero(self._done).tolist()
-        running = [i for i in everyone if i not in set(resetting)]
-        previous = {i: self.core.episode(i).state for i in running}
-        chosen = actions.tolist()
-        for i in running:  # before any of them acts
-            self.core.check_action(chosen[i])
-        for i in running:
-            self.core.act(i, chosen[i])
+        resetting = np.flatnonzero(self._done)
+        if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
+        running = np.flatnonzero(~self._done)
+        self.core.act(running, actions[running])
         self._steps[running] += 1
-        if resetting:  # NEXT_STEP: this step begins their new episodes
-            self._begin(resetting, [{}] * self.num_envs)
-            frames = self._merge(
-                self.core.observe(running, [previous[i] for i in running]) if running else None,
-                self.core.observe(resetting),
-                running,
-                resetting,
-            )
-            frames.reward[resetting] = 0.0
-        else:
-            frames = self.core.observe(everyone, [previous[i] for i in everyone])
-        reward, infos = frames.reward, self._vector_info(frames.info, everyone)
+        if len(resetting):  # NEXT_STEP: this step begins their new episodes
+            self._begin(resetting)
+        frames = self.core.observe(self._everyone)
+        frames.reward[resetting] = 0.0
         truncated = np.zeros(self.num_envs, dtype=bool)
         if self.max_episode_steps is not None:
-            truncated[running] = self._steps[running] >= self.max_episode_steps
-        observation = frames.observation
-        finished = np.flatnonzero(truncated).tolist()
-        if finished and self.autoreset_mode == AutoresetMode.SAME_STEP:
-            observation, infos = self._restart(finished, frames, infos)
+            truncated = self._steps >= self.max_episode_steps
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and truncated.any():
+            observation, infos = self._restart(np.flatnonzero(truncated), frames)
         else:
             self._done = truncated.copy()
             self._remember(frames)
+            observation = frames.observation
+            infos = self._vector_info(frames.info, self._everyone)
         self._keep(observation)
-        return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, infos
+        return observation, frames.reward, np.zeros_like(truncated), truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """One (H, W, 3) uint8 picture per environment; None without a render mode."""
@@ -190,79 +175,60 @@ class AutoExposureVectorEnv(
 
     # -- helpers ------------------------------------------------------------------------------
 
-    def _begin(self, indices: list[int], options: list[dict[str, Any]]) -> None:
+    def _begin(self, places: np.ndarray, options: Sequence[dict[str, Any]] | None = None) -> None:
         drawn = []
-        for i in indices:
+        for i in places.tolist():
             rng = self._rngs[i]
             if rng is None:
                 raise gym.error.ResetNeeded("call reset() before step()")
-            drawn.append(self.core.drawn(rng, options[i]))
-        for i, episode in zip(indices, drawn, strict=True):
-            self.core.begin(i, episode)
-        self._steps[indices] = 0
-        self._done[indices] = False
+            drawn.append(self.core.drawn(rng, options[i] if options else {}))
+        self.core.begin(places, drawn)
+        self._steps[places] = 0
+        self._done[places] = False
 
-    def _restart(
-        self, finished: list[int], frames: Frames, infos: dict[str, Any]
-    ) -> tuple[Observation, dict[str, Any]]:
+    def _restart(self, finished: np.ndarray, frames: Frames) -> tuple[Observation, dict[str, Any]]:
+        """Begins new episodes in place of those whose last frames are shown, at `finished`."""
+        whole = len(finished) == self.num_envs
+        last = frames.observation if whole else _taken(frames.observation, finished)
+        last_info = frames.info if whole else _taken(frames.info, finished)
         final_obs = np.full(self.num_envs, None, dtype=object)
-        final_info: dict[str, Any] = {}
-        for i in finished:
-            final_obs[i] = {name: values[i].copy() for name, values in frames.observation.items()}
-            final_info = self._add_info(final_info, single_info(frames.info, i), i)
-        self._begin(finished, [{}] * self.num_envs)
-        fresh = self.core.observe(finished)
-        if len(finished) == self.num_envs:
-            observation, merged = fresh.observation, fresh.info
-        else:
-            observation = frames.observation
-            for name, values in fresh.observation.items():
-                observation[name][finished] = values
-            merged = _overwrite(frames.info, fresh.info, finished)
-        self._remember(Frames(observation, merged, frames.reward))
+        for row, i in enumerate(finished.tolist()):
+            final_obs[i] = {name: values[row] for name, values in last.items()}
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[finished] = True
-        infos = {"final_obs": final_obs, "_final_obs": mask}
-        infos |= {"final_info": final_info, "_final_info": mask.copy()}
-        return observation, infos | self._vector_info(merged, list(range(self.num_envs)))
+        infos: dict[str, Any] = {"final_obs": final_obs, "_final_obs": mask}
+        infos["final_info"] = self._vector_info(last_info, finished)
+        infos["_final_info"] = mask.copy()
+        self._begin(finished)
+        fresh = self.core.observe(finished)
+        if whole:
+            frames = Frames(fresh.observation, fresh.info, frames.reward)
+        else:
+            _put(frames.observation, fresh.observation, finished)
+            _put(frames.info, fresh.info, finished)
+        self._remember(frames)
+        return frames.observation, infos | self._vector_info(frames.info, self._everyone)
 
-    def _merge(
-        self, first: Frames | None, second: Frames, running: list[int], resetting: list[int]
-    ) -> Frames:
-        if first is None:
-            return second
-        order = np.argsort(running + resetting)
-
-        def join(a: Any, b: Any) -> Any:
-            if isinstance(a, dict):
-                return {name: join(a[name], b[name]) for name in a}
-            return np.concatenate([a, b])[order]
-
-        return Frames(
-            join(first.observation, second.observation),
-            join(first.info, second.info),
-            join(first.reward, second.reward),
-        )
-
-    def _remember(self, frames: Frames, rows: list[int] | None = None) -> None:
+    def _remember(self, frames: Frames, places: np.ndarray | None = None) -> None:
+        """Keeps `frames`, of all or of `places`, for rendering."""
         if self.render_mode is None:
             return
-        if self._last is not None and rows is not None and len(rows) < self.num_envs:
-            last = self._last
-            frames = Frames(
-                _overwrite(last.observation, frames.observation, rows),
-                _overwrite(last.info, frames.info, rows),
-                _overwrite(last.reward, frames.reward, rows),
-            )
+        if self._last is not None and places is not None:
+            last = copy.deepcopy(self._last)  # the caller has its arrays
+            _put(last.observation, frames.observation, places)
+            _put(last.info, frames.info, places)
+            last.reward[places] = frames.reward
+            frames = last
         self._last = frames
 
-    def _place(self, observation: Observation, indices: list[int]) -> Observation:
-        """`observation` of `indices` among what the others show; it is theirs to change."""
-        if len(indices) < self.num_envs:
+    def _place(self, observation: Observation, places: np.ndarray) -> Observation:
+        """`observation` of `places` among what the others show; it is theirs to change."""
+        if len(places) < self.num_envs:
             shown = self._shown
             if shown is None:  # the same frames again
-                shown = self.core.observe(list(range(self.num_envs))).observation
-            observation = _overwrite(shown, observation, indices)
+                shown = self.core.observe(self._everyone).observation
+            _put(shown, observation, places)
+            observation = shown
         self._keep(observation)
         return observation
 
@@ -270,17 +236,22 @@ class AutoExposureVectorEnv(
         if self.autoreset_mode == AutoresetMode.DISABLED:
             self._shown = {name: values.copy() for name, values in observation.items()}
 
-    def _vector_info(self, columns: dict[str, Any], indices: list[int]) -> dict[str, Any]:
-        if len(indices) < self.num_envs:
-            info: dict[str, Any] = {}
-            for row, i in enumerate(indices):
-                info = self._add_info(info, single_info(columns, row), i)
-            return info
-        info = {}
-        for name, values in columns.items():
-            is_group = isinstance(values, dict)
-            info[name] = self._vector_info(values, indices) if is_group else values
-            info[f"_{name}"] = np.ones(self.num_envs, dtype=bool)
+    def _vector_info(self, columns: dict[str, Any], places: np.ndarray) -> dict[str, Any]:
+        """Columns of `places` as Gymnasium wants them: as long as there are environments.
+
+        Each has a mask beside it; what is not of `places` is 0 or None.
+        """
+        info: dict[str, Any] = {}
+        masks = np.zeros((len(columns), self.num_envs), dtype=bool)
+        masks[:, places] = True
+        for mask, (name, values) in zip(masks, columns.items(), strict=True):
+            if isinstance(values, dict):
+                values = self._vector_info(values, places)
+            elif len(places) < self.num_envs:
+                empty = None if values.dtype == object else 0
+                some, values = values, np.full(self.num_envs, empty, values.dtype)
+                values[places] = some
+            info[name], info[f"_{name}"] = values, mask
         return info
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -319,12 +290,21 @@ class AutoExposureVectorEnv(
         return split
 
 
-def _overwrite(old: Any, new: Any, rows: list[int]) -> Any:
-    if isinstance(old, dict):
-        return {name: _overwrite(old[name], new[name], rows) for name in old}
-    merged = old.copy()
-    merged[rows] = new
-    return merged
+def _taken(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+    """Copies of `rows` of columns, which may be grouped."""
+    return {
+        name: _taken(values, rows) if isinstance(values, dict) else values[rows]
+        for name, values in columns.items()
+    }
+
+
+def _put(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None:
+    """Writes `new` to `rows` of columns, which may be grouped."""
+    for name, values in columns.items():
+        if isinstance(values, dict):
+            _put(values, new[name], rows)
+        else:
+            values[rows] = new[name]
 
 
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:

@@ -52,16 +52,17 @@ class NoiseLevelFunction:
     def __post_init__(self) -> None:
         for name in ("shot", "read"):
             values = tuple(float(v) for v in getattr(self, name))
-            if len(values) != 4 or not all(math.isfinite(v) and v >= 0 for v in values):
+            if len(values) != 4 or not all(0.0 <= v < math.inf for v in values):
                 raise ValueError(f"`{name}` (={values}) must be 4 finite values >= 0")
             object.__setattr__(self, name, values)
 
-    @classmethod
-    def zero(cls) -> NoiseLevelFunction:
+    @staticmethod
+    @functools.cache
+    def zero() -> NoiseLevelFunction:
         """The NLF of a source without noise."""
-        return cls((0.0,) * 4, (0.0,) * 4, source="noise-free")
+        return NoiseLevelFunction((0.0,) * 4, (0.0,) * 4, source="noise-free")
 
-    @property
+    @functools.cached_property
     def is_zero(self) -> bool:
         """Whether there is no noise at all."""
         return max(*self.shot, *self.read) == 0.0

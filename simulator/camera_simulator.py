@@ -375,7 +375,8 @@ class CameraSimulator:
             )
             data, excess_noise = latent.capture(settings, seed, noise=noise)
             output_noise = latent.output_noise(settings)
-        clipped = 0.0 if latent.saturated is None else float(latent.saturated.float().mean())
+        marks = latent.saturated
+        clipped = 0.0 if marks is None else int(marks.count_nonzero()) / marks.numel()
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}
         metadata |= {
             "simulated_from": str(latent.reference),

@@ -16,8 +16,8 @@ import torch
 from simulator.blur import disc_blur, motion_blur
 from simulator.camera import CameraProfile
 from simulator.exposure import LATENT_LIMIT, SIGNAL_LIMIT, Exposure
-from simulator.noise import draw_normals, noise_variance
-from simulator.noise_bank import frame_noise
+from simulator.frame_noise import FrameNoise, Noise
+from simulator.noise import noise_variance
 from simulator.threads import in_shares
 
 _TINY = torch.finfo(torch.float32).tiny
@@ -48,19 +48,17 @@ def defocused_light(latent: torch.Tensor, defocus_px: float) -> torch.Tensor:
 
 
 def add_noise(
-    light: torch.Tensor, exposures: Sequence[Exposure], generators: Sequence[torch.Generator]
+    light: torch.Tensor, exposures: Sequence[Exposure], noises: Sequence[FrameNoise]
 ) -> tuple[torch.Tensor, np.ndarray]:
     """Tops the noise of each image of `light` (B, 4, H, W) up to its target's.
 
-    Each image draws from its own generator, so that it comes out the same alone or in a batch.
+    Each image has its own noise, so that it comes out the same alone or in a batch.
 
     Returns:
         See `top_up`.
     """
-    normals = torch.empty(light.shape, dtype=torch.float32)
-    for normal, generator in zip(normals, generators, strict=True):
-        draw_normals(normal, generator)
-    return top_up(light, exposures, normals.to(light.device))
+    normals = np.stack([noise.normals(light.shape[1:]) for noise in noises])
+    return top_up(light, exposures, torch.from_numpy(normals).to(light.device))
 
 
 def top_up(
@@ -94,7 +92,7 @@ def record(
     light: torch.Tensor,
     exposure: Exposure,
     camera: CameraProfile,
-    noise: torch.Generator | int | None,
+    noise: FrameNoise | None,
     *,
     out: torch.Tensor,
     threads: int | None = None,
@@ -107,33 +105,21 @@ def record(
         light: (4, H, W) with the blur of `exposure`, at the exposure of the latent.
         exposure: What happens to it.
         camera: The body.
-        noise: What draws it, or its key in the bank (`simulator.noise_bank.noise_keys`); None for
-            none.
+        noise: The noise; None for none.
         out: (4, H, W) float32, contiguous, that the frame in [-pedestal, 1] is written to.
         threads: Of the kernel, at most; those of torch by default.
     """
-    normals = None
-    if not lacks_noise(exposure):  # nothing to draw
+    if not lacks_noise(exposure):
         noise = None
-    if isinstance(noise, torch.Generator):
-        # A sample's normal is read before the sample is written: on the CPU they share memory.
-        place = out if out.device.type == "cpu" else torch.empty(light.shape)
-        draw_normals(place, noise, threads)
-        normals = place
     if light.device.type == "cpu":
         from simulator.kernels import record_capture  # numba: only where there is a capture
 
-        key = noise if isinstance(noise, int) else None
-        record_capture(light, exposure, camera, key=key, normals=normals, out=out, threads=threads)
+        record_capture(light, exposure, camera, noise=noise, out=out, threads=threads)
         return
-    if isinstance(noise, int):
-        normals = torch.from_numpy(frame_noise(noise, tuple(light.shape)))  # type: ignore[arg-type]
-    signal = exposed_light(light, exposure)
-    if normals is None:
-        out.copy_(clip_and_quantise(signal, camera))
-        return
-    noisy, _ = top_up(signal[None], [exposure], normals[None].to(light.device))
-    out.copy_(clip_and_quantise(noisy[0], camera))
+    signal = exposed_light(light, exposure)[None]
+    if noise is not None:
+        signal, _ = add_noise(signal, [exposure], [noise])
+    out.copy_(clip_and_quantise(signal[0], camera))
 
 
 def lacks_noise(exposure: Exposure) -> bool:
@@ -148,16 +134,18 @@ def record_batch(
     exposures: Sequence[Exposure],
     camera: CameraProfile,
     keys: np.ndarray,
+    noise: Noise,
     *,
     out: torch.Tensor,
 ) -> None:
-    """`record` of B frames at once on the CPU, with noise from the bank.
+    """`record` of B frames at once on the CPU.
 
     Args:
         lights: B of (4, H, W), blurred already; several may be the same.
         exposures: What happens to each.
         camera: The body.
         keys: (B,) uint64 of the noise of each.
+        noise: How the keys become noise.
         out: (B, 4, H, W) float32, contiguous.
     """
     from simulator.kernels import exposure_table, record_frames
@@ -172,8 +160,10 @@ def record_batch(
         exposure_table(exposures),
         camera,
         keys=keys,
+        noise=noise,
         remaining=addresses(shares),
         signals=out.numpy().reshape(len(out), 4, samples),
+        count=False,
     )
 
 

@@ -38,8 +38,8 @@ DEFAULT_COLOUR_MATRIX = (
 #: What EXIF writes for a date that is not known.
 _NO_DATE = "    :  :     :  :  "
 _CFA_BYTE = {"R": 0, "G": 1, "B": 2}
-#: Packed rows that are converted and written at a time.
-_STRIP_ROWS = 256
+#: Packed rows that are converted and written at a time: few, so that they stay in the cache.
+_STRIP_ROWS = 32
 
 
 def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
@@ -70,8 +70,10 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
 
 def _strip(raw: RawImage) -> Iterator[bytes | memoryview]:
     """The mosaic as it stands in the file, a few rows at a time."""
-    for rows in raw.data.split(_STRIP_ROWS, dim=1):
-        yield unpack_mosaic(rows, raw.camera).astype("<u2", copy=False).data.cast("B")
+    data, height = raw.data.detach().cpu().contiguous(), raw.data.shape[1]
+    for first in range(0, height, _STRIP_ROWS):
+        rows = unpack_mosaic(data, raw.camera, first, min(first + _STRIP_ROWS, height))
+        yield rows.astype("<u2", copy=False).data.cast("B")
 
 
 def _image_tags(raw: RawImage) -> dict[int, Tag]:

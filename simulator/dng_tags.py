@@ -12,7 +12,7 @@ import numpy as np
 from simulator.camera import BayerPattern, NoiseLevelFunction
 from simulator.exif import SOFTWARE
 from simulator.settings import CameraSettings
-from simulator.tiff import Directory
+from simulator.tiff import Content, Directory
 
 #: Begins the Software tag of every DNG written here.
 SOFTWARE_NAME = "ae-env"
@@ -166,7 +166,7 @@ def read_black_level(
     )
 
 
-def read_plain_mosaic(data: bytes, directories: list[Directory]) -> np.ndarray | None:
+def read_plain_mosaic(data: Content, directories: list[Directory]) -> np.ndarray | None:
     """The pixels of an uncompressed one-strip Bayer DNG as `write_dng` writes it, (H, W) uint16.
 
     LibRaw crops and misreads very small frames of some makes; these pixels are plainly there.
@@ -182,5 +182,5 @@ def read_plain_mosaic(data: bytes, directories: list[Directory]) -> np.ndarray |
     if where.get(258, (0,))[0] != 16 or int(where[279][0]) != size:
         return None
     order = "<u2" if data[:2] == b"II" else ">u2"
-    strip = np.frombuffer(data, order, count=width * height, offset=start)
+    strip = np.frombuffer(data[start : start + size], order)
     return strip.reshape(height, width).astype(np.uint16, copy=False)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-import struct
 
-from simulator.tiff import Directory, read_directories
+from simulator.tiff import Content, Directory, read_directories, unpack_at
 
 MAKE, MODEL, SOFTWARE = 271, 272, 305
 UNKNOWN_FILE = "a file of unknown type"
@@ -31,25 +30,26 @@ _SIGNATURES: tuple[tuple[bytes, str], ...] = (
 )
 
 
-def describe_file(data: bytes) -> str:
+def describe_file(data: Content) -> str:
     """What a file is, from its first bytes, in words for an error message."""
+    head = data[:4096]
     for signature, words in _SIGNATURES:
-        if data.startswith(signature):
+        if head.startswith(signature):
             return words
-    if not data:
+    if not head:
         return "an empty file"
-    if data[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"):
+    if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"):
         return "a HEIF or AVIF file"
-    if data[6:14] == b"HEAPCCDR":
+    if head[6:14] == b"HEAPCCDR":
         return "a Canon CRW file"
-    if data[:2] in (b"II", b"MM"):
+    if head[:2] in (b"II", b"MM"):
         return "a TIFF-structured file"
-    if b"\0" not in data[:4096] and all(b >= 32 or b in b"\t\n\r\f" for b in data[:4096]):
+    if b"\0" not in head and all(b >= 32 or b in b"\t\n\r\f" for b in head):
         return "a text file"
     return UNKNOWN_FILE
 
 
-def camera_identity(data: bytes, directories: list[Directory]) -> tuple[str, str]:
+def camera_identity(data: Content, directories: list[Directory]) -> tuple[str, str]:
     """Make and model as the camera recorded them; ``("", "")`` where the file does not say.
 
     Args:
@@ -60,10 +60,10 @@ def camera_identity(data: bytes, directories: list[Directory]) -> tuple[str, str
         if MODEL in tags:
             return str(tags.get(MAKE, ("",))[0]), str(tags[MODEL][0])
     if data[6:14] == b"HEAPCCDR":
-        return _ciff_identity(data, struct.unpack_from("<I", data, 2)[0], len(data))
-    if data.startswith(b"FUJIFILM"):
+        return _ciff_identity(data, unpack_at("<I", data, 2)[0], len(data))
+    if data[:8] == b"FUJIFILM":
         return "FUJIFILM", data[28:60].split(b"\0")[0].decode("ascii", "replace").strip()
-    if data.startswith(b"\0MRM"):  # Minolta MRW: a TIFF directory in its block TTW
+    if data[:4] == b"\0MRM":  # Minolta MRW: a TIFF directory in its block TTW
         block = data[:65536].find(b"\0TTW")
         return camera_identity(b"", read_directories(data[block + 8 :])) if block > 0 else ("", "")
     box = data[:65536].find(b"CMT1")  # Canon CR3: a TIFF directory in a box of that name
@@ -72,16 +72,16 @@ def camera_identity(data: bytes, directories: list[Directory]) -> tuple[str, str
     return "", ""
 
 
-def _ciff_identity(data: bytes, start: int, end: int, depth: int = 0) -> tuple[str, str]:
+def _ciff_identity(data: Content, start: int, end: int, depth: int = 0) -> tuple[str, str]:
     """Make and model from a Canon CIFF heap, whose directory stands at its end."""
     if depth > 4 or end > len(data) or end - start < 6:
         return "", ""
-    table = start + struct.unpack_from("<I", data, end - 4)[0]
+    table = start + unpack_at("<I", data, end - 4)[0]
     if not start <= table <= end - 6:
         return "", ""
-    (count,) = struct.unpack_from("<H", data, table)
+    (count,) = unpack_at("<H", data, table)
     for at in range(table + 2, min(table + 2 + 10 * count, end - 9), 10):
-        kind, size, offset = struct.unpack_from("<HII", data, at)
+        kind, size, offset = unpack_at("<HII", data, at)
         first, last = start + offset, start + offset + size
         if kind == _CIFF_MAKE_MODEL and last <= end:
             make, model = (*data[first:last].split(b"\0"), b"", b"")[:2]

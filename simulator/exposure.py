@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 
@@ -47,7 +48,7 @@ class Exposure:
     remaining: torch.Tensor | None = None
     errors: Mapping[str, float] = field(default_factory=dict, compare=False)
 
-    @property
+    @cached_property
     def source_noise(self) -> NoiseLevelFunction:
         """Noise that reaches the sensor from the latent: exposed, and averaged by the blur."""
         if self.source.is_zero:

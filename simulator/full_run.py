@@ -11,11 +11,11 @@ import torch
 
 from simulator.camera import NoiseLevelFunction
 from simulator.capture import record, sensor_light
+from simulator.frame_noise import FrameNoise, sweep_keys
 from simulator.latent import Latent
 from simulator.modules.aperture import ApertureModule
 from simulator.modules.exposure import ExposureModule
 from simulator.modules.noise import NoiseModule, smoothed, variance_map
-from simulator.noise import noise_generator
 from simulator.settings import CameraSettings
 
 
@@ -64,8 +64,7 @@ class FullRun:
                 source's leaves its blur.
             seed: Seed of the output's noise.
         """
-        key = (settings.iso, settings.exposure_time, settings.f_number)
-        generator = noise_generator(seed, *key)  # a bad seed is told before any work
+        key = int(sweep_keys(seed, [settings])[0])  # a bad seed is told before any work
         bare = replace(latent, denoised=None, opening=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = self.exposure(latent.light[None], exposure.ratio)
@@ -86,5 +85,5 @@ class FullRun:
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
         light = sensor_light(opened[0], at_target)
         capture = torch.empty_like(light)
-        record(light, at_target, latent.camera, generator, out=capture)
+        record(light, at_target, latent.camera, FrameNoise(key), out=capture)
         return Stages(exposed[0], denoised[0], opened[0], light, capture)

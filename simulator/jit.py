@@ -17,6 +17,8 @@ import numba
 from numba.core import event
 
 logger = logging.getLogger(__name__)
+#: Modules that hold kernels, or constants and functions of kernels, besides ``*_kernels``.
+_CONSTANTS = ("coverage", "kernels", "noise_bank", "noise_keys", "pointers")
 _PACKAGE = __name__.partition(".")[0]
 
 
@@ -61,7 +63,7 @@ def _harden(cache: Any) -> None:
 def _sources() -> int:
     """Checksum of every module that kernels stand in or take constants from."""
     folder = Path(__file__).parent
-    files = [folder / f"{name}.py" for name in ("coverage", "kernels", "noise_bank", "pointers")]
+    files = [folder / f"{name}.py" for name in _CONSTANTS]
     files += folder.glob("*_kernels.py")
     return functools.reduce(
         lambda value, path: zlib.crc32(path.read_bytes(), value), sorted(files), 0

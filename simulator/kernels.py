@@ -17,10 +17,13 @@ import numba
 import numpy as np
 import torch
 
-from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.camera import CameraProfile
 from simulator.exposure import SIGNAL_LIMIT, Exposure
+from simulator.frame_noise import FrameNoise, Noise
 from simulator.jit import kernel
 from simulator.noise_bank import BANK_SIZE, BLOCK, STRIDE, noise_bank
+from simulator.noise_keys import KEY_STEP, mixed_word
+from simulator.normal_kernels import draw_block
 from simulator.pointers import addresses, as_pointer
 from simulator.threads import in_shares
 
@@ -35,10 +38,13 @@ _UNIT_BLOCKS = 256
 _WORTH_A_THREAD = 4 * 64 * 64 * 4
 _FAST = {"nnan", "nsz", "contract"}
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
-_STEP = np.uint64(0x9E3779B97F4A7C15)
-_MIX_1, _MIX_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-#: How the noise is drawn: not at all, from the bank, or given.
-_OFF, _BANK, _GIVEN = 0, 1, 2
+#: What a sample that is clipped high counts as: more than all blocks of a unit can be clipped low.
+_HIGH_BITS = 16
+_HIGH = np.int32(1 << _HIGH_BITS)
+#: How the noise is made: not at all, from the bank, or drawn.
+_OFF, _BANK, _DRAWN = 0, 1, 2
+_NO_BANK = np.empty(0, np.float32)
+_NO_BANK.flags.writeable = False  # of the bank's type
 _LARGEST = float(np.finfo(np.float32).max)
 _START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
 
@@ -67,70 +73,74 @@ def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
     The rows: exposure ratio; shot and read noise that is missing to the target's (negative where
     the source has more); shot and read noise of the source.
     """
-    table = np.zeros((len(exposures), 5, 4))
-    for row, exposure in zip(table, exposures, strict=True):
-        row[0] = exposure.ratio
-        row[1:3] = _noise_rows(exposure.target)
-        if not exposure.source.is_zero:
-            row[3:] = _noise_rows(exposure.source_noise)
-            row[1:3] -= row[3:]
+    rows = []
+    for exposure in exposures:
+        target, source = exposure.target, exposure.source_noise
+        rows.append(((exposure.ratio,) * 4, target.shot, target.read, source.shot, source.read))
+    table = np.array(rows).reshape(-1, 5, 4)
+    table[:, 1:3] -= table[:, 3:]
     return table.astype(np.float32)
-
-
-@functools.lru_cache(maxsize=4096)
-def _noise_rows(nlf: NoiseLevelFunction) -> np.ndarray:
-    return np.array([nlf.shot, nlf.read])
 
 
 _jit = functools.partial(kernel, fastmath=_FAST, boundscheck=False)
 
 
 @_jit()
-def _expose(light, ratio, bound, out):  # type: ignore[no-untyped-def]
-    """Signals, limited before the product so that it cannot overflow."""
-    for j in range(len(out)):
-        x = light[j]
-        x = x if x < bound else bound
-        out[j] = (x if x > -bound else -bound) * ratio
+def _exposed(x, ratio, bound):  # type: ignore[no-untyped-def]
+    """Signal of a light, limited before the product so that it cannot overflow."""
+    x = x if x < bound else bound
+    return (x if x > -bound else -bound) * ratio
 
 
 @_jit()
-def _add_noise(signal, normals, sign, shot, read):  # type: ignore[no-untyped-def]
-    for j in range(len(signal)):
-        x = signal[j]
-        variance = (x if x > _ZERO else _ZERO) * shot + read
-        variance = variance if variance > _ZERO else _ZERO
-        signal[j] = x + sign * np.sqrt(variance) * normals[j]
+def _noisy(x, normal, variance):  # type: ignore[no-untyped-def]
+    return x + normal * np.sqrt(variance if variance > _ZERO else _ZERO)
 
 
 @_jit()
-def _add_noise_after_blur(  # type: ignore[no-untyped-def]
-    signal, normals, sign, shot, read, source_shot, source_read, remaining
+def _rounded(x, span, black, white):  # type: ignore[no-untyped-def]
+    """Digital number of a signal."""
+    x = np.rint(x * span + black)
+    x = x if x > _ZERO else _ZERO
+    return x if x < white else white
+
+
+@_jit()
+def _digitise(  # type: ignore[no-untyped-def]
+    light, bound, normals, sign, exposure, remaining, span, black, white, out
 ):
-    for j in range(len(signal)):
-        x = signal[j]
-        light = x if x > _ZERO else _ZERO
-        variance = light * shot + read
-        variance += (_ONE - remaining[j]) * (light * source_shot + source_read)
-        variance = variance if variance > _ZERO else _ZERO
-        signal[j] = x + sign * np.sqrt(variance) * normals[j]
+    """Digital numbers of light; without `normals` there is no noise.
+
+    `exposure` is a plane's column of `exposure_table`; `remaining` is empty where no blur has
+    averaged the source's noise.
+    """
+    ratio, shot, read, source_shot, source_read = exposure
+    if len(normals) == 0:
+        for j in range(len(out)):
+            out[j] = _rounded(_exposed(light[j], ratio, bound), span, black, white)
+    elif len(remaining) == 0:
+        for j in range(len(out)):
+            x = _exposed(light[j], ratio, bound)
+            variance = (x if x > _ZERO else _ZERO) * shot + read
+            out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
+    else:
+        for j in range(len(out)):
+            x = _exposed(light[j], ratio, bound)
+            bright = x if x > _ZERO else _ZERO
+            variance = bright * shot + read
+            variance += (_ONE - remaining[j]) * (bright * source_shot + source_read)
+            out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
 
 
 @_jit()
-def _quantise(signal, span, black, white):  # type: ignore[no-untyped-def]
-    for j in range(len(signal)):
-        x = np.rint(signal[j] * span + black)
-        x = x if x > _ZERO else _ZERO
-        signal[j] = x if x < white else white
+def _count(numbers, low, high, counts):  # type: ignore[no-untyped-def]
+    """Counts clipped samples by their place in the block: low ones as 1, high ones as 2^16.
 
-
-@_jit()
-def _count(numbers, low, high):  # type: ignore[no-untyped-def]
-    below, above = np.int32(0), np.int32(0)
+    A sum over the block would cost more than all comparisons.
+    """
     for j in range(len(numbers)):
-        below += np.int32(1) if numbers[j] <= low else np.int32(0)
-        above += np.int32(1) if numbers[j] >= high else np.int32(0)
-    return below, above
+        counts[j] += np.int32(1) if numbers[j] <= low else np.int32(0)
+        counts[j] += _HIGH if numbers[j] >= high else np.int32(0)
 
 
 @_jit()
@@ -156,10 +166,7 @@ def _as_signals(numbers, black, span, out):  # type: ignore[no-untyped-def]
 @_jit()
 def _in_bank(key, block):  # type: ignore[no-untyped-def]
     """Where in the bank a block of a frame starts, and its sign; see `simulator.noise_bank`."""
-    word = key + _STEP * np.uint64(block + 1)
-    word = (word ^ (word >> np.uint64(30))) * _MIX_1
-    word = (word ^ (word >> np.uint64(27))) * _MIX_2
-    word = word ^ (word >> np.uint64(31))
+    word = mixed_word(key + KEY_STEP * np.uint64(block + 1))
     return np.int64(word & _START_BITS) * STRIDE, -_ONE if word >> np.uint64(63) else _ONE
 
 
@@ -182,50 +189,45 @@ def _record(  # type: ignore[no-untyped-def]
     counts,
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order."""
-    buffer = np.empty(BLOCK, np.float32)
+    part, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
     for unit in range(first, last):
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
-        ratio, most = exposure[frame, 0, 0], bound[frame]
-        shot, read = exposure[frame, 1, plane], exposure[frame, 2, plane]
-        source_shot, source_read = exposure[frame, 3, plane], exposure[frame, 4, plane]
-        span, black = sensor[0, plane], sensor[1, plane]
-        low, high, white = sensor[2, plane], sensor[3, plane], sensor[4, plane]
+        column = exposure[frame, :, plane].copy()
+        span, black, low, high, white = sensor[:, plane]
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
         plane_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[call-arg]
-        share = numba.carray(as_pointer(remaining[frame]), (samples,))  # type: ignore[call-arg]
-        below, above = 0, 0
+        shares = samples if remaining[frame] else 0
+        share = numba.carray(as_pointer(remaining[frame]), (shares,))  # type: ignore[call-arg]
+        clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start = block * BLOCK
             end = min(start + BLOCK, samples)
-            at = plane * samples + start
-            part = buffer[: end - start]
-            _expose(plane_light[at : at + len(part)], ratio, most, part)
-            if drawn != _OFF:
-                place, sign = np.int64(keys[frame]) * 4 * samples + at, _ONE
-                if drawn == _BANK:
-                    place, sign = _in_bank(keys[frame], plane * blocks + block)
-                normals = bank[place : place + len(part)]
-                if remaining[frame] == 0:
-                    _add_noise(part, normals, sign, shot, read)
-                else:
-                    _add_noise_after_blur(
-                        part, normals, sign, shot, read, source_shot, source_read, share[start:end]
-                    )
-            _quantise(part, span, black, white)
-            lower, higher = _count(part, low, high)
-            below += lower
-            above += higher
+            at, number = plane * samples + start, plane * blocks + block
+            exposed, out = plane_light[at : at + end - start], part[: end - start]
+            given = (column, share[start:end], span, black, white, out)
+            if drawn == _BANK:
+                place, sign = _in_bank(keys[frame], number)
+                _digitise(exposed, bound[frame], bank[place : place + BLOCK], sign, *given)
+            else:
+                if drawn == _DRAWN:
+                    draw_block(keys[frame], number, words, normals)
+                made = normals[: BLOCK * (drawn == _DRAWN)]
+                _digitise(exposed, bound[frame], made, _ONE, *given)
+            if counts.size:
+                _count(out, low, high, clipped)
             if codes.size:
-                _compand(part, darkest, scale, codes[frame, plane, start:end])
+                _compand(out, darkest, scale, codes[frame, plane, start:end])
             if numbers.size:
-                _as_integers(part, numbers[frame, plane, start:end])
+                _as_integers(out, numbers[frame, plane, start:end])
             if signals.size:
-                _as_signals(part, black, span, signals[frame, plane, start:end])
-        counts[unit, 0] = below
-        counts[unit, 1] = above
+                _as_signals(out, black, span, signals[frame, plane, start:end])
+        if counts.size:
+            counts[unit, 0] = (clipped & (_HIGH - 1)).sum()
+            counts[unit, 1] = (clipped >> _HIGH_BITS).sum()
 
 
 def record_frames(
@@ -235,11 +237,12 @@ def record_frames(
     camera: CameraProfile,
     *,
     keys: np.ndarray | None = None,
-    normals: np.ndarray | None = None,
+    noise: Noise = "bank",
     remaining: np.ndarray | None = None,
     codes: np.ndarray | None = None,
     numbers: np.ndarray | None = None,
     signals: np.ndarray | None = None,
+    count: bool = True,
     threads: int | None = None,
 ) -> np.ndarray:
     """Records a batch of frames; every output that is given is filled.
@@ -250,36 +253,35 @@ def record_frames(
         samples: Pixels of a plane.
         exposure: (B, 5, 4) float32, see `exposure_table`.
         camera: The body.
-        keys: (B,) uint64 of the noise from the bank, see `noise_keys`.
-        normals: (B, 4 * samples) float32 standard normals to use instead. Without either there is
-            no noise.
+        keys: (B,) uint64 of the noise, see `noise_keys`; None for no noise.
+        noise: How the keys become noise.
         remaining: (B,) uintp addresses of the share of the source's variance that a blur has left,
             `samples` float32; 0 for all of it.
         codes: (B, 4, samples) uint8, companded (`ae_env.observation`).
         numbers: (B, 4, samples) uint16, digital numbers.
         signals: (B, 4, samples) float32, on the scale where white is 1.
+        count: Whether to count clipped samples.
         threads: At most so many; those of torch by default.
 
     Returns:
-        (B, 2) int64: samples of each frame that are clipped low, and high.
+        (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
     """
-    count = len(light)
+    frames = len(light)
     with np.errstate(divide="ignore"):  # no light at all: any bound will do
         bound = np.minimum(SIGNAL_LIMIT / exposure[:, 0, 0].astype(np.float64), _LARGEST)
     blocks = -(-samples // BLOCK)
     pieces = -(-blocks // _UNIT_BLOCKS)
-    counts = np.empty((count * 4 * pieces, 2), np.int64)
-    if normals is not None:
-        keys = np.arange(count, dtype=np.uint64)
-    drawn = _OFF if keys is None else _BANK if normals is None else _GIVEN
+    units = frames * 4 * pieces
+    counts = np.empty((units if count else 0, 2), np.int64)
+    drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
     fixed = (
         samples,
         np.ascontiguousarray(light, np.uintp),
-        np.zeros(count, np.uintp) if remaining is None else remaining,
+        np.zeros(frames, np.uintp) if remaining is None else remaining,
         exposure,
-        np.zeros(count, np.uint64) if keys is None else keys,
+        np.zeros(frames, np.uint64) if keys is None else keys,
         drawn,
-        noise_bank() if normals is None else normals.reshape(-1),
+        noise_bank() if drawn == _BANK else _NO_BANK,
         sensor_table(camera),
         bound.astype(np.float32),
         np.empty((0, 4, 0), np.uint8) if codes is None else codes,
@@ -288,10 +290,8 @@ def record_frames(
         counts,
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
-    in_shares(
-        lambda first, last: _record(first, last, *fixed), len(counts), least=least, threads=threads
-    )
-    return counts.reshape(count, -1, 2).sum(axis=1)
+    in_shares(lambda first, last: _record(first, last, *fixed), units, least=least, threads=threads)
+    return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)
 
 
 def record_capture(
@@ -299,8 +299,7 @@ def record_capture(
     exposure: Exposure,
     camera: CameraProfile,
     *,
-    key: int | None = None,
-    normals: torch.Tensor | None = None,
+    noise: FrameNoise | None = None,
     out: torch.Tensor | None = None,
     threads: int | None = None,
 ) -> torch.Tensor:
@@ -310,8 +309,7 @@ def record_capture(
         light: (4, H, W) float32 on the CPU, at the exposure of the latent.
         exposure: What happens to it; its blur is not applied here.
         camera: The body.
-        key: Key of the noise from the bank (`noise_keys`).
-        normals: (4, H, W) standard normals to use instead; without either there is no noise.
+        noise: The noise; None for none.
         out: (4, H, W) contiguous float32 to write into.
         threads: At most so many; those of torch by default.
 
@@ -328,10 +326,11 @@ def record_capture(
         light[0].numel(),
         exposure_table([exposure]),
         camera,
-        keys=None if key is None else np.array([key], np.uint64),
-        normals=None if normals is None else normals.reshape(1, -1).numpy(),
+        keys=None if noise is None else np.array([noise.key], np.uint64),
+        noise="bank" if noise is None else noise.kind,
         remaining=addresses([remaining]),
         signals=signals.numpy().reshape(1, 4, -1),
+        count=False,
         threads=threads,
     )
     return signals

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol, get_args
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -18,23 +18,21 @@ from simulator.camera import CameraProfile, NoiseLevelFunction
 from simulator.capture import exposed_light, noise_balance, record, record_batch
 from simulator.denoised import Denoised
 from simulator.exposure import Exposure
+from simulator.frame_noise import FrameNoise, Noise, check_noise, sweep_keys
 from simulator.light_statistics import LightStatistics
-from simulator.noise import noise_generator
-from simulator.noise_bank import noise_keys
 from simulator.opening import Opening
 from simulator.optics import Optics, blur_key
 from simulator.plan import SimulationPlan, make_plan
 from simulator.raw_image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.threads import in_shares
 from simulator.tolerance import DEFAULT_TOLERANCE, Budget, check_tolerance
 
-#: How the noise of a capture is made: drawn, or looked up in a bank of normals.
-Noise = Literal["exact", "bank"]
 #: Noise below this share of the light is not worth denoising: the networks err as much.
 WORTH_DENOISING = 0.006
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
+#: Frames that a stream makes at a time [byte], at least one.
+_STREAMED_BYTES = 2**22
 
 
 class HasLatent(Protocol):
@@ -247,15 +245,9 @@ class Latent:
         Returns:
             (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
         """
+        (frame,) = self.expose([settings], seed=seed, noise=noise)
         exposure = self.exposure(settings)
-        frame = self._frame(exposure, _noise_of(noise, seed, settings))
         return frame, noise_balance(self.optics.blurred(exposure), exposure).relative_excess
-
-    def _frame(self, exposure: Exposure, noise: torch.Generator | int) -> torch.Tensor:
-        light = self.optics.blurred(exposure)
-        frame = new_frame(light)
-        record(light, exposure, self.camera, noise, out=frame)
-        return frame
 
     def expose(
         self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
@@ -272,62 +264,40 @@ class Latent:
         """
         check_noise(noise)
         states = list(states)
-        if not states:
-            return self.light.new_empty((0, *self.light.shape))
-        _noise_of(noise, seed, states[0])  # a bad seed is told before any work
+        keys = sweep_keys(seed, states)  # a bad seed is told before any work
         exposures = [self.exposure(settings) for settings in states]
         frames = new_frame(self.light.expand(len(states), *self.light.shape))
         groups: dict[tuple[object, ...], list[int]] = {}
         for index, exposure in enumerate(exposures):
             groups.setdefault(blur_key(exposure), []).append(index)
-
-        def record_one(i: int, threads: int | None = None) -> None:
-            drawn = _noise_of(noise, seed, states[i])
-            light = self.optics.blurred(exposures[i])
-            record(light, exposures[i], self.camera, drawn, out=frames[i], threads=threads)
-
-        def record_some(first: int, last: int) -> None:
-            for i in range(first, last):
-                record_one(i, threads=1)
-
-        if len(groups) * self.light.nbytes > _TOGETHER_BYTES or self.light.device.type != "cpu":
-            for i in itertools.chain.from_iterable(groups.values()):
-                record_one(i)
+        if len(groups) * self.light.nbytes <= _TOGETHER_BYTES and self.light.device.type == "cpu":
+            lights = [self.optics.blurred(exposure) for exposure in exposures]
+            record_batch(lights, exposures, self.camera, keys, noise, out=frames)
             return frames
-        lights = [self.optics.blurred(exposure) for exposure in exposures]  # kept from here on
-        if noise == "bank":
-            keys = noise_keys(np.array([seed]), *np.array([_noise_key(s) for s in states]).T)
-            record_batch(lights, exposures, self.camera, keys, out=frames)
-        else:
-            in_shares(record_some, len(states))
+        for i in itertools.chain.from_iterable(groups.values()):
+            light, drawn = self.optics.blurred(exposures[i]), FrameNoise(int(keys[i]), noise)
+            record(light, exposures[i], self.camera, drawn, out=frames[i])
         return frames
 
     def stream(
         self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
     ) -> Iterator[torch.Tensor]:
-        """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once."""
-        for settings in states:
-            yield self._frame(self.exposure(settings), _noise_of(noise, seed, settings))
+        """The sweep a few captures at a time, for frames too large to hold all at once.
 
+        Args:
+            states: Settings to simulate.
+            seed: See `capture`.
+            noise: See `capture`.
 
-def _noise_key(settings: CameraSettings) -> tuple[float, float, float]:
-    """What the noise of a sweep's frames differs by."""
-    return settings.iso, settings.exposure_time, settings.f_number
-
-
-def _noise_of(noise: Noise, seed: int, settings: CameraSettings) -> torch.Generator | int:
-    """What draws the noise of one frame, or its key in the bank."""
-    key = _noise_key(settings)
-    check_noise(noise)
-    if noise == "bank":
-        return int(noise_keys(np.array([seed]), *key)[0])
-    return noise_generator(seed, *key)
-
-
-def check_noise(noise: str) -> None:
-    """Raises a `ValueError` unless `noise` is a kind of noise."""
-    if noise not in get_args(Noise):
-        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
+        Yields:
+            One capture (4, H, W) per state.
+        """
+        remaining = iter(states)
+        count = max(1, _STREAMED_BYTES // self.light.nbytes)
+        while some := list(itertools.islice(remaining, count)):
+            frames = list(self.expose(some, seed=seed, noise=noise))[::-1]
+            while frames:  # those that were handed out are not kept
+                yield frames.pop()
 
 
 @functools.lru_cache(maxsize=4096)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +19,6 @@ SAMPLES = 65_536
 _SORTED = 4096
 #: Pixels from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
-#: Answers of a kind that are kept.
-_KEPT = 256
 _FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
 
 
@@ -51,8 +48,7 @@ class LightStatistics:
     ``sqrt(dm^2 + ds^2) / s``, where dm and ds are what a pixel's mean and standard deviation move
     by and s is the standard deviation that it should have.
 
-    Each answer costs tens of microseconds and is kept; `blur_error` for many streaks and discs at
-    one ratio and target is arithmetic on what `curvature` gives once.
+    The first answer takes a pass over the pixels, the others a few microseconds each.
 
     Args:
         light: (4, H, W) linear light at the reference exposure.
@@ -60,18 +56,15 @@ class LightStatistics:
 
     def __init__(self, light: torch.Tensor) -> None:
         self.light = light
-        # Plain dictionaries: a cache around a method would be a circle that keeps the light alive.
-        self._curvatures: dict[tuple[Any, ...], tuple[float, float]] = {}
-        self._excesses: dict[tuple[Any, ...], float] = {}
 
     def __reduce__(self) -> tuple[type[LightStatistics], tuple[torch.Tensor]]:
         return LightStatistics, (self.light,)
 
     @functools.cached_property
     def median(self) -> np.ndarray:
-        """(4,) median light of each plane, at least 0."""
-        light, rows = self._rows
-        return np.maximum(np.median(light[:, rows].reshape(4, -1), axis=1), 0.0)
+        """(4,) median light of each plane, at least 0; of a sample where there are many pixels."""
+        middle = self._sorted.shape[1] // 2
+        return np.maximum(self._sorted[:, [middle, -middle - 1]].mean(axis=1), 0.0)
 
     def excess(self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction) -> float:
         """Error of a source's noise that is left where it exceeds the target's, rather too high.
@@ -83,20 +76,12 @@ class LightStatistics:
         """
         if source.is_zero:
             return 0.0
-        key = (ratio, source, target)
-        if key not in self._excesses:
-            _make_room(self._excesses)
-            self._excesses[key] = self._excess(ratio, source, target)
-        return self._excesses[key]
+        from simulator.statistics_kernels import excess  # numba: only where it is needed
 
-    def _excess(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
-    ) -> float:
-        wanted = _variance(self._bins.edges * ratio, target)
-        given = _variance(self._bins.edges, source) * (ratio * ratio)
-        relative = np.sqrt(given / np.maximum(wanted, _FLOOR)) - 1.0
+        bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
-        return _root_mean(self._bins.share, (np.maximum(relative, 0.0) ** 2).mean(axis=0))
+        noises = _numbers(source), _numbers(target)
+        return float(excess(bins.share, bins.edges, float(ratio), *noises, _FLOOR))
 
     def blur_error(
         self,
@@ -122,22 +107,13 @@ class LightStatistics:
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """`blur_error` of a disc of one pixel and of a streak of one pixel; others go with the
         square of their extent."""
-        key = (ratio, target)
-        if key not in self._curvatures:
-            _make_room(self._curvatures)
-            self._curvatures[key] = self._curvature(ratio, target)
-        return self._curvatures[key]
+        from simulator.statistics_kernels import curvature
 
-    def _curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
-        wanted = np.maximum(_variance(bins.edges[0] * ratio, target), _FLOOR)
-        _, shot = _columns(target)
-        weight = bins.share * (1.0 + shot * shot / wanted) / wanted  # dm^2, and ds^2 of shot noise
-        return (
-            abs(ratio) / 32.0 * _root_mean(weight, bins.disc),  # m = d^2 / 16
-            abs(ratio) / 24.0 * _root_mean(weight, bins.row),  # m = e^2 / 12
-        )
+        squares = bins.edges[0], bins.disc, bins.row
+        disc, row = curvature(bins.share, *squares, float(ratio), _numbers(target), _FLOOR)
+        return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
@@ -182,21 +158,27 @@ class LightStatistics:
         return picked, np.arange(1, picked.shape[1], 3)
 
     @functools.cached_property
+    def _sorted(self) -> np.ndarray:
+        """(4, S) light of some pixels of each plane, ascending."""
+        light, rows = self._rows
+        seen = light[:, rows].reshape(4, -1)
+        return np.sort(seen[:, :: max(1, seen.shape[1] // _SORTED)], axis=1)
+
+    @functools.cached_property
     def _bins(self) -> _Bins:
         from simulator.statistics_kernels import accumulate  # numba: only where it is needed
 
         light, rows = self._rows
-        seen = light[:, rows].reshape(4, -1)
-        some = np.sort(seen[:, :: max(1, seen.shape[1] // _SORTED)], axis=1)
-        edges = some[:, np.arange(1, BINS) * some.shape[1] // BINS]
+        samples = len(rows) * light.shape[-1]
+        edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
         sums, levels = np.zeros((4, 4, BINS)), np.zeros((2, 4, BINS))
         levels[0] = np.inf
-        least = 1 + _WORTH_A_THREAD // seen.shape[1]
+        least = 1 + _WORTH_A_THREAD // samples
         fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
         in_shares(lambda first, last: accumulate(first, last, *fixed), 4, least=least)
         counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
         return _Bins(
-            share=sums[0] / (4.0 * seen.shape[1]),
+            share=sums[0] / (4.0 * samples),
             light=sums[1] / counts,
             edges=np.where(sums[0] > 0, levels, 0.0),
             disc=sums[2] / counts,
@@ -204,21 +186,15 @@ class LightStatistics:
         )
 
 
-def _make_room(kept: dict[Any, Any]) -> None:
-    """Lets go of what is kept where it has become much: changing light asks for ever more."""
-    if len(kept) >= _KEPT:
-        kept.clear()
-
-
 def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
-    read, shot = _columns(nlf)
+    shot, read = _numbers(nlf)[..., None]
     return read + shot * signal
 
 
 @functools.lru_cache(maxsize=256)
-def _columns(nlf: NoiseLevelFunction) -> tuple[np.ndarray, np.ndarray]:
-    """Read and shot noise of the planes, each (4, 1)."""
-    return np.array(nlf.read)[:, None], np.array(nlf.shot)[:, None]
+def _numbers(nlf: NoiseLevelFunction) -> np.ndarray:
+    """(2, 4) shot and read noise of the planes."""
+    return np.array([nlf.shot, nlf.read])
 
 
 def _root_mean(weight: np.ndarray, square: np.ndarray) -> float:

@@ -6,10 +6,6 @@ import numpy as np
 import torch
 
 from simulator.camera import NoiseLevelFunction
-from simulator.threads import in_shares
-
-#: Normals that take longer to draw than a thread to wake.
-_WORTH_A_THREAD = 2**19
 
 
 def noise_generator(seed: int, *key: int | float) -> torch.Generator:
@@ -24,26 +20,6 @@ def noise_generator(seed: int, *key: int | float) -> torch.Generator:
     words = [int(seed), *(int(np.float64(k).view(np.uint64)) for k in key)]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
-
-
-def draw_normals(out: torch.Tensor, generator: torch.Generator, threads: int | None = None) -> None:
-    """Fills `out` (P, H, W) on the CPU with standard normals.
-
-    Each plane draws from a generator of its own that `generator` seeds, so that the planes of a
-    large frame are drawn side by side; the numbers do not depend on the number of threads.
-
-    Args:
-        out: float32, contiguous.
-        generator: Decides on everything.
-        threads: At most so many; by default as many as pay.
-    """
-    seeds = torch.randint(2**62, (len(out),), generator=generator).tolist()
-
-    def draw(first: int, last: int) -> None:
-        for plane, seed in zip(out[first:last], seeds[first:last], strict=True):
-            plane.normal_(generator=torch.Generator().manual_seed(seed))
-
-    in_shares(draw, len(out), threads=1 if out.numel() < _WORTH_A_THREAD else threads)
 
 
 def nlf_tensors(

@@ -16,6 +16,7 @@ import torch
 
 from simulator.camera import NoiseLevelFunction
 from simulator.raw_image import check_packed
+from simulator.threads import in_shares
 
 _BLOCK, _STEP = 8, 4
 #: Share of each level's blocks, those with the least slope, that are looked at.
@@ -71,8 +72,7 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
     >>> bool(abs(nlf.shot[0] / 1e-4 - 1) < 0.05 and abs(nlf.read[0] / 1e-6 - 1) < 0.25)
     True
     """
-    planes = check_packed("data", data).detach().cpu().numpy().astype(np.float64)
-    planes = _central_bands(planes)
+    planes = _central_bands(check_packed("data", data).detach().cpu().numpy()).astype(np.float64)
     white = min(1.0, float(planes.max()))
     floor = float(planes.min())
     if np.mean(planes == floor) < 1e-3:
@@ -85,9 +85,10 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
             "noise; give `nlf`"
         )
     shot, read = 0.0, 1.0
+    levels = _level_sets(blocks)
     for _ in range(3):
         # A level set spans a range of signals: take out the variance's course inside it.
-        level, variance, weight = _variance_by_level(blocks, shot, read)
+        level, variance, weight = _variance_by_level(blocks, levels, shot, read)
         # Close to a clip the noise is cut off: leave out levels within three standard deviations.
         sigma = np.sqrt(variance)
         clear = (level + 3 * sigma < white) & (level - 3 * sigma > floor)
@@ -107,52 +108,78 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
     return np.concatenate([planes[:, s : s + 64] for s in starts], axis=0)
 
 
-def _box_mean(image: np.ndarray, size: int) -> np.ndarray:
-    """Mean over every size x size window."""
-    total = np.cumsum(np.cumsum(np.pad(image, ((1, 0), (1, 0))), axis=0), axis=1)
-    window = (
-        total[size:, size:] - total[:-size, size:] - total[size:, :-size] + total[:-size, :-size]
-    )
-    return window / (size * size)
+def _sums(image: np.ndarray) -> np.ndarray:
+    """(H + 1, W + 1) sum over everything above and to the left of each corner of a pixel."""
+    from simulator.estimation_kernels import summed_area  # numba: only where it is needed
+
+    total = np.empty((image.shape[0] + 1, image.shape[1] + 1))
+    summed_area(image, total)
+    return total
+
+
+def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.ndarray:
+    """Mean over size x size windows, one every `_STEP` rows and columns from `top` and `left` on.
+
+    As many as there are blocks, wherever the windows lie in them.
+    """
+    rows, columns = (range(0, n - _BLOCK, _STEP) for n in total.shape)
+    corners = [
+        total[top + i : top + i + rows.stop : _STEP, left + j : left + j + columns.stop : _STEP]
+        for i in (0, size)
+        for j in (0, size)
+    ]
+    first, right, below, last = corners
+    return (last - right - below + first) / (size * size)
 
 
 def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks:
     """Overlapping blocks of all planes; the clipped ones are left out."""
-    means, energies, slopes = [np.empty(0)], [np.empty(0)], [np.empty(0)]
-    grid = (slice(None, None, _STEP), slice(None, None, _STEP))
-    for plane in planes if min(planes.shape[1:]) >= _BLOCK + 2 else ():
-        # Immerkaer's [1 -2 1] x [1 -2 1]: blind to slopes and to curvature along one axis; over 6,
-        # it keeps the variance of white noise.
-        rows = plane[:-2] - 2.0 * plane[1:-1] + plane[2:]
-        high_pass = (rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]) / 6.0
-        inner = plane[1:-1, 1:-1]
-        clipped = ((inner >= white) | (inner <= floor)).astype(np.float64)
-        mean = _box_mean(inner, _BLOCK)
-        half = _BLOCK // 2
-        quarter = _box_mean(inner, half)
-        height, width = mean.shape
-        quarters = np.stack(
-            [quarter[i : i + height, j : j + width] for i in (0, half) for j in (0, half)]
-        )
-        keep = _box_mean(clipped, _BLOCK)[grid] <= _CLIPPED
-        means.append(mean[grid][keep])
-        energies.append(_box_mean(high_pass**2, _BLOCK)[grid][keep])
-        slopes.append(np.ptp(quarters, axis=0)[grid][keep])
-    return _Blocks(np.concatenate(means), np.concatenate(energies), np.concatenate(slopes))
+    found: list[tuple[np.ndarray, ...]] = [(np.empty(0),) * 3] * len(planes)
+
+    def look(first: int, last: int) -> None:
+        for index in range(first, last):
+            found[index] = _blocks_of(planes[index], white, floor)
+
+    if min(planes.shape[1:]) >= _BLOCK + 2:
+        in_shares(look, len(planes))
+    return _Blocks(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarray, ...]:
+    """Mean, energy and slope of the blocks of one plane; see `_Blocks`."""
+    # Immerkaer's [1 -2 1] x [1 -2 1]: blind to slopes and to curvature along one axis; over 6,
+    # it keeps the variance of white noise.
+    rows = plane[:-2] - 2.0 * plane[1:-1] + plane[2:]
+    high_pass = (rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]) / 6.0
+    inner = plane[1:-1, 1:-1]
+    clipped = ((inner >= white) | (inner <= floor)).astype(np.float64)
+    half, total = _BLOCK // 2, _sums(np.ascontiguousarray(inner))
+    quarters = [_box_mean(total, half, i, j) for i in (0, half) for j in (0, half)]
+    slope = np.maximum.reduce(quarters) - np.minimum.reduce(quarters)
+    keep = _box_mean(_sums(clipped), _BLOCK) <= _CLIPPED
+    energy = _box_mean(_sums(high_pass**2), _BLOCK)
+    return _box_mean(total, _BLOCK)[keep], energy[keep], slope[keep]
+
+
+def _level_sets(blocks: _Blocks) -> list[np.ndarray]:
+    """The smooth blocks of equally populated levels, as indices."""
+    count = len(blocks.mean)
+    levels = int(np.clip(count // _BLOCKS_PER_LEVEL, 1, _MAX_LEVELS))
+    found = []
+    for members in np.array_split(np.argsort(blocks.mean, kind="stable"), levels):
+        slope = blocks.slope[members]
+        found.append(members[slope <= np.quantile(slope, _SMOOTH)])
+    return found
 
 
 def _variance_by_level(
-    blocks: _Blocks, shot: float, read: float
+    blocks: _Blocks, levels: list[np.ndarray], shot: float, read: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Level, noise variance and number of blocks of equally populated level sets, each (L,)."""
+    """Level, noise variance and number of blocks of each level set, each (L,)."""
     expected = np.maximum(shot * np.maximum(blocks.mean, 0.0) + read, _TINY)
     relative = blocks.energy / expected
-    count = len(blocks.mean)
-    levels = int(np.clip(count // _BLOCKS_PER_LEVEL, 1, _MAX_LEVELS))
     rows = []
-    for members in np.array_split(np.argsort(blocks.mean, kind="stable"), levels):
-        slope = blocks.slope[members]
-        smooth = members[slope <= np.quantile(slope, _SMOOTH)]
+    for smooth in levels:
         level = float(blocks.mean[smooth].mean())
         scale = max(shot * max(level, 0.0) + read, _TINY)
         variance = scale * np.quantile(relative[smooth], _QUANTILE) / _QUANTILE_OF_NOISE

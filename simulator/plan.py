@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import torch
-
 from simulator.capture import noise_balance
 from simulator.exposure import Exposure
 from simulator.settings import CameraSettings
@@ -173,7 +171,7 @@ def make_plan(latent: Latent, settings: CameraSettings, *, noise: bool = True) -
         excess_noise=balance.relative_excess,
         clipped_source=0.0
         if latent.saturated is None
-        else float(latent.saturated.float().mean(dtype=torch.float64)),
+        else int(latent.saturated.count_nonzero()) / latent.saturated.numel(),
         extrapolated_noise=exposure.target.extrapolated,
         predicted_rmse=balance.excess**0.5,
         predicted_difference=_difference(latent, exposure, steps),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -34,7 +35,7 @@ from simulator.exif import UNKNOWN_FILE, camera_identity, describe_file, normali
 from simulator.noise_estimation import estimate_nlf
 from simulator.raw_image import RawImage, pack_mosaic
 from simulator.settings import CameraSettings
-from simulator.tiff import Directory, missing_bytes, read_directories, read_file
+from simulator.tiff import Content, Directory, FileContent, missing_bytes, read_directories
 
 logger = logging.getLogger(__name__)
 
@@ -101,18 +102,19 @@ def read_raw(
         ValueError: If settings are missing from the file and not given, or `camera` does not fit.
     """
     path = Path(path)
-    data = read_file(path)
-    directories = read_directories(data)
-    make, model = camera_identity(data, directories)
-    _refuse_early(path, data, directories, model)
-    own = read_own_record(directories)
-    decoded = None if own is None else _from_own_dng(data, directories, own)
-    if decoded is None:
-        decoded = _decode(path, data, directories)
-    known = settings or _settings(path, decoded.exposure, own)
-    profile = _profile(path, decoded, make, model, camera, own)
+    with ExitStack() as opened:
+        data = opened.enter_context(closing(FileContent(path)))
+        directories = read_directories(data)
+        make, model = camera_identity(data, directories)
+        _refuse_early(path, data, directories, model)
+        own = read_own_record(directories)
+        decoded = None if own is None else _from_own_dng(data, directories, own)
+        if decoded is None:
+            decoded = _decode(path, data, directories, opened)
+        known = settings or _settings(path, decoded.exposure, own)
+        profile = _profile(path, decoded, make, model, camera, own)
+        packed = pack_mosaic(decoded.mosaic, profile)
     box_factor = own.box_factor if own is not None else 1
-    packed = pack_mosaic(decoded.mosaic, profile)
     noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
         profile = profile.with_nlf(known.iso, noise)
@@ -123,7 +125,7 @@ def read_raw(
     return RawImage(packed, known, profile, noise, gains, box_factor, metadata)
 
 
-def _refuse_early(path: Path, data: bytes, directories: list[Directory], model: str) -> None:
+def _refuse_early(path: Path, data: Content, directories: list[Directory], model: str) -> None:
     """Refuse what can be told from the structure: no header, linear DNG, files cut short."""
     if not model and describe_file(data) == UNKNOWN_FILE:
         # LibRaw takes some headerless files for a camera's from their size alone.
@@ -146,7 +148,7 @@ def _refuse_early(path: Path, data: bytes, directories: list[Directory], model: 
         )
 
 
-def _from_own_dng(data: bytes, directories: list[Directory], own: OwnRecord) -> _Decoded | None:
+def _from_own_dng(data: Content, directories: list[Directory], own: OwnRecord) -> _Decoded | None:
     """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes."""
     tags = {tag: value for directory in reversed(directories) for tag, value in directory.items()}
     mosaic = read_plain_mosaic(data, directories)
@@ -176,11 +178,12 @@ def _from_own_dng(data: bytes, directories: list[Directory], own: OwnRecord) -> 
     )
 
 
-def _decode(path: Path, data: bytes, directories: list[Directory]) -> _Decoded:
+def _decode(path: Path, data: Content, directories: list[Directory], opened: ExitStack) -> _Decoded:
+    """What LibRaw reads; its mosaic lies in LibRaw's memory, which `opened` lets go of."""
     words = describe_file(data)
     try:
-        with rawpy.imread(str(path)) as raw:
-            return _from_libraw(path, raw, words, directories)
+        raw = opened.enter_context(rawpy.imread(str(path)))
+        return _from_libraw(path, raw, words, directories)
     except rawpy.LibRawFileUnsupportedError:
         raise RawFileError(
             f"`path` (={path.name!r}) must be a camera raw that LibRaw reads, but is {words}, or "
@@ -215,11 +218,12 @@ def _from_libraw(
         black = list(exact)
     white_balance, source = _white_balance(raw)
     matrix, matrix_source = _colour_matrix(raw, directories)
-    mosaic = raw.raw_image_visible.copy()
+    mosaic = raw.raw_image_visible
     if min(mosaic.shape) < 2 or float(raw.white_level) <= max(black):
         raise RawFileError(f"`path` (={path.name!r}) must hold an image, but is empty: {words}")
     extra: dict[str, Any] = {"flip": int(sizes.flip)}
     other = raw.other
+    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
     if other.timestamp is not None and other.timestamp.timestamp() > 0:
         extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
     if np.isfinite(other.focal_length) and other.focal_length > 0:
@@ -233,13 +237,7 @@ def _from_libraw(
         white_balance_source=source,
         colour_matrix=matrix,
         colour_matrix_source=matrix_source,
-        exposure=(
-            (read_long_iso(directories) or 65535.0)
-            if other.iso_speed == 65535
-            else other.iso_speed,
-            other.shutter_speed,
-            other.aperture,
-        ),
+        exposure=(iso, other.shutter_speed, other.aperture),
         extra=extra,
     )
 

@@ -16,8 +16,8 @@ from simulator.settings import CameraSettings
 from simulator.threads import in_shares
 
 PLANES = ("R", "G1", "G2", "B")
-#: Packed rows from which a second thread helps.
-_SHARE = 128
+#: Packed rows from which a second thread helps, and that are packed at a time.
+_SHARE, _ROWS = 128, 32
 
 
 def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
@@ -44,33 +44,54 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
     planes = np.empty((4, height, width), np.float32)
 
     # One kernel for what files hold, and one for all else.
-    mosaic = np.ascontiguousarray(mosaic, None if mosaic.dtype == np.uint16 else np.float64)
+    dtype = np.uint16 if mosaic.dtype == np.uint16 else np.float64
+    tile = _tile(camera)
     black, span = (np.array(v, np.float64) for v in (camera.black_level, camera.span))
-    offsets = np.array(camera.cfa.offsets)
 
     def pack(first: int, last: int) -> None:
-        pack_rows(mosaic, offsets, black, span, first, last, planes)
+        for top in range(first, last, _ROWS):  # what has to be copied stays in the cache
+            rows = mosaic[2 * top : 2 * min(top + _ROWS, last)]
+            pack_rows(np.ascontiguousarray(rows, dtype), tile, black, span, top, planes)
 
     in_shares(pack, height, least=_SHARE)
     return torch.from_numpy(planes)
 
 
-def unpack_mosaic(data: torch.Tensor, camera: CameraProfile) -> np.ndarray:
-    """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`."""
+def unpack_mosaic(
+    data: torch.Tensor, camera: CameraProfile, first: int = 0, last: int | None = None
+) -> np.ndarray:
+    """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`.
+
+    Args:
+        data: The packed raw.
+        camera: See `pack_mosaic`.
+        first: First packed row of the part that is wanted.
+        last: Where that part ends; by default with the frame.
+    """
     from simulator.mosaic_kernels import unpack_rows
 
     planes = data.detach().float().cpu().contiguous().numpy()
     _, height, width = planes.shape
-    mosaic = np.empty((2 * height, 2 * width), np.uint16)
+    count = (height if last is None else last) - first
+    mosaic = np.empty((2 * count, 2 * width), np.uint16)
 
+    tile, white = _tile(camera), np.float32(camera.white_level)
     black, span = (np.array(v, np.float32) for v in (camera.black_level, camera.span))
-    offsets, white = np.array(camera.cfa.offsets), np.float32(camera.white_level)
 
-    def unpack(first: int, last: int) -> None:
-        unpack_rows(planes, offsets, black, span, white, first, last, mosaic)
+    def unpack(top: int, bottom: int) -> None:
+        part = mosaic[2 * top : 2 * bottom]
+        unpack_rows(planes, tile, black, span, white, first + top, first + bottom, part)
 
-    in_shares(unpack, height, least=_SHARE)
+    in_shares(unpack, count, least=_SHARE)
     return mosaic
+
+
+def _tile(camera: CameraProfile) -> np.ndarray:
+    """(2, 2) plane at each place of the colour filter array."""
+    tile = np.empty((2, 2), np.int64)
+    for plane, place in enumerate(camera.cfa.offsets):
+        tile[place] = plane
+    return tile
 
 
 def new_frame(like: torch.Tensor) -> torch.Tensor:
@@ -164,9 +185,20 @@ class RawImage:
     @property
     def saturated(self) -> torch.Tensor:
         """(H, W) bool: some plane of the pixel is within half a digital number of white."""
-        limits = np.array([1.0 - 0.5 / s for s in self.camera.span], np.float32).tolist()
-        planes = zip(self.data.unbind(), limits, strict=True)
-        return functools.reduce(torch.Tensor.bitwise_or_, (p >= limit for p, limit in planes))
+        limits = np.array([1.0 - 0.5 / s for s in self.camera.span], np.float32)
+        if self.data.device.type != "cpu":
+            planes = zip(self.data.unbind(), limits.tolist(), strict=True)
+            return functools.reduce(torch.Tensor.bitwise_or_, (p >= limit for p, limit in planes))
+        from simulator.mosaic_kernels import mark_saturated
+
+        data = self.data.detach().contiguous().numpy()
+        marks = np.empty(data.shape[1:], np.bool_)
+        in_shares(
+            lambda first, last: mark_saturated(data, limits, first, last, marks),
+            len(marks),
+            least=_SHARE,
+        )
+        return torch.from_numpy(marks)
 
     def __repr__(self) -> str:
         _, height, width = self.data.shape

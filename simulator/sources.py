@@ -48,7 +48,7 @@ def _recorded(raw: RawImage, device: torch.device) -> Latent:
         reference=raw.settings,
         camera=camera,
         nlf=raw.noise,
-        saturated=saturated.to(device) if bool(saturated.any()) else None,
+        saturated=saturated.to(device) if saturated.count_nonzero() else None,
         white_balance=raw.white_balance,
         box_factor=raw.box_factor,
     )

@@ -1,4 +1,7 @@
-"""Levels and curvature of a light in one pass, for `simulator.light_statistics`; CPU only."""
+"""Sums over pixels, and over bins of pixels, for `simulator.light_statistics`; CPU only.
+
+This module imports numba.
+"""
 
 from __future__ import annotations
 
@@ -70,3 +73,61 @@ def accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[n
                 sums[kind, plane, place] += bins[place, kind]
             levels[0, plane, place] = min(levels[0, plane, place], bins[place, 4])
             levels[1, plane, place] = max(levels[1, plane, place], bins[place, 5])
+
+
+_SUMS = {"reassoc", "nnan", "nsz", "contract"}
+
+
+@kernel(fastmath=_SUMS, boundscheck=False)
+def excess(share, edges, ratio, source, target, floor):  # type: ignore[no-untyped-def]
+    """`simulator.light_statistics.LightStatistics.excess` of bins.
+
+    Args:
+        share: (P, B) share of all pixels.
+        edges: (2, P, B) least and most light.
+        ratio: Exposure ratio.
+        source: (2, P) shot and read noise of the light.
+        target: (2, P) shot and read noise that are wanted.
+        floor: Least variance that counts as noise.
+    """
+    total = 0.0
+    for plane in range(share.shape[0]):
+        source_shot, source_read = (
+            source[0, plane] * ratio * ratio,
+            source[1, plane] * ratio * ratio,
+        )
+        shot, read = target[0, plane] * ratio, target[1, plane]
+        for edge in range(2):
+            light, shares = edges[edge, plane], share[plane]
+            for place in range(len(shares)):
+                wanted = read + shot * light[place]
+                given = source_read + source_shot * light[place]
+                beyond = np.sqrt(given / (wanted if wanted > floor else floor)) - 1.0
+                beyond = beyond if beyond > 0.0 else 0.0
+                total += shares[place] * beyond * beyond
+    return np.sqrt(total / 2.0)
+
+
+@kernel(fastmath=_SUMS, boundscheck=False)
+def curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no-untyped-def]
+    """Root mean squares over bins of second differences in units of a target's noise.
+
+    Args:
+        share: (P, B) share of all pixels.
+        light: (P, B) level that stands for the bin.
+        disc, row: (P, B) mean squares of the Laplacian and of the second difference along a row.
+        ratio: Exposure ratio.
+        target: (2, P) shot and read noise that are wanted.
+        floor: Least variance that counts as noise.
+    """
+    discs, rows = 0.0, 0.0
+    for plane in range(share.shape[0]):
+        shot, read = target[0, plane], target[1, plane]
+        for place in range(share.shape[1]):
+            wanted = read + shot * ratio * light[plane, place]
+            wanted = wanted if wanted > floor else floor
+            # What the mean moves by, and with it the deviation of shot noise.
+            weight = share[plane, place] * (1.0 + shot * shot / wanted) / wanted
+            discs += weight * disc[plane, place]
+            rows += weight * row[plane, place]
+    return np.sqrt(discs), np.sqrt(rows)

@@ -6,6 +6,7 @@ with an EXIF directory is written. Numbers follow TIFF 6.0 and EXIF 2.3.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -121,6 +122,50 @@ def tiff_head(tags: Mapping[int, Tag], exif: Mapping[int, Tag], size: int) -> by
     return head.ljust(strip_at, b"\0")
 
 
+class FileContent:
+    """The bytes of a file, of which only those are read that are looked at.
+
+    (Memory that is mapped would end the process where a file shrinks or a disk fails meanwhile.)
+
+    Args:
+        path: The file. It stays open until `close`.
+
+    Raises:
+        FileNotFoundError: If there is no such file; also for a folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            what = "is a folder" if path.is_dir() else "does not exist"
+            raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
+        self._path, self._stream = path, path.open("rb")
+        self._size = os.fstat(self._stream.fileno()).st_size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        start, stop, _ = part.indices(self._size)
+        self._stream.seek(start)
+        found = self._stream.read(max(0, stop - start))
+        if len(found) < stop - start:
+            raise OSError(f"`path` (={str(self._path)!r}) became shorter while it was read")
+        return found
+
+    def close(self) -> None:
+        """Nothing can be read afterwards."""
+        self._stream.close()
+
+
+#: The bytes of a file, at hand or not.
+Content = bytes | FileContent
+
+
+def unpack_at(form: str, data: Content, offset: int) -> tuple[Any, ...]:
+    """`struct.unpack` of what stands at `offset`."""
+    return struct.unpack(form, data[offset : offset + struct.calcsize(form)])
+
+
 def _decode(kind: int, data: bytes, order: str) -> tuple[Any, ...]:
     if kind == TiffType.ASCII:
         return (data.split(b"\0")[0].decode("utf-8", "replace").strip(),)
@@ -134,28 +179,28 @@ def _decode(kind: int, data: bytes, order: str) -> tuple[Any, ...]:
     return values
 
 
-def _read_directory(data: bytes, offset: int, order: str) -> tuple[Directory, int]:
+def _read_directory(data: Content, offset: int, order: str) -> tuple[Directory, int]:
     """Tags of the directory at `offset`, without broken fields, and where the next one is."""
     if not 8 <= offset <= len(data) - 2:
         return {}, 0
-    (count,) = struct.unpack_from(f"{order}H", data, offset)
+    (count,) = unpack_at(f"{order}H", data, offset)
     end = offset + 2 + 12 * count
     if end > len(data):
         return {}, 0
     tags: Directory = {}
     for at in range(offset + 2, end, 12):
-        number, kind, length = struct.unpack_from(f"{order}HHI", data, at)
+        number, kind, length = unpack_at(f"{order}HHI", data, at)
         if kind not in _FORMATS:
             continue
         size = length * struct.calcsize("=" + _FORMATS[kind])
-        start = at + 8 if size <= 4 else struct.unpack_from(f"{order}I", data, at + 8)[0]
+        start = at + 8 if size <= 4 else unpack_at(f"{order}I", data, at + 8)[0]
         if start + size <= len(data):
             tags[number] = _decode(kind, data[start : start + size], order)
-    following = struct.unpack_from(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
+    following = unpack_at(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
     return tags, following
 
 
-def read_directories(data: bytes) -> list[Directory]:
+def read_directories(data: Content) -> list[Directory]:
     """All directories of a TIFF-structured file, SubIFDs and EXIF included, in reading order.
 
     Args:
@@ -168,7 +213,7 @@ def read_directories(data: bytes) -> list[Directory]:
     order = {b"II": "<", b"MM": ">"}.get(data[:2])
     if order is None or len(data) < 8:
         return []
-    magic, first = struct.unpack_from(f"{order}HI", data, 2)
+    magic, first = unpack_at(f"{order}HI", data, 2)
     if magic not in _MAGIC:
         return []
     pending, seen = [first], set()
@@ -197,15 +242,3 @@ def missing_bytes(directories: Sequence[Directory], size: int) -> int:
             pairs = zip(tags.get(offsets, ()), tags.get(counts, ()), strict=False)
             end = max([end, *(a + b for a, b in pairs)])
     return end - size
-
-
-def read_file(path: Path) -> bytes:
-    """The bytes of `path`.
-
-    Raises:
-        FileNotFoundError: If there is no such file; also for a folder.
-    """
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "does not exist"
-        raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
-    return path.read_bytes()

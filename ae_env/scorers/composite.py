@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 
 from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
@@ -139,7 +140,8 @@ def _developed(images: torch.Tensor, captures: Captures) -> torch.Tensor:
 
 
 def _log(values: Any) -> Any:
-    return torch.as_tensor(values).log().numpy() if not torch.is_tensor(values) else values.log()
+    """Of arrays by numpy: torch may use threads for it, which a forked process does not have."""
+    return values.log() if torch.is_tensor(values) else np.log(values)
 
 
 def _checked(name: str, scores: Any, count: int) -> torch.Tensor:

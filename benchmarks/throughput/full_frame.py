@@ -25,6 +25,10 @@ from simulator.dng_tags import SOFTWARE_NAME
 
 #: Packed height and width of 24 megapixels, and of the quick run's 1.5.
 FULL, QUICK = (2000, 3000), (500, 750)
+#: The same of the frame that loads all code: large enough for every thread.
+SMALL = (256, 256)
+#: Times that a process takes the file through everything; the first one counts by itself.
+PASSES = 4
 #: The synthetic raw was taken so; the targets follow.
 SOURCE = CameraSettings(400, 1 / 64, 8.0)
 #: Name: weights, depth, target, noise. The last needs both networks: it is cleaner, and opens.
@@ -82,18 +86,20 @@ def _limits(file: Path, threads: int, quick: bool) -> dict[str, float]:
 def _row(file: Path, case: str, threads: int, quick: bool) -> dict[str, Any]:
     once = quick or CASES[case][0] is not None  # networks take long
 
-    def repeated(task: Callable[..., Any], times: int) -> list[dict[str, Any]]:
+    def repeated(task: Callable[..., Any]) -> list[dict[str, Any]]:
         arguments: dict[str, Any] = {"path": str(file), "case": case}
+        arguments["passes"] = 1 if once else PASSES
         return [
             isolated(task, num_threads=threads, fresh_cache=True, **arguments)
-            for _ in range(1 if once else times)
+            for _ in range(1 if once else 3)
         ]
 
-    whole, stages = repeated(end_to_end, 5), repeated(by_stage, 3)
+    whole, stages = repeated(end_to_end), repeated(by_stage)
     seconds = [run["seconds"] for run in whole]
     return {
         "megapixels": whole[0]["megapixels"],
         "seconds": statistics.median(seconds),
+        "first": statistics.median(run["first"] for run in whole),
         "spread": max(seconds) - min(seconds),
         "peak_mib": max(run["peak_mib"] for run in whole),
         "modules": stages[0]["modules"],
@@ -111,27 +117,35 @@ def _row(file: Path, case: str, threads: int, quick: bool) -> dict[str, Any]:
 # -- run in processes of their own ----------------------------------------------------------------
 
 
-def end_to_end(path: str, case: str) -> dict[str, Any]:
-    """`read_raw`, `simulate`, `write_dng`, with networks loaded and all code warm."""
+def end_to_end(path: str, case: str, passes: int) -> dict[str, Any]:
+    """`read_raw`, `simulate`, `write_dng`, with networks loaded and all code warm.
+
+    ``first`` is the time of the process' first frame of that size, which the system has to give
+    memory for; ``seconds`` the median of those that follow, if any.
+    """
     weights, depth, target, noise = CASES[case]
-    settings, simulator = CameraSettings(*target), _warm(weights, depth)
-    with tempfile.TemporaryDirectory() as folder:
-        start = time.perf_counter()
-        raw = read_raw(path)
-        result = simulator.simulate(raw, settings, depth=depth, noise=noise)
+    settings, simulator = CameraSettings(*target), _warm(weights, depth, noise)
+
+    def run(folder: str) -> None:
+        result = simulator.simulate(read_raw(path), settings, depth=depth, noise=noise)
         write_dng(Path(folder) / "out.dng", result)
-        seconds = time.perf_counter() - start
+
+    seconds = []
+    for _ in range(passes):
+        with tempfile.TemporaryDirectory() as folder:
+            seconds.append(timed(lambda place=folder: run(place)))
     return {
-        "megapixels": 4e-6 * raw.data[0].numel(),
-        "seconds": seconds,
+        "megapixels": 4e-6 * read_raw(path).data[0].numel(),
+        "first": seconds[0],
+        "seconds": statistics.median(seconds[1:] or seconds),
         "peak_mib": peak_memory(),
     }
 
 
-def by_stage(path: str, case: str) -> dict[str, Any]:
-    """The same step by step: seconds, and peak memory of the process during each."""
+def by_stage(path: str, case: str, passes: int) -> dict[str, Any]:
+    """The last pass step by step: seconds, and peak memory of the process during each."""
     weights, depth, target, noise = CASES[case]
-    settings, simulator = CameraSettings(*target), _warm(weights, depth)
+    settings, simulator = CameraSettings(*target), _warm(weights, depth, noise)
     found: dict[str, dict[str, float]] = {}
 
     @contextmanager
@@ -141,23 +155,29 @@ def by_stage(path: str, case: str) -> dict[str, Any]:
         yield
         found[name] = {"seconds": time.perf_counter() - start, "peak_mib": peak_memory()}
 
-    with tempfile.TemporaryDirectory() as folder:
-        with stage("read"):
-            raw = read_raw(path)
-        with stage("prepare"):
-            latent = simulator.prepare(raw, depth=depth)
-        del raw
-        with stage("simulate"):
-            result = simulator.simulate(latent, settings, noise=noise)
-        modules = list(latent.plan(settings).modules)
-        del latent
-        with stage("write"):
-            write_dng(Path(folder) / "out.dng", result)
+    for _ in range(passes):
+        with tempfile.TemporaryDirectory() as folder:
+            with stage("read"):
+                raw = read_raw(path)
+            with stage("prepare"):
+                latent = simulator.prepare(raw, depth=depth)
+            del raw
+            with stage("simulate"):
+                result = simulator.simulate(latent, settings, noise=noise)
+            modules = list(latent.plan(settings).modules)
+            del latent
+            with stage("write"):
+                write_dng(Path(folder) / "out.dng", result)
+            del result
     return {"stages": found, "modules": modules}
 
 
 def libraw(path: str) -> dict[str, float]:
-    """Seconds of LibRaw for the file: unpacking, writing as many bytes, developing."""
+    """Seconds of LibRaw for the file: unpacking, writing as many bytes, developing.
+
+    ``first`` is the first unpacking and writing of the process; the others are medians of those
+    that follow.
+    """
 
     def unpack() -> int:
         with rawpy.imread(path) as raw:
@@ -167,20 +187,28 @@ def libraw(path: str) -> dict[str, float]:
         with rawpy.imread(path) as raw:
             raw.postprocess(use_camera_wb=True, no_auto_bright=True)
 
-    content = os.urandom(unpack())  # also warms up
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "mosaic"
-        write = [timed(lambda: file.write_bytes(content)) for _ in range(3)]
+        unpacking = [timed(unpack) for _ in range(PASSES)]
+        content = os.urandom(unpack())
+        writing = [timed(lambda: file.write_bytes(content)) for _ in range(PASSES)]
     return {
-        "unpack": statistics.median(timed(unpack) for _ in range(3)),
-        "write": statistics.median(write),
+        "first": unpacking[0] + writing[0],
+        "unpack": statistics.median(unpacking[1:]),
+        "write": statistics.median(writing[1:]),
         "develop": timed(develop),
     }
 
 
-def _warm(weights: str | None, depth: str) -> CameraSimulator:
+def _warm(weights: str | None, depth: str, noise: str) -> CameraSimulator:
+    """A simulator that has taken a small file of the same kind through every step."""
     simulator = CameraSimulator()
     if weights is not None:
         simulator = CameraSimulator.from_pretrained(weights, cache=None)
-    simulator.simulate(noisy_raw(64, 64), CameraSettings(100, 1 / 16, 4.0), depth=depth)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "small.dng"
+        write_foreign_dng(path, *SMALL)
+        opened = CameraSettings(100, 1 / 16, 4.0)
+        result = simulator.simulate(read_raw(path), opened, depth=depth, noise=noise)
+        write_dng(path, result)
     return simulator

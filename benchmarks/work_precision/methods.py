@@ -18,8 +18,8 @@ from benchmarks.simulator.models import FOLDER, Models
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, exposure_ratio
 from simulator.capture import add_noise, clip_and_quantise
 from simulator.exposure import Exposure
+from simulator.frame_noise import FrameNoise, sweep_keys
 from simulator.latent import Latent
-from simulator.noise import noise_generator
 from simulator.training.data import settings_parameters
 
 Dtype = Literal["float32", "bfloat16"]
@@ -220,8 +220,8 @@ def baseline(name: str, network: nn.Module, dtype: Dtype = "float32") -> Method:
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=dtype == "bfloat16"):
             light = network(raw.data[None], torch.tensor([told])).float()
         target = Exposure(1.0, NoiseLevelFunction.zero(), raw.camera.nlf(settings.iso))
-        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
-        noisy, _ = add_noise(light, [target], [generator])
+        noise = FrameNoise(int(sweep_keys(seed, [settings])[0]))
+        noisy, _ = add_noise(light, [target], [noise])
         return Shot(clip_and_quantise(noisy[0], raw.camera), lambda: light[0])
 
     return Method(name, dtype, shoot=shoot)

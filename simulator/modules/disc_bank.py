@@ -43,6 +43,15 @@ class DiscBank:
             self._levels[index] = disc_blur(self._levels[0], DIAMETERS[index])
         return self._levels[index]
 
+    def _blur(self, indices: list[int]) -> None:
+        """Makes several levels side by side, which wakes the other threads once."""
+        from simulator.blur_kernels import Blur, blur_many
+
+        image = self._levels[0].contiguous()
+        made = {index: torch.empty_like(image) for index in indices}
+        blur_many([Blur(image, DIAMETERS[index], level) for index, level in made.items()])
+        self._levels |= made
+
     def blurred(self, diameter: Tensor) -> Tensor:
         """The image blurred by `diameter`, differentiable in it.
 
@@ -54,8 +63,9 @@ class DiscBank:
         if frame is not None and frame.shape == image.shape[-2:] and _has_kernels(image):
             from simulator.blend_kernels import blend, needed  # numba: only where it is needed
 
-            levels = {index: self.level(index) for index in needed(frame, _KNOTS)}
-            return blend(levels, frame, _KNOTS)
+            indices = needed(frame, _KNOTS)
+            self._blur([index for index in indices if index not in self._levels])
+            return blend({index: self._levels[index] for index in indices}, frame, _KNOTS)
         return self._blended(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
 
     def _blended(self, squared: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 import pickle
 from dataclasses import replace
@@ -20,8 +21,8 @@ from ae_env.options import EnvOptions
 from ae_env.score_table import scene_latent
 from simulator import get_camera
 from simulator.capture import exposed_light
-from simulator.noise import noise_generator
-from simulator.noise_bank import frame_noise, noise_keys
+from simulator.frame_noise import FrameNoise
+from simulator.noise_keys import noise_keys
 
 ID = "ae_env/AutoExposure-v0"
 SMALL = {"scenes": "bundled:small", "resolution": 40}
@@ -50,7 +51,7 @@ def _assert_equal(first: list[np.ndarray], second: list[np.ndarray]) -> None:
 @pytest.mark.parametrize("tolerance", [0.0, 0.1])
 @pytest.mark.parametrize("lighting", ["static", "sine"])
 def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lighting: str) -> None:
-    """Light of `Latent`, noise of the bank or of torch's generator, step by step in float64."""
+    """Light of `Latent`, noise from the bank or drawn, step by step in float64."""
     envs = _vector(noise=noise, tolerance=tolerance, lighting=lighting, observation="dn")
     core = envs.core
     span = np.array(core.camera.span)[:, None, None]
@@ -73,12 +74,9 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
             latent = replace(latent, tolerance=tolerance)
             exposure = latent.exposure(state)
             light = exposed_light(latent.optics.blurred(exposure), exposure).double().numpy()
-            if noise == "exact":
-                generator = noise_generator(episode.noise_seed, episode.frame)
-                normals = torch.empty(4, 40, 40).normal_(generator=generator).numpy()
-            else:
-                key = int(noise_keys(episode.noise_seed, episode.frame)[0])
-                normals = frame_noise(key, (4, 40, 40))
+            key = int(noise_keys(episode.noise_seed, episode.frame)[0])
+            kind = "exact" if noise == "exact" else "bank"
+            normals = FrameNoise(key, kind).normals((4, 40, 40))
             shot, read = (
                 np.array(v)[:, None, None] for v in (exposure.target.shot, exposure.target.read)
             )
@@ -169,11 +167,9 @@ def test_tolerance_zero_and_small_blur() -> None:
 def test_held_state_of_a_scene_at_rest_needs_no_memory_of_its_own() -> None:
     envs = _vector(motion="none", depth="far", tolerance=0.0)
     envs.reset(seed=0)
-    recorder = envs.core.recorder
-    for i in range(5):
-        light = recorder._lights[i]
-        scene = envs.core.scenes[envs.core.episode(i).scene]
-        assert light.data_ptr() == scene.light.data_ptr()
+    episodes, plans = envs.core.episodes, envs.core.recorder._plans
+    for row, scene in zip(episodes.slot * 64 + episodes.state, episodes.scene, strict=True):
+        assert plans.light[row].data_ptr() == envs.core.scenes[scene].light.data_ptr()
 
 
 def test_memory_of_ended_episodes_is_used_again() -> None:
@@ -187,16 +183,16 @@ def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
     envs, plain = _vector(3, **arguments), _vector(3, **arguments)
     for env in (envs, plain):
         env.reset(seed=0, options={"state": 10})
-    before = list(envs.core.episodes)
+    before = [envs.core.episode(i) for i in range(3)]
     for wrong in ({"state": [1, 2, 64]}, {"frame": [0, 0, -1]}, {"scene": [0, 0, "none"]}):
         with pytest.raises(ValueError, match="options"):
             envs.reset(options=wrong)
-        assert [a is b for a, b in zip(envs.core.episodes, before, strict=True)] == [True] * 3
+        assert [envs.core.episode(i) for i in range(3)] == before
     assert not envs.core.recorder._buffers._free
     for actions in (np.full(3, 10), np.full(3, 21)):
         np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
-    envs.core.recorder.end(1, envs.core.episode(1))
-    assert envs.core.recorder._shots[1] is None
+    envs.core.recorder.end(np.array([1]))
+    assert len(envs.core.recorder._buffers._free) == 2 + 1  # two apertures and a streak
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
@@ -233,12 +229,14 @@ def test_wide_discs_are_those_of_the_sum(monkeypatch: pytest.MonkeyPatch, motion
     arguments = {"resolution": 64, "motion": motion, "depth": 48.0, "noise": False}
     options = {"state": 0}  # f/4
     fourier, direct = _vector(2, **arguments), _vector(2, **arguments)
+    wide = recorder_module._WIDE_PX
     fourier.reset(seed=0, options=options)
-    assert fourier.core.recorder._shots[0].exposure.defocus_px > recorder_module._WIDE_PX
     monkeypatch.setattr(recorder_module, "_WIDE_PX", 1e9)
     direct.reset(seed=0, options=options)
-    lights = zip(fourier.core.recorder._lights, direct.core.recorder._lights, strict=True)
-    for mine, wanted in lights:
+    plans = [env.core.recorder._plans for env in (fourier, direct)]
+    rows = fourier.core.recorder._shown
+    assert all(exposure.defocus_px > wide for exposure in plans[0].exposure[rows])
+    for mine, wanted in zip(plans[0].light[rows], plans[1].light[rows], strict=True):
         torch.testing.assert_close(mine, wanted, rtol=1e-4, atol=1e-6)
 
 
@@ -266,6 +264,54 @@ def test_batches_in_changing_light_are_worked_out_in_chunks(
     monkeypatch.setattr(core_module, "describe_captures", described)
     _vector(lighting="sine").reset(seed=0)
     assert sizes == [2, 2, 1]
+
+
+@pytest.mark.parametrize("arguments", [{"motion": "none", "depth": "far"}, {}])
+def test_rewards_are_the_closed_forms_of_the_running_episodes(arguments: dict[str, Any]) -> None:
+    """Over several episodes at each place, some of which show the same scene."""
+    envs = _vector(8, autoreset_mode="SAME_STEP", max_episode_steps=2, **arguments)
+    core, rng = envs.core, np.random.default_rng(0)
+    envs.reset(seed=0)
+    for _ in range(7):
+        info = envs.step(rng.integers(64, size=8))[4]
+        for i in range(8):
+            episode = core.episode(i)
+            scene = core.scenes[episode.scene]
+            wanted = core.tables.table(scene, speed=episode.speed, defocus=episode.defocus)
+            for name, scores in wanted.parts.items():
+                assert info["rewards"][name][i] == pytest.approx(scores[episode.state], abs=1e-12)
+            score = wanted.mean[episode.state]
+            assert info["rewards"]["score"][i] == pytest.approx(score, abs=1e-12)
+
+
+def test_interrupted_scores_are_worked_out_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    envs, plain = _vector(3), _vector(3)
+    closed_parts, calls = envs.core.tables.closed_parts, []
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return closed_parts(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(envs.core.tables, "closed_parts", fail)
+        with pytest.raises(KeyboardInterrupt):
+            envs.reset(seed=0)
+    plain.reset(seed=0)
+    actions = np.array([3, 20, 40])
+    np.testing.assert_array_equal(envs.step(actions)[1], plain.step(actions)[1])
+
+
+def test_a_copy_goes_on_like_the_original() -> None:
+    envs = _vector(3, motion=0.5, depth=2.0, delay=1)
+    envs.reset(seed=0)
+    envs.step(np.array([3, 20, 40]))
+    other = copy.deepcopy(envs)
+    for actions in (np.array([5, 6, 7]), np.array([3, 20, 40])):
+        mine, theirs = envs.step(actions), other.step(actions)
+        np.testing.assert_array_equal(mine[0]["raw"], theirs[0]["raw"])
+        np.testing.assert_array_equal(mine[1], theirs[1])
 
 
 def test_environment_survives_pickling_before_and_after_steps() -> None:

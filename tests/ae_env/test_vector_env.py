@@ -184,6 +184,44 @@ def test_final_info_describes_the_last_frame() -> None:
     assert set(info["final_info"]["rewards"]) == set(info["rewards"])
 
 
+@pytest.mark.parametrize("mask", [[True, True, True], [False, True, False]])
+def test_final_observations_are_the_callers_own(mask: list[bool]) -> None:
+    """Where all episodes end together, and where only some do."""
+    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=2)
+    envs.reset(seed=0)
+    if not all(mask):
+        envs.step(np.array([7, 8, 9]))
+        envs.reset(options={"reset_mask": ~np.array(mask)})
+        finished = envs.step(np.array([4, 5, 6]))
+    else:
+        envs.step(np.array([7, 8, 9]))
+        finished = envs.step(np.array([4, 5, 6]))
+    observation, _, _, truncated, info = finished
+    assert truncated.tolist() == mask
+    assert [final is not None for final in info["final_obs"]] == mask
+    for i in np.flatnonzero(mask):
+        final = info["final_obs"][i]
+        before = final["raw"].copy()
+        assert (before != observation["raw"][i]).any()
+        observation["raw"][i] = 0
+        envs.step(np.array([1, 2, 3]))
+        np.testing.assert_array_equal(final["raw"], before)
+
+
+def test_info_of_some_is_laid_out_as_gymnasium_does() -> None:
+    """The last frames of episodes that end apart from the others, against `VectorEnv._add_info`."""
+    costs = {"costs": {"switch": 0.1}, "with_oracle": True}
+    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=2, **costs)
+    alone = _make_single(**costs)
+    envs.reset(seed=0)
+    alone.reset(seed=1)
+    alone.step(8)
+    envs.step(np.array([7, 8, 9]))
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    info = envs.step(np.array([4, 5, 6]))[4]["final_info"]
+    _assert_same(info, envs.unwrapped._add_info({}, alone.step(5)[4], 1))
+
+
 def test_reset_options_per_environment() -> None:
     envs = _native()
     ids = [envs.unwrapped.scenes[i].scene_id for i in (0, 2, 4)]

@@ -17,8 +17,8 @@ from scipy.stats import norm
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
 from simulator.capture import add_noise, clip_and_quantise, sensor_light
 from simulator.exposure import Exposure
+from simulator.frame_noise import FrameNoise
 from simulator.latent import Latent
-from simulator.noise import noise_generator
 from simulator.settings import CameraSettings
 
 STATES = [
@@ -317,7 +317,7 @@ def test_noise_is_that_of_the_blurred_light() -> None:
     exposure = Exposure(1.0, NoiseLevelFunction.zero(), target, motion_px=8.0)
     blurred = sensor_light(light, exposure)
     np.testing.assert_allclose(blurred[:, 0, 4].numpy(), 0.4, rtol=1e-5)
-    noisy, _ = add_noise(blurred[None], [exposure], [noise_generator(0)])
+    noisy, _ = add_noise(blurred[None], [exposure], [FrameNoise(0)])
     middle = noisy[0, :, :, 4].double()
     count = middle.numel()
     assert float(middle.var()) == pytest.approx(0.4e-4, rel=5 * math.sqrt(2 / count))
@@ -353,12 +353,10 @@ def test_a_capture_is_the_same_alone_and_in_a_batch(noisy_source: bool) -> None:
         for i in range(4)
     ] + [Exposure(1.0, source, Z6.nlf(100), motion_px=2.5, defocus_px=1.5)]
     light = torch.stack([sensor_light(x, e) for x, e in zip(latents, exposures, strict=True)])
-    together, excess = add_noise(
-        light.clone(), exposures, [noise_generator(9, i) for i in range(5)]
-    )
+    together, excess = add_noise(light.clone(), exposures, [FrameNoise(i) for i in range(5)])
     frames = clip_and_quantise(together, Z6)
     for i, exposure in enumerate(exposures):
-        alone, one = add_noise(light[i : i + 1].clone(), [exposure], [noise_generator(9, i)])
+        alone, one = add_noise(light[i : i + 1].clone(), [exposure], [FrameNoise(i)])
         assert torch.equal(clip_and_quantise(alone[0], Z6), frames[i])
         assert one[0] == excess[i]
 
@@ -368,5 +366,5 @@ def test_the_latent_is_left_alone() -> None:
     before = light.clone()
     for motion, defocus in ((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)):
         exposure = Exposure(4.0, Z6.nlf(100), Z6.nlf(400), motion, defocus)
-        add_noise(sensor_light(light, exposure)[None], [exposure], [noise_generator(0)])
+        add_noise(sensor_light(light, exposure)[None], [exposure], [FrameNoise(0)])
         assert torch.equal(light, before)

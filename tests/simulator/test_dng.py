@@ -261,3 +261,12 @@ def test_a_frame_larger_than_what_is_written_at_a_time(tmp_path: Path) -> None:
     write_dng(tmp_path / "a.dng", RawImage.from_mosaic(mosaic, CameraSettings(100, 1, 4), profile))
     back = read_raw(tmp_path / "a.dng", nlf=NoiseLevelFunction.zero())
     np.testing.assert_array_equal(back.to_mosaic(), mosaic)
+
+
+def test_data_in_any_order_of_memory_gives_the_same_file(tmp_path: Path) -> None:
+    plain = make_raw()
+    turned = replace(plain, data=plain.data.permute(2, 0, 1).contiguous().permute(1, 2, 0))
+    assert not turned.data.is_contiguous()
+    for name, raw in (("plain", plain), ("turned", turned)):
+        write_dng(tmp_path / f"{name}.dng", raw)
+    assert (tmp_path / "turned.dng").read_bytes() == (tmp_path / "plain.dng").read_bytes()

@@ -14,8 +14,9 @@ from ae_env.observation import encode_observation
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera, list_cameras
 from simulator.capture import clip_and_quantise
 from simulator.exposure import Exposure
+from simulator.frame_noise import FrameNoise, Noise
 from simulator.kernels import exposure_table, record_capture, record_frames, sensor_table
-from simulator.noise_bank import frame_noise, noise_keys
+from simulator.noise_keys import noise_keys
 
 Z6 = get_camera("nikon_z6")
 CLEAN = NoiseLevelFunction.zero()
@@ -42,8 +43,9 @@ def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) ->
 @pytest.mark.parametrize("size", [(1, 1), (5, 3), (37, 53), (16, 16), (128, 128), (300, 500)])
 @pytest.mark.parametrize("noisy_source", [False, True])
 @pytest.mark.parametrize("blurred", [False, True])
+@pytest.mark.parametrize("kind", ["exact", "bank"])
 def test_captures_are_those_of_the_reference(
-    size: tuple[int, int], noisy_source: bool, blurred: bool
+    size: tuple[int, int], noisy_source: bool, blurred: bool, kind: Noise
 ) -> None:
     light = random_light(4, *size)
     exposure = Exposure(
@@ -52,10 +54,9 @@ def test_captures_are_those_of_the_reference(
         target=Z6.nlf(400),
         remaining=torch.rand(size) if blurred else None,
     )
-    key = int(noise_keys(5, 3)[0])
-    normals = torch.from_numpy(frame_noise(key, (4, *size)))
-    found = record_capture(light, exposure, Z6, key=key)
-    assert torch.equal(found, record_capture(light, exposure, Z6, normals=normals))
+    noise = FrameNoise(int(noise_keys(5, 3)[0]), kind)
+    normals = torch.from_numpy(noise.normals((4, *size)))
+    found = record_capture(light, exposure, Z6, noise=noise)
     difference = (found - reference(light, exposure, normals)).abs()
     assert float(difference.max()) < 1.01 / 14512.0  # one digital number, where rounding is close
     assert float((difference > 1e-6).float().mean()) < 1e-3
@@ -90,7 +91,7 @@ def test_every_digital_number_is_written_exactly(camera: str) -> None:
 def test_clipping_and_extreme_light() -> None:
     light = torch.tensor([3e38, 1e9, 2.0, 1.0, 0.5, 0.0, -0.01, -3e38]).repeat(4, 1)[:, None]
     exposure = Exposure(1e3, CLEAN, Z6.nlf(6400))
-    found = record_capture(light.contiguous(), exposure, Z6, key=1)
+    found = record_capture(light.contiguous(), exposure, Z6, noise=FrameNoise(1))
     assert bool(torch.isfinite(found).all())
     assert (found[:, 0, :5] == 1.0).all()
     pedestal = -1008.0 / 14512.0
@@ -99,10 +100,12 @@ def test_clipping_and_extreme_light() -> None:
     assert (dark == 0.0).all()
 
 
-def test_noise_has_the_variance_of_the_camera() -> None:
+@pytest.mark.parametrize("kind", ["exact", "bank"])
+def test_noise_has_the_variance_of_the_camera(kind: Noise) -> None:
     """Mean and variance of a flat patch, 5 standard errors; quantisation adds 1 / 12."""
     nlf, n = Z6.nlf(6400), 4 * 512 * 512
-    signal = record_capture(torch.full((4, 512, 512), 0.2), Exposure(1.0, CLEAN, nlf), Z6, key=3)
+    flat, exposure = torch.full((4, 512, 512), 0.2), Exposure(1.0, CLEAN, nlf)
+    signal = record_capture(flat, exposure, Z6, noise=FrameNoise(3, kind))
     for plane in range(4):
         variance = nlf.read[plane] + 0.2 * nlf.shot[plane] + 1.0 / 12.0 / 14512.0**2
         values = signal[plane].double()
@@ -110,7 +113,8 @@ def test_noise_has_the_variance_of_the_camera() -> None:
         assert float(values.var()) == pytest.approx(variance, rel=5.0 * (2.0 / (n / 4)) ** 0.5)
 
 
-def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads() -> None:
+@pytest.mark.parametrize("kind", ["exact", "bank"])
+def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind: Noise) -> None:
     lights = [random_light(4, 70, 90, seed=i) for i in range(5)]
     isos = (100, 400, 1600, 6400, 400)
     exposures = [Exposure(0.1 * (i + 1), CLEAN, Z6.nlf(iso)) for i, iso in enumerate(isos)]
@@ -118,12 +122,13 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads() -> 
     keys, frames = noise_keys(np.arange(5), 2), []
     for threads in (1, 2, 3):
         codes = np.empty((5, 4, 6300), np.uint8)
-        record_frames(
-            addresses, 6300, exposure_table(exposures), Z6, keys=keys, codes=codes, threads=threads
-        )
+        table = exposure_table(exposures)
+        drawn = {"keys": keys, "noise": kind}
+        record_frames(addresses, 6300, table, Z6, **drawn, codes=codes, threads=threads)
         frames.append(codes)
     for i, (light, exposure) in enumerate(zip(lights, exposures, strict=True)):
-        alone = encode_observation(record_capture(light, exposure, Z6, key=int(keys[i])))
+        frame = record_capture(light, exposure, Z6, noise=FrameNoise(int(keys[i]), kind))
+        alone = encode_observation(frame)
         for codes in frames:
             np.testing.assert_array_equal(codes[i], alone.reshape(4, -1).numpy())
 

@@ -118,7 +118,9 @@ def test_levels_in_units_of_the_noise() -> None:
 def test_median_of_each_plane() -> None:
     light = LIGHTS["natural"] * np.array([1.0, 2.0, 3.0, -1.0])[:, None, None]
     median = LightStatistics(tensor(light)).median
-    np.testing.assert_allclose(median[:3], np.median(light[:3], axis=(1, 2)), rtol=1e-6)
+    np.testing.assert_allclose(
+        median[:3], np.median(light[:3], axis=(1, 2)), rtol=0.03
+    )  # of a sample
     assert median[3] == 0.0
 
 

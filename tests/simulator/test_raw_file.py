@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+import torch
 from skimage.io import imsave
 
-from simulator import CameraSettings, NoiseLevelFunction, RawImage, get_camera, read_raw
+from simulator import CameraSettings, NoiseLevelFunction, RawImage, get_camera, read_raw, write_dng
 from simulator.camera import BayerPattern, CameraProfile
 from simulator.raw_file import RawFileError
 
@@ -257,6 +259,26 @@ def test_files_that_are_no_raw_say_what_they_are(tmp_path: Path, suffix: str) ->
         read_raw(path, settings=SETTINGS)
     assert f"a.{suffix}" in str(caught.value)
     assert str(tmp_path) not in str(caught.value)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_what_was_read_does_not_depend_on_the_file(
+    tmp_path: Path, mosaic: np.ndarray, own: bool
+) -> None:
+    """Neither LibRaw's memory nor the file is looked at once it was read."""
+    path = tmp_path / "a.dng"
+    write_sample_dng(path, mosaic)
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    if own:
+        write_dng(path, raw)
+        raw = read_raw(path)
+    before = raw.data.clone()
+    with path.open("r+b") as stream:  # in place, so that a mapping would see it
+        stream.write(bytes(path.stat().st_size))
+    gc.collect()
+    assert torch.equal(raw.data, before)
+    expected = (mosaic[::2, ::2].astype(np.float64) - 64) / (4095 - 64)
+    np.testing.assert_array_equal(raw.data[0].numpy(), expected.astype(np.float32))
 
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:

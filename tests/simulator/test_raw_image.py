@@ -66,6 +66,26 @@ def test_an_odd_last_row_or_column_is_dropped(rows: int, columns: int) -> None:
     np.testing.assert_array_equal(unpack_mosaic(packed, camera()), even)
 
 
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32, ">u2"])
+def test_any_layout_of_a_mosaic_is_packed_alike(cfa: str, dtype: str) -> None:
+    """LibRaw's visible area is a part of its array: rows do not follow each other in memory."""
+    whole = np.random.default_rng(4).integers(0, 4096, (300, 40)).astype(dtype)
+    visible = whole[3:295, 5:34]  # odd columns, more rows than are converted at a time
+    plain = np.array(visible.tolist(), np.uint16)
+    assert torch.equal(pack_mosaic(visible, camera(cfa)), pack_mosaic(plain, camera(cfa)))
+    turned = np.array(visible.T, order="C").T
+    assert torch.equal(pack_mosaic(turned, camera(cfa)), pack_mosaic(plain, camera(cfa)))
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 7), (3, 5), (250, 300), (0, 300), (7, 7)])
+def test_part_of_the_rows_is_unpacked_as_the_whole(first: int, last: int) -> None:
+    mosaic = np.random.default_rng(5).integers(0, 4096, (600, 6), dtype=np.uint16)
+    packed = pack_mosaic(mosaic, camera("GBRG"))
+    part = unpack_mosaic(packed, camera("GBRG"), first, last)
+    np.testing.assert_array_equal(part, mosaic[2 * first : 2 * last])
+
+
 def test_unpack_clips_to_the_sensor_and_rounds() -> None:
     data = torch.tensor([-9.0, 9.0, 0.4 / 4031, 0.6 / 4031]).reshape(4, 1, 1)
     numbers = unpack_mosaic(data, camera(black=64))
@@ -144,6 +164,19 @@ def test_saturated_pixels_are_those_at_white_in_any_plane() -> None:
     mosaic[3, 2] = 4095  # G2 of the last
     saturated = RawImage.from_mosaic(mosaic, SETTINGS, camera()).saturated
     assert saturated.tolist() == [[True, False], [False, True]]
+
+
+@pytest.mark.parametrize("rows", [1, 127, 300])
+def test_saturated_pixels_of_frames_in_shares(rows: int) -> None:
+    """Each plane has a limit of its own; NumPy marks the same pixels."""
+    limits = [1 - 0.5 / (4095 - black) for black in BLACK]
+    levels = np.random.default_rng(6).uniform(0.9995, 1.0001, (4, 9, rows)).astype(np.float32)
+    data = levels.transpose(0, 2, 1)  # not in the order of memory
+    expected = np.any(data >= np.array(limits, np.float32)[:, None, None], axis=0)
+    assert expected.any()
+    assert not expected.all()
+    raw = RawImage(torch.from_numpy(data), SETTINGS, camera())
+    np.testing.assert_array_equal(raw.saturated.numpy(), expected)
 
 
 def test_repr_says_what_it_is() -> None:

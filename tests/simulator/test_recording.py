@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
+from simulator import kernels
 from simulator.camera import NoiseLevelFunction, get_camera
 from simulator.capture import (
     add_noise,
@@ -16,8 +19,7 @@ from simulator.capture import (
     top_up,
 )
 from simulator.exposure import Exposure
-from simulator.noise import noise_generator
-from simulator.noise_bank import frame_noise
+from simulator.frame_noise import FrameNoise
 
 Z6 = get_camera("nikon_z6")
 SPAN = 14512
@@ -39,9 +41,9 @@ def test_recording_equals_the_steps_one_by_one(
         1.3, source, Z6.nlf(iso), motion_px=3.0, remaining=remaining if blurred_noise else None
     )
     frame = torch.empty_like(light)
-    record(light, exposure, Z6, noise_generator(3), out=frame)
+    record(light, exposure, Z6, FrameNoise(3), out=frame)
     signal = exposed_light(light, exposure)
-    noisy, _ = add_noise(signal[None], [exposure], [noise_generator(3)])
+    noisy, _ = add_noise(signal[None], [exposure], [FrameNoise(3)])
     expected = clip_and_quantise(noisy[0], Z6)
     difference = ((frame - expected).double() * SPAN).abs().round()
     assert difference.max() <= 1
@@ -52,8 +54,8 @@ def test_noise_from_the_bank_is_what_the_bank_reads() -> None:
     light = torch.full((4, 40, 50), 0.2)
     exposure = Exposure(1.0, NoiseLevelFunction.zero(), Z6.nlf(800))
     frame = torch.empty_like(light)
-    record(light, exposure, Z6, 12345, out=frame)
-    normals = torch.from_numpy(frame_noise(12345, (4, 40, 50)))
+    record(light, exposure, Z6, FrameNoise(12345, "bank"), out=frame)
+    normals = torch.from_numpy(FrameNoise(12345, "bank").normals((4, 40, 50)))
     noisy, _ = top_up(light[None], [exposure], normals[None])
     difference = ((frame - clip_and_quantise(noisy[0], Z6)).double() * SPAN).abs().round()
     assert difference.max() <= 1
@@ -95,14 +97,19 @@ def test_a_source_without_noise_lacks_all_of_it() -> None:
 
 
 @pytest.mark.parametrize("source", [100, 6400])
-def test_no_noise_is_drawn_where_the_source_has_enough(
+def test_noise_is_made_only_where_the_source_lacks_some(
     source: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn = []
-    monkeypatch.setattr("simulator.capture.draw_normals", lambda out, *_: drawn.append(out.zero_()))
+    made = []
+    original = kernels.record_frames
+
+    def watched(*args: Any, keys: Any, **options: Any) -> Any:
+        made.append(keys)
+        return original(*args, keys=keys, **options)
+
+    monkeypatch.setattr(kernels, "record_frames", watched)
     light = torch.full((4, 8, 8), 0.2)
     exposure = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
-    record(light, exposure, Z6, noise_generator(3), out=torch.empty_like(light))
-    assert not drawn
-    record(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), Z6, noise_generator(3), out=light)
-    assert drawn
+    record(light, exposure, Z6, FrameNoise(3), out=torch.empty_like(light))
+    record(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), Z6, FrameNoise(3), out=light)
+    assert [keys is None for keys in made] == [True, False]

@@ -1,0 +1,144 @@
+"""Standard normals drawn by counting: each block of a frame from its number and the frame's key.
+
+Philox4x32-10 (Salmon, Moraes, Dror and Shaw 2011) turns a counter and a key into four random words,
+the transform of Box and Muller (1958) two words into two independent normals. Any block can be
+drawn alone, on any thread, and the compiler draws many counters at once: 4 x 128 x 128 normals take
+about 70 microseconds, with torch's generator 220. They reach to 6.7 standard deviations.
+
+This module imports numba.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from simulator.jit import kernel
+from simulator.noise_bank import BLOCK
+from simulator.threads import in_shares
+
+#: Counters of a block: each gives four words, and those four normals.
+_COUNTERS = BLOCK // 4
+_ROUNDS = 10
+_MULTIPLIERS = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+_WEYL = np.uint32(0x9E3779B9), np.uint32(0xBB67AE85)
+_WORD = np.uint64(32)
+_ONE, _HALF, _TWO = np.float32(1), np.float32(0.5), np.float32(2)
+_UNIT = np.float32(2.0**-31)
+_LN2, _EIGHTH_TURN = np.float32(math.log(2.0)), np.float32(math.pi / 4 * 2.0**-31)
+_SQRT_HALF_BITS = np.int32(np.float32(math.sqrt(0.5)).view(np.int32))
+
+
+def _coefficients(
+    function: Callable[[Any], Any], low: float, high: float, degree: int
+) -> tuple[np.float32, ...]:
+    """Of the polynomial, lowest power first, that meets `function` at the Chebyshev nodes."""
+    fit = np.polynomial.Chebyshev.interpolate(function, degree, domain=[low, high])
+    return tuple(np.float32(c) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
+
+
+# What is left of series behind their first terms: (log(1 + t) - t + t^2 / 2) / t^3, and with
+# y = t^2, (sin(t) / t - 1) / y and (cos(t) - 1 + y / 2) / y^2.
+_LOG = _coefficients(
+    lambda t: (np.log1p(t) - t + t * t / 2) / t**3, math.sqrt(0.5) - 1, math.sqrt(2) - 1, 8
+)
+_SIN = _coefficients(lambda y: (np.sin(y**0.5) / y**0.5 - 1) / y, 0.0, (math.pi / 4) ** 2, 2)
+_COS = _coefficients(lambda y: (np.cos(y**0.5) - 1 + y / 2) / y**2, 0.0, (math.pi / 4) ** 2, 2)
+
+_jit = functools.partial(kernel, fastmath={"nnan", "nsz", "contract"}, boundscheck=False)
+
+
+@_jit(inline="always")
+def philox(c0, c1, c2, c3, k0, k1):  # type: ignore[no-untyped-def]
+    """Four random words of a counter of four words and a key of two, all uint32."""
+    for _ in range(_ROUNDS):
+        first, second = _MULTIPLIERS[0] * np.uint64(c0), _MULTIPLIERS[1] * np.uint64(c2)
+        c0 = np.uint32(np.uint32(second >> _WORD) ^ c1 ^ k0)
+        c2 = np.uint32(np.uint32(first >> _WORD) ^ c3 ^ k1)
+        c1, c3 = np.uint32(second), np.uint32(first)
+        k0, k1 = np.uint32(k0 + _WEYL[0]), np.uint32(k1 + _WEYL[1])
+    return c0, c1, c2, c3
+
+
+@_jit()
+def _polynomial(x, coefficients):  # type: ignore[no-untyped-def]
+    value = coefficients[len(coefficients) - 1]
+    for i in range(len(coefficients) - 1):
+        value = value * x + coefficients[len(coefficients) - 2 - i]
+    return value
+
+
+@_jit()
+def _logarithm(x):  # type: ignore[no-untyped-def]
+    """Of a float32 in (0, 1]: a power of two, and a polynomial from sqrt(1/2) to sqrt(2)."""
+    bits = np.float32(x).view(np.int32)
+    power = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> np.int32(23))
+    t = np.int32(bits - np.int32(power << np.int32(23))).view(np.float32) - _ONE
+    return t + t * t * (t * _polynomial(t, _LOG) - _HALF) + np.float32(power) * _LN2
+
+
+@_jit()
+def _transform(length, angle, first, second):  # type: ignore[no-untyped-def]
+    """Independent normals of random words: a length, and an angle of which two bits are the octant
+    pair and the others turn it by up to an eighth either way."""
+    for j in range(len(first)):
+        share = (np.float32(np.int32(length[j] >> np.uint32(1))) + _HALF) * _UNIT
+        radius = np.sqrt(-_TWO * _logarithm(share))
+        word = angle[j]
+        t = (np.float32(np.int32(np.uint32(word << np.uint32(2)))) + _HALF) * _EIGHTH_TURN
+        y = t * t
+        sine = t + t * y * _polynomial(y, _SIN)
+        cosine = _ONE + y * (y * _polynomial(y, _COS) - _HALF)
+        steep = (word >> np.uint32(30)) & np.uint32(1)
+        radius = -radius if word >> np.uint32(31) else radius
+        first[j] = radius * (sine if steep else cosine)
+        second[j] = radius * (cosine if steep else sine)
+
+
+@_jit()
+def draw_block(key, block, words, out):  # type: ignore[no-untyped-def]
+    """Draws the `BLOCK` normals of a block.
+
+    Args:
+        key: uint64, of the frame.
+        block: Number of the block in the frame, below 2**26.
+        words: (4, BLOCK / 4) uint32 to work in.
+        out: (BLOCK,) float32.
+    """
+    low, high, zero = np.uint32(key), np.uint32(key >> _WORD), np.uint32(0)
+    for j in range(_COUNTERS):
+        c0, c1, c2, c3 = philox(np.uint32(block * _COUNTERS + j), zero, zero, zero, low, high)
+        words[0, j], words[1, j], words[2, j], words[3, j] = c0, c1, c2, c3
+    quarter, half = _COUNTERS, 2 * _COUNTERS
+    _transform(words[0], words[1], out[:quarter], out[quarter:half])
+    _transform(words[2], words[3], out[half : half + quarter], out[half + quarter :])
+
+
+@_jit()
+def _draw(first, last, key, blocks, out):  # type: ignore[no-untyped-def]
+    words, drawn = np.empty((4, _COUNTERS), np.uint32), np.empty(BLOCK, np.float32)
+    for block in range(first, last):
+        draw_block(key, block, words, drawn)
+        part = out[block // blocks, (block % blocks) * BLOCK :][:BLOCK]
+        part[:] = drawn[: len(part)]
+
+
+def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
+    """The standard normals of a frame of `shape` (P, H, W), float32.
+
+    What `simulator.kernels` adds to it, as an array of its own: for other devices, for the steps
+    one by one, and for tests.
+    """
+    planes, samples = shape[0], shape[1] * shape[2]
+    blocks = -(-samples // BLOCK)
+    out = np.empty((planes, samples), np.float32)
+    in_shares(
+        lambda first, last: _draw(first, last, np.uint64(key), blocks, out),
+        planes * blocks,
+        least=1024,
+    )
+    return out.reshape(shape)
