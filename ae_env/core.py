@@ -32,7 +32,7 @@ SPEED_SIGMA = 1.3
 #: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
-CHUNK_SAMPLES = 4 * 64 * 64 * 8
+CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
 OPTICS_BYTES = 256 * 2**20
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
@@ -166,8 +166,8 @@ class EpisodeCore:
         phase, noise_seed = rng.random(), int(rng.integers(2**62))
         scene = self._chosen_scene(options.get("scene"), scene)
         median = self.scenes[scene].median_speed
-        drawn_speed = moves * median * np.exp(SPEED_SIGMA * speed)
-        drawn_defocus = DEFOCUS_MEDIAN * np.exp(DEFOCUS_SIGMA * defocus)
+        drawn_speed = moves * median * math.exp(SPEED_SIGMA * speed)
+        drawn_defocus = DEFOCUS_MEDIAN * math.exp(DEFOCUS_SIGMA * defocus)
         shown = _fixed_or_drawn(
             self.options.depth, float(min(max(drawn_defocus, DEFOCUS_MIN), DEFOCUS_MAX))
         )

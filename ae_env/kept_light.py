@@ -15,8 +15,8 @@ from simulator.latent import Latent
 class Plans:
     """Captures that were planned: all that a frame depends on but for its noise, as columns.
 
-    Row ``slot * num_states + state`` is that of a state of a slot (`Episodes.slot`); memory is only
-    taken for those that are used. A pickled copy is empty.
+    Row ``slot * num_states + state`` is that of a state of a slot (`Episodes.slot`). A row takes
+    some 40 bytes from the start, the rest of its memory when it is used. A pickled copy is empty.
 
     Args:
         num_slots: Number of slots.

@@ -156,6 +156,7 @@ class Recorder:
 
     def _begin_blur(self, place: int, row: int) -> Blur | None:
         exposure = self._plans.exposure[row]
+        self._latent(place)  # it may have been let go of since this was planned
         self._plans.light[row], blur = self._kept[place].blurred(exposure)
         remaining = exposure.remaining
         if remaining is not None:

@@ -40,12 +40,12 @@ _FAST = {"nnan", "nsz", "contract"}
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
 #: What a sample that is clipped high counts as: more than all blocks of a unit can be clipped low.
 _HIGH_BITS = 16
-_HIGH = np.int32(1 << _HIGH_BITS)
+_NEITHER, _LOW, _HIGH = np.int32(0), np.int32(1), np.int32(1 << _HIGH_BITS)
 #: How the noise is made: not at all, from the bank, or drawn.
 _OFF, _BANK, _DRAWN = 0, 1, 2
 _NO_BANK = np.empty(0, np.float32)
 _NO_BANK.flags.writeable = False  # of the bank's type
-_LARGEST = float(np.finfo(np.float32).max)
+_LIMIT, _LARGEST = np.float32(SIGNAL_LIMIT), np.finfo(np.float32).max
 _START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
 
 
@@ -139,16 +139,21 @@ def _count(numbers, low, high, counts):  # type: ignore[no-untyped-def]
     A sum over the block would cost more than all comparisons.
     """
     for j in range(len(numbers)):
-        counts[j] += np.int32(1) if numbers[j] <= low else np.int32(0)
-        counts[j] += _HIGH if numbers[j] >= high else np.int32(0)
+        counts[j] += _clips(numbers[j], low, high)
 
 
 @_jit()
-def _compand(numbers, darkest, scale, out):  # type: ignore[no-untyped-def]
-    """Codes ``round(255 sqrt((x + p) / (1 + p)))`` of digital numbers."""
+def _clips(number, low, high):  # type: ignore[no-untyped-def]
+    return (_LOW if number <= low else _NEITHER) + (_HIGH if number >= high else _NEITHER)
+
+
+@_jit()
+def _compand(numbers, darkest, scale, low, high, counts, out):  # type: ignore[no-untyped-def]
+    """Codes ``round(255 sqrt((x + p) / (1 + p)))`` of digital numbers, which are counted, too."""
     for j in range(len(out)):
         x = numbers[j] - darkest
         out[j] = np.uint8(np.int32(np.sqrt(x if x > _ZERO else _ZERO) * scale + _HALF))
+        counts[j] += _clips(numbers[j], low, high)
 
 
 @_jit()
@@ -182,7 +187,6 @@ def _record(  # type: ignore[no-untyped-def]
     drawn,
     bank,
     sensor,
-    bound,
     codes,
     numbers,
     signals,
@@ -197,6 +201,8 @@ def _record(  # type: ignore[no-untyped-def]
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
         column = exposure[frame, :, plane].copy()
         span, black, low, high, white = sensor[:, plane]
+        # A light beyond it is white; one of an exposure of 0 has no bound.
+        bound = min(_LIMIT / column[0], _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
         plane_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[call-arg]
@@ -211,16 +217,16 @@ def _record(  # type: ignore[no-untyped-def]
             given = (column, share[start:end], span, black, white, out)
             if drawn == _BANK:
                 place, sign = _in_bank(keys[frame], number)
-                _digitise(exposed, bound[frame], bank[place : place + BLOCK], sign, *given)
+                _digitise(exposed, bound, bank[place : place + BLOCK], sign, *given)
             else:
                 if drawn == _DRAWN:
                     draw_block(keys[frame], number, words, normals)
                 made = normals[: BLOCK * (drawn == _DRAWN)]
-                _digitise(exposed, bound[frame], made, _ONE, *given)
-            if counts.size:
-                _count(out, low, high, clipped)
+                _digitise(exposed, bound, made, _ONE, *given)
             if codes.size:
-                _compand(out, darkest, scale, codes[frame, plane, start:end])
+                _compand(out, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
+            elif counts.size:
+                _count(out, low, high, clipped)
             if numbers.size:
                 _as_integers(out, numbers[frame, plane, start:end])
             if signals.size:
@@ -267,8 +273,6 @@ def record_frames(
         (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
     """
     frames = len(light)
-    with np.errstate(divide="ignore"):  # no light at all: any bound will do
-        bound = np.minimum(SIGNAL_LIMIT / exposure[:, 0, 0].astype(np.float64), _LARGEST)
     blocks = -(-samples // BLOCK)
     pieces = -(-blocks // _UNIT_BLOCKS)
     units = frames * 4 * pieces
@@ -283,7 +287,6 @@ def record_frames(
         drawn,
         noise_bank() if drawn == _BANK else _NO_BANK,
         sensor_table(camera),
-        bound.astype(np.float32),
         np.empty((0, 4, 0), np.uint8) if codes is None else codes,
         np.empty((0, 4, 0), np.uint16) if numbers is None else numbers,
         np.empty((0, 4, 0), np.float32) if signals is None else signals,

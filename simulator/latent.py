@@ -31,8 +31,6 @@ from simulator.tolerance import DEFAULT_TOLERANCE, Budget, check_tolerance
 WORTH_DENOISING = 0.006
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
-#: Frames that a stream makes at a time [byte], at least one.
-_STREAMED_BYTES = 2**22
 
 
 class HasLatent(Protocol):
@@ -250,7 +248,12 @@ class Latent:
         return frame, noise_balance(self.optics.blurred(exposure), exposure).relative_excess
 
     def expose(
-        self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
+        self,
+        states: Iterable[CameraSettings],
+        *,
+        seed: int = 0,
+        noise: Noise = "exact",
+        out: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """A sweep: one capture per state, (S, 4, H, W) float32.
 
@@ -261,12 +264,13 @@ class Latent:
             states: Settings to simulate.
             seed: See `capture`.
             noise: See `capture`.
+            out: (S, 4, H, W) contiguous float32 to write to, instead of new memory.
         """
         check_noise(noise)
         states = list(states)
+        frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed is told before any work
         exposures = [self.exposure(settings) for settings in states]
-        frames = new_frame(self.light.expand(len(states), *self.light.shape))
         groups: dict[tuple[object, ...], list[int]] = {}
         for index, exposure in enumerate(exposures):
             groups.setdefault(blur_key(exposure), []).append(index)
@@ -279,10 +283,28 @@ class Latent:
             record(light, exposures[i], self.camera, drawn, out=frames[i])
         return frames
 
+    def _frames(self, count: int, given: torch.Tensor | None) -> torch.Tensor:
+        """Memory for `count` frames, `given` if that fits."""
+        wanted = self.light.expand(count, *self.light.shape)
+        if given is None:
+            return new_frame(wanted)
+        if (
+            given.shape != wanted.shape
+            or (given.dtype, given.device) != (torch.float32, wanted.device)
+            or not given.is_contiguous()
+        ):
+            raise ValueError(
+                f"`out` ({given.dtype}, shape {tuple(given.shape)}, on {given.device}) must be "
+                f"contiguous float32 {tuple(wanted.shape)} on {wanted.device}"
+            )
+        return given
+
     def stream(
         self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
     ) -> Iterator[torch.Tensor]:
-        """The sweep a few captures at a time, for frames too large to hold all at once.
+        """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once.
+
+        A state is asked for when its frame is: the next one may depend on the last frame.
 
         Args:
             states: Settings to simulate.
@@ -292,12 +314,8 @@ class Latent:
         Yields:
             One capture (4, H, W) per state.
         """
-        remaining = iter(states)
-        count = max(1, _STREAMED_BYTES // self.light.nbytes)
-        while some := list(itertools.islice(remaining, count)):
-            frames = list(self.expose(some, seed=seed, noise=noise))[::-1]
-            while frames:  # those that were handed out are not kept
-                yield frames.pop()
+        for settings in states:
+            yield self.expose([settings], seed=seed, noise=noise)[0]
 
 
 @functools.lru_cache(maxsize=4096)

@@ -15,7 +15,7 @@ from simulator.threads import in_shares
 #: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
 BINS = 64
 SAMPLES = 65_536
-#: Pixels of a plane that are sorted for the bins, at most about this many.
+#: Pixels of a plane that are sorted for bins and median, at most about this many.
 _SORTED = 4096
 #: Pixels from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
@@ -159,10 +159,13 @@ class LightStatistics:
 
     @functools.cached_property
     def _sorted(self) -> np.ndarray:
-        """(4, S) light of some pixels of each plane, ascending."""
+        """(4, S) light of some pixels of each plane, ascending; every column counts alike."""
         light, rows = self._rows
         seen = light[:, rows].reshape(4, -1)
-        return np.sort(seen[:, :: max(1, seen.shape[1] // _SORTED)], axis=1)
+        step = max(1, seen.shape[1] // _SORTED)
+        while math.gcd(step, light.shape[-1]) > 1:
+            step += 1
+        return np.sort(seen[:, ::step], axis=1)
 
     @functools.cached_property
     def _bins(self) -> _Bins:

@@ -6,11 +6,13 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
-from benchmarks.throughput.growth import clean_latent, many_states, noise_argument
+from benchmarks.throughput.growth import clean_latent, many_states
+from simulator.frame_noise import Noise
+from simulator.latent import Latent
 
 SIZES = ((128, 128), (512, 768), (2000, 3000))
 #: Bytes that a state must move: the light is read and the frame written, float32.
@@ -26,11 +28,10 @@ def measure_gpu(quick: bool) -> dict[str, Any]:
     for height, width in SIZES[:2] if quick else SIZES:
         latent = clean_latent(height, width)
         latent = replace(latent, light=latent.light.cuda())
-        for noise in ("bank", "exact"):
-            extra = noise_argument(latent.stream, noise)
+        for noise in get_args(Noise):
 
-            def sweep(latent: Any = latent, extra: Any = extra) -> None:
-                for _ in latent.stream(states, **extra):
+            def sweep(latent: Latent = latent, noise: Noise = noise) -> None:
+                for _ in latent.stream(states, noise=noise):
                     pass
 
             seconds = _timed(sweep) / len(states)

@@ -6,7 +6,6 @@ peak less what the process held before it, with all libraries loaded and warm.
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 
 import ae_env  # noqa: F401  registers the environment
 from ae_env.scenes import Scene
@@ -22,6 +22,7 @@ from benchmarks.throughput.frames import noisy_raw
 from benchmarks.throughput.isolated import forget_peak, isolated, median_seconds, peak_memory, timed
 from benchmarks.throughput.kernel_limit import KernelLimit
 from simulator import CameraSettings, CameraSimulator, get_camera
+from simulator.frame_noise import Noise
 from simulator.latent import Latent
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.
@@ -135,14 +136,13 @@ def measure_pixels(
     return {"x": 4.0 * height * width, "seconds": float(np.median(seconds)), "mib": memory}
 
 
-def measure_states(count: int, noise: str, *, quick: bool) -> dict[str, float]:
+def measure_states(count: int, noise: Noise, *, quick: bool) -> dict[str, float]:
     """`Latent.expose` of a 128 x 128 scene at `count` states: time, and memory of the frames."""
     latent, states = clean_latent(128, 128), many_states(512)
-    extra = noise_argument(latent.expose, noise)
-    latent.expose(states[:1], **extra)
+    latent.expose(states[:1], noise=noise)
     before = _held()
     seconds = median_seconds(
-        lambda: latent.expose(states[:count], **extra), least=_LEAST[not quick]
+        lambda: latent.expose(states[:count], noise=noise), least=_LEAST[not quick]
     )
     return {"x": float(count), "seconds": seconds, "mib": peak_memory() - before}
 
@@ -197,25 +197,24 @@ def measure_scenes(count: int, *, quick: bool) -> dict[str, float]:
     }
 
 
-def measure_marginal(height: int, width: int, noise: str, *, quick: bool) -> dict[str, float]:
+def measure_marginal(height: int, width: int, noise: Noise, *, quick: bool) -> dict[str, float]:
     """Seconds of one more state of a sweep beside the bare loop on the same frame.
 
-    States are streamed, so that both write to memory that is there. Sweeps of several lengths and
+    Both write to memory that is there, one frame behind the other. Sweeps of several lengths and
     the bare loop take turns; the cost is the slope of time against the number of states.
     """
     latent, states = clean_latent(height, width), many_states(64)
-    extra = noise_argument(latent.stream, noise)
-    bare = KernelLimit(latent.light.numpy()[None], 1, noise=noise, result="raw")
     lengths = (1, 8, 16, 32, 64) if height < 512 and not quick else (1, 4, 8)
+    bare = KernelLimit(latent.light.numpy()[None], max(lengths), noise=noise, result="raw")
+    frames = torch.zeros(max(lengths), *latent.light.shape)
 
     def sweep(length: int) -> None:
-        for _ in latent.stream(states[:length], **extra):
-            pass
+        latent.expose(states[:length], noise=noise, out=frames[:length])
 
     slopes, limits = [], []
     for turn in range(4 if quick else 10):
         times = [timed(lambda length=length: sweep(length)) for length in lengths]
-        limit = timed(lambda: [bare.step() for _ in range(max(lengths))]) / max(lengths)
+        limit = timed(bare.step) / max(lengths)
         if turn:  # the first warms up
             slopes.append(float(np.polynomial.Polynomial.fit(lengths, times, 1).convert().coef[1]))
             limits.append(limit)
@@ -234,11 +233,6 @@ def measure_marginal(height: int, width: int, noise: str, *, quick: bool) -> dic
 def _held() -> float:
     forget_peak()
     return peak_memory()
-
-
-def noise_argument(function: Any, noise: str) -> dict[str, str]:
-    """``{"noise": noise}`` for functions that take it; others only know exact noise."""
-    return {"noise": noise} if "noise" in inspect.signature(function).parameters else {}
 
 
 def clean_latent(height: int, width: int) -> Latent:

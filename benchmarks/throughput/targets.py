@@ -96,4 +96,6 @@ def _full_frame(meta: dict[str, Any]) -> list[Target]:
             limit = row["limits"]["unpack"] + row["limits"]["write"]
             what = f"time over LibRaw's unpacking and writing, {where}"
             found.append(_at_most(what, row["seconds"] / limit, TIMES_LIBRAW))
+            first = row["first"] / row["limits"]["first"]
+            found.append(_at_most(f"{what}, a process' first frame", first, TIMES_LIBRAW))
     return found

@@ -384,3 +384,26 @@ def test_unknown_noise() -> None:
 
 def test_no_states_no_frames() -> None:
     assert latent().expose([]).shape == (0, 4, SIDE, SIDE)
+
+
+def test_frames_are_written_where_they_are_wanted() -> None:
+    states = [CameraSettings(100, 1 / 64, 4.0), CameraSettings(800, 1 / 8, 4.0)]
+    place = torch.full((3, 4, SIDE, SIDE), -7.0)
+    frames = latent().expose(states, seed=3, out=place[1:])
+    assert frames.data_ptr() == place[1:].data_ptr()
+    assert torch.equal(frames, latent().expose(states, seed=3))
+    assert bool((place[0] == -7.0).all())
+
+
+@pytest.mark.parametrize(
+    "out",
+    [
+        torch.empty(1, 4, SIDE, SIDE),
+        torch.empty(2, 4, SIDE, SIDE, dtype=torch.float64),
+        torch.empty(2, 4, SIDE, 2 * SIDE)[..., ::2],
+    ],
+)
+def test_frames_do_not_fit_everywhere(out: torch.Tensor) -> None:
+    states = [CameraSettings(100, 1 / 64, 4.0)] * 2
+    with pytest.raises(ValueError, match=r"`out` .*must be contiguous float32 \(2, 4"):
+        latent().expose(states, out=out)

@@ -124,6 +124,13 @@ def test_median_of_each_plane() -> None:
     assert median[3] == 0.0
 
 
+def test_median_of_columns_that_repeat() -> None:
+    """Every fourth column is bright: whatever pixels are looked at, most are not."""
+    light = torch.full((4, 128, 128), 0.002)
+    light[..., ::4] = 0.5
+    np.testing.assert_allclose(LightStatistics(light).median, 0.002, rtol=1e-6)
+
+
 # Blur
 
 
