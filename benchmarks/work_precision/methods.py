@@ -33,8 +33,10 @@ DEFAULT = 0.1
 class Prepared(Protocol):
     """A raw, ready to be exposed."""
 
-    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
-        """One capture per state, (S, 4, H, W)."""
+    def expose(
+        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
+    ) -> Tensor:
+        """One capture per state, (S, 4, H, W); written to `out` if that is given."""
 
     def expected(self, settings: CameraSettings) -> Tensor:
         """(4, H, W) the same without noise, not clipped."""
@@ -123,9 +125,11 @@ class _Exposed:
     def __init__(self, raw: RawImage) -> None:
         self._raw = raw
 
-    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
+    def expose(
+        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
+    ) -> Tensor:
         camera = self._raw.camera
-        return torch.stack([clip_and_quantise(self.expected(s), camera) for s in states])
+        return torch.stack([clip_and_quantise(self.expected(s), camera) for s in states], out=out)
 
     def expected(self, settings: CameraSettings) -> Tensor:
         return self._raw.data * exposure_ratio(self._raw.settings, settings)
@@ -160,8 +164,10 @@ class _Banked:
         self._latent = latent
         self.expected = latent.expected
 
-    def expose(self, states: Iterable[CameraSettings], *, seed: int = 0) -> Tensor:
-        return self._latent.expose(states, seed=seed, noise="bank")
+    def expose(
+        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
+    ) -> Tensor:
+        return self._latent.expose(states, seed=seed, noise="bank", out=out)
 
 
 def planned(

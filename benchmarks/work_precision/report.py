@@ -193,9 +193,9 @@ def _sweep_section(rows: Sequence[Row]) -> list[str]:
     lines = [
         "One preparation and 64 exposures against 64 full runs, the same scenes in the same run, "
         "depth unknown: both networks where they are needed. Nothing is cached: every sweep begins "
-        "with the raw. PSNR is of the expected value; *fair*: over the states within 3 EV of the "
-        "right exposure alone, as nearly black or white frames count little. *Bank*: noise looked "
-        "up in a bank of normals in place of drawn.",
+        "with the raw. Both write captures to memory that is there. PSNR is of the expected value; "
+        "*fair*: over the states within 3 EV of the right exposure alone, as nearly black or white "
+        "frames count little. *Bank*: noise looked up in a bank of normals in place of drawn.",
         "",
         "| size | method | scenes | ms per state | ms per sweep | PSNR, 64 states [dB] | PSNR, "
         "fair [dB] |",

