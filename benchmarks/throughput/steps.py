@@ -114,6 +114,9 @@ def _environments(size: int, seed: int, quick: bool, full: bool) -> Iterator[Cas
     cached = "cached scene"
     yield _single(f"one environment, {cached}", size, seed, **CACHED)
     yield _batch(f"vector env, {cached}", 64, size, seed, **CACHED)
+    # An episode of 8 steps takes 9 frames; the kernel takes one per step.
+    endless = f"vector env, {cached}, endless episodes"
+    yield _batch(endless, 64, size, seed, max_episode_steps=None, **CACHED)
     yield _batch(f"vector env, {cached}, live scoring", 64, size, seed, **CACHED, **live)
     yield _batch("vector env, motion and defocus", 64, size, seed)
     yield _batch("vector env, motion and defocus, held states", 64, size, seed, hold=True)
