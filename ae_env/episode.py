@@ -19,7 +19,7 @@ class Episode:
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
         focus_drive: Blur at f/4 that the focus drive tells of [pixel of a 64-pixel frame].
         phase: Phase of a periodic lighting, in [0, 1).
-        noise_seed: Seed of the noise; the frame number is added to it.
+        noise_seed: Seed of the noise, which differs from frame to frame.
         frame: Number of the current frame.
     """
 

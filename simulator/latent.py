@@ -243,8 +243,8 @@ class Latent:
         Returns:
             (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
         """
-        (frame,) = self.expose([settings], seed=seed, noise=noise)
         exposure = self.exposure(settings)
+        (frame,) = self.expose([settings], seed=seed, noise=noise)
         return frame, noise_balance(self.optics.blurred(exposure), exposure).relative_excess
 
     def expose(
@@ -267,7 +267,9 @@ class Latent:
             out: (S, 4, H, W) contiguous float32 to write to, instead of new memory.
         """
         check_noise(noise)
-        states = list(states)
+        states = list(states) if isinstance(states, Iterable) else states
+        if not isinstance(states, list) or not all(isinstance(s, CameraSettings) for s in states):
+            raise ValueError(f"`states` (={states!r}) must be several CameraSettings")
         frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed is told before any work
         exposures = [self.exposure(settings) for settings in states]
@@ -288,14 +290,19 @@ class Latent:
         wanted = self.light.expand(count, *self.light.shape)
         if given is None:
             return new_frame(wanted)
+        if not isinstance(given, torch.Tensor):
+            raise ValueError(f"`out` (={type(given).__name__}) must be a torch tensor")
+        if given.untyped_storage().data_ptr() == self.light.untyped_storage().data_ptr():
+            raise ValueError("`out` must not be the memory of the light that is exposed")
         if (
             given.shape != wanted.shape
             or (given.dtype, given.device) != (torch.float32, wanted.device)
             or not given.is_contiguous()
+            or given.requires_grad
         ):
             raise ValueError(
                 f"`out` ({given.dtype}, shape {tuple(given.shape)}, on {given.device}) must be "
-                f"contiguous float32 {tuple(wanted.shape)} on {wanted.device}"
+                f"contiguous float32 {tuple(wanted.shape)} on {wanted.device}, without gradient"
             )
         return given
 

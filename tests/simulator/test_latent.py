@@ -407,3 +407,17 @@ def test_frames_do_not_fit_everywhere(out: torch.Tensor) -> None:
     states = [CameraSettings(100, 1 / 64, 4.0)] * 2
     with pytest.raises(ValueError, match=r"`out` .*must be contiguous float32 \(2, 4"):
         latent().expose(states, out=out)
+
+
+def test_only_settings_are_exposed_and_never_into_the_light() -> None:
+    own = latent()
+    with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
+        own.expose([HIGH, 3])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
+        own.expose(HIGH)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"`out` .=list. must be a torch tensor"):
+        own.expose([HIGH], out=[1])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="`out` must not be the memory of the light"):
+        own.expose([HIGH], out=own.light[None])
+    with pytest.raises(ValueError, match="without gradient"):
+        own.expose([HIGH], out=torch.empty(1, 4, SIDE, SIDE, requires_grad=True))
