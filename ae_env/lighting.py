@@ -13,9 +13,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-#: Frames per second of an episode.
-FRAME_RATE = 30.0
-
 
 @dataclass(frozen=True)
 class Lighting:

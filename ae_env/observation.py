@@ -23,8 +23,6 @@ SENSOR_RANGES = np.array([[-9.0, 3.0], [-4.0, 4.0]])
 SENSOR_NOISE = 0.15
 _LOG2_NOISE = SENSOR_NOISE / np.log(2.0)
 _TINY = np.finfo(np.float64).tiny
-#: Frame height that the defocus spread is stated for [pixel].
-DEFOCUS_FRAME = 64
 
 
 def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:

@@ -95,7 +95,6 @@ def record(
     noise: FrameNoise | None,
     *,
     out: torch.Tensor,
-    threads: int | None = None,
 ) -> None:
     """One capture of light that is blurred already: exposed, noisy, clipped and quantised.
 
@@ -107,14 +106,13 @@ def record(
         camera: The body.
         noise: The noise; None for none.
         out: (4, H, W) float32, contiguous, that the frame in [-pedestal, 1] is written to.
-        threads: Of the kernel, at most; those of torch by default.
     """
     if not lacks_noise(exposure):
         noise = None
     if light.device.type == "cpu":
         from simulator.kernels import record_capture  # numba: only where there is a capture
 
-        record_capture(light, exposure, camera, noise=noise, out=out, threads=threads)
+        record_capture(light, exposure, camera, noise=noise, out=out)
         return
     signal = exposed_light(light, exposure)[None]
     if noise is not None:

@@ -304,7 +304,6 @@ def record_capture(
     *,
     noise: FrameNoise | None = None,
     out: torch.Tensor | None = None,
-    threads: int | None = None,
 ) -> torch.Tensor:
     """One capture of `light`: exposed, noisy, clipped and quantised, blurred by the caller.
 
@@ -314,7 +313,6 @@ def record_capture(
         camera: The body.
         noise: The noise; None for none.
         out: (4, H, W) contiguous float32 to write into.
-        threads: At most so many; those of torch by default.
 
     Returns:
         (4, H, W) float32 in [-pedestal, 1].
@@ -334,6 +332,5 @@ def record_capture(
         remaining=addresses([remaining]),
         signals=signals.numpy().reshape(1, 4, -1),
         count=False,
-        threads=threads,
     )
     return signals
