@@ -6,7 +6,6 @@ happens here, so that the two cannot differ.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from ae_env.draws import Draws
 from ae_env.episode import Episode, Episodes
 from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
@@ -25,12 +25,6 @@ from ae_env.scorers.protocol import DependsOn
 from simulator.modules.disc_bank import DIAMETERS
 from simulator.noise_bank import single_normals
 
-#: Share of the episodes in which nothing moves.
-STATIC_SHARE = 1.0 / 3.0
-#: Standard deviation of the natural logarithm of the image speed.
-SPEED_SIGMA = 1.3
-#: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
-DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
@@ -78,8 +72,7 @@ class EpisodeCore:
             tolerance=options.tolerance,
         )
         self.episodes = Episodes(num_envs, int(options.delay))
-        self._scene_index = {scene.scene_id: i for i, scene in enumerate(self.scenes)}
-        self._own_blur = [s.own_blur(4.0) * 64.0 / options.resolution for s in self.scenes]
+        self._draws = Draws(options, self.scenes, len(self.grid))
         self._scene_ids = np.array([scene.scene_id for scene in self.scenes], object)
         states = self.grid.states
         apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
@@ -87,10 +80,13 @@ class EpisodeCore:
         # (4, S), see `_STATE_INFO`
         self._bounds = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._static = type(self.lighting) is Lighting
+        has_map = np.array([scene.defocus_map is not None for scene in self.scenes])
+        self._shareable = self._static & ~has_map
         # In static light, by slot and state: scores of the parts that have a closed form, the last
         # column those of the whole where it has one; and which slots have them.
         slots = len(self.scenes) + num_envs
         self._closed = self.scorer.names("light", "blur") if self._static else []
+        self._closed_columns = [f"score:{name}" for name in self._closed]
         self._scores = np.zeros((slots, len(states), len(self._closed) + 1))
         self._scored = np.zeros(slots, bool)
         self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
@@ -134,74 +130,26 @@ class EpisodeCore:
     # -- life of an episode -------------------------------------------------------------------
 
     def start(self, place: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
-        """Begins an episode at `place`; see `drawn`."""
-        self.begin(np.array([place]), [self.drawn(rng, options)])
+        """Begins an episode at `place`; see `Draws.draw`."""
+        self.begin(np.array([place]), [rng], [options])
 
-    def begin(self, places: np.ndarray, drawn: Sequence[Episode]) -> None:
-        """Puts the episodes `drawn` into `places` (K,), where others may end."""
+    def begin(
+        self,
+        places: np.ndarray,
+        rngs: Sequence[np.random.Generator],
+        options: Sequence[Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Draws episodes for `places` (K,), where others may end; see `Draws.draw`."""
+        drawn = self._draws.draw(rngs, options)
         self.recorder.end(places)
         own = len(self.scenes) + places
-        slots = [e.scene if self._is_shared(e) else i for e, i in zip(drawn, own, strict=True)]
-        self.episodes.begin(places, drawn, np.array(slots))
+        # At rest, its light and its scores are those of every episode that shows its scene.
+        moves = (drawn["speed"] > 0.0) | (drawn["defocus"] > 0.0)
+        shared = ~moves & self._shareable[drawn["scene"]]
+        self.episodes.begin(places, drawn, np.where(shared, drawn["scene"], own))
         self._scored[own] = False
         for place in places.tolist():
             self._tables[place] = None
-
-    def _is_shared(self, episode: Episode) -> bool:
-        """Whether its light and its scores are those of every episode that shows its scene."""
-        at_rest = not (episode.speed or episode.defocus)
-        return at_rest and self._static and self.scenes[episode.scene].defocus_map is None
-
-    def drawn(self, rng: np.random.Generator, options: Mapping[str, Any]) -> Episode:
-        """An episode: draws the scene, the start state, the motion and the defocus.
-
-        The draws do not depend on `options`, which only replace what was drawn.
-
-        Raises:
-            ValueError: If there is no such scene, state or frame as `options` ask for.
-        """
-        scene = int(rng.integers(len(self.scenes)))
-        state = int(rng.integers(len(self.grid)))
-        moves, speed, defocus = rng.random() >= STATIC_SHARE, *rng.standard_normal(2)
-        phase, noise_seed = rng.random(), int(rng.integers(2**62))
-        scene = self._chosen_scene(options.get("scene"), scene)
-        median = self.scenes[scene].median_speed
-        drawn_speed = moves * median * math.exp(SPEED_SIGMA * speed)
-        drawn_defocus = DEFOCUS_MEDIAN * math.exp(DEFOCUS_SIGMA * defocus)
-        shown = _fixed_or_drawn(
-            self.options.depth, float(min(max(drawn_defocus, DEFOCUS_MIN), DEFOCUS_MAX))
-        )
-        own = self._own_blur[scene]
-        return Episode(
-            scene=scene,
-            state=self._chosen("state", options.get("state"), state, len(self.grid)),
-            speed=_fixed_or_drawn(self.options.motion, float(drawn_speed)),
-            defocus=shown,
-            focus_drive=math.hypot(shown, own),
-            phase=float(phase),
-            noise_seed=noise_seed,
-            frame=self._chosen("frame", options.get("frame"), 0, 2**31),
-        )
-
-    def _chosen_scene(self, wanted: Any, drawn: int) -> int:
-        if wanted is None:
-            return drawn
-        if isinstance(wanted, str) and wanted in self._scene_index:
-            return self._scene_index[wanted]
-        if isinstance(wanted, int | np.integer) and 0 <= wanted < len(self.scenes):
-            return int(wanted)
-        raise ValueError(
-            f"`options['scene']` (={wanted!r}) must be a scene id, such as "
-            f"{self.scenes[0].scene_id!r}, or an index below {len(self.scenes)}"
-        )
-
-    @staticmethod
-    def _chosen(name: str, wanted: Any, drawn: int, limit: int) -> int:
-        if wanted is None:
-            return drawn
-        if isinstance(wanted, int | np.integer) and 0 <= wanted < limit:
-            return int(wanted)
-        raise ValueError(f"`options[{name!r}]` (={wanted!r}) must be an integer in [0, {limit})")
 
     def episode(self, place: int) -> Episode:
         """The episode at `place` as it is now."""
@@ -336,8 +284,8 @@ class EpisodeCore:
         if self._static:
             if not self._scored[slots].all():
                 self._score(places)
-            names = [f"score:{name}" for name in self._closed]
-            scores = dict(zip(names, self._scores[slots, states].T, strict=False))
+            known = self._scores[slots, states].T
+            scores = dict(zip(self._closed_columns, known, strict=False))
         kinds: list[DependsOn] = [] if self.scorer.closed_form else ["image"]
         if not self._static:
             kinds += ["light", "blur"]
@@ -389,10 +337,3 @@ class EpisodeCore:
             before = self.grid.controls(np.where(first, 0, episodes.previous[places]))
             costs["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
         return costs
-
-
-def _fixed_or_drawn(option: str | float, drawn: float) -> float:
-    """`drawn` for ``"random"``, 0 for every other word, or the number itself."""
-    if option == "random":
-        return drawn
-    return 0.0 if isinstance(option, str) else float(option)

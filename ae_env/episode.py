@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -59,10 +59,10 @@ class Episodes:
         self.pending = np.zeros((count, delay + 1), np.int64)
         self.image_mean = np.full(count, np.nan)
 
-    def begin(self, places: np.ndarray, drawn: Sequence[Episode], slots: np.ndarray) -> None:
-        """Puts the episodes `drawn` into `places`, with their `slots`."""
+    def begin(self, places: np.ndarray, drawn: Mapping[str, np.ndarray], slots: np.ndarray) -> None:
+        """Puts the episodes `drawn`, columns of `Episode`, into `places`, with their `slots`."""
         for name in _FIELDS:
-            getattr(self, name)[places] = [getattr(episode, name) for episode in drawn]
+            getattr(self, name)[places] = drawn[name]
         self.slot[places] = slots
         self.previous[places] = -1
         self.pending[places] = self.state[places, None]

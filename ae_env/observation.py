@@ -6,9 +6,13 @@ same number of codes per standard deviation of photon noise.
 
 from __future__ import annotations
 
+import math
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from simulator.jit import kernel
 
 if TYPE_CHECKING:
     import torch
@@ -21,8 +25,8 @@ SETTINGS_RANGES = np.array([[0.0, 10.0], [-5.0, 15.0], [4.0, 17.0]])
 SENSOR_RANGES = np.array([[-9.0, 3.0], [-4.0, 4.0]])
 #: Relative standard deviation of both sensors.
 SENSOR_NOISE = 0.15
-_LOG2_NOISE = SENSOR_NOISE / np.log(2.0)
-_TINY = np.finfo(np.float64).tiny
+_LOG2_NOISE = SENSOR_NOISE / math.log(2.0)
+_TINY = sys.float_info.min
 
 
 def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
@@ -76,15 +80,25 @@ def encode_sensors(speed: np.ndarray, defocus: np.ndarray, noise: np.ndarray) ->
     """Readings of the gyro and the focus drive.
 
     Args:
-        speed: (...,) image speed [frame heights/s], >= 0.
-        defocus: (...,) blur diameter at f/4 [pixel of a 64-pixel frame], > 0.
-        noise: (..., 2) standard normals; the readings are off by 15 % times these.
+        speed: (N,) image speed [frame heights/s], >= 0.
+        defocus: (N,) blur diameter at f/4 [pixel of a 64-pixel frame], > 0.
+        noise: (N, 2) standard normals; the readings are off by 15 % times these.
 
     Returns:
-        (..., 2) float32 in [-1, 1]; no motion reads -1.
+        (N, 2) float32 in [-1, 1]; no motion reads -1.
     """
-    values = np.log2(np.maximum(np.stack([speed, defocus], axis=-1), _TINY))
-    return _to_unit(values + _LOG2_NOISE * noise, SENSOR_RANGES)
+    out = np.empty((len(speed), 2), np.float32)
+    _read_sensors(speed, defocus, noise, out)
+    return out
+
+
+@kernel()
+def _read_sensors(speed, defocus, noise, out):  # type: ignore[no-untyped-def]
+    for i in range(len(out)):
+        for j, value in enumerate((speed[i], defocus[i])):
+            low, high = SENSOR_RANGES[j]
+            reading = np.log2(max(value, _TINY)) + _LOG2_NOISE * noise[i, j]
+            out[i, j] = min(max(2.0 * (reading - low) / (high - low) - 1.0, -1.0), 1.0)
 
 
 def decode_sensors(sensors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -197,6 +197,7 @@ class Recorder:
         seeds, frames = self.episodes.noise_seed[places], self.episodes.frame[places]
         keys = noise_keys(seeds, frames.astype(np.float64))
         flat = (len(rows), 4, self._samples)
+        blurred = plans.blurs[rows].any()  # else all of the source's variance remains
         counts = record_frames(
             addresses(plans.light[rows]),
             self._samples,
@@ -204,7 +205,7 @@ class Recorder:
             self.camera,
             keys=None if self.options.noise is False else keys,
             noise="exact" if self.options.noise == "exact" else "bank",
-            remaining=addresses(plans.remaining[rows]),
+            remaining=addresses(plans.remaining[rows]) if blurred else None,
             codes=None if codes is None else codes.reshape(flat),
             numbers=None if numbers is None else numbers.reshape(flat),
             signals=None if signals is None else signals.reshape(flat),

@@ -176,13 +176,13 @@ class AutoExposureVectorEnv(
     # -- helpers ------------------------------------------------------------------------------
 
     def _begin(self, places: np.ndarray, options: Sequence[dict[str, Any]] | None = None) -> None:
-        drawn = []
+        rngs = []
         for i in places.tolist():
             rng = self._rngs[i]
             if rng is None:
                 raise gym.error.ResetNeeded("call reset() before step()")
-            drawn.append(self.core.drawn(rng, options[i] if options else {}))
-        self.core.begin(places, drawn)
+            rngs.append(rng)
+        self.core.begin(places, rngs, [options[i] for i in places] if options else None)
         self._steps[places] = 0
         self._done[places] = False
 

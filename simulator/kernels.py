@@ -106,30 +106,37 @@ def _rounded(x, span, black, white):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _digitise(  # type: ignore[no-untyped-def]
-    light, bound, normals, sign, exposure, remaining, span, black, white, out
-):
-    """Digital numbers of light; without `normals` there is no noise.
+def _digitise(size, light, bound, ratio, sensor, out):  # type: ignore[no-untyped-def]
+    """Digital numbers of light, without noise; `sensor` is of `sensor_table`."""
+    span, black, white = sensor
+    for j in range(size):
+        out[j] = _rounded(_exposed(light[j], ratio, bound), span, black, white)
 
-    `exposure` is a plane's column of `exposure_table`; `remaining` is empty where no blur has
-    averaged the source's noise.
-    """
-    ratio, shot, read, source_shot, source_read = exposure
-    if len(normals) == 0:
-        for j in range(len(out)):
-            out[j] = _rounded(_exposed(light[j], ratio, bound), span, black, white)
-    elif len(remaining) == 0:
-        for j in range(len(out)):
-            x = _exposed(light[j], ratio, bound)
-            variance = (x if x > _ZERO else _ZERO) * shot + read
-            out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
-    else:
-        for j in range(len(out)):
-            x = _exposed(light[j], ratio, bound)
-            bright = x if x > _ZERO else _ZERO
-            variance = bright * shot + read
-            variance += (_ONE - remaining[j]) * (bright * source_shot + source_read)
-            out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
+
+@_jit()
+def _digitise_noisy(  # type: ignore[no-untyped-def]
+    size, light, normals, sign, bound, ratio, shot, read, sensor, out
+):
+    """The same with noise of the variance that is missing."""
+    span, black, white = sensor
+    for j in range(size):
+        x = _exposed(light[j], ratio, bound)
+        variance = (x if x > _ZERO else _ZERO) * shot + read
+        out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
+
+
+@_jit()
+def _digitise_averaged(  # type: ignore[no-untyped-def]
+    size, light, normals, sign, remaining, bound, ratio, noise, sensor, out
+):
+    """The same where a blur has left a share `remaining` of the source's variance."""
+    (shot, read, source_shot, source_read), (span, black, white) = noise, sensor
+    for j in range(size):
+        x = _exposed(light[j], ratio, bound)
+        bright = x if x > _ZERO else _ZERO
+        variance = bright * shot + read
+        variance += (_ONE - remaining[j]) * (bright * source_shot + source_read)
+        out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
 
 
 @_jit()
@@ -193,36 +200,43 @@ def _record(  # type: ignore[no-untyped-def]
     counts,
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order."""
-    part, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
     pieces = (blocks + _UNIT_BLOCKS - 1) // _UNIT_BLOCKS
     for unit in range(first, last):
         frame, plane, piece = unit // (4 * pieces), (unit // pieces) % 4, unit % pieces
-        column = exposure[frame, :, plane].copy()
+        ratio, shot, read, source_shot, source_read = exposure[frame, :, plane]
         span, black, low, high, white = sensor[:, plane]
+        body = span, black, white
         # A light beyond it is white; one of an exposure of 0 has no bound.
-        bound = min(_LIMIT / column[0], _LARGEST)
+        bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
-        plane_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[call-arg]
+        frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[call-arg]
         shares = samples if remaining[frame] else 0
         share = numba.carray(as_pointer(remaining[frame]), (shares,))  # type: ignore[call-arg]
         clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start = block * BLOCK
             end = min(start + BLOCK, samples)
-            at, number = plane * samples + start, plane * blocks + block
-            exposed, out = plane_light[at : at + end - start], part[: end - start]
-            given = (column, share[start:end], span, black, white, out)
+            size, at, number = end - start, plane * samples + start, plane * blocks + block
+            exposed, normals, sign = frame_light[at : at + size], made, _ONE
             if drawn == _BANK:
                 place, sign = _in_bank(keys[frame], number)
-                _digitise(exposed, bound, bank[place : place + BLOCK], sign, *given)
+                normals = bank[place : place + BLOCK]
+            elif drawn == _DRAWN:
+                draw_block(keys[frame], number, words, made)
+            if drawn == _OFF:
+                _digitise(size, exposed, bound, ratio, body, part)
+            elif shares:
+                noise, left = (shot, read, source_shot, source_read), share[start:end]
+                _digitise_averaged(
+                    size, exposed, normals, sign, left, bound, ratio, noise, body, part
+                )
             else:
-                if drawn == _DRAWN:
-                    draw_block(keys[frame], number, words, normals)
-                made = normals[: BLOCK * (drawn == _DRAWN)]
-                _digitise(exposed, bound, made, _ONE, *given)
+                _digitise_noisy(size, exposed, normals, sign, bound, ratio, shot, read, body, part)
+            out = part[:size]
             if codes.size:
                 _compand(out, darkest, scale, low, high, clipped, codes[frame, plane, start:end])
             elif counts.size:

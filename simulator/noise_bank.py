@@ -16,7 +16,8 @@ import functools
 import numpy as np
 from scipy.special import ndtri
 
-from simulator.noise_keys import KEY_STEP, mixed
+from simulator.jit import kernel
+from simulator.noise_keys import KEY_STEP, mixed, mixed_word
 
 #: Number of different normals.
 BANK_SIZE = 2**20
@@ -38,12 +39,20 @@ def noise_bank() -> np.ndarray:
     return bank
 
 
+@kernel()
+def _singles(keys, bank, out):  # type: ignore[no-untyped-def]
+    for i in range(len(out)):
+        for j in range(out.shape[1]):
+            word = mixed_word((keys[i] ^ _SINGLES) + KEY_STEP * np.uint64(j + 1))
+            value = np.float64(bank[word & np.uint64(BANK_SIZE - 1)])
+            out[i, j] = -value if word >> np.uint64(63) else value
+
+
 def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
     """(B, count) float64: `count` standard normals for each key, apart from its frame's noise."""
-    turns = np.arange(1, count + 1, dtype=np.uint64) * KEY_STEP
-    words = mixed((keys[:, None] ^ _SINGLES) + turns)
-    values = noise_bank()[words & np.uint64(BANK_SIZE - 1)].astype(np.float64)
-    return np.where(words >> np.uint64(63), -values, values)
+    out = np.empty((len(keys), count))
+    _singles(keys, noise_bank(), out)
+    return out
 
 
 def bank_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -21,10 +23,15 @@ def _episode(number: int) -> Episode:
     )
 
 
+def _columns(*numbers: int) -> dict[str, np.ndarray]:
+    episodes = [asdict(_episode(number)) for number in numbers]
+    return {name: np.array([e[name] for e in episodes]) for name in episodes[0]}
+
+
 def _filled(count: int, delay: int = 0) -> Episodes:
     episodes = Episodes(count, delay)
     places = np.arange(count)
-    episodes.begin(places, [_episode(i) for i in range(count)], places)
+    episodes.begin(places, _columns(*range(count)), places)
     return episodes
 
 
@@ -43,7 +50,7 @@ def test_only_the_episodes_at_the_given_places_go_on_or_begin() -> None:
     assert episodes.frame.tolist() == [1, 100, 201, 300]
     assert episodes.previous.tolist() == [10, -1, 12, -1]
     assert earlier == _episode(2)  # a copy
-    episodes.begin(np.array([2]), [_episode(3)], np.array([9]))
+    episodes.begin(np.array([2]), _columns(3), np.array([9]))
     assert episodes[2] == _episode(3)
     assert (episodes.slot[2], episodes.previous[2]) == (9, -1)
     assert episodes.state.tolist() == [5, 11, 13, 13]

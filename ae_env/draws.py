@@ -1,0 +1,111 @@
+"""What an episode begins with: scene, start state, motion, defocus, seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from ae_env.options import EnvOptions
+from ae_env.scenes.scene import Scene
+
+#: Share of the episodes in which nothing moves.
+STATIC_SHARE = 1.0 / 3.0
+#: Standard deviation of the natural logarithm of the image speed.
+SPEED_SIGMA = 1.3
+#: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
+DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
+#: Uniform numbers that an episode is made of.
+_NUMBERS = 7
+#: Those have so many different values.
+_VALUES = 2.0**53
+
+
+class Draws:
+    """Draws episodes.
+
+    Args:
+        options: The environment's arguments.
+        scenes: What episodes choose from.
+        num_states: Number of exposure states.
+    """
+
+    def __init__(self, options: EnvOptions, scenes: Sequence[Scene], num_states: int) -> None:
+        self._options, self._num_states = options, num_states
+        self._index = {scene.scene_id: i for i, scene in enumerate(scenes)}
+        self._ids = [scene.scene_id for scene in scenes]
+        self._speeds = np.array([scene.median_speed for scene in scenes])
+        self._own_blur = np.array([s.own_blur(4.0) * 64.0 / options.resolution for s in scenes])
+
+    def draw(
+        self,
+        rngs: Sequence[np.random.Generator],
+        chosen: Sequence[Mapping[str, Any]] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """K episodes as columns, each of its own generator.
+
+        What is drawn does not depend on what is chosen, which only replaces it.
+
+        Args:
+            rngs: K generators; each gives the same count of numbers for every episode.
+            chosen: For each the ``scene``, ``state`` and ``frame`` that it shall have.
+
+        Returns:
+            (K,) arrays by the names of `ae_env.episode.Episode`.
+
+        Raises:
+            ValueError: If there is no such scene, state or frame.
+        """
+        uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
+        place, start, moving, speed, defocus, phase, seed = uniforms
+        scene = (place * len(self._ids)).astype(np.int64)
+        state = (start * self._num_states).astype(np.int64)
+        frame = np.zeros(len(rngs), np.int64)
+        for i, wanted in enumerate(chosen or ()):
+            scene[i] = self._scene(wanted.get("scene"), scene[i])
+            state[i] = _number("state", wanted.get("state"), state[i], self._num_states)
+            frame[i] = _number("frame", wanted.get("frame"), 0, 2**31)
+        speeds = (moving >= STATIC_SHARE) * np.exp(SPEED_SIGMA * ndtri(speed)) * self._speeds[scene]
+        discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
+        discs = _fixed_or_drawn(
+            self._options.depth, np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
+        )
+        return {
+            "scene": scene,
+            "state": state,
+            "speed": _fixed_or_drawn(self._options.motion, speeds),
+            "defocus": discs,
+            "focus_drive": np.hypot(discs, self._own_blur[scene]),
+            "phase": phase,
+            "noise_seed": (seed * _VALUES).astype(np.int64),
+            "frame": frame,
+        }
+
+    def _scene(self, wanted: Any, drawn: int) -> int:
+        if wanted is None:
+            return drawn
+        if isinstance(wanted, str) and wanted in self._index:
+            return self._index[wanted]
+        if isinstance(wanted, int | np.integer) and 0 <= wanted < len(self._ids):
+            return int(wanted)
+        raise ValueError(
+            f"`options['scene']` (={wanted!r}) must be a scene id, such as {self._ids[0]!r}, or an "
+            f"index below {len(self._ids)}"
+        )
+
+
+def _number(name: str, wanted: Any, drawn: int, limit: int) -> int:
+    if wanted is None:
+        return drawn
+    if isinstance(wanted, int | np.integer) and 0 <= wanted < limit:
+        return int(wanted)
+    raise ValueError(f"`options[{name!r}]` (={wanted!r}) must be an integer in [0, {limit})")
+
+
+def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
+    """`drawn` for ``"random"``, 0 for every other word, or the number itself."""
+    if option == "random":
+        return drawn
+    return np.full(len(drawn), 0.0 if isinstance(option, str) else float(option))
