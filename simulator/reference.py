@@ -18,6 +18,7 @@ from simulator.blur import motion_blur
 from simulator.camera import CameraProfile
 from simulator.capture import clip_and_quantise
 from simulator.exposure import SIGNAL_LIMIT
+from simulator.lamps import Lamp
 from simulator.noise import nlf_tensors, noise_generator
 from simulator.raw_image import check_packed
 from simulator.settings import CameraSettings, exposure_ratio
@@ -222,18 +223,30 @@ class ReferenceCamera:
         settings: CameraSettings,
         *,
         image_speed: float = 0.0,
+        lamp: Lamp | None = None,
+        start: float = 0.0,
     ) -> torch.Tensor:
         """Signal without noise at `settings`, with this body's hidden errors, unclipped.
+
+        Where the image moves in light that changes, each is integrated by itself.
 
         Args:
             light: (..., 4, H, W) at the exposure of `reference`, as `optics` gives it.
             reference: Settings of `light`.
             settings: Nominal settings of the capture.
             image_speed: Speed of the image along the rows [frame heights per second].
+            lamp: What lights the scene, whose long-term mean `light` is; None for steady light.
+                Rows are read one after the other (`CameraProfile.row_time`).
+            start: When the first row begins its exposure [s].
         """
         ratio = exposure_ratio(reference, settings) * self.body.light_error(settings)
         time = self.body.exposure_time(settings.exposure_time)
         moved = motion_blur(light, image_speed * time * light.shape[-2])
+        if lamp is not None:
+            bands = lamp.row_light(
+                start, time, light.shape[-2], self.camera.row_time, 2 * self.box_factor
+            )
+            moved = moved * torch.from_numpy(bands).to(moved)[:, None]
         return moved * ratio + self._black_offset(light)
 
     def _black_offset(self, signal: torch.Tensor) -> torch.Tensor:
@@ -285,6 +298,8 @@ class ReferenceCamera:
         seed: int,
         *,
         light: torch.Tensor | None = None,
+        lamp: Lamp | None = None,
+        start: float = 0.0,
     ) -> ReferenceCapture:
         """Photographs a scene that stands still.
 
@@ -294,10 +309,12 @@ class ReferenceCamera:
             seed: Seed of the noise, >= 0; the noise is a function of it and of the settings.
             light: What ``optics(scene, settings.f_number)`` gave, where it is at hand: it serves
                 every capture at that f-number.
+            lamp: See `expose`.
+            start: See `expose`.
         """
         if light is None:
             light = self.optics(scene, settings.f_number)
-        signal = self.expose(light, scene.reference, settings)
+        signal = self.expose(light, scene.reference, settings, lamp=lamp, start=start)
         generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
         sample = self.record(signal, settings.iso, generator)
         return ReferenceCapture(self.clip(signal, settings.iso), sample, settings)

@@ -17,6 +17,9 @@ from simulator.training.data import Batch
 _MAP_WEIGHT = 0.1
 #: Pixels around a clipped highlight that the aperture stage leaves out: what was there is unknown.
 _CLIP_MARGIN = 7
+#: A source with less noise than this (standard deviation) counts as having this much: black, and
+#: free of noise, it would have none to be measured by. Cameras have 7e-5 and more.
+_LEAST_NOISE = 1e-6
 
 
 class ExposureLoss(nn.Module):
@@ -49,10 +52,12 @@ class NoiseLoss(nn.Module):
         exposed, shot, read = expose(self.exposure, batch)
         output = self.noise(exposed, shot, read)
         used = (batch.source <= OVER_EXPOSED) & (batch.target < 1.0)
-        unit = variance_map(smoothed(exposed), shot, read).mean(dim=(1, 2, 3), keepdim=True).sqrt()
+        variance = variance_map(smoothed(exposed), shot, read).mean(dim=(1, 2, 3), keepdim=True)
+        unit = variance.sqrt().clamp(min=_LEAST_NOISE)
         error = (output - batch.target) / unit * used
         before = (exposed - batch.target) / unit * used
-        gain = 10 * torch.log10(before.square().sum() / error.detach().square().sum())
+        left = error.detach().square().sum().clamp(min=_LEAST_NOISE)
+        gain = 10 * torch.log10(before.square().sum().clamp(min=_LEAST_NOISE) / left)
         return {"loss": error.abs().sum() / used.sum().clamp(min=1), "gain_db": gain}
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from simulator.camera import BayerPattern, CameraProfile, NoiseLevelFunction, get_camera
+from simulator.lamps import PulsedLamp
 from simulator.noise import noise_generator
 from simulator.reference import BodyError, ReferenceCamera, ReferenceScene
 from simulator.settings import CameraSettings
@@ -368,3 +369,20 @@ def test_camera_refuses_bad_input() -> None:
     late = ReferenceCamera(plain, body=BodyError(shutter_delay=-0.001))
     with pytest.raises(ValueError, match=r"`exposure_time`.*shutter error"):
         late.capture(scene(flat(0.1)), replace(BASE, exposure_time=1 / 2000), 0)
+
+
+def test_a_rolling_shutter_shows_bands_of_a_lamp() -> None:
+    camera = ReferenceCamera(sensor(1e-5, 1e-8, row_time=1e-3), box_factor=2)
+    # On for 5 ms of every 10; exposed for 1 us, four sensor rows of 1 ms to a packed row.
+    lit = PulsedLamp(frequency=100.0, duty=0.5)
+    settings = CameraSettings(100, 1e-6, 4)
+    signal = camera.expose(flat(0.1, 5), BASE, settings, lamp=lit)
+    steady = camera.expose(flat(0.1, 5), BASE, settings)
+    # Sensor rows begin at 0, 1, ... 19 ms: lit in 0 to 4 and 10 to 14.
+    shares = [np.mean([t % 10 < 5 for t in range(4 * row, 4 * row + 4)]) for row in range(5)]
+    bands = (signal / steady)[:, :, 0]
+    np.testing.assert_allclose(bands, 2.0 * np.array([shares] * 4), rtol=1e-5)
+    # A whole period has no bands.
+    whole = CameraSettings(100, 0.01, 4)
+    even = camera.capture(scene(flat(0.1, 5)), whole, seed=0, lamp=lit, start=0.0031).mean
+    np.testing.assert_allclose(even, camera.capture(scene(flat(0.1, 5)), whole, seed=0).mean)

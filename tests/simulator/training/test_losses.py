@@ -116,6 +116,27 @@ def test_halving_the_error_gains_six_decibels() -> None:
     assert float(loss(data)["gain_db"]) == pytest.approx(20 * math.log10(2), abs=1e-4)
 
 
+@pytest.mark.parametrize("level", [0.0, 1.0, 1e4])
+@pytest.mark.parametrize("noise", [0.0, SHOT])
+def test_black_and_blown_out_batches_teach_finite_gradients(level: float, noise: float) -> None:
+    image = torch.full((2, 4, 32, 32), level)
+    given = replace(
+        batch(noise=False),
+        source=image,
+        target=image.clamp(max=1.0),
+        ratio=torch.ones(2),
+        shot=torch.full((2, 4), noise),
+        read=torch.full((2, 4), noise / 100),
+    )
+    module = NoiseModule("compact")
+    values = NoiseLoss(ExposureModule(), module)(given)
+    assert all(bool(torch.isfinite(value)) for value in values.values())
+    values["loss"].backward()
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    assert gradients
+    assert all(bool(torch.isfinite(g).all()) for g in gradients)
+
+
 def test_clipped_pixels_teach_no_denoising() -> None:
     data = batch()
     good = denoiser(lambda image, _: torch.where(data.target >= 1, 77.0, data.target))

@@ -1,0 +1,164 @@
+"""Light that changes while the shutter is open: mains, pulse-width modulation, strobes, lightning.
+
+Each lamp gives its mean light over an exposure in closed form, relative to its long-term mean, so
+that the cost does not depend on how many periods the exposure lasts and no pulse, however short, is
+missed between two samples. On a rolling shutter each row has an exposure of its own, which
+`row_light` gives: bands.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+#: Shortest and longest exposure [s], and how far from 0 a moment may lie [s]: periods are counted
+#: in whole numbers, and no product of the following leaves the range of float64.
+_SHORTEST, _LONGEST = 1e-12, 1e9
+#: Least and greatest value of each field.
+_RANGES = {
+    "frequency": (1e-9, 1e9),
+    "depth": (0.0, 1.0),
+    "phase": (-1e9, 1e9),
+    "duty": (1e-12, 1.0),
+    "at": (-_LONGEST, _LONGEST),
+    "decay": (1e-12, _LONGEST),
+    "energy": (0.0, 1e9),
+}
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """Light that does not change; base of the others."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if not number or not math.isfinite(value):
+                raise ValueError(f"`{field.name}` (={value!r}) must be a finite number")
+            low, high = _RANGES[field.name]
+            if not low <= value <= high:
+                raise ValueError(f"`{field.name}` (={value!r}) must be in [{low:g}, {high:g}]")
+
+    def mean_light(self, start: ArrayLike, exposure_time: float) -> np.ndarray:
+        """Mean light of exposures.
+
+        Args:
+            start: (...) when each exposure begins [s], in [-1e9, 1e9].
+            exposure_time: How long each lasts [s], in [1e-12, 1e9].
+
+        Returns:
+            (...) float64, relative to the lamp's long-term mean.
+        """
+        start = np.asarray(start, np.float64)
+        time = float(exposure_time)
+        if not (np.abs(start) <= _LONGEST).all():
+            raise ValueError(f"`start` must be finite, in [{-_LONGEST:g}, {_LONGEST:g}] s")
+        if not _SHORTEST <= time <= _LONGEST:
+            raise ValueError(
+                f"`exposure_time` (={exposure_time!r}) must be in [{_SHORTEST:g}, {_LONGEST:g}] s"
+            )
+        return self._mean(start, time)
+
+    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
+        return np.ones_like(start)
+
+    def row_light(
+        self, start: float, exposure_time: float, rows: int, row_time: float, sensor_rows: int = 2
+    ) -> np.ndarray:
+        """Mean light of each row of a packed raw behind a rolling shutter.
+
+        Args:
+            start: When the first sensor row begins its exposure [s].
+            exposure_time: How long each row is exposed [s].
+            rows: Rows of the packed raw.
+            row_time: From one sensor row's begin to the next one's [s].
+            sensor_rows: Sensor rows that one packed row is the mean of.
+
+        Returns:
+            (rows,) float64.
+        """
+        begins = start + row_time * np.arange(rows * sensor_rows)
+        return self.mean_light(begins, exposure_time).reshape(rows, sensor_rows).mean(axis=1)
+
+
+@dataclass(frozen=True)
+class MainsLamp(Lamp):
+    """A lamp on the mains without a capacitor: ``1 + depth cos(2 pi (frequency t + phase))``.
+
+    Args:
+        frequency: Of the light [Hz], twice that of the mains: 100 or 120.
+        depth: From 0 (steady) to 1 (dark once a period).
+        phase: Of the first brightest moment, in periods.
+    """
+
+    frequency: float = 100.0
+    depth: float = 1.0
+    phase: float = 0.0
+
+    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
+        begin, whole, rest = _periods(start, time, self.frequency, self.phase)
+        # sin(pi (n + r)) = (-1)^n sin(pi r), and half a period's turn for every odd n in cos.
+        swing = math.sin(math.pi * rest) / (math.pi * (whole + rest))
+        # Where the lamp is darkest, 1 - |cos| would lose its digits: 2 sin^2 of half the angle.
+        half = math.pi * (begin + rest / 2.0 + 0.5)
+        dark = 2.0 * np.sin(half) ** 2  # 1 + cos of the middle, less whole periods
+        return (1.0 - self.depth * swing) + self.depth * swing * dark
+
+
+@dataclass(frozen=True)
+class PulsedLamp(Lamp):
+    """A lamp that is switched on for a share of each period: dimmed LEDs, screens, strobes.
+
+    Args:
+        frequency: Pulses per second [Hz].
+        duty: Share of the period that it is on, in (0, 1]; a strobe's is tiny.
+        phase: Where in a period the time 0 is, in periods; it is on from 0 to `duty`.
+    """
+
+    frequency: float = 1000.0
+    duty: float = 0.5
+    phase: float = 0.0
+
+    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
+        begin, whole, rest = _periods(start, time, self.frequency, self.phase)
+        now = np.clip(self.duty - begin, 0.0, rest)  # of the pulse that it begins in
+        later = np.clip(rest - (1.0 - begin), 0.0, self.duty)  # of the next one
+        return (whole + (now + later) / self.duty) / (whole + rest)
+
+
+@dataclass(frozen=True)
+class Flash(Lamp):
+    """Steady light and one flash that decays exponentially: lightning, a photographer's strobe.
+
+    Args:
+        at: When it fires [s].
+        decay: Time in which it falls to 1/e [s]: microseconds to milliseconds.
+        energy: Its light in all, in seconds of the steady light.
+    """
+
+    at: float = 0.0
+    decay: float = 50e-6
+    energy: float = 1.0
+
+    def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
+        since = start - self.at
+        seen = np.clip(since + time, 0.0, time) / self.decay
+        left = np.exp(-np.maximum(since, 0.0) / self.decay)
+        return 1.0 - self.energy / time * left * np.expm1(-seen)
+
+
+def _periods(
+    start: np.ndarray, time: float, frequency: float, phase: float
+) -> tuple[np.ndarray, int, float]:
+    """Where in a period exposures begin, in [0, 1), and how long they last.
+
+    Returns:
+        Begin; whole periods of the exposure; what is left of one, in [0, 1).
+    """
+    span = time * frequency
+    whole = math.floor(span)
+    return np.mod(start * frequency + phase, 1.0), whole, span - whole
