@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterator
 from datetime import datetime
 from importlib import metadata
-from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from simulator.dng_tags import (
     OwnRecord,
 )
 from simulator.exif import MAKE, MODEL, SOFTWARE
-from simulator.files import write_atomically
+from simulator.files import as_path, write_atomically
 from simulator.raw_image import RawImage, unpack_mosaic
 from simulator.tiff import Tag, TiffType, tiff_head
 
@@ -58,8 +57,9 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
 
     Raises:
         ValueError: If `path` does not end in ``.dng``.
+        OSError: If the file cannot be written; nothing half-written stays.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.suffix.lower() != ".dng":
         raise ValueError(f"`path` (={str(path)!r}) must end in '.dng'")
     if not isinstance(raw, RawImage):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from simulator.camera import BayerPattern, NoiseLevelFunction
 from simulator.exif import SOFTWARE
 from simulator.settings import CameraSettings
-from simulator.tiff import Content, Directory
+from simulator.tiff import Content, Directory, numbers
 
 #: Begins the Software tag of every DNG written here.
 SOFTWARE_NAME = "ae-env"
@@ -28,6 +28,8 @@ _COLOUR_SETS = ((50721, 50723, 50778), (50722, 50724, 50779))
 _LONG_ISO_TAGS = (34866, 34867, 34865)
 #: EXIF orientation for LibRaw's flip codes.
 ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}
+#: Beyond these a file is damaged.
+_MAX_BOX_FACTOR, _LARGEST_FACTOR = 4096, 1000.0
 _EXPOSURE_TAGS = {"iso": 34866, "exposure_time": 33434, "f_number": 33437}
 
 
@@ -61,10 +63,16 @@ def _first(directories: list[Directory], tag: int) -> tuple[Any, ...] | None:
     return next((d[tag] for d in directories if tag in d), None)
 
 
+def first_numbers(directories: list[Directory], tag: int) -> tuple[float, ...]:
+    """The field's values where it is first; empty if it is nowhere or not made of numbers."""
+    return next((numbers(d, tag) for d in directories if tag in d), ())
+
+
 def read_own_record(directories: list[Directory]) -> OwnRecord | None:
     """The record of a DNG that `write_dng` wrote, else None.
 
-    A record that no longer agrees with the standard EXIF tags (someone edited them) yields to them.
+    A record that no longer agrees with the standard EXIF tags (someone edited them) yields to them
+    where they can be a camera's.
     """
     software = _first(directories, SOFTWARE)
     comment = _first(directories, USER_COMMENT)
@@ -72,22 +80,26 @@ def read_own_record(directories: list[Directory]) -> OwnRecord | None:
         return None
     try:
         fields = json.loads(comment[0].removeprefix(COMMENT_PREFIX).rstrip(b"\0 ").decode("ascii"))
-        stated = {k: float(fields[k]) for k in _EXPOSURE_TAGS}
+        settings = CameraSettings(**{k: float(fields[k]) for k in _EXPOSURE_TAGS})
         box_factor, source = int(fields["box_factor"]), str(fields["colour_matrix_source"])
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
     for key, tag in _EXPOSURE_TAGS.items():
-        value = _first(directories, tag)
-        rounding = 0.5 if key == "iso" else 1e-6 * stated[key]
-        if value is not None and not abs(value[0] - stated[key]) <= rounding:
-            stated[key] = float(value[0])
-    return OwnRecord(CameraSettings(**stated), max(1, box_factor), source)
+        stated = getattr(settings, key)
+        value = next(iter(first_numbers(directories, tag)), stated)
+        written, rounding = stated, 1e-6 * stated
+        if key == "iso":  # whole, and at least 1
+            written, rounding = max(1.0, stated), 0.5
+        if abs(value - written) > rounding:
+            with suppress(ValueError):
+                settings = replace(settings, **{key: float(value)})
+    return OwnRecord(settings, min(max(1, box_factor), _MAX_BOX_FACTOR), source)
 
 
 def read_long_iso(directories: list[Directory]) -> float | None:
     """The ISO speed that does not fit EXIF's 16 bits, None where the file has none."""
-    values = (_first(directories, tag) for tag in _LONG_ISO_TAGS)
-    return next((float(v[0]) for v in values if v is not None and v[0] > 0), None)
+    values = (first_numbers(directories, tag) for tag in _LONG_ISO_TAGS)
+    return next((float(v[0]) for v in values if v and v[0] > 0), None)
 
 
 def read_colour_matrix(
@@ -99,17 +111,17 @@ def read_colour_matrix(
     """
     chosen = None
     for matrix_tag, calibration_tag, illuminant_tag in _COLOUR_SETS:
-        values = _first(directories, matrix_tag)
-        if values is None or len(values) != 9:
+        values = first_numbers(directories, matrix_tag)
+        calibration = first_numbers(directories, calibration_tag)
+        balance = first_numbers(directories, ANALOG_BALANCE)
+        if len(values) != 9 or max(map(abs, (*values, *calibration, *balance))) > _LARGEST_FACTOR:
             continue
         matrix = np.array(values, np.float64).reshape(3, 3)
-        calibration = _first(directories, calibration_tag)
-        if calibration is not None and len(calibration) == 9:
+        if len(calibration) == 9:
             matrix = np.array(calibration, np.float64).reshape(3, 3) @ matrix
-        balance = _first(directories, ANALOG_BALANCE)
-        if balance is not None and len(balance) == 3:
+        if len(balance) == 3:
             matrix = np.array(balance, np.float64)[:, None] * matrix
-        if np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-6:
+        if abs(np.linalg.det(matrix)) > 1e-6:
             chosen = tuple(tuple(float(v) for v in row) for row in matrix)
             if _first(directories, illuminant_tag) == (D65,):
                 break
@@ -121,17 +133,16 @@ def read_noise_profile(directories: list[Directory]) -> NoiseLevelFunction | Non
 
     The tag holds pairs (S, O), one for all colour planes or one per plane in the order of
     CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
-    (DNG specification 1.4). Values that cannot be a noise profile are ignored.
+    (DNG specification 1.4). Values that cannot be a noise profile are ignored: negative slopes, and
+    variances beyond 1, the square of the whole range.
     """
-    values = _first(directories, NOISE_PROFILE)
-    if values is None:
-        return None
-    colours = _first(directories, CFA_PLANE_COLOUR) or (0, 1, 2)
+    values = first_numbers(directories, NOISE_PROFILE)
+    colours = first_numbers(directories, CFA_PLANE_COLOUR) or (0, 1, 2)
     if len(values) == 2:
         values = tuple(values) * len(colours)
     if len(values) != 2 * len(colours) or sorted(colours) != [0, 1, 2]:
         return None
-    if not all(math.isfinite(v) for v in values) or any(v < 0 for v in values[::2]):
+    if any(abs(v) > 1 for v in values) or any(v < 0 for v in values[::2]):
         return None
     slots = [tuple(colours).index(c) for c in (0, 1, 1, 2)]
     return NoiseLevelFunction(
@@ -155,12 +166,17 @@ def read_black_level(
     where = next((d for d in directories if BLACK_LEVEL in d), None)
     if where is None or BLACK_DELTA_H in where or BLACK_DELTA_V in where:
         return None
-    repeat, values = where.get(BLACK_REPEAT, (1, 1)), where[BLACK_LEVEL]
+    repeat, values = where.get(BLACK_REPEAT, (1, 1)), numbers(where, BLACK_LEVEL)
+    if any(v < 0 for v in values):
+        return None
     if tuple(repeat) == (1, 1) and len(values) == 1:
         values = tuple(values) * 4
     elif tuple(repeat) != (2, 2) or len(values) != 4:
         return None
-    down, right = (a - b for a, b in zip(origin, where.get(ACTIVE_AREA, (0, 0))[:2], strict=True))
+    corner = numbers(where, ACTIVE_AREA)[:2] or (0, 0)
+    if len(corner) != 2:
+        return None
+    down, right = (a - int(b) for a, b in zip(origin, corner, strict=True))
     return tuple(  # type: ignore[return-value]
         float(values[2 * ((row + down) % 2) + (column + right) % 2]) for row, column in cfa.offsets
     )
@@ -174,12 +190,14 @@ def read_plain_mosaic(data: Content, directories: list[Directory]) -> np.ndarray
     Returns:
         None if the file is laid out in another way.
     """
-    where = next((d for d in directories if d.get(262, (0,))[0] == 32803), None)
-    if where is None or where.get(259, (0,))[0] != 1 or len(where.get(273, ())) != 1:
+    where = next((d for d in directories if d.get(262) == (32803,)), {})
+    if where.get(258) != (16,) or where.get(259) != (1,):
         return None
-    width, height = int(where[256][0]), int(where[257][0])
-    start, size = int(where[273][0]), 2 * width * height
-    if where.get(258, (0,))[0] != 16 or int(where[279][0]) != size:
+    layout = [numbers(where, tag) for tag in (257, 256, 273, 279)]
+    if any(len(values) != 1 for values in layout):
+        return None
+    height, width, start, size = (int(values[0]) for values in layout)
+    if min(height, width) < 2 or size != 2 * width * height or start + size > len(data):
         return None
     order = "<u2" if data[:2] == b"II" else ">u2"
     strip = np.frombuffer(data[start : start + size], order)

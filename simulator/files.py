@@ -16,6 +16,45 @@ RAW_SUFFIXES = (
 )
 
 
+#: Pixels that a raw or a radiance map may claim: 268 million, beyond any camera with a Bayer array.
+MAX_PIXELS = 2**28
+#: And for each byte of the file: no compression gives more for pictures that are worth reading.
+MAX_PIXELS_PER_BYTE = 1024
+
+
+def as_path(path: object) -> Path:
+    """`path` as a `Path`.
+
+    Raises:
+        ValueError: If it is neither text nor a path.
+    """
+    if not isinstance(path, str | os.PathLike) or not isinstance(os.fspath(path), str):
+        raise ValueError(f"`path` (={path!r}) must be a file's name: a str or a pathlib.Path")
+    return Path(path)
+
+
+def refuse_bomb(height: int, width: int, size: int) -> str:
+    """Why a picture must not be decoded, before memory is taken for it; empty where it may be.
+
+    Args:
+        height: Rows that the file claims.
+        width: Columns that it claims.
+        size: Length of the file [byte].
+
+    >>> refuse_bomb(60_000, 60_000, 4096)
+    'claims 60000 x 60000 pixels, where at most 268435456 are read'
+    """
+    pixels = height * width
+    if pixels > MAX_PIXELS:
+        return f"claims {height} x {width} pixels, where at most {MAX_PIXELS} are read"
+    if pixels > MAX_PIXELS_PER_BYTE * size:
+        return (
+            f"claims {height} x {width} pixels in {size} bytes, where at most "
+            f"{MAX_PIXELS_PER_BYTE} a byte are read"
+        )
+    return ""
+
+
 def write_atomically(
     path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
 ) -> Path:
@@ -27,10 +66,25 @@ def write_atomically(
 
     Returns:
         `path`.
+
+    Raises:
+        ValueError: If `path` is not a file's name.
+        OSError: If it cannot be written (no permission, a full disk); nothing half-written stays.
     """
-    path = Path(path)
+    path = as_path(path)
+    try:
+        return _replace(path, content)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        reason = f"`path` (={str(path)!r}) cannot be written: {error.strerror}"
+        raise OSError(error.errno, reason) from error
+
+
+def _replace(path: Path, content: bytes | str | Iterable[bytes | memoryview]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    prefix = f".{path.name[:200]}."  # a file's name may have 255 bytes
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=".tmp")
     content = content.encode() if isinstance(content, str) else content
     pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
     try:

@@ -6,62 +6,45 @@ import logging
 import os
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rawpy
 
 from simulator.camera import (
-    BayerPattern,
     CameraProfile,
     NoiseLevelFunction,
     get_camera,
     list_cameras,
 )
-from simulator.dng_tags import (
-    ORIENTATIONS,
-    OwnRecord,
-    read_black_level,
-    read_colour_matrix,
-    read_long_iso,
-    read_noise_profile,
-    read_own_record,
-    read_plain_mosaic,
+from simulator.dng_tags import NOISE_PROFILE, OwnRecord, read_noise_profile, read_own_record
+from simulator.exif import (
+    CANON_CRW,
+    UNKNOWN_FILE,
+    camera_identity,
+    describe_file,
+    normalised_model,
 )
-from simulator.exif import UNKNOWN_FILE, camera_identity, describe_file, normalised_model
+from simulator.files import as_path
 from simulator.noise_estimation import estimate_nlf
+from simulator.raw_decoding import (
+    COLOUR_FILTER_ARRAY,
+    PHOTOMETRIC,
+    Decoded,
+    RawFileError,
+    decode_own_dng,
+    decode_with_libraw,
+)
 from simulator.raw_image import RawImage, pack_mosaic
 from simulator.settings import CameraSettings
-from simulator.tiff import Content, Directory, FileContent, missing_bytes, read_directories
+from simulator.tiff import Content, Directory, FileContent, missing_bytes, numbers, read_directories
 
 logger = logging.getLogger(__name__)
 
 #: A profile whose white level differs by more than this factor is of another bit depth.
 _WHITE_TOLERANCE = 2.0
-_DNG_VERSION, _PHOTOMETRIC, _LINEAR_RAW = 50706, 262, 34892
-
-
-class RawFileError(ValueError):
-    """A file that is not a Bayer raw, or not a whole one; the message says what it is."""
-
-
-@dataclass(frozen=True)
-class _Decoded:
-    """What LibRaw makes of a file."""
-
-    mosaic: np.ndarray  # (H, W) uint16, visible area
-    cfa: BayerPattern
-    black_level: tuple[float, float, float, float]
-    white_level: float
-    white_balance: tuple[float, float, float]
-    white_balance_source: str
-    colour_matrix: tuple[tuple[float, float, float], ...] | None
-    colour_matrix_source: str
-    exposure: tuple[float, float, float]  # ISO, seconds, f-number; 0 where the file does not say
-    extra: dict[str, Any]
+_LINEAR_RAW = 34892
 
 
 def read_raw(
@@ -74,7 +57,10 @@ def read_raw(
     """Read a Bayer raw file: CR2, CR3, CRW, NEF, ARW, DNG, RW2 ... whatever LibRaw decodes.
 
     The mosaic is cropped to its visible area, not rotated, and split into R, G1 (on red's rows),
-    G2 and B; black and white levels are the file's.
+    G2 and B; black and white levels are the file's. A white level of 0, or beyond what its bits can
+    hold, is taken for the largest number they can; a noise profile that cannot be one is left out,
+    and values of a `write_dng` that were lost fall back to neutral white balance, upright, no date.
+    The log says so of levels and noise, and of pixels far above white.
 
     Args:
         path: The file.
@@ -98,22 +84,44 @@ def read_raw(
     Raises:
         FileNotFoundError: If there is no such file.
         RawFileError: (a `ValueError`) If the file is not a raw, not a Bayer raw (X-Trans, Foveon,
-            linear DNG, monochrome) or cut short.
+            linear DNG, monochrome), cut short or damaged, may not be read, changes meanwhile, or
+            claims more than `simulator.files.MAX_PIXELS` pixels, or `MAX_PIXELS_PER_BYTE` of them
+            for each byte of the file.
         ValueError: If settings are missing from the file and not given, or `camera` does not fit.
     """
-    path = Path(path)
+    path = as_path(path)
+    try:
+        return _read(path, settings, camera, nlf)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
+
+
+def _read(
+    path: Path,
+    settings: CameraSettings | None,
+    camera: CameraProfile | str | None,
+    nlf: NoiseLevelFunction | None,
+) -> RawImage:
     with ExitStack() as opened:
         data = opened.enter_context(closing(FileContent(path)))
         directories = read_directories(data)
         make, model = camera_identity(data, directories)
         _refuse_early(path, data, directories, model)
         own = read_own_record(directories)
-        decoded = None if own is None else _from_own_dng(data, directories, own)
+        decoded = None if own is None else decode_own_dng(path, data, directories, own)
         if decoded is None:
-            decoded = _decode(path, data, directories, opened)
+            decoded = decode_with_libraw(path, data, directories, opened)
         known = settings or _settings(path, decoded.exposure, own)
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
+    if float(packed.max()) > _WHITE_TOLERANCE:
+        logger.warning(
+            "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: give "
+            "`camera` with the right one",
+            *(path.name, float(packed.max()), profile.white_level),
+        )
     box_factor = own.box_factor if own is not None else 1
     noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
@@ -127,11 +135,19 @@ def read_raw(
 
 def _refuse_early(path: Path, data: Content, directories: list[Directory], model: str) -> None:
     """Refuse what can be told from the structure: no header, linear DNG, files cut short."""
-    if not model and describe_file(data) == UNKNOWN_FILE:
+    words = describe_file(data)
+    if not len(data):
+        raise RawFileError(f"`path` (={path.name!r}) must be a camera raw, but is {words}")
+    if not model and words == UNKNOWN_FILE:
         # LibRaw takes some headerless files for a camera's from their size alone.
         raise RawFileError(
             f"`path` (={path.name!r}) must say which camera it is from, but is {UNKNOWN_FILE} "
             "without a header; read a bare array with numpy.fromfile and RawImage.from_mosaic"
+        )
+    if not model and words == CANON_CRW:
+        raise RawFileError(
+            f"`path` (={path.name!r}) must be a whole file, but its directory, with which {words} "
+            "ends, is missing: it is truncated or damaged"
         )
     lost = missing_bytes(directories, len(data))
     if lost:
@@ -139,161 +155,19 @@ def _refuse_early(path: Path, data: Content, directories: list[Directory], model
             f"`path` (={path.name!r}) must be a whole file, but its directory names {lost} bytes "
             "beyond its end: it is truncated"
         )
-    if any(d.get(_PHOTOMETRIC, (0,))[0] == _LINEAR_RAW for d in directories) and not any(
-        d.get(_PHOTOMETRIC, (0,))[0] == 32803 for d in directories
-    ):
+    arrays = [d for d in directories if d.get(PHOTOMETRIC) == (COLOUR_FILTER_ARRAY,)]
+    for tags in arrays:
+        height, width = (next(iter(numbers(tags, tag)), 0) for tag in (257, 256))
+        if height < 1 or width < 1 or not (numbers(tags, 273) or numbers(tags, 324)):
+            raise RawFileError(
+                f"`path` (={path.name!r}) must hold an image, but its directory names "
+                f"{height:g} x {width:g} pixels at {tags.get(273, 'no place')}: it is damaged"
+            )
+    if not arrays and any(d.get(PHOTOMETRIC) == (_LINEAR_RAW,) for d in directories):
         raise RawFileError(
             f"`path` (={path.name!r}) must be a Bayer raw, but is a linear DNG: already "
             "demosaicked, its noise is no longer per pixel"
         )
-
-
-def _from_own_dng(data: Content, directories: list[Directory], own: OwnRecord) -> _Decoded | None:
-    """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes."""
-    tags = {tag: value for directory in reversed(directories) for tag, value in directory.items()}
-    mosaic = read_plain_mosaic(data, directories)
-    cfa = BayerPattern("".join("RGB"[colour] for colour in tags[33422]))
-    black = read_black_level(directories, cfa, (0, 0))
-    if mosaic is None or black is None:
-        return None
-    red, green, blue = tags[50728]
-    flips = {orientation: flip for flip, orientation in ORIENTATIONS.items()}
-    extra: dict[str, Any] = {"flip": flips.get(tags[274][0], 0)}
-    moment = str(tags[36867][0]).strip()
-    if moment[:1].isdigit():
-        extra["datetime"] = datetime.strptime(moment, "%Y:%m:%d %H:%M:%S").isoformat()
-    if tags[37386][0] > 0:
-        extra["focal_length"] = float(tags[37386][0])
-    return _Decoded(
-        mosaic=mosaic,
-        cfa=cfa,
-        black_level=black,
-        white_level=float(tags[50717][0]),
-        white_balance=(green / red, 1.0, green / blue),
-        white_balance_source="camera",
-        colour_matrix=read_colour_matrix(directories),
-        colour_matrix_source="XYZ to camera RGB, ColorMatrix of the file",
-        exposure=(own.settings.iso, own.settings.exposure_time, own.settings.f_number),
-        extra=extra,
-    )
-
-
-def _decode(path: Path, data: Content, directories: list[Directory], opened: ExitStack) -> _Decoded:
-    """What LibRaw reads; its mosaic lies in LibRaw's memory, which `opened` lets go of."""
-    words = describe_file(data)
-    try:
-        raw = opened.enter_context(rawpy.imread(str(path)))
-        return _from_libraw(path, raw, words, directories)
-    except rawpy.LibRawFileUnsupportedError:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a camera raw that LibRaw reads, but is {words}, or "
-            "is truncated"
-        ) from None
-    except (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError) as error:
-        reason = error.args[0] if error.args else error
-        reason = reason.decode() if isinstance(reason, bytes) else reason
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a whole raw file, but LibRaw says {reason!s}: "
-            f"{words}, truncated or damaged"
-        ) from None
-
-
-def _from_libraw(
-    path: Path, raw: rawpy.RawPy, words: str, directories: list[Directory]
-) -> _Decoded:
-    sizes = raw.sizes
-    if raw.raw_type != rawpy.RawType.Flat:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a Bayer raw, but has every colour at every pixel "
-            f"(linear or Foveon): {words}"
-        )
-    indices = _tile_indices(path, raw, words)
-    letters = "".join(raw.color_desc.decode()[i] for i in indices)
-    cfa = BayerPattern(letters)
-    order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
-    black = [float(raw.black_level_per_channel[i]) for i in order]
-    exact = read_black_level(directories, cfa, (sizes.top_margin, sizes.left_margin))
-    if exact is not None and np.abs(np.sort(exact) - np.sort(black)).max() < 1.0:
-        # LibRaw drops the fraction, and the phase where it moves an odd margin to an even one.
-        black = list(exact)
-    white_balance, source = _white_balance(raw)
-    matrix, matrix_source = _colour_matrix(raw, directories)
-    mosaic = raw.raw_image_visible
-    if min(mosaic.shape) < 2 or float(raw.white_level) <= max(black):
-        raise RawFileError(f"`path` (={path.name!r}) must hold an image, but is empty: {words}")
-    extra: dict[str, Any] = {"flip": int(sizes.flip)}
-    other = raw.other
-    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
-    if other.timestamp is not None and other.timestamp.timestamp() > 0:
-        extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
-    if np.isfinite(other.focal_length) and other.focal_length > 0:
-        extra["focal_length"] = float(other.focal_length)
-    return _Decoded(
-        mosaic=mosaic,
-        cfa=cfa,
-        black_level=tuple(black),  # type: ignore[arg-type]
-        white_level=float(raw.white_level),
-        white_balance=white_balance,
-        white_balance_source=source,
-        colour_matrix=matrix,
-        colour_matrix_source=matrix_source,
-        exposure=(iso, other.shutter_speed, other.aperture),
-        extra=extra,
-    )
-
-
-def _tile_indices(path: Path, raw: rawpy.RawPy, words: str) -> list[int]:
-    """LibRaw's colour indices of the 2 x 2 tile at the origin of the visible area."""
-    try:
-        pattern = raw.raw_pattern
-    except NotImplementedError:
-        pattern = None
-    shape = None if pattern is None else pattern.shape
-    if shape == (6, 6):
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a Bayer raw, but has Fujifilm's X-Trans array"
-        )
-    top, left = raw.sizes.top_margin, raw.sizes.left_margin
-    description = raw.color_desc.decode()
-    if shape == (2, 2):
-        # The visible area may begin on an odd row or column: ask there, not at the sensor's corner.
-        indices = [int(raw.raw_color(top + r, left + c)) for r in (0, 1) for c in (0, 1)]
-        letters = "".join(description[i] for i in indices)
-        if letters in {p.value for p in BayerPattern}:
-            return indices
-        description = letters
-    raise RawFileError(
-        f"`path` (={path.name!r}) must be a Bayer raw (R, G, B in a 2 x 2 tile), but its colour "
-        f"array is {description or 'monochrome'} in {shape or 'no'} tile: {words}"
-    )
-
-
-def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
-    """Gains of R, G, B with green 1: the camera's, else LibRaw's daylight ones, else neutral."""
-    for gains, source in (
-        (raw.camera_whitebalance, "camera"),
-        (raw.daylight_whitebalance, "daylight"),
-    ):
-        red, green, blue = gains[:3]
-        if all(np.isfinite(g) and g > 0 for g in (red, green, blue)):
-            return (red / green, 1.0, blue / green), source
-    return (1.0, 1.0, 1.0), "none"
-
-
-def _colour_matrix(
-    raw: rawpy.RawPy, directories: list[Directory]
-) -> tuple[tuple[tuple[float, float, float], ...] | None, str]:
-    """XYZ to camera RGB and its source: a DNG's own, else LibRaw's table."""
-    stated = read_colour_matrix(directories)
-    if stated is not None:
-        return stated, "XYZ to camera RGB, ColorMatrix of the file"
-    matrix = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
-        return None, ""
-    version = ".".join(map(str, rawpy.libraw_version))
-    # float32 to the nearest short decimal: LibRaw's own tables have four digits.
-    rows = tuple(tuple(round(float(v), 7) for v in row) for row in matrix)
-    return rows, f"XYZ to camera RGB, as LibRaw {version} has it"  # type: ignore[return-value]
 
 
 def _settings(path: Path, exposure: Iterable[float], own: OwnRecord | None) -> CameraSettings:
@@ -310,7 +184,10 @@ def _settings(path: Path, exposure: Iterable[float], own: OwnRecord | None) -> C
         )
     # LibRaw hands on float32; 7 digits are what it holds.
     rounded = {k: float(f"{v:.7g}") for k, v in values.items()}
-    return CameraSettings.from_exif(**rounded)
+    try:
+        return CameraSettings.from_exif(**rounded)
+    except ValueError as error:
+        raise ValueError(f"`settings` (=None) must be given: {path.name!r} says {error}") from error
 
 
 def _match(make: str, model: str) -> CameraProfile | None:
@@ -324,7 +201,7 @@ def _match(make: str, model: str) -> CameraProfile | None:
 
 def _profile(
     path: Path,
-    decoded: _Decoded,
+    decoded: Decoded,
     make: str,
     model: str,
     camera: CameraProfile | str | None,
@@ -364,7 +241,7 @@ def _profile(
     )
 
 
-def _check_profile(path: Path, decoded: _Decoded, camera: CameraProfile) -> None:
+def _check_profile(path: Path, decoded: Decoded, camera: CameraProfile) -> None:
     hint = "; dataclasses.replace(camera, ...) adapts a profile"
     if camera.cfa != decoded.cfa:
         raise ValueError(
@@ -392,6 +269,8 @@ def _noise(
     stated = read_noise_profile(directories)
     if stated is not None:
         return stated.scaled(float(box_factor**2)), "DNG NoiseProfile"
+    if any(NOISE_PROFILE in tags for tags in directories):
+        logger.warning("the NoiseProfile of the file cannot be one, and is not used")
     if camera.nlf_by_iso:
         return None, f"camera calibration ({camera.name})"
     estimate = estimate_nlf(packed)

@@ -6,6 +6,7 @@ with an EXIF directory is written. Numbers follow TIFF 6.0 and EXIF 2.3.
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,9 @@ Directory = dict[int, tuple[Any, ...]]
 SUB_DIRECTORIES = (330, 34665)
 EXIF_DIRECTORY = 34665
 _STRIPS, _TILES = (273, 279), (324, 325)
-_MAX_DIRECTORIES = 64
+#: Beyond these a file is damaged, or made to take forever; camera files stay far below. Longer
+#: values (maker notes, previews) are passed over.
+_MAX_DIRECTORIES, _MAX_ENTRIES, _MAX_VALUE, _MAX_VALUES = 64, 4096, 2**16, 2**22
 #: 42 is TIFF; the others are the same structure under Olympus' and Panasonic's own magic.
 _MAGIC = (42, 0x4F52, 0x5352, 0x55)
 
@@ -136,7 +139,8 @@ class FileContent:
 
     def __init__(self, path: Path) -> None:
         if not path.is_file():
-            what = "is a folder" if path.is_dir() else "does not exist"
+            missing = "is no ordinary file" if path.exists() else "does not exist"
+            what = "is a folder" if path.is_dir() else missing
             raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
         self._path, self._stream = path, path.open("rb")
         self._size = os.fstat(self._stream.fileno()).st_size
@@ -179,25 +183,32 @@ def _decode(kind: int, data: bytes, order: str) -> tuple[Any, ...]:
     return values
 
 
-def _read_directory(data: Content, offset: int, order: str) -> tuple[Directory, int]:
-    """Tags of the directory at `offset`, without broken fields, and where the next one is."""
+def _read_directory(
+    data: Content, offset: int, order: str, room: int
+) -> tuple[Directory, int, int]:
+    """Tags of the directory at `offset`, where the next one is, and how many bytes they took.
+
+    Broken fields are left out, and those that do not fit into `room` bytes.
+    """
     if not 8 <= offset <= len(data) - 2:
-        return {}, 0
+        return {}, 0, 0
     (count,) = unpack_at(f"{order}H", data, offset)
     end = offset + 2 + 12 * count
-    if end > len(data):
-        return {}, 0
+    if end > len(data) or count > _MAX_ENTRIES:
+        return {}, 0, 0
     tags: Directory = {}
+    used = 0
     for at in range(offset + 2, end, 12):
         number, kind, length = unpack_at(f"{order}HHI", data, at)
-        if kind not in _FORMATS:
+        if kind not in _FORMATS or length == 0:
             continue
         size = length * struct.calcsize("=" + _FORMATS[kind])
         start = at + 8 if size <= 4 else unpack_at(f"{order}I", data, at + 8)[0]
-        if start + size <= len(data):
+        if start + size <= len(data) and size <= min(_MAX_VALUE, room - used):
             tags[number] = _decode(kind, data[start : start + size], order)
+            used += size
     following = unpack_at(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
-    return tags, following
+    return tags, following, used
 
 
 def read_directories(data: Content) -> list[Directory]:
@@ -207,8 +218,8 @@ def read_directories(data: Content) -> list[Directory]:
         data: The file. Maker notes are not followed.
 
     Returns:
-        One ``{tag: values}`` per directory; rationals as floats, ASCII as one ``str``, UNDEFINED
-        as one ``bytes``. Empty if `data` is not TIFF-structured.
+        One ``{tag: values}`` per directory, at least one value each; rationals as floats, ASCII as
+        one ``str``, UNDEFINED as one ``bytes``. Empty if `data` is not TIFF-structured.
     """
     order = {b"II": "<", b"MM": ">"}.get(data[:2])
     if order is None or len(data) < 8:
@@ -216,14 +227,16 @@ def read_directories(data: Content) -> list[Directory]:
     magic, first = unpack_at(f"{order}HI", data, 2)
     if magic not in _MAGIC:
         return []
-    pending, seen = [first], set()
+    pending, seen = [first], set[int]()
     found: list[Directory] = []
-    while pending and len(found) < _MAX_DIRECTORIES:
+    room = _MAX_VALUES
+    while pending and len(seen) < _MAX_DIRECTORIES:
         offset = pending.pop(0)
         if offset in seen:
             continue
         seen.add(offset)
-        tags, following = _read_directory(data, offset, order)
+        tags, following, used = _read_directory(data, offset, order, room)
+        room -= used
         if not tags:
             continue
         found.append(tags)
@@ -234,11 +247,21 @@ def read_directories(data: Content) -> list[Directory]:
     return found
 
 
+def numbers(tags: Directory, tag: int) -> tuple[float, ...]:
+    """The values of a field; empty where it is missing or any is no finite number.
+
+    >>> numbers({33434: (0.5,), 33437: (math.nan,), 271: ("Canon",)}, 33434)
+    (0.5,)
+    """
+    values = tags.get(tag, ())
+    return values if all(isinstance(v, int | float) and math.isfinite(v) for v in values) else ()
+
+
 def missing_bytes(directories: Sequence[Directory], size: int) -> int:
     """How many bytes of pixels lie beyond the end of a file of `size` bytes; 0 if it is whole."""
     end = size
     for tags in directories:
         for offsets, counts in (_STRIPS, _TILES):
-            pairs = zip(tags.get(offsets, ()), tags.get(counts, ()), strict=False)
-            end = max([end, *(a + b for a, b in pairs)])
+            pairs = zip(numbers(tags, offsets), numbers(tags, counts), strict=False)
+            end = max([end, *(int(a + b) for a, b in pairs)])
     return end - size

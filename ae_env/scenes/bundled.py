@@ -148,6 +148,7 @@ def _cache_path(
     key = cache_key(
         {
             "generator": GENERATOR_VERSION,
+            "format": 2,
             "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,
@@ -169,7 +170,8 @@ def _write_cache(path: Path, scenes: list[Scene]) -> None:
         reference = scene.reference
         row["reference"] = (reference.iso, reference.exposure_time, reference.f_number)
         rows.append(row)
-    metadata = {"scenes": json.dumps(rows), "checksum": _checksum(tensors)}
+    text = json.dumps(rows)
+    metadata = {"scenes": text, "checksum": _checksum(tensors, text)}
     try:
         write_atomically(path, safetensors.torch.save(tensors, metadata))
     except OSError as error:  # a full or read-only disk must not stop the run
@@ -178,13 +180,13 @@ def _write_cache(path: Path, scenes: list[Scene]) -> None:
 
 def _read_cache(path: Path, camera: CameraProfile) -> list[Scene] | None:
     """The scenes in `path`; None if there is no such file or it is damaged."""
-    if not path.is_file():
-        return None
     try:
+        if not path.is_file():
+            return None
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
-        if metadata.get("checksum") != _checksum(tensors):
+        if metadata.get("checksum") != _checksum(tensors, metadata["scenes"]):
             raise ValueError("its checksum does not match its content")
         rows = json.loads(metadata["scenes"])
         if len(rows) != len(tensors):
@@ -211,8 +213,8 @@ def _scene_of(row: dict[str, Any], light: torch.Tensor, camera: CameraProfile) -
     )
 
 
-def _checksum(tensors: dict[str, torch.Tensor]) -> str:
-    value = 0
+def _checksum(tensors: dict[str, torch.Tensor], text: str) -> str:
+    value = zlib.crc32(text.encode())
     for name in sorted(tensors):
         value = zlib.crc32(tensors[name].contiguous().numpy().tobytes(), value)
     return f"{value:08x}"

@@ -5,11 +5,14 @@ from __future__ import annotations
 import glob
 import logging
 import re
-from collections.abc import Mapping
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
+from ae_env.checks import check_flag, check_number, check_word
 from ae_env.scenes.grouping import (
     FEWEST_GROUPS_TO_SPLIT,
     Shot,
@@ -28,6 +31,11 @@ from simulator.raw_file import read_raw
 logger = logging.getLogger(__name__)
 
 
+OnError = Literal["stop", "skip"]
+#: Seconds between two log lines about how far the reading is, and names in one about what is bad.
+_PROGRESS_SECONDS, _NAMES = 10.0, 5
+
+
 @dataclass(frozen=True)
 class FolderOptions:
     """What the caller knows about the files.
@@ -38,6 +46,9 @@ class FolderOptions:
         hard: Whether they count as hard.
         median_speed: Median image speed of a moving episode [frame heights / s].
         ev100: EV100 of the radiance maps, in place of the assumed one.
+        on_error: What a file that cannot be read does: ``"stop"`` raises an error that names it, so
+            that nothing goes missing unseen; ``"skip"`` leaves it out, and a warning in the log
+            says how many were and why.
     """
 
     illuminance: float | Mapping[str, float] | None = None
@@ -45,6 +56,22 @@ class FolderOptions:
     hard: bool | None = None
     median_speed: float | None = None
     ev100: float | None = None
+    on_error: OnError = "stop"
+
+    def __post_init__(self) -> None:
+        check_word("on_error", self.on_error, get_args(OnError))
+        lux = self.illuminance
+        for value in lux.values() if isinstance(lux, Mapping) else [lux]:
+            if value is not None:
+                check_number("illuminance", value, 1e-6, 1e9, more=" lux")
+        if self.kind is not None and not isinstance(self.kind, str):
+            raise ValueError(f"`kind` (={self.kind!r}) must be a name or None")
+        if self.hard is not None:
+            check_flag("hard", self.hard)
+        if self.median_speed is not None:
+            check_number("median_speed", self.median_speed, 0.0, 1e6, more=" frame heights / s")
+        if self.ev100 is not None:
+            check_number("ev100", self.ev100, -20.0, 40.0)
 
     def fields(self, path: Path, raw: bool) -> dict[str, Any]:
         """Keyword arguments for the scenes of `path`."""
@@ -70,20 +97,11 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
     """
-    path = Path(spec).expanduser()
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
-    if path.is_file():
-        base, found = path.parent, [path]
-    elif path.is_dir():
-        base, found = path, [p for p in path.rglob("*") if p.is_file()]
-    else:
-        matches = [Path(p) for p in glob.glob(str(path), recursive=True)]
-        if not matches:
-            raise ValueError(
-                f"`scenes` (={str(spec)!r}) must name an existing file, folder or glob"
-            )
-        first = next((i for i, p in enumerate(path.parts) if glob.has_magic(p)), -1)
-        base, found = Path(*path.parts[:first]), [p for p in matches if p.is_file()]
+    try:
+        base, found = _listed(spec)
+    except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
+        raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
     files = [
         p
         for p in found
@@ -97,6 +115,20 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
             f"({', '.join(RAW_SUFFIXES[:8])} ...) or radiance maps ({', '.join(RADIANCE_SUFFIXES)})"
         )
     return base, sorted(files, key=_natural)
+
+
+def _listed(spec: str | Path) -> tuple[Path, list[Path]]:
+    """The base folder and every file that `spec` names."""
+    path = Path(spec).expanduser()
+    if path.is_file():
+        return path.parent, [path]
+    if path.is_dir():
+        return path, [p for p in path.rglob("*") if p.is_file()]
+    matches = [Path(p) for p in glob.glob(str(path), recursive=True)]
+    if not matches:
+        raise ValueError(f"`scenes` (={str(spec)!r}) must name an existing file, folder or glob")
+    first = next((i for i, p in enumerate(path.parts) if glob.has_magic(p)), -1)
+    return Path(*path.parts[:first]), [p for p in matches if p.is_file()]
 
 
 def folder_scenes(
@@ -123,8 +155,8 @@ def folder_scenes(
         resize: Brings each scene to `resolution`, before the next file is read.
 
     Raises:
-        ValueError: If a file cannot be read (the message names it), or `split` is ``"train"`` and
-            there are too few groups to hold any out.
+        ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
+            if no file can), or `split` is ``"train"`` and there are too few groups to hold any out.
     """
     options = FolderOptions() if options is None else options
     base, files = find_files(spec)
@@ -132,31 +164,90 @@ def folder_scenes(
     names = _scene_names(base, files)
     if split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
         raise _too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    scenes: list[Scene] = []
-    shots: dict[str, Shot] = {}
-    for number, path in enumerate(files, start=1):
-        logger.info("reading scene file %d of %d: %s", number, len(files), path.name)
-        name = names[path]
-        group = named.get(path.resolve())
-        if group is None:
-            group = name if path.parent == base else path.parent.relative_to(base).as_posix()
-        raw_file = path.suffix.lower() in RAW_SUFFIXES
-        fields = options.fields(path, raw_file)
-        try:
-            if raw_file:
-                scene, shot = _raw_scene(path, name, group, fields)
-                scenes.append(resize(scene, resolution, crop))
-                if path.parent == base and path.resolve() not in named:
-                    shots[name] = shot
-            else:
-                fields |= {"name": name, "group": group, "resolution": resolution, "crop": crop}
-                scenes += radiance_scenes(path, camera, resize=resize, **fields)
-        except ValueError as error:
-            raise ValueError(f"scene file {str(path)!r}: {error}") from error
+    reader = _Reader(base, names, named, options, camera, resolution, crop, resize)
+    scenes, shots = _read_all(spec, files, reader)
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
     scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
     log_groups(str(spec), {s.scene_id: s.group for s in scenes})
     return _of_split(spec, scenes, split)
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Makes scenes of one file after the other; see `folder_scenes`."""
+
+    base: Path
+    names: Mapping[Path, str]
+    named: Mapping[Path, str]
+    options: FolderOptions
+    camera: CameraProfile
+    resolution: int | None
+    crop: Crop
+    resize: Resize
+
+    def __call__(self, path: Path) -> tuple[list[Scene], Shot | None]:
+        """The scenes of a file, and what tells the group of a raw that none is named for."""
+        name, group = self.names[path], self.named.get(path.resolve())
+        grouped = group is not None or path.parent != self.base
+        if group is None:
+            group = path.parent.relative_to(self.base).as_posix() if grouped else name
+        raw_file = path.suffix.lower() in RAW_SUFFIXES
+        fields = self.options.fields(path, raw_file)
+        if raw_file:
+            scene, shot = _raw_scene(path, name, group, fields)
+            return [self.resize(scene, self.resolution, self.crop)], None if grouped else shot
+        fields |= {"resolution": self.resolution, "crop": self.crop, "resize": self.resize}
+        return list(radiance_scenes(path, self.camera, name=name, group=group, **fields)), None
+
+
+def _read_all(
+    spec: str | Path, files: list[Path], reader: _Reader
+) -> tuple[list[Scene], dict[str, Shot]]:
+    scenes: list[Scene] = []
+    shots: dict[str, Shot] = {}
+    skipped: dict[Path, Exception] = {}
+    for path in _with_progress(spec, files):
+        try:
+            own, shot = reader(path)
+        except (ValueError, OSError) as error:  # it may also have vanished since it was listed
+            if reader.options.on_error == "stop":
+                hint = "; 'on_error': 'skip' leaves such files out" if len(files) > 1 else ""
+                raise ValueError(f"scene file {str(path)!r}: {error}{hint}") from error
+            skipped[path] = error
+            continue
+        scenes += own
+        if shot is not None:
+            shots[own[0].scene_id] = shot
+    _report_skipped(spec, skipped, len(files))
+    return scenes, shots
+
+
+def _with_progress(spec: str | Path, files: list[Path]) -> Iterator[Path]:
+    """`files`, with a log line at the beginning and every few seconds."""
+    logger.info("reading %d scene files of %s", len(files), spec)
+    last = time.monotonic()
+    for number, path in enumerate(files, start=1):
+        if time.monotonic() - last > _PROGRESS_SECONDS:
+            logger.info("reading scene file %d of %d: %s", number, len(files), path.name)
+            last = time.monotonic()
+        yield path
+
+
+def _report_skipped(spec: str | Path, skipped: Mapping[Path, Exception], total: int) -> None:
+    """Log what was left out; an error if nothing is left."""
+    if not skipped:
+        return
+    reasons = [f"{path.name}: {error}" for path, error in list(skipped.items())[:_NAMES]]
+    more = f"; and {len(skipped) - _NAMES} more" if len(skipped) > _NAMES else ""
+    if len(skipped) == total:
+        raise ValueError(
+            f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all {total} were "
+            f"skipped ({'; '.join(reasons)}{more})"
+        )
+    logger.warning(
+        "%s: %d of %d scene files skipped (%s%s)",
+        *(spec, len(skipped), total, "; ".join(reasons), more),
+    )
 
 
 def _of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
@@ -188,8 +279,9 @@ def _raw_scene(path: Path, name: str, group: str, fields: dict[str, Any]) -> tup
 def _scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
     """Scene ids: the path below `base` without its ending, with it where two would be equal."""
     stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
+    times = Counter(stems)
     return {
-        p: stem if stems.count(stem) == 1 else p.relative_to(base).as_posix()
+        p: stem if times[stem] == 1 else p.relative_to(base).as_posix()
         for p, stem in zip(files, stems, strict=True)
     }
 

@@ -130,21 +130,24 @@ def named_groups(folders: Sequence[Path]) -> dict[Path, str]:
         table = folder / "groups.csv"
         if not table.is_file():
             continue
-        with table.open(newline="", encoding="utf-8-sig") as stream:
-            rows = csv.DictReader(stream)
-            if not {"file", "group"} <= set(rows.fieldnames or ()):
+        try:
+            with table.open(newline="", encoding="utf-8-sig") as stream:
+                reader = csv.DictReader(stream)
+                rows, columns = list(reader), reader.fieldnames
+        except (csv.Error, OSError, UnicodeError) as error:
+            raise ValueError(f"{str(table)!r} must be a CSV file in UTF-8: {error}") from error
+        if not {"file", "group"} <= set(columns or ()):
+            raise ValueError(
+                f"{str(table)!r} (columns {columns}) must have the columns `file` and `group`"
+            )
+        for number, row in enumerate(rows, start=2):
+            name, group = (row["file"] or "").strip(), (row["group"] or "").strip()
+            if not group or not name or not (folder / name).is_file():
                 raise ValueError(
-                    f"{str(table)!r} (columns {rows.fieldnames}) must have the columns "
-                    "`file` and `group`"
+                    f"{str(table)!r}, line {number} (={name!r}, {group!r}): `file` must exist "
+                    "beside it and `group` must not be empty"
                 )
-            for number, row in enumerate(rows, start=2):
-                name, group = (row["file"] or "").strip(), (row["group"] or "").strip()
-                if not group or not name or not (folder / name).is_file():
-                    raise ValueError(
-                        f"{str(table)!r}, line {number} (={name!r}, {group!r}): `file` must exist "
-                        "beside it and `group` must not be empty"
-                    )
-                groups[(folder / name).resolve()] = group
+            groups[(folder / name).resolve()] = group
     return groups
 
 

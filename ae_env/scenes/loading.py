@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -96,7 +97,7 @@ def _by_name(
             return bundled_scenes(split, camera, resolution, crop, size=BUNDLED[spec])
         finest = bundled_scenes(split, camera, None, size=BUNDLED[spec])
         return [resize(scene, resolution, crop) for scene in finest]
-    if not Path(spec).expanduser().exists():
+    if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             known = {"split": split, "camera": camera, "resolution": resolution}
             found = _checked(_attribute(spec, known), spec)
@@ -134,7 +135,7 @@ def _attribute(spec: str, known: Mapping[str, Any]) -> Any:
     module_name, _, attribute = spec.partition(":")
     try:
         value: Any = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
+    except Exception as error:  # a user's module may raise anything
         raise ValueError(f"`scenes` (={spec!r}): cannot import: {error}") from error
     for name in attribute.split("."):
         if not hasattr(value, name):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ae_env.scenes.light_scale import mean_anchor
 from ae_env.scenes.procedural import NATIVE_SIZE
 from ae_env.scenes.scene import Crop, Resize, Scene
 from simulator.camera import CameraProfile
+from simulator.files import as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +34,8 @@ AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
 FIELD_OF_VIEW = 60.0
 #: Range of the EV100 assumed for a map of unknown light.
 EV100_RANGE = (3.0, 14.0)
+#: Maps whose median lies beyond 2 to this power, or below its inverse, are scaled first.
+_USUAL_EXPONENT = 20
 
 
 def read_radiance(path: str | Path) -> np.ndarray:
@@ -50,16 +54,22 @@ def read_radiance(path: str | Path) -> np.ndarray:
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, is empty of light or is neither kind.
+        ValueError: If the file cannot be read, is empty of light or is neither kind, or claims more
+            pixels than `simulator.files.MAX_PIXELS`, or than its length can hold.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.is_file():
         raise FileNotFoundError(f"`path` (={str(path)!r}) must be an existing file")
     suffix = path.suffix.lower()
     if suffix not in RADIANCE_SUFFIXES:
         raise ValueError(f"`path` (={path.name!r}) must end in one of {list(RADIANCE_SUFFIXES)}")
-    image = _read_hdr(path) if suffix == ".hdr" else _read_exr(path)
-    return _clean(image.astype(np.float32), path)
+    try:
+        image = _read_hdr(path) if suffix == ".hdr" else _read_exr(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(f"radiance map {str(path)!r} cannot be read: {error}") from error
+    return _clean(image.astype(np.float32, copy=False), path)
 
 
 def radiance_scenes(
@@ -93,6 +103,8 @@ def radiance_scenes(
         **fields: Further arguments of `Scene.from_radiance`.
     """
     image = read_radiance(path)
+    if "illuminance" not in fields:
+        image = _near_one(image)
     height, width = image.shape[1:]
     if "illuminance" not in fields and ev100 is None:
         ev100 = assumed_ev100(group)
@@ -116,6 +128,15 @@ def radiance_scenes(
         except ValueError as error:
             raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
         yield resize(scene, resolution, crop)
+
+
+def _near_one(image: np.ndarray) -> np.ndarray:
+    """A map of unknown scale whose median is far from 1, divided by a power of two near to it."""
+    _, exponent = math.frexp(float(np.quantile(image[image > 0], 0.5, method="lower")))
+    if abs(exponent) <= _USUAL_EXPONENT:
+        return image
+    with np.errstate(over="ignore", under="ignore"):
+        return np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100))
 
 
 def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
@@ -212,16 +233,42 @@ def _read_hdr(path: Path) -> np.ndarray:
         import cv2
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
-    content = np.frombuffer(path.read_bytes(), np.uint8)
+    content = path.read_bytes()
+    _refuse_lies(path, *_hdr_size(content), len(content))
+    level = cv2.utils.logging.setLogLevel(0)  # what is wrong is said below, and only there
     try:
-        image = (
-            cv2.imdecode(content, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR) if content.size else None
-        )
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     except cv2.error as error:
         raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if image is None or image.dtype != np.float32:
         raise ValueError(f"radiance map {str(path)!r} must be a complete Radiance RGBE file")
     return image[:, :, ::-1].transpose(2, 0, 1)
+
+
+def _hdr_size(content: bytes) -> tuple[int, int]:
+    """Rows and columns that a Radiance file claims; 0 where it does not say."""
+    found = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
+    return (int(found[1]), int(found[2])) if found else (0, 0)
+
+
+def _refuse_lies(path: Path, height: int, width: int, size: int) -> None:
+    bomb = refuse_bomb(height, width, size)
+    if bomb:
+        raise ValueError(f"radiance map {str(path)!r} {bomb}")
+
+
+def _exr_size(file: Any) -> tuple[int, int]:
+    """Rows and columns of all parts of an OpenEXR file, below one another; channels in threes."""
+    height = width = 0
+    for part in file.parts:
+        low, high = (np.asarray(corner, np.int64) for corner in part.header["dataWindow"])
+        columns, rows = (high - low + 1).tolist()
+        height += rows * -(-len(part.header["channels"]) // 3)
+        width = max(width, columns)
+    return height, width
 
 
 def _read_exr(path: Path) -> np.ndarray:
@@ -230,10 +277,16 @@ def _read_exr(path: Path) -> np.ndarray:
     except ImportError:
         raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            _refuse_lies(path, *_exr_size(file), path.stat().st_size)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: c.pixels for name, c in file.channels().items()}
-    except (RuntimeError, ValueError, OSError) as error:
-        raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+    except (RuntimeError, ValueError) as error:
+        if "radiance map" in str(error):
+            raise
+        raise ValueError(
+            f"radiance map {str(path)!r} must be a complete OpenEXR file, but OpenEXR says: {error}"
+        ) from error
     names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
     missing = sorted({n for n in names if n not in channels})
     if missing:

@@ -1,0 +1,97 @@
+"""Checks of arguments: an error names the argument, its value and the rule."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+
+
+class UserCodeError(ValueError):
+    """A scorer or a policy of the user's own raised, or returned what it must not return."""
+
+
+def did_you_mean(name: Any, known: Iterable[str], mark: str = "'") -> str:
+    """The nearest of `known` to a misspelt `name`, as the end of a message; empty if none is near.
+
+    >>> did_you_mean("scorrer", ["scenes", "scorer"])
+    "; did you mean 'scorer'?"
+    """
+    near = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean {mark}{near[0]}{mark}?" if near else ""
+
+
+def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -> None:
+    """Raises a `ValueError` unless `value` is one of the strings `known`, or is one of `others`."""
+    if any(value is other for other in others) or (isinstance(value, str) and value in known):
+        return
+    rule = ", ".join(map(repr, (*others, *known)))
+    hint = did_you_mean(value, known)
+    raise ValueError(f"`{name}` (={value!r}) must be one of {rule}{hint}")
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Raises a `ValueError` unless `value` is True or False."""
+    if not isinstance(value, bool):
+        raise ValueError(f"`{name}` (={value!r}) must be True or False")
+
+
+def check_integer(
+    name: str, value: Any, low: int, high: int | None = None, *, more: str = ""
+) -> int:
+    """`value` as an int.
+
+    Raises:
+        ValueError: Unless it is an integer (no bool, no float) from `low` to `high`; `more` ends
+            the message.
+    """
+    if isinstance(value, Integral) and not isinstance(value, bool):
+        number = int(value)
+        if number >= low and (high is None or number <= high):
+            return number
+    rule = f">= {low}" if high is None else f"in [{low}, {high}]"
+    raise ValueError(f"`{name}` (={value!r}) must be an integer {rule}{more}")
+
+
+def check_number(name: str, value: Any, low: float, high: float, *, more: str = "") -> float:
+    """`value` as a float.
+
+    Raises:
+        ValueError: Unless it is a number (no bool, no text) from `low` to `high`, which NaN is not;
+            `more` ends the message.
+    """
+    number: Any = value if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if low <= number <= high:
+        return float(number)
+    raise ValueError(f"`{name}` (={value!r}) must be a number in [{low:g}, {high:g}]{more}")
+
+
+def check_seed(seed: Any, name: str = "seed") -> int | None:
+    """`seed` as an int, or None.
+
+    Raises:
+        ValueError: Unless it is an integer >= 0 or None.
+    """
+    return None if seed is None else check_integer(name, seed, 0)
+
+
+def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """`actions` as an array.
+
+    Raises:
+        ValueError: Unless they are integers of `shape`, () for a single one.
+    """
+    try:
+        array = np.asarray(actions)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, object)
+    if array.shape != shape or array.dtype.kind not in "iu":
+        rule = f"integers of shape {shape}" if shape else "an integer"
+        raise ValueError(
+            f"`{name}` (={actions!r}, {array.dtype}, shape {array.shape}) must be {rule}"
+        )
+    return array
