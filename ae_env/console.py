@@ -18,7 +18,9 @@ from simulator.files import write_atomically
 
 console = Console()
 
-Seed = Annotated[int, typer.Option(help="Seed of everything that is random.", min=0)]
+MAX_SEED = 2**63 - 1
+Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
+OwnSeed = Annotated[int | None, typer.Option(help="Not the YAML's.", min=0, max=MAX_SEED)]
 Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
 
 
@@ -77,17 +79,30 @@ def parse_seconds(text: str) -> float:
         raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
 
 
-def make_folder(path: Path) -> None:
-    """Makes a folder for results before any time is spent on them."""
-    existing = next(p for p in (path, *path.parents) if p.exists())
-    if not existing.is_dir():
-        raise ValueError(f"`out` (={str(path)!r}) must be a folder, but {existing} is a file")
+def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> None:
+    """Makes a folder for results before any time is spent on them.
+
+    Args:
+        path: The folder.
+        name: The option that named it.
+        file: What the option named, where that is a file in the folder.
+
+    Raises:
+        ValueError: If nothing can be written there.
+    """
+    given = f"`{name}` (={str(file or path)!r})"
     try:
+        existing = next(p for p in (path, *path.parents) if p.exists())
+        if not existing.is_dir():
+            wanted = "be" if file is None else "lie in"
+            raise ValueError(f"{given} must {wanted} a folder, but {existing} is a file")
+        if file is not None and file.is_dir():
+            raise ValueError(f"{given} must be a file, but it is a folder")
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise ValueError(f"`out` (={str(path)!r}) cannot be written: {error.strerror}") from error
+        raise ValueError(f"{given} cannot be written: {error.strerror}") from error
 
 
 def torch_device(name: str) -> str:

@@ -16,7 +16,7 @@ import torch
 
 from ae_env.draws import Draws
 from ae_env.episode import Episode, Episodes
-from ae_env.lighting import Lighting, make_lighting
+from ae_env.lighting import Lighting
 from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
 from ae_env.options import COSTS, EnvOptions
 from ae_env.recorder import Recorder
@@ -62,7 +62,7 @@ class EpisodeCore:
         self.grid = options.make_grid()
         self.camera = options.make_camera()
         self.scorer = options.make_scorer()
-        self.lighting = make_lighting(options.lighting)
+        self.lighting = options.make_lighting()
         self.scenes = options.load_scenes()
         self.tables = ScoreTables(
             self.grid,
@@ -236,7 +236,7 @@ class EpisodeCore:
         if self.options.reward == "expected":
             pairs = zip(places.tolist(), states.tolist(), strict=True)
             return np.array([self.expected_scores(place).mean[state] for place, state in pairs])
-        return np.asarray(self.scorer.combine(parts), dtype=np.float64)
+        return self.scorer.totals(parts)
 
     def _capture_all(self, places: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Observations of `raw` and the info columns, worked out chunk by chunk."""
@@ -317,7 +317,7 @@ class EpisodeCore:
                 self._scores[slot, :, column] = parts[name]
         if self.scorer.closed_form:
             columns = np.moveaxis(self._scores[slots], -1, 0).copy()
-            totals = self.scorer.combine(dict(zip(self._closed, columns, strict=False)))
+            totals = self.scorer.totals(dict(zip(self._closed, columns, strict=False)))
             self._scores[slots, :, -1] = totals
         self._scored[slots] = True
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from ae_env.checks import check_integer, did_you_mean
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
 
@@ -17,6 +18,10 @@ STATIC_SHARE = 1.0 / 3.0
 SPEED_SIGMA = 1.3
 #: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
+#: What a reset may choose, and what its errors call it; frames are counted up to `MAX_FRAME`.
+OPTIONS = ("scene", "state", "frame")
+_OPTION = tuple(f"options[{name!r}]" for name in OPTIONS)
+MAX_FRAME = 2**31 - 1
 #: Uniform numbers that an episode is made of.
 _NUMBERS = 7
 #: Those have so many different values.
@@ -58,15 +63,16 @@ class Draws:
         Raises:
             ValueError: If there is no such scene, state or frame.
         """
+        given = [self._chosen(options) for options in chosen or ()]  # refused before any draw
         uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
         place, start, moving, speed, defocus, phase, seed = uniforms
         scene = (place * len(self._ids)).astype(np.int64)
         state = (start * self._num_states).astype(np.int64)
         frame = np.zeros(len(rngs), np.int64)
-        for i, wanted in enumerate(chosen or ()):
-            scene[i] = self._scene(wanted.get("scene"), scene[i])
-            state[i] = _number("state", wanted.get("state"), state[i], self._num_states)
-            frame[i] = _number("frame", wanted.get("frame"), 0, 2**31)
+        for i, wanted in enumerate(given):
+            for column, value in zip((scene, state, frame), wanted, strict=True):
+                if value is not None:
+                    column[i] = value
         speeds = (moving >= STATIC_SHARE) * np.exp(SPEED_SIGMA * ndtri(speed)) * self._speeds[scene]
         discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
         discs = _fixed_or_drawn(
@@ -83,25 +89,44 @@ class Draws:
             "frame": frame,
         }
 
-    def _scene(self, wanted: Any, drawn: int) -> int:
-        if wanted is None:
-            return drawn
-        if isinstance(wanted, str) and wanted in self._index:
-            return self._index[wanted]
-        if isinstance(wanted, int | np.integer) and 0 <= wanted < len(self._ids):
-            return int(wanted)
-        raise ValueError(
-            f"`options['scene']` (={wanted!r}) must be a scene id, such as {self._ids[0]!r}, or an "
-            f"index below {len(self._ids)}"
+    def _chosen(self, options: Mapping[str, Any]) -> tuple[int | None, int | None, int | None]:
+        """Scene, state and frame that the options of a reset ask for; None where they do not."""
+        scene, state, frame = (options.get(name) for name in OPTIONS)
+        return (
+            None if scene is None else self._scene(scene),
+            None if state is None else check_integer(_OPTION[1], state, 0, self._num_states - 1),
+            None if frame is None else check_integer(_OPTION[2], frame, 0, MAX_FRAME),
         )
 
+    def _scene(self, wanted: Any) -> int:
+        if isinstance(wanted, str) and wanted in self._index:
+            return self._index[wanted]
+        hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
+        rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
+        return check_integer(_OPTION[0], wanted, 0, len(self._ids) - 1, more=rule)
 
-def _number(name: str, wanted: Any, drawn: int, limit: int) -> int:
-    if wanted is None:
-        return drawn
-    if isinstance(wanted, int | np.integer) and 0 <= wanted < limit:
-        return int(wanted)
-    raise ValueError(f"`options[{name!r}]` (={wanted!r}) must be an integer in [0, {limit})")
+
+def check_options(options: Any, *more: str) -> dict[str, Any]:
+    """The options of a reset as a dictionary of its own.
+
+    Args:
+        options: What `reset` was given: None or a mapping.
+        more: Names that are allowed beside those of `OPTIONS`.
+
+    Raises:
+        ValueError: If there is another name, or it is no mapping.
+    """
+    known = [*OPTIONS, *more]
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"`options` (={options!r}) must be None or a dictionary with {known}")
+    for name in options:
+        if name not in known:
+            raise ValueError(
+                f"`options` has {name!r}; it may have {known}{did_you_mean(name, known)}"
+            )
+    return dict(options)
 
 
 def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:

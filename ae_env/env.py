@@ -7,7 +7,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from ae_env.checks import check_actions, check_seed, check_word
 from ae_env.core import EpisodeCore, Frames
+from ae_env.draws import check_options
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
@@ -100,8 +102,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
 
     def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"`render_mode` (={render_mode!r}) must be None or 'rgb_array'")
+        check_word("render_mode", render_mode, ("rgb_array",), None)
         self.render_mode = render_mode
         self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs=1)
         self.action_space = gym.spaces.Discrete(len(self.core.grid))
@@ -132,17 +133,15 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begins an episode; see the class for `options`."""
-        super().reset(seed=seed)
-        self.core.start(0, self.np_random, _checked_options(options))
+        chosen = check_options(options)
+        super().reset(seed=check_seed(seed))
+        self.core.start(0, self.np_random, chosen)
         self._last = self.core.observe(_PLACE)
         return _first(self._last.observation), single_info(self._last.info, 0)
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
-        number = np.asarray(action)
-        if number.ndim or number.dtype.kind not in "iub":
-            raise ValueError(f"`action` (={action!r}) must be an integer")
-        self.core.act(_PLACE, number[None])
+        self.core.act(_PLACE, check_actions("action", action, ())[None])
         self._last = self.core.observe(_PLACE)
         info = single_info(self._last.info, 0)
         return _first(self._last.observation), float(self._last.reward[0]), False, False, info
@@ -162,14 +161,6 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         if self._last is None:
             raise gym.error.ResetNeeded("call reset() before render()")
         return render_frame(self.core, 0, self._last)
-
-
-def _checked_options(options: dict[str, Any] | None) -> dict[str, Any]:
-    known = ("scene", "state", "frame")
-    for name in options or {}:
-        if name not in known:
-            raise ValueError(f"`options` has {name!r}; it may have {list(known)}")
-    return dict(options or {})
 
 
 def _first(observation: Observation) -> Observation:

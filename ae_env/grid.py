@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from numbers import Real
 
 import numpy as np
 
+from ae_env.checks import did_you_mean
 from simulator.settings import CameraSettings
 
 
@@ -38,10 +40,16 @@ class ExposureGrid:
 
     def __post_init__(self) -> None:
         for name in ("isos", "exposure_times", "f_numbers"):
-            values = tuple(float(v) for v in getattr(self, name))
-            if not values or any(a >= b for a, b in pairwise(values)):
-                raise ValueError(f"`{name}` (={values}) must be a strictly ascending list")
-            object.__setattr__(self, name, values)
+            given = getattr(self, name)
+            listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str | bytes)
+            values = tuple(given) if listed and np.ndim(given) == 1 else ()
+            numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in values)
+            # What is out of range is refused by CameraSettings, NaN here.
+            if not (values and numbers and all(a < b for a, b in pairwise(values))):
+                raise ValueError(
+                    f"`{name}` (={given!r}) must be a strictly ascending list of numbers"
+                )
+            object.__setattr__(self, name, tuple(float(v) for v in values))
         assert self.states  # every combination is checked by CameraSettings
 
     @classmethod
@@ -64,12 +72,18 @@ class ExposureGrid:
         named = {"default": cls.default, "third_stop": cls.third_stop}
         if isinstance(spec, str) and spec in named:
             return named[spec]()
-        fields = {"isos", "exposure_times", "f_numbers"}
-        if isinstance(spec, Mapping) and set(spec) == fields:
-            return cls(**{name: tuple(spec[name]) for name in fields})
+        names = ("isos", "exposure_times", "f_numbers")
+        if isinstance(spec, Mapping) and set(spec) == set(names):
+            try:
+                return cls(**dict(spec))  # type: ignore[arg-type]
+            except ValueError as error:
+                raise ValueError(f"`grid`: {error}") from None
+        hint = did_you_mean(spec, named) if isinstance(spec, str) else ""
+        if isinstance(spec, Mapping):
+            hint = "".join(did_you_mean(key, names) for key in spec if key not in names)
         raise ValueError(
             f"`grid` (={spec!r}) must be one of {sorted(named)}, an ExposureGrid, or a mapping "
-            f"with exactly the keys {sorted(fields)}"
+            f"with exactly the keys {list(names)}{hint}"
         )
 
     @property

@@ -5,13 +5,23 @@ A lighting gives, for each frame, the factor by which the scene's light differs 
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
-import numpy as np
+from ae_env.checks import check_integer, check_number, did_you_mean
+
+#: Most stops that the light may change by: float32 holds it at any settings of a grid.
+MAX_STOPS = 64
+#: Least and greatest value of each option, and what checks it.
+_FRAME = (-(2**31), 2**31, check_integer)
+_RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
+    "stops": (-MAX_STOPS, MAX_STOPS, check_number),
+    "stops_per_frame": (-MAX_STOPS, MAX_STOPS, check_number),
+    "period": (1e-3, 2**31, check_number),
+    **dict.fromkeys(("at", "enter", "leave", "edge", "on", "off"), _FRAME),
+}
 
 
 @dataclass(frozen=True)
@@ -22,6 +32,12 @@ class Lighting:
     """
 
     name: ClassVar[str] = "static"
+
+    def __post_init__(self) -> None:
+        for option in fields(self):
+            if option.name in _RANGES:
+                low, high, check = _RANGES[option.name]
+                check(f"lighting[{option.name!r}]", getattr(self, option.name), low, high)
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """Mean relative light of an exposure.
@@ -84,6 +100,10 @@ class TunnelLighting(Lighting):
     leave: int = 10
     edge: int = 2
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "enter", "leave")
+
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
         edge = max(self.edge, 1)
@@ -100,6 +120,10 @@ class LensCapLighting(Lighting):
     stops: float = -20.0
     on: int = 2
     off: int = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "on", "off")
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
@@ -123,23 +147,36 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     """A lighting from a name or from a mapping such as ``{"kind": "step", "stops": 3}``.
 
     Raises:
-        ValueError: If the kind or one of its options is unknown, or an option is not a number.
+        ValueError: If the kind or one of its options is unknown, or an option is out of range.
 
     >>> make_lighting({"kind": "step", "stops": 3, "at": 2}).gain(2, 0.01, 0.0)
     8.0
     """
     if isinstance(spec, Lighting):
         return spec
+    if not isinstance(spec, str | Mapping):
+        raise ValueError(
+            f"`lighting` (={spec!r}) must be one of {sorted(KINDS)}, a mapping with a 'kind' of "
+            "them, or a Lighting"
+        )
     options = {"kind": spec} if isinstance(spec, str) else dict(spec)
     name = options.pop("kind", None)
-    if name not in KINDS:
-        near = difflib.get_close_matches(str(name), KINDS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+    if not isinstance(name, str) or name not in KINDS:
+        hint = did_you_mean(name, KINDS)
         raise ValueError(f"`lighting` (={spec!r}) must be one of {sorted(KINDS)}{hint}")
     known = [f.name for f in fields(KINDS[name])]
-    for option, value in options.items():
+    for option in options:
         if option not in known:
-            raise ValueError(f"`lighting` (={spec!r}): {name!r} takes {known}, not {option!r}")
-        if not np.isfinite(value):
-            raise ValueError(f"`lighting` option {option!r} (={value!r}) must be a finite number")
+            hint = did_you_mean(option, known)
+            raise ValueError(
+                f"`lighting` (={spec!r}): {name!r} takes {known}, not {option!r}{hint}"
+            )
     return KINDS[name](**options)
+
+
+def _check_order(lighting: Lighting, first: str, last: str) -> None:
+    begin, end = getattr(lighting, first), getattr(lighting, last)
+    if end < begin:
+        raise ValueError(
+            f"`lighting[{last!r}]` (={end!r}) must not be before `lighting[{first!r}]` (={begin!r})"
+        )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from ae_env.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from ae_env.grid import ExposureGrid
+from ae_env.lighting import Lighting, make_lighting
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.networks import (
     DEFAULT_SIMULATOR,
@@ -26,6 +27,12 @@ MIN_RESOLUTION = 36
 COSTS = ("flicker", "switch")
 DEPTHS = ("random", "far", "unknown")
 NOISES = ("bank", "exact")
+#: Longest delay [frame].
+MAX_DELAY = 16
+#: Highest image speed [frame heights/s] and blur diameter [pixel of a 64-pixel frame].
+MAX_BLUR = 1e3
+#: Highest weight of a cost: scores are in [0, 1].
+MAX_COST = 1e6
 
 
 @dataclass(frozen=True)
@@ -55,28 +62,25 @@ class EnvOptions:
     def __post_init__(self) -> None:
         if isinstance(self.scenes, str) and not self.scenes:
             raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
-        _one_of("split", self.split, ("train", "test", "all"))
-        _one_of("observation", self.observation, ("uint8", "linear", "dn"))
-        _one_of("crop", self.crop, ("box", "native"))
-        _one_of("reward", self.reward, ("capture", "expected"))
-        if not isinstance(self.noise, bool):  # True is "bank"
-            _one_of("noise", self.noise, NOISES)
+        check_word("split", self.split, ("train", "test", "all"))
+        check_word("observation", self.observation, ("uint8", "linear", "dn"))
+        check_word("crop", self.crop, ("box", "native"))
+        check_word("reward", self.reward, ("capture", "expected"))
+        check_word("noise", self.noise, NOISES, True, False)  # True is "bank"
+        check_flag("sensors", self.sensors)
+        check_flag("with_oracle", self.with_oracle)
         check_tolerance(self.tolerance)
-        if not _is_integer(self.resolution):
-            raise ValueError(f"`resolution` (={self.resolution!r}) must be an integer")
-        if not MIN_RESOLUTION <= self.resolution <= 4096:
-            raise ValueError(
-                f"`resolution` (={self.resolution}) must be in [{MIN_RESOLUTION}, 4096]: the "
-                "default CNNs of RL libraries take no smaller image"
-            )
+        why = ": the default CNNs of RL libraries take no smaller image"
+        resolution = check_integer("resolution", self.resolution, MIN_RESOLUTION, 4096, more=why)
+        delay = check_integer("delay", self.delay, 0, MAX_DELAY, more=" frames")
+        object.__setattr__(self, "resolution", resolution)  # those of numpy, too, as an int
+        object.__setattr__(self, "delay", delay)
         for name, words in (("motion", ("random", "none")), ("depth", DEPTHS)):
             value = getattr(self, name)
             if isinstance(value, str):
-                _one_of(name, value, words)
-            elif isinstance(value, bool) or not 0.0 <= float(value) < 1e3:
-                raise ValueError(
-                    f"`{name}` (={value!r}) must be one of {list(words)} or in [0, 1000)"
-                )
+                check_word(name, value, words)
+            else:
+                check_number(name, value, 0.0, MAX_BLUR, more=f", or one of {list(words)}")
         if self.depth == "unknown" and self.simulator is None:
             raise ValueError(
                 "`depth` (='unknown') needs the networks that find a scene's defocus: give "
@@ -84,12 +88,13 @@ class EnvOptions:
             )
         if self.simulator is not None:
             check_weights(self.simulator)
-        if not _is_integer(self.delay) or not 0 <= self.delay <= 16:
-            raise ValueError(f"`delay` (={self.delay!r}) must be an integer in [0, 16] frames")
+        if not isinstance(self.costs, Mapping):
+            raise ValueError(
+                f"`costs` (={self.costs!r}) must map names of {list(COSTS)} to weights"
+            )
         for name, weight in self.costs.items():
-            _one_of("costs", name, COSTS)
-            if not 0.0 <= float(weight) < float("inf"):
-                raise ValueError(f"`costs[{name!r}]` (={weight!r}) must be finite and >= 0")
+            check_word("costs", name, COSTS)
+            check_number(f"costs[{name!r}]", weight, 0.0, MAX_COST)
 
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
@@ -97,8 +102,7 @@ class EnvOptions:
         known = [f.name for f in fields(cls)]
         for name in kwargs:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean `{near[0]}`?" if near else ""
+                hint = did_you_mean(name, known, "`")
                 raise ValueError(f"unknown argument `{name}`: the arguments are {known}{hint}")
         return cls(**kwargs)
 
@@ -113,6 +117,10 @@ class EnvOptions:
     def make_scorer(self) -> CompositeScorer:
         """The scorer."""
         return make_scorer(self.scorer)
+
+    def make_lighting(self) -> Lighting:
+        """How the light changes."""
+        return make_lighting(self.lighting)
 
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; kept for the next environment like this."""
@@ -147,6 +155,7 @@ class EnvOptions:
         if not scenes:
             raise ValueError(f"`scenes` (={self.scenes!r}) has none in split {self.split!r}")
         scenes = [self._prepared(scene, networks) for scene in scenes]
+        _check_light(scenes)
         if kept and self.scenes.startswith("bundled"):
             _LOADED.put(key, list(scenes), sum(scene.light.nbytes for scene in scenes))
         return scenes
@@ -159,16 +168,14 @@ class EnvOptions:
         return scene if self.noise else without_noise(scene)
 
 
+def _check_light(scenes: list[Scene]) -> None:
+    """Raises a `ValueError` where the light is unknown and cannot be told from the scene."""
+    for scene in scenes:
+        try:
+            _ = scene.ev100  # kept: every score asks for it
+        except ValueError as error:
+            raise ValueError(f"scene {scene.scene_id!r}: {error}") from error
+
+
 #: Bundled scenes by what they were made for; at most so many bytes of light.
 _LOADED: LruCache[list[Scene]] = LruCache(2**30)
-
-
-def _is_integer(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _one_of(name: str, value: Any, known: tuple[str, ...]) -> None:
-    if value not in known:
-        near = difflib.get_close_matches(str(value), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"`{name}` (={value!r}) must be one of {list(known)}{hint}")

@@ -14,8 +14,10 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from ae_env.checks import check_integer
 from ae_env.grid import ExposureGrid
 from ae_env.scenes.scene import Scene
+from ae_env.scorers.call import is_own
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures, DependsOn
 from ae_env.scorers.registry import scorer_fingerprint
@@ -168,14 +170,15 @@ class ScoreTables:
         tolerance: float = DEFAULT_TOLERANCE,
         use_cache: bool = True,
     ) -> None:
-        if noise_seeds < 1:
-            raise ValueError(f"`noise_seeds` (={noise_seeds}) must be at least 1")
+        check_integer("noise_seeds", noise_seeds, 1)
         self.grid, self.camera, self.scorer = grid, camera, scorer
         self.noise, self.noise_seeds = noise, noise_seeds if noise else 1
         check_tolerance(tolerance)
         self.tolerance = tolerance
         fingerprint = scorer_fingerprint(scorer) if use_cache else None
         self._fingerprint = fingerprint
+        # Scorers of one's own get a copy of the light, lest they write to the scene.
+        self._copies = is_own(scorer)
         self._disk = DiskCache()
         self._light_parts: LruCache[_LightParts] = LruCache(MEMORY_BYTES)
         self._at_rest: LruCache[_AtRest] = LruCache(MEMORY_BYTES)
@@ -187,10 +190,10 @@ class ScoreTables:
         parts = self.closed_parts(scene, speed=speed, defocus=defocus, gain=gain)
         if self.scorer.closed_form:
             parts = {name: parts[name] for name in self.scorer.parts}
-            mean = np.asarray(self.scorer.combine(parts))
+            mean = self.scorer.totals(parts)
             return ScoreTable(mean, np.zeros(len(self.grid)), parts)
         samples = self._samples(scene, speed, defocus, gain)
-        totals = np.asarray(self.scorer.combine({**parts, **samples}))  # (seeds, S)
+        totals = self.scorer.totals({**parts, **samples})  # (seeds, S)
         if not self.noise:
             error = np.zeros(len(self.grid))
         elif self.noise_seeds > 1:
@@ -262,7 +265,7 @@ class ScoreTables:
             speed=np.full(count, speed),
             defocus=np.full(count, defocus),
             gain=np.full(count, gain),
-            light=scene.clean_light.expand(count, -1, -1, -1),
+            light=self._light(scene, count),
         )
 
     def _blurred_captures(
@@ -278,9 +281,13 @@ class ScoreTables:
         blur = np.hypot(speed * known.times * height, defocus * known.openings * height / 64.0)
         return replace(
             known.captures,
-            scene_light=scene.clean_light.expand(len(states), -1, -1, -1),
+            scene_light=self._light(scene, len(states)),
             blur_px=torch.from_numpy(np.hypot(blur, known.captures.blur_px.numpy())),
         )
+
+    def _light(self, scene: Scene, count: int) -> torch.Tensor:
+        light = scene.clean_light.clone() if self._copies else scene.clean_light
+        return light.expand(count, -1, -1, -1)
 
     def _described(self, scene: Scene, states: list[CameraSettings]) -> _AtRest:
         captures = self._captures(scene, states, 0.0, 0.0, 1.0)

@@ -14,6 +14,7 @@ import typer
 
 from ae_env.console import (
     Device,
+    OwnSeed,
     Seed,
     command_line,
     console,
@@ -82,14 +83,15 @@ def simulate(
     check_noise(noise)
     check_tolerance(tolerance)
     settings = CameraSettings(iso, parse_seconds(shutter), aperture)
-    if out.suffix.lower() != ".dng":
-        raise ValueError(f"`out` (={str(out)!r}) must end in .dng")
     device = torch_device(device)
+    for name, path in (("out", out), ("png", png)):
+        suffix = ".dng" if name == "out" else ".png"
+        if path is not None and path.suffix.lower() != suffix:
+            raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
     source = read_raw(raw)
-    if png is not None and png.suffix.lower() != ".png":
-        raise ValueError(f"`png` (={str(png)!r}) must end in .png")
-    for path in (out, png or out):
-        make_folder(path.parent)
+    for name, path in (("out", out), ("png", png)):
+        if path is not None:
+            make_folder(path.parent, name=name, file=path)
     simulator = _simulator(weights, device, cache)
     latent = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
@@ -151,7 +153,7 @@ def train_simulator(
     out: Annotated[
         Path | None, typer.Option(help="Folder; by default runs/simulator/NAME-OF-THE-CONFIG.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Instead of the YAML's.", min=0)] = None,
+    seed: OwnSeed = None,
     device: Device = "auto",
     tensorboard: Annotated[bool, typer.Option(help="Log to OUT/tensorboard.")] = True,
 ) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +12,9 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from ae_env.checks import check_actions, check_integer, check_seed, check_word
 from ae_env.core import EpisodeCore, Frames
+from ae_env.draws import check_options
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
@@ -20,6 +22,8 @@ from ae_env.scenes import Scene
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]
+#: Most environments in one process: at 64 pixels, they observe 1 GiB.
+MAX_ENVS = 2**16
 
 
 class AutoExposureVectorEnv(
@@ -47,12 +51,11 @@ class AutoExposureVectorEnv(
         render_mode: str | None = None,
         **arguments: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"`num_envs` (={num_envs}) must be at least 1")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"`max_episode_steps` (={max_episode_steps}) must be at least 1")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"`render_mode` (={render_mode!r}) must be None or 'rgb_array'")
+        num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVS)
+        if max_episode_steps is not None:
+            rule = ", or None for never"
+            max_episode_steps = check_integer("max_episode_steps", max_episode_steps, 1, more=rule)
+        check_word("render_mode", render_mode, ("rgb_array",), None)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
@@ -116,7 +119,7 @@ class AutoExposureVectorEnv(
                 all or a sequence with one per environment; ``reset_mask`` (N,) bool.
         """
         seeds = self._seeds(seed)
-        options = dict(options or {})
+        options = check_options(options, "reset_mask")
         mask = self._reset_mask(options.pop("reset_mask", None))
         per_env = self._split_options(options)
         places = np.flatnonzero(mask)
@@ -134,12 +137,7 @@ class AutoExposureVectorEnv(
         self, actions: np.ndarray
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Takes the next frame of every episode with the states `actions` (N,)."""
-        actions = np.asarray(actions)
-        if actions.shape != (self.num_envs,) or actions.dtype.kind not in "iu":
-            raise ValueError(
-                f"`actions` ({actions.dtype}, shape {actions.shape}) must be integers "
-                f"({self.num_envs},)"
-            )
+        actions = check_actions("actions", actions, (self.num_envs,))
         resetting = np.flatnonzero(self._done)
         if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
@@ -257,11 +255,12 @@ class AutoExposureVectorEnv(
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"`seed` (length {len(seed)}) must have {self.num_envs} entries")
-        return list(seed)
+        if _is_list(seed):
+            if len(seed) != self.num_envs:
+                raise ValueError(f"`seed` (length {len(seed)}) must have {self.num_envs} entries")
+            return [check_seed(single, f"seed[{i}]") for i, single in enumerate(seed)]
+        first = check_integer("seed", seed, 0, more=f", or {self.num_envs} of them")
+        return list(range(first, first + self.num_envs))
 
     def _reset_mask(self, mask: Any) -> np.ndarray:
         if mask is None:
@@ -275,12 +274,9 @@ class AutoExposureVectorEnv(
         return mask
 
     def _split_options(self, options: dict[str, Any]) -> list[dict[str, Any]]:
-        known = ("scene", "state", "frame")
         split: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for name, value in options.items():
-            if name not in known:
-                raise ValueError(f"`options` has {name!r}; it may have {[*known, 'reset_mask']}")
-            alike = value is None or isinstance(value, str | int | np.integer)
+            alike = not _is_list(value)
             if not alike and len(value) != self.num_envs:
                 raise ValueError(
                     f"`options[{name!r}]` (length {len(value)}) must have {self.num_envs} entries"
@@ -288,6 +284,13 @@ class AutoExposureVectorEnv(
             for i, single in enumerate(split):
                 single[name] = value if alike else value[i]
         return split
+
+
+def _is_list(value: Any) -> TypeGuard[Sequence[Any]]:
+    """Whether `value` is one for each environment."""
+    if isinstance(value, np.ndarray):
+        return value.ndim > 0
+    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
 
 
 def _taken(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
@@ -310,7 +313,5 @@ def _put(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     if isinstance(mode, AutoresetMode):
         return mode
-    if mode in AutoresetMode.__members__:
-        return AutoresetMode[mode]
-    known = list(AutoresetMode.__members__)
-    raise ValueError(f"`autoreset_mode` (={mode!r}) must be one of {known}")
+    check_word("autoreset_mode", mode, tuple(AutoresetMode.__members__))
+    return AutoresetMode[mode]

@@ -18,6 +18,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector.utils import batch_space
 
+from ae_env.checks import check_actions
 from ae_env.grid import ExposureGrid
 
 #: Distances in stops are compared to this many decimals, so that ties do not hang on rounding.
@@ -29,11 +30,7 @@ _DISTANCE_DECIMALS = 9
 
 def _check_steps(actions: Any, sizes: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
     """`actions` as int64 of `shape` with column i in [0, sizes[i])."""
-    values = np.asarray(actions)
-    if values.shape != shape or values.dtype.kind not in "iu":
-        raise ValueError(
-            f"`action` ({values.dtype}, shape {values.shape}) must be integers of shape {shape}"
-        )
+    values = check_actions("action", actions, shape)
     if bool(((values < 0) | (values >= np.array(sizes))).any()):
         raise ValueError(f"`action` (={values.tolist()}) must be in [0, {list(sizes)}) by column")
     return values.astype(np.int64)
@@ -49,8 +46,13 @@ def _states_of_steps(grid: ExposureGrid, states: np.ndarray, steps: np.ndarray) 
 
 
 def _check_apex(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    values = np.asarray(actions, dtype=np.float64)
-    if values.shape != shape or not np.isfinite(values).all():
+    try:
+        values = np.asarray(actions)
+    except ValueError:  # rows of different lengths
+        values = np.empty(0, object)
+    numbers = values.shape == shape and values.dtype.kind in "iuf"
+    values = values.astype(np.float64) if numbers else values
+    if not numbers or not np.isfinite(values).all():
         raise ValueError(f"`action` (={actions!r}) must be finite numbers of shape {shape}")
     return np.clip(values, -1.0, 1.0)
 

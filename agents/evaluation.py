@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.checks import UserCodeError, check_integer, check_number
 from agents.episodes import EpisodeBatch, episode_batches, expected_scores, make_envs
 from agents.evaluation_result import EvaluationResult, Track
 from agents.metering import linear_signal
@@ -50,7 +52,8 @@ def fit_policies(
         for i, (name, policy) in enumerate(learners.items()):
             if progress is not None:
                 progress(i, len(learners), name)
-            policy.fit(envs, seed)
+            with _named(name, "fit"):
+                policy.fit(envs, seed)
         if progress is not None:
             progress(len(learners), len(learners), "")
     finally:
@@ -83,22 +86,24 @@ def evaluate(
         progress: Called with frames done and frames in all.
 
     Raises:
-        ValueError: If an argument is out of range or a policy returns something else than allowed
-            states.
+        ValueError: If an argument is out of range.
+        UserCodeError: If a policy raises (the cause is chained), or returns something else than
+            allowed states.
     """
-    for key, value in (
-        ("episodes_per_scene", episodes_per_scene),
-        ("frames", frames),
-        ("batch", batch),
-        ("policies", len(policies)),
-    ):
-        if value < 1:
-            raise ValueError(f"`{key}` (={value}) must be >= 1")
+    check_integer("episodes_per_scene", episodes_per_scene, 1)
+    check_integer("frames", frames, 1)
+    check_integer("batch", batch, 1)
+    check_integer("seed", seed, 0)
     runs = [
         (name, k, policy)
         for name, entry in policies.items()
         for k, policy in enumerate(entry if isinstance(entry, Sequence) else [entry])
     ]
+    if not runs:
+        raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
+    for name, _, policy in runs:
+        captures = getattr(policy, "captures_per_decision", 1.0)
+        check_number(f"captures_per_decision` of policy `{name}", captures, 0.0, 1e9)
     privileged = any(getattr(policy, "privileged", False) for _, _, policy in runs)
     envs = make_envs(env_options, num_envs=batch, frames=frames, with_oracle=privileged)
     try:
@@ -180,14 +185,16 @@ def _run_batch(
     """Run one policy over one batch of episodes."""
     recorder.begin(batch)
     base: Any = envs.unwrapped
-    policy.reset(envs.num_envs, seed=batch.seed)
+    with _named(name, "reset"):
+        policy.reset(envs.num_envs, seed=batch.seed)
     observations, info = batch.observations, batch.info
     states, means, high, low, scores = [], [], [], [], []
     seconds = 0.0
     for _ in range(frames):
         extra: dict[str, Any] = {"info": info} if getattr(policy, "privileged", False) else {}
         begin = time.perf_counter()
-        actions = policy.act(observations, batch.action_masks, **extra)
+        with _named(name, "act"):
+            actions = policy.act(observations, batch.action_masks, **extra)
         seconds += time.perf_counter() - begin
         actions = _checked(name, actions, batch.action_masks)
         observations, _, _, _, info = envs.step(actions)
@@ -210,22 +217,35 @@ def _run_batch(
     }
 
 
+@contextmanager
+def _named(policy: str, method: str) -> Iterator[None]:
+    """What a policy raises then names the policy, which may be the user's own."""
+    try:
+        yield
+    except Exception as error:
+        text = f"policy {policy!r}: `{method}` raised {type(error).__name__}: {error}"
+        raise UserCodeError(text) from error
+
+
 def _checked(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
     """The policy's actions as int64, or an error that says what is wrong with them."""
-    array = np.asarray(actions)
+    try:
+        array = np.asarray(actions)
+    except Exception:  # rows of different lengths, a tensor of a GPU
+        array = np.empty(0, object)
     if array.shape != masks.shape[:1] or not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(
+        raise UserCodeError(
             f"policy {name!r}: `act` must return {masks.shape[0]} integers, one per camera, not "
-            f"an array of shape {array.shape} and dtype {array.dtype}"
+            f"{type(actions).__name__} of shape {array.shape} and dtype {array.dtype}"
         )
     outside = (array < 0) | (array >= masks.shape[1])
     if outside.any():
-        raise ValueError(
+        raise UserCodeError(
             f"policy {name!r}: state {array[outside][0]} is not in [0, {masks.shape[1]})"
         )
     forbidden = ~np.take_along_axis(masks, array[:, None], axis=1)[:, 0]
     if forbidden.any():
-        raise ValueError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")
+        raise UserCodeError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")
     return array.astype(np.int64)
 
 

@@ -141,7 +141,8 @@ def make_policy(
         options: Passed to the class.
 
     Raises:
-        ValueError: If there is no such policy, or the class found is not one.
+        ValueError: If there is no such policy, its file cannot be loaded (the cause is chained), or
+            the class found is not a policy.
     """
     head, _, tail = str(name).rpartition(":") if ".py:" in str(name) else name.partition(":")
     if not tail:
@@ -165,7 +166,7 @@ def make_policy(
 
 def _unknown(name: str) -> str:
     known = [*METERS, *list_policies(), *(f"{t}:PATH" for t in _TRAINED)]
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return (
         f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
@@ -183,11 +184,16 @@ def _class_in_module(module: str, name: str, policy: str) -> Any:
         raise ValueError(_unknown(policy))
     try:
         loaded = importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not (module == error.name or module.startswith(f"{error.name}.")):
-            raise  # the module is there, but something that it imports is not
-        raise ValueError(f"{_unknown(policy)} (there is no module {error.name!r})") from None
+    except Exception as error:
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing is not None and (module == missing or module.startswith(f"{missing}.")):
+            raise ValueError(f"{_unknown(policy)} (there is no module {missing!r})") from None
+        raise ValueError(_broken(policy, f"{module} cannot be imported", error)) from error
     return _attribute(loaded, name, policy)
+
+
+def _broken(policy: str, what: str, error: BaseException) -> str:
+    return f"`policy` (={policy!r}): {what}: {type(error).__name__}: {error}"
 
 
 def _class_in_file(path: str, name: str, policy: str) -> Any:
@@ -204,9 +210,9 @@ def _class_in_file(path: str, name: str, policy: str) -> Any:
     sys.modules[key] = module  # dataclasses look their module up while it loads
     try:
         spec.loader.exec_module(module)
-    except BaseException:
+    except (Exception, SystemExit) as error:  # a script, for example, ends the program
         del sys.modules[key]
-        raise
+        raise ValueError(_broken(policy, f"{path} cannot be loaded", error)) from error
     return _attribute(module, name, policy)
 
 
@@ -244,5 +250,9 @@ def _construct(cls: Any, name: str, context: PolicyContext, options: dict[str, A
             f"`policy` (={name!r}): {cls.__name__} does not take (context"
             f"{''.join(f', {key}=' for key in options)}): {error}"
         ) from None
-    policy: Policy = cls(context, **options)
-    return policy
+    if cls.__module__.startswith("agents."):  # its own errors say what is wrong
+        return cls(context, **options)
+    try:
+        return cls(context, **options)
+    except Exception as error:
+        raise ValueError(_broken(name, f"{cls.__name__} cannot be made", error)) from error

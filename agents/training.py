@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
@@ -10,17 +9,18 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from ae_env.checks import did_you_mean
 from agents.regression import RegressionTraining
 from agents.weights import load_agent, sibling
-from simulator.config_file import load_yaml, one_line
+from simulator.config_file import Configuration, load_yaml, one_line
 
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
 
 
-class AgentConfig(BaseModel):
+class AgentConfig(Configuration):
     """Everything that decides a training.
 
     Args:
@@ -29,8 +29,6 @@ class AgentConfig(BaseModel):
         num_envs: Episodes side by side.
         training: Hyperparameters, those of `RegressionTraining` or `PPOTraining`.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     agent: Literal["regression", "ppo"]
     environment: dict[str, Any] = Field(default_factory=dict)
@@ -44,9 +42,9 @@ class AgentConfig(BaseModel):
         hyperparameters = self.hyperparameters()
         try:
             options = EnvOptions.from_kwargs(self.environment)
-            for make in (options.make_grid, options.make_camera, options.make_scorer):
-                make()
-        except (TypeError, AttributeError, ValueError) as error:
+            options.make_grid(), options.make_camera(), options.make_scorer()
+            options.make_lighting()
+        except ValueError as error:
             raise ValueError(f"environment: {error}") from error
         if options.observation != "uint8":
             raise ValueError(
@@ -68,10 +66,11 @@ class AgentConfig(BaseModel):
         else:
             from agents.ppo import PPOTraining as kind
         known = [field.name for field in fields(kind)]
-        for name in self.training:
+        for name, value in self.training.items():
+            if isinstance(value, bool):
+                raise ValueError(f"training.{name} (={value!r}) should not be true or false")
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
+                hint = did_you_mean(name, known)
                 raise ValueError(f"training.{name} is unknown: the entries are {known}{hint}")
         try:
             return TypeAdapter(kind).validate_python(self.training)
@@ -79,8 +78,14 @@ class AgentConfig(BaseModel):
             raise ValueError(one_line(error, "training.")) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
-        """The same training with another seed."""
-        return self.model_copy(update={"training": {**self.training, "seed": seed}})
+        """The same training with another seed.
+
+        Raises:
+            ValueError: If the seed is out of range.
+        """
+        changed = self.model_copy(update={"training": {**self.training, "seed": seed}})
+        changed.hyperparameters()
+        return changed
 
     def card(self) -> dict[str, Any]:
         """JSON values that identify the training, every hyperparameter spelled out."""

@@ -123,9 +123,12 @@ class SimulationPlan:
                 "  networks  ran once for all settings; their error: docs/results/simulator.md"
             )
         lines.append(
-            f"  error     {self.predicted_error:.2g} of the target's noise for what is left out "
-            f"(tolerance {self.tolerance:g}); within {self.predicted_difference:.2g} of the "
-            "full run"
+            f"  error     {self.predicted_error:.2g} of the target's noise is due to what is left "
+            f"out (tolerance {self.tolerance:g})"
+        )
+        lines.append(
+            f"            at most {self.predicted_difference:.2g} of the target's noise away from "
+            "the full run of this simulator"
         )
         lines.append(
             f"            noise variance {self.excess_noise:.1%} above the target's "

@@ -18,7 +18,7 @@ def check_tolerance(tolerance: float) -> float:
     if (
         isinstance(tolerance, bool)
         or not isinstance(tolerance, Real)
-        or not (math.isfinite(tolerance) and tolerance >= 0)
+        or not 0 <= tolerance < math.inf
     ):
         raise ValueError(f"`tolerance` (={tolerance!r}) must be a finite number >= 0")
     return float(tolerance)

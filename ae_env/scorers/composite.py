@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from numbers import Real
+from typing import Any, get_args
 
 import numpy as np
 import torch
 
+from ae_env.checks import UserCodeError
+from ae_env.scorers.call import ROUNDING, describe_range, scores_of
 from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
 from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
 from simulator.isp import develop
@@ -27,7 +31,8 @@ class CompositeScorer:
         weights: Weight of each part, > 0; they are divided by their sum. Equal by default.
 
     Raises:
-        ValueError: If there are no parts, or a weight is missing or not positive.
+        ValueError: If there are no parts, one is not a scorer, or a weight is missing or not
+            positive.
     """
 
     domain: Domain = "raw"
@@ -38,8 +43,10 @@ class CompositeScorer:
         weights = dict.fromkeys(parts, 1.0) if weights is None else dict(weights)
         if not parts or set(weights) != set(parts):
             raise ValueError(f"`weights` (={weights}) must name exactly the parts {list(parts)}")
-        if not all(w > 0 for w in weights.values()):
-            raise ValueError(f"`weights` (={weights}) must all be > 0")
+        if not all(isinstance(w, Real) and 0 < w < math.inf for w in weights.values()):
+            raise ValueError(f"`weights` (={weights}) must all be > 0, and finite numbers")
+        for name, part in parts.items():
+            _check_part(name, part)
         total = sum(weights.values())
         self.parts = dict(parts)
         self.weights = {name: weight / total for name, weight in weights.items()}
@@ -87,12 +94,31 @@ class CompositeScorer:
                     if srgb is None:
                         srgb = _developed(images, captures)
                     view = srgb
-            scores[name] = _checked(name, part(view, captures), len(captures))
+                if (
+                    len(self.names("image")) > 1
+                ):  # what one does to its images is not seen by the others
+                    view = view.clone()
+            scores[name] = scores_of(name, part, view, captures)
         return scores
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total score from the parts' scores, tensors or arrays of any one shape."""
-        return sum(weight * scores[name] for name, weight in self.weights.items())
+        total: Any = sum(weight * scores[name] for name, weight in self.weights.items())
+        return total.clip(0.0, 1.0)  # rounding
+
+    def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
+        """`combine` of arrays of any one shape, checked: a class of the user's own may override it.
+
+        Raises:
+            UserCodeError: If a total is not in [0, 1].
+        """
+        totals = np.asarray(self.combine(scores), np.float64)
+        if not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
+            found = describe_range(totals)
+            raise UserCodeError(
+                f"scorer {type(self).__name__!r}: `combine` returned {found}: rule is [0, 1]"
+            )
+        return np.minimum(np.maximum(totals, 0.0), 1.0)
 
 
 class Balanced(CompositeScorer):
@@ -124,7 +150,8 @@ class Balanced(CompositeScorer):
         """Total score from the parts' scores, tensors or arrays of any one shape."""
         blown = -Highlights.scale * _log(scores["highlights"])
         blocked = -Shadows.scale * _log(scores["shadows"])
-        score = (1.0 - blown**4) * (1.0 - blocked**4)
+        # A share of 1 may be rounded up.
+        score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
         for name, weight in self.weights.items():
             score = score * scores[name] ** weight
         return score
@@ -144,12 +171,15 @@ def _log(values: Any) -> Any:
     return values.log() if torch.is_tensor(values) else np.log(values)
 
 
-def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
-    if not isinstance(scores, torch.Tensor) or scores.shape != (count,):
-        shape = tuple(scores.shape) if isinstance(scores, torch.Tensor) else type(scores).__name__
-        raise ValueError(f"scorer {name!r} returned {shape}: it must return a tensor ({count},)")
-    scores = scores.double()
-    if not bool(((scores >= -1e-6) & (scores <= 1 + 1e-6)).all()):
-        low, high = float(scores.min()), float(scores.max())
-        raise ValueError(f"scorer {name!r} returned scores from {low} to {high}: rule is [0, 1]")
-    return scores.clamp(0.0, 1.0)
+def _check_part(name: str, part: Any) -> None:
+    """Raises a `ValueError` unless `part` is a scorer."""
+    if not callable(part):
+        raise ValueError(f"`scorer` (={name!r}) must be callable, got {type(part).__name__}")
+    for attribute, known, value in (
+        ("domain", get_args(Domain), getattr(part, "domain", None)),
+        ("depends_on", get_args(DependsOn), depends_on(part)),
+    ):
+        if value not in known:
+            *others, last = map(repr, known)
+            rule = f"{', '.join(others)} or {last}"
+            raise ValueError(f"scorer {name!r} has `{attribute}` (={value!r}); it must be {rule}")

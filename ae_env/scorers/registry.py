@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import importlib
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
+from numbers import Real
 from typing import Any, TypeVar
 
+from ae_env.checks import did_you_mean
 from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.protocol import Scorer
 from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
@@ -43,7 +45,7 @@ def register_scorer(name: str) -> Callable[[Factory], Factory]:
     >>> "constant" in list_scorers()
     True
     """
-    if not name.isidentifier():
+    if not isinstance(name, str) or not name.isidentifier():
         raise ValueError(f"`name` (={name!r}) must be a Python identifier")
 
     def register(factory: Factory) -> Factory:
@@ -63,28 +65,34 @@ def list_scorers() -> list[str]:
 
 def _find_scorer(name: str) -> Scorer:
     if name in _REGISTRY:
-        return _REGISTRY[name]()
+        return _loaded(name, _REGISTRY[name])
     for point in entry_points(group=ENTRY_POINT_GROUP):
         if point.name == name:
-            return _instantiate(name, point.load())
+            return _instantiate(name, _loaded(name, point.load))
     module_name, _, attribute = name.partition(":")
     if attribute:
-        try:
-            found = getattr(importlib.import_module(module_name), attribute)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"`scorer` (={name!r}) cannot be imported: {error}") from error
-        return _instantiate(name, found)
+
+        def load() -> Any:
+            return getattr(importlib.import_module(module_name), attribute)
+
+        return _instantiate(name, _loaded(name, load))
     known = list_scorers()
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(name, known)
     raise ValueError(f"`scorer` (={name!r}) must be one of {known} or 'package.module:name'{hint}")
 
 
-def _instantiate(name: str, found: Any) -> Scorer:
-    scorer = found() if inspect.isclass(found) else found
-    if not callable(scorer):
-        raise ValueError(f"`scorer` (={name!r}) must be callable, got {type(scorer).__name__}")
-    return scorer
+def _loaded(name: str, load: Callable[[], Any]) -> Any:
+    """What `load` returns; it runs code of the user's own, or of another package."""
+    try:
+        return load()
+    except Exception as error:
+        raise ValueError(
+            f"`scorer` (={name!r}) cannot be loaded: {type(error).__name__}: {error}"
+        ) from error
+
+
+def _instantiate(name: str, found: Any) -> Any:
+    return _loaded(name, found) if inspect.isclass(found) else found
 
 
 def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
@@ -99,7 +107,8 @@ def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
         A composite of one or more parts.
 
     Raises:
-        ValueError: If a name is unknown (the nearest is proposed) or the callable has no domain.
+        ValueError: If a name is unknown (the nearest is proposed) or cannot be loaded (the cause is
+            chained), a weight is not positive, or the callable has no domain.
     """
     if isinstance(spec, CompositeScorer):
         return spec
@@ -107,24 +116,32 @@ def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
         scorer = _find_scorer(spec)
         if isinstance(scorer, CompositeScorer):
             return scorer
-        return CompositeScorer({spec.rpartition(":")[2]: _with_domain(spec, scorer)})
+        return CompositeScorer({_short(spec): scorer})
     if isinstance(spec, Mapping):
-        parts: dict[str, Scorer] = {}
-        for name in spec:
-            parts[name.rpartition(":")[2]] = _with_domain(name, _find_scorer(name))
-        weights = {name.rpartition(":")[2]: float(weight) for name, weight in spec.items()}
-        return CompositeScorer(parts, weights)
+        return _weighted_mean(spec)
     if callable(spec):
         name = getattr(spec, "__name__", type(spec).__name__)
-        return CompositeScorer({name: _with_domain(name, _instantiate(name, spec))})
+        scorer = _instantiate(name, spec)
+        return scorer if isinstance(scorer, CompositeScorer) else CompositeScorer({name: scorer})
     raise ValueError(f"`scorer` (={spec!r}) must be a name, a mapping of weights or a callable")
 
 
-def _with_domain(name: str, scorer: Any) -> Scorer:
-    domain = getattr(scorer, "domain", None)
-    if domain not in ("raw", "srgb"):
-        raise ValueError(f"scorer {name!r} has `domain` (={domain!r}); it must be 'raw' or 'srgb'")
-    return scorer
+def _weighted_mean(spec: Mapping[str, float]) -> CompositeScorer:
+    rule = f"`scorer` (={dict(spec)!r}) must map"
+    if not spec or not all(isinstance(name, str) for name in spec):
+        raise ValueError(f"{rule} one name or more to weights, as {{'noise': 0.5}} does")
+    for weight in spec.values():
+        known = isinstance(weight, Real) and not isinstance(weight, bool)
+        if not (known and 0 < weight < math.inf):
+            raise ValueError(f"{rule} names to weights, which must all be > 0 and finite")
+    if len({_short(name) for name in spec}) < len(spec):
+        raise ValueError(f"{rule} names that differ behind the colon, too")
+    parts = {_short(name): _find_scorer(name) for name in spec}
+    return CompositeScorer(parts, {_short(name): float(w) for name, w in spec.items()})
+
+
+def _short(name: str) -> str:
+    return name.rpartition(":")[2]
 
 
 def scorer_fingerprint(scorer: CompositeScorer) -> str | None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from simulator.camera import get_camera
-from simulator.config_file import load_yaml
+from simulator.config_file import Configuration, load_yaml
 
 
-class StageConfig(BaseModel):
+class StageConfig(Configuration):
     """One stage of the training.
 
     Args:
@@ -22,8 +22,6 @@ class StageConfig(BaseModel):
         crop: Height and width of the crops [packed pixel].
         learning_rate: Peak of a one-cycle schedule (rise over 5 %, cosine fall to 0).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     steps: int | None = Field(default=None, ge=1, le=10_000_000)
     minutes: float | None = Field(default=None, gt=0, le=100_000)
@@ -38,7 +36,7 @@ class StageConfig(BaseModel):
         return self
 
 
-class SceneConfig(BaseModel):
+class SceneConfig(Configuration):
     """What the reference camera photographs.
 
     Args:
@@ -48,14 +46,12 @@ class SceneConfig(BaseModel):
             its subfolders; null leaves them out.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     procedural: int = Field(default=240, ge=1, le=100_000)
     size: int = Field(default=256, ge=32, le=4096)
     radiance: str | None = None
 
 
-class SimulatorConfig(BaseModel):
+class SimulatorConfig(Configuration):
     """A training of the three modules, or of a baseline.
 
     Args:
@@ -69,8 +65,6 @@ class SimulatorConfig(BaseModel):
         exposure, noise, aperture: The three stages of a preset.
         baseline: The stage of ``"pc"`` and ``"dl"``.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: Literal["compact", "paper", "pc", "dl"]
     camera: str = "nikon_z6"

@@ -1,10 +1,9 @@
-"""The command line: what it writes, and what it says when the user errs."""
+"""The command line: what it writes."""
 
 from __future__ import annotations
 
 import csv
 import json
-import logging
 import re
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from typer.testing import CliRunner
 
 from ae_env import cli
 from agents.weights import sibling
-from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
+from simulator import CameraSettings, RawImage, read_raw
 
 COMMANDS = sorted(c.callback.__name__.replace("_", "-") for c in cli.app.registered_commands)
 #: The design's columns of an evaluation, in their order.
@@ -42,39 +41,6 @@ COLUMNS = [
     "captures_per_decision",
     "ms_per_decision",
 ]
-
-
-@pytest.fixture
-def ae_env(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path):
-    """Runs the command line as the console script does, in a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)  # pytest has its own handlers
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        argv = ["ae-env", *map(str, arguments)]
-        monkeypatch.setattr("sys.argv", argv)
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        output = capsys.readouterr()
-        return int(caught.value.code or 0), output.out, output.err
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def raw() -> RawImage:
-    rows, columns = np.mgrid[0:100, 0:120]
-    light = 0.04 + 0.2 * (rows / 100) + 0.1 * ((rows // 20 + columns // 20) % 2)
-    data = np.tile(light.astype(np.float32), (4, 1, 1))
-    settings = CameraSettings(iso=400, exposure_time=1 / 64, f_number=5.6)
-    return RawImage(data, settings, get_camera("nikon_z6"), white_balance=(2.0, 1.0, 1.5))
-
-
-@pytest.fixture
-def dng(raw: RawImage, tmp_path: Path) -> Path:
-    write_dng(tmp_path / "IMG_1.dng", raw)
-    return tmp_path / "IMG_1.dng"
 
 
 def test_every_command_is_there() -> None:
@@ -216,95 +182,3 @@ def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     )
     assert code == 2
     assert "resolution = [4, 36, 36], the environment has [4, 64, 64]" in error
-
-
-SIMULATE = ("--iso", "800", "--shutter", "1/60", "--aperture", "4")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("simulate", "none.dng", *SIMULATE), "`path` (='none.dng') does not exist"),
-        (("simulate", "text.dng", *SIMULATE), "must be a whole raw file"),
-        (("simulate", "empty", *SIMULATE), "`path` (='empty') is a folder"),
-        (("simulate", "picture.png", *SIMULATE), "PNG"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--iso", "-3"), "`iso` (=-3.0) must be"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "fast"), "`shutter` (='fast')"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter=-1"), "`exposure_time` (=-1.0)"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "-o", "text.dng/a.dng"), "text.dng is a file"),
-        (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
-        (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
-        (("sweep", "none.dng"), "does not exist"),
-        (("evaluate", "--policy", "randm"), "did you mean 'random'?"),
-        (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),
-        (("evaluate", "--policy", "none.py:Mine"), "there is no file 'none.py'"),
-        (("evaluate", "--policy", "ppo:none"), "there is no none.safetensors"),
-        (("evaluate", "--policy", "random", "--scenes", "none"), "must name an existing file"),
-        (("evaluate", "--policy", "random", "--scenes", "empty"), "must hold raws"),
-        (("evaluate", "--policy", "random", "--split", "tset"), "did you mean 'test'?"),
-        (("evaluate", "--policy", "random", "--lighting", "disco"), "`lighting` (='disco')"),
-        (("evaluate", "--policy", "random", "--out", "text.dng"), "text.dng is a file"),
-        (("quickstart", "--out", "text.dng"), "text.dng is a file"),
-        (("quickstart", "--scenes", "empty"), "must hold raws"),
-        (("train", "none.yaml"), "there is no such file"),
-        (("train", "bad.py"), "`config` (='bad.py')"),
-        (("train", "wrong.yaml"), "training.frame is unknown"),
-        (("bench", "thruput"), "did you mean 'throughput'?"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
-)
-def test_errors_are_one_line(ae_env, dng: Path, arguments, message, monkeypatch) -> None:
-    folder = dng.parent
-    (folder / "text.dng").write_text("not a raw\n")
-    (folder / "bad.py").write_text("def (:\n")
-    (folder / "empty").mkdir()
-    (folder / "wrong.yaml").write_text("agent: regression\ntraining: {frame: 3}\n")
-    Image.new("RGB", (8, 8)).save(folder / "picture.png")
-    if arguments[0] == "evaluate" and "--scenes" not in arguments:
-        arguments = (*arguments, "--scenes", "bundled:small")
-    before = {path.name for path in folder.iterdir()}
-    code, _, error = ae_env(*arguments)
-    assert code == 2
-    lines = error.strip().splitlines()
-    assert len(lines) == 1, error
-    assert lines[0].startswith("error ")
-    assert message in lines[0]
-    left = {path.name for path in folder.iterdir()} - before
-    assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
-
-
-def test_unwritable_folder(ae_env, dng: Path, tmp_path: Path, monkeypatch) -> None:
-    def refuse(*args: object, **kwargs: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
-    code, _, error = ae_env("sweep", dng, "--out", "locked")
-    assert code == 2
-    assert "`out` (='locked') cannot be written: Permission denied" in error
-
-
-@pytest.mark.parametrize("arguments", [("simulate", "a.dng"), ("evaluate",), ("nonsense",)])
-def test_usage_errors(ae_env, arguments: tuple[str, ...]) -> None:
-    code, _, error = ae_env(*arguments)
-    assert code == 2
-    assert "Usage: ae-env" in error
-
-
-def test_debug_shows_the_traceback(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
-    monkeypatch.setattr("sys.argv", ["ae-env", "--debug", "sweep", "none.dng"])
-    with pytest.raises((ValueError, FileNotFoundError)):
-        cli.main()
-
-
-def test_ctrl_c(ae_env, dng: Path, monkeypatch) -> None:
-    def interrupted(*args: object, **kwargs: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("simulator.read_raw", interrupted)
-    code, _, error = ae_env("sweep", dng)
-    assert code == 130
-    assert error == "\nstopped\n"  # a sweep begins anew

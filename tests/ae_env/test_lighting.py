@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
-from ae_env.lighting import KINDS, Lighting, make_lighting
+from ae_env.lighting import KINDS, MAX_STOPS, Lighting, StepLighting, make_lighting
 
 
 def _gains(spec: object, frames: int = 14, phase: float = 0.0) -> list[float]:
@@ -55,13 +56,38 @@ def test_every_kind_is_made_from_its_name_with_positive_gains(name: str) -> None
     assert all(0 < gain < math.inf for gain in _gains(name, 40, phase=0.3))
 
 
+@pytest.mark.parametrize("stops", [-MAX_STOPS, MAX_STOPS])
+@pytest.mark.parametrize("name", sorted(set(KINDS) - {"static"}))
+def test_the_most_stops_are_finite_in_float32(name: str, stops: int) -> None:
+    gains = np.array(_gains({"kind": name, "stops": stops}, 40), np.float32)
+    assert ((gains >= 2.0**-MAX_STOPS) & (gains <= 2.0**MAX_STOPS)).all()
+
+
+def test_own_lightings_are_checked_too() -> None:
+    with pytest.raises(ValueError, match="stops"):
+        StepLighting(stops=math.inf)
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
         ("stepp", "did you mean 'step'"),
         ({"stops": 3}, "must be one of"),
-        ({"kind": "step", "stop": 3}, "not 'stop'"),
-        ({"kind": "step", "stops": math.nan}, "finite"),
+        ({"kind": "step", "stop": 3}, "not 'stop'; did you mean 'stops'"),
+        ({"kind": "step", "stops": math.nan}, r"`lighting\['stops'\]` \(=nan\) must be a number"),
+        ({"kind": "step", "stops": -2000}, r"`lighting\['stops'\]` \(=-2000\) .*\[-64, 64\]"),
+        ({"kind": "step", "stops": "4"}, r"`lighting\['stops'\]` \(='4'\)"),
+        ({"kind": "step", "stops": [4]}, r"`lighting\['stops'\]`"),
+        ({"kind": "step", "at": True}, r"`lighting\['at'\]` \(=True\) must be an integer"),
+        ({"kind": "step", "at": 1.5}, r"`lighting\['at'\]` \(=1.5\) must be an integer"),
+        ({"kind": "sine", "period": 0}, r"`lighting\['period'\]` \(=0\)"),
+        ({"kind": "sine", "period": -4}, r"`lighting\['period'\]` \(=-4\)"),
+        ({"kind": "ramp", "stops_per_frame": math.inf}, r"`lighting\['stops_per_frame'\]`"),
+        ({"kind": "tunnel", "enter": 5, "leave": 4}, r"'leave'.*\(=4\).*'enter'.*\(=5\)"),
+        ({"kind": "lens_cap", "on": 6}, r"'off'.*\(=5\).*'on'.*\(=6\)"),
+        ({"kind": ["step"]}, "must be one of"),
+        (None, r"`lighting` \(=None\)"),
+        ([("kind", "step")], r"`lighting` \("),
     ],
 )
 def test_bad_lightings_are_refused(spec: object, message: str) -> None:

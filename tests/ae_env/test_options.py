@@ -7,10 +7,14 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+import torch
 
 import ae_env  # noqa: F401  (registers the environment)
 from ae_env.options import EnvOptions
-from simulator import get_camera
+from ae_env.scenes import Scene
+from simulator import CameraSettings, get_camera
+
+STATE = CameraSettings(100.0, 1 / 64, 4.0)
 
 
 @pytest.mark.parametrize(
@@ -102,3 +106,12 @@ def test_scenes_of_ones_own_and_another_camera() -> None:
     env.reset(seed=0)
     assert env.unwrapped.camera.name == "canon_70d"
     assert len(env.unwrapped.scenes) == 2
+
+
+def test_a_black_scene_in_unknown_light_is_refused_by_name() -> None:
+    camera = get_camera("nikon_z6")
+    black = Scene.from_array(torch.zeros(4, 40, 40), STATE, camera, scene_id="cap")
+    with pytest.raises(ValueError, match=r"scene 'cap': `light` is 0 .* give `illuminance`"):
+        EnvOptions(scenes=[black], resolution=36).load_scenes()
+    lit = replace(black, illuminance=10.0)
+    assert EnvOptions(scenes=[lit], resolution=36).load_scenes()[0].ev100 == 2.0

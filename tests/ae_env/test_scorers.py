@@ -251,8 +251,8 @@ def test_scorers_of_other_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     ("spec", "message"),
     [
         ("balancd", "did you mean 'balanced'"),
-        ("no_such_module:Thing", "cannot be imported"),
-        ("ae_env.scorers.terms:Nothing", "cannot be imported"),
+        ("no_such_module:Thing", "cannot be loaded: "),
+        ("ae_env.scorers.terms:Nothing", "cannot be loaded: "),
         ("math:pi", "must be callable"),
         ({}, "weights"),
         ({"noise": 0.0}, "must all be > 0"),

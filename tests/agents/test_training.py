@@ -47,6 +47,11 @@ def test_shipped_configs(path: Path) -> None:
     assert json.loads(json.dumps(config.card())) == config.card()
 
 
+def test_a_seed_out_of_range_is_told_before_the_training() -> None:
+    with pytest.raises(ValueError, match=r"`seed` \(=4294967296\)"):
+        tiny("ppo").with_seed(2**32)
+
+
 def test_there_is_a_config_for_each_agent() -> None:
     assert {load_config(path).agent for path in CONFIGS} == {"regression", "ppo"}
 
@@ -54,11 +59,11 @@ def test_there_is_a_config_for_each_agent() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("agent: ppo\nnum_env: 3", r"num_env \(=3\): Extra inputs are not permitted"),
+        ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
         ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression' or 'ppo'"),
         ("{}", r"agent: Field required"),
-        ("", r"should be a valid dictionary"),
-        ("[1, 2]", r"should be a valid dictionary"),
+        ("", r"is empty: it must have entries"),
+        ("[1, 2]", r"holds \[1, 2\]: it must have entries"),
         ("agent: [", r"is not YAML"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step is unknown.*mean 'n_steps'"),
@@ -68,10 +73,14 @@ def test_there_is_a_config_for_each_agent() -> None:
         ("agent: regression\ntraining: {frames: -1}", r"`frames` \(=-1\) must be in"),
         ("agent: regression\ntraining: {frames: 1.5}", r"training.frames \(=1.5\)"),
         ("agent: ppo\nenvironment: {resolutoin: 64}", r"`resolutoin`.*mean `resolution`"),
-        ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be in"),
+        ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be an integer in"),
         ("agent: ppo\nenvironment: {scorer: balnced}", r"environment: .*balnced"),
         ("agent: ppo\nenvironment: {camera: leica}", r"environment: .*leica"),
-        ("agent: ppo\nenvironment: {costs: 3}", r"environment: "),
+        ("agent: ppo\nenvironment: {costs: 3}", r"environment: `costs` \(=3\) must map"),
+        ("agent: ppo\nenvironment: {lighting: {kind: sine, period: 0}}", r"lighting\['period'\]"),
+        ("agent: ppo\nenvironment: {grid: [1]}", r"environment: `grid` \(=\[1\]\) must be"),
+        ("agent: ppo\nnum_envs: true", r"num_envs \(=True\)"),
+        ("agent: ppo\ntraining: {n_epochs: true}", r"training.n_epochs \(=True\)"),
         ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
         ("agent: ppo\nenvironment: {1: 2}", r"environment.*valid string"),
     ],

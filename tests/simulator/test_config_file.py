@@ -7,7 +7,12 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from simulator.config_file import load_yaml
+from simulator.config_file import Configuration, load_yaml
+
+#: Nine lists of nine, each of the one before: 3 * 10**8 entries where the aliases are followed.
+BOMB = "a0: &a0 [x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
+)
 
 
 class Part(BaseModel):
@@ -49,10 +54,23 @@ def test_the_home_folder_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyP
     [
         ("name: x\npart: {steps: 0}", ["part.steps (=0)", "greater than or equal to 1"]),
         ("name: x\npart: {steps: 3}", ["part.steps (=3): must be even"]),
-        ("name: x\nprat: {steps: 2}", ["prat (={'steps': 2})", "not permitted"]),
+        ("name: x\nprat: {steps: 2}", ["prat (={'steps': 2}): unknown", "did you mean `part`?"]),
         ("part: {}", ["name: Field required; part.steps: Field required"]),
-        ("", ["valid dictionary"]),
-        ("- a\n- b", ["valid dictionary"]),
+        ("name: x\npart: {stesp: 2}", ["part.stesp (=2): unknown", "did you mean `steps`?"]),
+        ("", ["is empty: it must have entries, of name, part"]),
+        ("- a\n- b", ["holds ['a', 'b']: it must have entries"]),
+        ("7", ["holds 7: it must have entries"]),
+        ("name: x\npart: {steps: 2}\nname: y", ["'name' is given twice, again in line 3"]),
+        ("name: x\npart: {steps: 2, steps: 4}", ["'steps' is given twice"]),
+        ("name: " + "[" * 100 + "]" * 100, ["nested deeper than 50"]),
+        ("name: " + "[" * 20_000, ["nested too deeply"]),
+        ("name: &a [*a]", ["nested deeper than 50"]),
+        (BOMB, ["at most 10000 entries"]),
+        ("name: !!int x", ["is not YAML: invalid literal"]),
+        ("name: 2001-13-45", ["is not YAML: month must be"]),
+        ("name: [1]: 2", ["is not YAML"]),
+        ("name: x" + " " * 2**20, ["must not be larger than"]),
+        ("name: true", ["name (=True): Input should be a valid string"]),
         ("name: [", ["is not YAML"]),
         (b"name: \xff\xfe", ["is not YAML"]),
         ("name: !!python/object/apply:os.getcwd []", ["is not YAML"]),  # nothing is executed
@@ -71,7 +89,36 @@ def test_errors_name_file_and_entry_in_one_line(
         assert part in message
 
 
-@pytest.mark.parametrize("name", ["none.yaml", "."])
-def test_a_missing_file_or_a_folder(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ValueError, match="there is no such file"):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("none.yaml", "there is no such file"), (".", "is a folder"), ("x" * 5000, "cannot be read")],
+)
+def test_a_missing_file_or_a_folder(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         load_yaml(tmp_path / name, Whole)
+
+
+def test_an_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: object, **kwargs: object) -> str:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_text", refuse)  # root may read anything
+    with pytest.raises(ValueError, match=r"`config` .*cannot be read: Permission denied"):
+        load(tmp_path, "name: x")
+
+
+def test_aliases_and_merges_work(tmp_path: Path) -> None:
+    text = "name: &n x\npart:\n  <<: {steps: 2}\n"
+    assert load(tmp_path, text) == Whole(name="x", part=Part(steps=2))
+
+
+class Numbers(Configuration):
+    share: float = 0.5
+    steps: int = 1
+
+
+@pytest.mark.parametrize("entry", ["share", "steps"])
+def test_true_is_no_number(tmp_path: Path, entry: str) -> None:
+    (tmp_path / "a.yaml").write_text(f"{entry}: yes\n")
+    with pytest.raises(ValueError, match=rf"{entry} \(=True\): .*not be true or false"):
+        load_yaml(tmp_path / "a.yaml", Numbers)

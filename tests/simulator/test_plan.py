@@ -150,7 +150,9 @@ def test_each_decision_says_what_it_costs() -> None:
     assert (strict.predicted_error, loose.predicted_error) == (0.0, pytest.approx(0.25))
     assert "hardly noisier" in loose.left_out["noise_reduction"]
     assert "(error 0.25)" in loose.explain()
-    assert "0.25 of the target's noise for what is left out (tolerance 0.3)" in loose.explain()
+    assert (
+        "0.25 of the target's noise is due to what is left out (tolerance 0.3)" in loose.explain()
+    )
     # The network that did not run would itself have erred: by BIAS of 5e-3, and GAMMA of 0.2.
     own = math.hypot(BIAS * 5e-3, GAMMA * 0.2) / 4e-3
     assert loose.predicted_difference == pytest.approx(math.hypot(0.25, own), rel=1e-3)

@@ -1,0 +1,45 @@
+"""The command line in a folder of its own, and a raw to give it."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ae_env import cli
+from simulator import CameraSettings, RawImage, get_camera, write_dng
+
+
+@pytest.fixture
+def ae_env(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Runs the command line as the console script does, in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)  # pytest has its own handlers
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        argv = ["ae-env", *map(str, arguments)]
+        monkeypatch.setattr("sys.argv", argv)
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        output = capsys.readouterr()
+        return int(caught.value.code or 0), output.out, output.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def raw() -> RawImage:
+    rows, columns = np.mgrid[0:100, 0:120]
+    light = 0.04 + 0.2 * (rows / 100) + 0.1 * ((rows // 20 + columns // 20) % 2)
+    data = np.tile(light.astype(np.float32), (4, 1, 1))
+    settings = CameraSettings(iso=400, exposure_time=1 / 64, f_number=5.6)
+    return RawImage(data, settings, get_camera("nikon_z6"), white_balance=(2.0, 1.0, 1.5))
+
+
+@pytest.fixture
+def dng(raw: RawImage, tmp_path: Path) -> Path:
+    write_dng(tmp_path / "IMG_1.dng", raw)
+    return tmp_path / "IMG_1.dng"
