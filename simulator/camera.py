@@ -10,6 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib import resources
+from numbers import Integral, Real
+
+#: Variances beyond it are limited: float32 holds their sums over a frame of any signals.
+VARIANCE_LIMIT = 1e24
 
 
 class BayerPattern(StrEnum):
@@ -80,9 +84,12 @@ class NoiseLevelFunction:
         return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
 
     def exposed(self, ratio: float) -> NoiseLevelFunction:
-        """NLF of this noise after the raw was multiplied by `ratio` (paper, section 3.2)."""
-        shot = tuple(v * ratio for v in self.shot)
-        read = tuple(v * ratio * ratio for v in self.read)
+        """NLF of this noise after the raw was multiplied by `ratio` (paper, section 3.2).
+
+        No variance exceeds `VARIANCE_LIMIT`.
+        """
+        shot = tuple(min(v * ratio, VARIANCE_LIMIT) for v in self.shot)
+        read = tuple(min(v * ratio * ratio, VARIANCE_LIMIT) for v in self.read)
         return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
 
 
@@ -96,7 +103,7 @@ class CameraProfile:
         model: Model as EXIF spells it.
         cfa: Order of the colour filter array.
         black_level: Digital number of no light, per plane R, G1, G2, B.
-        white_level: Digital number at which the sensor saturates.
+        white_level: Digital number at which the sensor saturates, whole.
         bit_depth: Bits per sample of its raw files.
         nlf_by_iso: Calibrated noise level function by ISO; empty if unknown.
         segments: ISO at which a new conversion-gain segment begins; interpolation never crosses it.
@@ -128,19 +135,21 @@ class CameraProfile:
         except ValueError:
             known = ", ".join(p.value for p in BayerPattern)
             raise ValueError(f"`cfa` (={self.cfa!r}) must be one of {known}") from None
-        given: float | Sequence[float] = self.black_level
-        black = (float(given),) * 4 if isinstance(given, int | float) else tuple(map(float, given))
+        given = self.black_level
+        black = (float(given),) * 4 if isinstance(given, Real) else tuple(map(float, given))
         if len(black) != 4:
             raise ValueError(f"`black_level` (={black}) must be one number or 4 (R, G1, G2, B)")
         object.__setattr__(self, "black_level", black)
-        if not 1 <= self.bit_depth <= 16:
-            raise ValueError(f"`bit_depth` (={self.bit_depth}) must be in [1, 16]")
+        if not isinstance(self.bit_depth, Integral) or not 1 <= self.bit_depth <= 16:
+            raise ValueError(f"`bit_depth` (={self.bit_depth!r}) must be an integer in [1, 16]")
         if not all(0 <= b < self.white_level for b in black):
             raise ValueError(
                 f"`white_level` (={self.white_level}) must be above every black level (={black})"
             )
         if self.white_level > 2**16 - 1:
             raise ValueError(f"`white_level` (={self.white_level}) must fit in 16 bits")
+        if self.white_level != round(self.white_level):
+            raise ValueError(f"`white_level` (={self.white_level}) must be a whole number")
 
     @property
     def span(self) -> tuple[float, float, float, float]:
@@ -175,7 +184,7 @@ class CameraProfile:
                 f"camera {self.name!r} has no noise calibration; give `nlf`, or estimate one with "
                 "simulator.estimate_nlf"
             )
-        if not (math.isfinite(iso) and iso > 0):
+        if not (isinstance(iso, Real) and math.isfinite(iso) and iso > 0):
             raise ValueError(f"`iso` (={iso!r}) must be positive and finite")
         return _interpolate_nlf(self, float(iso))
 
@@ -241,7 +250,7 @@ def get_camera(name: str) -> CameraProfile:
     """
     try:
         return _built_in()[name]
-    except KeyError:
+    except (KeyError, TypeError):  # a list cannot be looked up
         known = list_cameras()
         near = difflib.get_close_matches(str(name), known, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from simulator.blur import disc_blur, motion_blur
-from simulator.camera import CameraProfile
+from simulator.camera import VARIANCE_LIMIT, CameraProfile
 from simulator.exposure import LATENT_LIMIT, SIGNAL_LIMIT, Exposure
 from simulator.frame_noise import FrameNoise, Noise
 from simulator.noise import noise_variance
@@ -217,14 +217,14 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
 
     in_shares(balance, 4, threads=None if len(parts) > 4 else 1)
     count = light.numel()
-    return NoiseBalance(
-        abs(float(relative.sum())) / count, abs(float(excess.sum())) / count, bool(is_short.any())
-    )
+    share = min(abs(float(relative.sum())) / count, VARIANCE_LIMIT)  # finite over no noise, too
+    return NoiseBalance(share, abs(float(excess.sum())) / count, bool(is_short.any()))
 
 
 def _relative_excess(missing: torch.Tensor, wanted: torch.Tensor) -> float:
     relative = missing / wanted.clamp_(min=_TINY)
-    return max(0.0, -float(relative.clamp_(max=0.0).mean(dtype=torch.float64)))
+    share = -float(relative.clamp_(max=0.0).mean(dtype=torch.float64))
+    return min(max(0.0, share), VARIANCE_LIMIT)
 
 
 def _planes(values: list[tuple[float, float, float, float]]) -> torch.Tensor:

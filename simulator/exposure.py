@@ -17,6 +17,8 @@ SIGNAL_LIMIT = 1e6
 #: Light beyond this many times the reference's white is clipped before it is blurred: it is white
 #: at every exposure, and sums of larger numbers would no longer resolve the shadows.
 LATENT_LIMIT = 1e9
+#: Exposure ratios beyond it are limited: float32 must hold them, and any two settings keep below.
+RATIO_LIMIT = 2.0**107
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ DEMOSAICS = ("half", "malvar")
 TONES = ("linear", "photographic")
 
 _SRGB_TOE = 0.0031308
+_LARGEST_GAIN = 2.0**32  # of a plane against another: float32 holds its product with any code
 _CHUNK = 2**18  # elements
 
 Gains = torch.Tensor | np.ndarray | Sequence[float]
@@ -70,7 +71,8 @@ def develop(
     check_name("tone", tone, TONES)
     gains = _check_gains(white_balance, images)
     encoded = torch.empty(len(images), 3, *images.shape[2:], device=images.device)
-    # A few images at a time stay in the CPU's cache: twice as fast, and the same bits.
+    # A few images at a time stay in the CPU's cache: twice as fast, and the
+    # same up to the last bits of float32, which depend on a pixel's place in the array.
     step = max(1, _CHUNK // images[0].numel()) if images.device.type == "cpu" else len(images)
     for start in range(0, len(images), step):
         part = slice(start, start + step)
@@ -213,7 +215,7 @@ def _check_gains(white_balance: Gains, images: torch.Tensor) -> torch.Tensor:
         )
     if not bool((torch.isfinite(gains) & (gains > 0)).all()):
         raise ValueError(f"`white_balance` (={gains.tolist()}) must be positive and finite")
-    gains = gains / gains.amin(dim=-1, keepdim=True)
+    gains = (gains / gains.amin(dim=-1, keepdim=True)).clamp_(max=_LARGEST_GAIN)
     return gains[..., [0, 1, 1, 2]].expand(len(images), 4)[..., None, None]
 
 

@@ -17,7 +17,7 @@ from simulator.blur_shapes import kernel_energy
 from simulator.camera import CameraProfile, NoiseLevelFunction
 from simulator.capture import exposed_light, noise_balance, record, record_batch
 from simulator.denoised import Denoised
-from simulator.exposure import Exposure
+from simulator.exposure import RATIO_LIMIT, Exposure
 from simulator.frame_noise import FrameNoise, Noise, check_noise, sweep_keys
 from simulator.light_statistics import LightStatistics
 from simulator.opening import Opening
@@ -120,7 +120,7 @@ class Latent:
         if not isinstance(settings, CameraSettings):
             raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
         f_number = settings.effective_f_number
-        ratio = self.gain * exposure_ratio(self.reference, settings)
+        ratio = min(self.gain * exposure_ratio(self.reference, settings), RATIO_LIMIT)
         target = _averaged_nlf(self.camera, settings.iso, self.box_factor)
         budget = Budget(self.tolerance)
         added_px = self.optics.added_blur(f_number)

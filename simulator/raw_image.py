@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -160,6 +161,8 @@ class RawImage:
         if len(gains) != 3 or not all(np.isfinite(g) and g > 0 for g in gains):
             raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
         object.__setattr__(self, "white_balance", gains)
+        if not isinstance(self.box_factor, Integral) or self.box_factor < 1:
+            raise ValueError(f"`box_factor` (={self.box_factor!r}) must be an integer >= 1")
 
     @classmethod
     def from_mosaic(

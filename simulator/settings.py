@@ -60,7 +60,7 @@ class CameraSettings:
             value = getattr(self, name)
             try:
                 number = math.nan if isinstance(value, str | bytes | bool) else float(value)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 number = math.nan
             if not low <= number <= high:
                 raise ValueError(f"`{name}` (={value!r}) must be a number in [{low:g}, {high:g}]")
@@ -136,7 +136,7 @@ def incident_ev100(illuminance: float) -> float:
     >>> round(incident_ev100(20_000), 1)
     13.0
     """
-    if not (math.isfinite(illuminance) and illuminance > 0):
+    if not (math.isfinite(illuminance) and illuminance / LUX_AT_EV0 > 0):
         raise ValueError(f"`illuminance` (={illuminance!r}) must be positive and finite")
     return math.log2(illuminance / LUX_AT_EV0)
 

@@ -5,8 +5,25 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
 import torch
+
+# Property tests run the same examples every time, keep none, and may wait for a kernel to compile;
+# HYPOTHESIS_EXAMPLES asks for more of them.
+hypothesis.settings.register_profile(
+    "tests",
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=int(os.environ.get("HYPOTHESIS_EXAMPLES", "25")),
+    print_blob=True,
+    suppress_health_check=[
+        hypothesis.HealthCheck.function_scoped_fixture,  # the cache's folder serves all examples
+        hypothesis.HealthCheck.too_slow,
+    ],
+)
+hypothesis.settings.load_profile("tests")
 
 torch.set_num_threads(min(2, torch.get_num_threads()))
 

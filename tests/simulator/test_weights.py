@@ -75,7 +75,7 @@ def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
     content = bytearray(file.read_bytes())
     content[position] ^= 1
     file.write_bytes(content)
-    with pytest.raises(ValueError, match=r"hash .* must be the model card's"):
+    with pytest.raises(ValueError, match=r"the hash of net-0.5.safetensors .* train or copy"):
         load_modules(saved)
 
 
@@ -123,7 +123,10 @@ def test_a_missing_file_is_named(saved: Path, ending: str) -> None:
     ("card", "message"),
     [
         ("{", "is damaged"),
-        ("[]", "must be a model card of format"),
+        ("[" * 10**6, "net-0.5.json is damaged"),
+        ("[]", "must hold a JSON object"),
+        ('{"format": [1]}', r"model card of format 1, got \[1\]"),
+        ('{"format": 1}', "must hold the hash, `sha256`"),
         ('{"format": 0}', "must be a model card of format"),
     ],
 )
@@ -133,11 +136,22 @@ def test_damaged_cards(saved: Path, card: str, message: str) -> None:
         load_modules(saved)
 
 
-def test_an_unknown_preset_in_the_card(saved: Path) -> None:
+@pytest.mark.parametrize("preset", ["huge", None, ["compact"], {"compact": 1}])
+def test_an_unknown_preset_in_the_card(saved: Path, preset: Any) -> None:
     card: dict[str, Any] = json.loads(beside(saved, ".json").read_text())
-    beside(saved, ".json").write_text(json.dumps({**card, "preset": "huge"}))
-    with pytest.raises(ValueError, match="unknown preset 'huge'"):
+    beside(saved, ".json").write_text(json.dumps({**card, "preset": preset}))
+    with pytest.raises(ValueError, match=re.escape(f"unknown preset {preset!r}")):
         load_modules(saved)
+
+
+def test_modules_that_are_not_finite_are_not_saved(saved: Path) -> None:
+    before = beside(saved, ".safetensors").read_bytes()
+    broken = build_modules("compact")
+    with torch.no_grad():
+        next(broken.parameters()).fill_(torch.inf)
+    with pytest.raises(ValueError, match="must be finite: their training has failed"):
+        save_modules(saved, broken, "compact", {})
+    assert beside(saved, ".safetensors").read_bytes() == before
 
 
 @pytest.fixture
