@@ -28,6 +28,7 @@ format: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/ae-env bench scorers
 	$(BIN)/ae-env bench throughput
+	$(BIN)/ae-env bench stability
 	@echo "error against time (about 20 minutes, and an hour once for the networks to compare with): $(BIN)/ae-env bench work-precision"
 	@echo "the simulator against the reference camera (trains the networks to compare with: about 1.5 hours): $(BIN)/ae-env bench simulator"
 	@echo "the agents' long training (about an hour): $(BIN)/ae-env bench agents"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import logging
 import shlex
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,8 +15,10 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 
+from ae_env.checks import UserCodeError, check_word
 from ae_env.console import (
     Device,
+    OwnSeed,
     Seed,
     command_line,
     console,
@@ -36,17 +38,20 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`.",
+    epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
 )
 BENCHMARKS = (
-    *("agents", "brackets", "colour_checker", "scorers", "simulator", "throughput"),
-    "work-precision",
+    *("agents", "brackets", "colour_checker", "scorers", "simulator", "stability"),
+    *("throughput", "work-precision"),
 )
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
 #: Commands that go on where they were stopped.
 _RESUMING = ("quickstart", "train", "train-simulator", "bench")
-#: Exit status after Ctrl-C.
-_INTERRUPTED = 130
+#: Errors about what the user gave.
+_USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
+#: Exit status after Ctrl-C, and after SIGTERM.
+_INTERRUPTED, _TERMINATED = 130, 143
 
 Scenes = Annotated[
     str, typer.Option(help="'bundled', or a folder or file of raws or .hdr/.exr radiance maps.")
@@ -54,28 +59,43 @@ Scenes = Annotated[
 
 
 def main() -> None:
-    """Runs the command line; errors of the user's become one line and exit status 2."""
+    """Runs the command line.
+
+    An error becomes one line, and exit status 2 where it is about what the user gave (options,
+    files), 1 where something failed while running; Ctrl-C gives 130, SIGTERM 143.
+    """
     logging.basicConfig(
         level=logging.WARNING,
         format="%(message)s",
         handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
     )
+    signal.signal(signal.SIGTERM, _terminate)
     try:
         app(prog_name="ae-env")
-    except (ValueError, OSError, ImportError, SyntaxError) as error:
+    except Exception as error:
         if "--debug" in sys.argv:
             raise
-        text = " ".join(str(error).split())
-        Console(stderr=True).print(f"[bold red]error[/] {escape(text)}", soft_wrap=True)
-        raise SystemExit(2) from None
+        Console(stderr=True).print(f"[bold red]error[/] {escape(_one_line(error))}", soft_wrap=True)
+        usage = isinstance(error, _USAGE) and not isinstance(error, UserCodeError)
+        raise SystemExit(2 if usage else 1) from None
     except SystemExit as stop:
-        if stop.code == _INTERRUPTED:  # what Typer makes of Ctrl-C
-            resumes = any(
-                name in sys.argv[1:] for name in ("quickstart", "train", "train-simulator", "bench")
-            )
+        if stop.code in (_INTERRUPTED, _TERMINATED):  # the first is what Typer makes of Ctrl-C
+            resumes = any(name in sys.argv[1:] for name in _RESUMING)
             more = "; the same command goes on where it was" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
         raise
+
+
+def _terminate(*_: Any) -> None:
+    """Lets SIGTERM end a command as Ctrl-C does: a training writes its checkpoint first."""
+    raise SystemExit(_TERMINATED)
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    if isinstance(error, ValueError | OSError | ImportError):
+        return text
+    return f"{type(error).__name__}: {text}; `ae-env --debug` shows where"
 
 
 @app.callback()
@@ -125,7 +145,7 @@ def train(
     out: Annotated[Path, typer.Option(help="File name of the agent, without suffix.")] = Path(
         "runs/agent"
     ),
-    seed: Annotated[int | None, typer.Option(help="Instead of the YAML's.", min=0)] = None,
+    seed: OwnSeed = None,
     device: Device = "cpu",
     tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
 ) -> None:
@@ -136,11 +156,12 @@ def train(
     from agents.training import load_config, train_agent
     from agents.weights import sibling
 
+    device = torch_device(device)
     agent = load_config(config)
-    make_folder(sibling(out, ".json").parent)
+    file = sibling(out, ".json")
+    make_folder(file.parent, file=file)
     if seed is not None:
         agent = agent.with_seed(seed)
-    device = torch_device(device)
     with progress_bars() as progress, progress(f"training {agent.agent}") as task:
 
         def report(done: int, total: int, values: dict[str, float]) -> None:
@@ -187,9 +208,9 @@ def evaluate(
         "sensors": sensors,
         "resolution": resolution,
     }
+    device = torch_device(device)
     envs = make_envs(options, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
-    device = torch_device(device)
     policies = {name: make_policy(name, context, device=device) for name in policy}
     make_folder(out)
     training = {**options, "scenes": training_scenes(scenes)[0], "lighting": "static", "delay": 0}
@@ -222,10 +243,7 @@ def bench(
 
     Example: `ae-env bench throughput --quick --out /tmp/results`
     """
-    if name not in BENCHMARKS:
-        near = difflib.get_close_matches(name, BENCHMARKS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"`name` (={name!r}) must be one of {list(BENCHMARKS)}{hint}")
+    check_word("name", name, BENCHMARKS)
     package = f"benchmarks.{name.replace('-', '_')}"
     sys.path.insert(0, str(Path.cwd()))
     try:

@@ -18,8 +18,9 @@ from agents.training import AgentConfig, is_trained, train_agent
 
 #: Seconds between two looks at the queue.
 _PATIENCE = 0.2
-#: In a worker: set when it is to end.
+#: In a worker: set when it is to end, and where its progress goes.
 _stop: Any = None
+_messages: Any = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def train_in_parallel(
 
     Raises:
         KeyboardInterrupt: After Ctrl-C; every job has its checkpoint, the same call resumes.
+        SystemExit: Of status 143, where a worker gets SIGTERM; likewise.
     """
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
     if not waiting:
@@ -64,18 +66,12 @@ def train_in_parallel(
     workers = min(workers or cores, len(waiting))
     threads = max(1, cores // workers)
     context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    with (
-        context.Manager() as manager,
-        ProcessPoolExecutor(
-            workers, mp_context=context, initializer=_obey, initargs=(stop,)
-        ) as executor,
-    ):
-        messages = manager.Queue()
+    stop, messages = context.Event(), context.Queue()
+    with ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_obey, initargs=(stop, messages)
+    ) as executor:
         with _interrupts_ignored():
-            running: set[Future[None]] = {
-                executor.submit(_train, job, threads, messages) for job in waiting
-            }
+            running: set[Future[None]] = {executor.submit(_train, job, threads) for job in waiting}
         try:
             while running:
                 done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
@@ -101,10 +97,32 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _obey(stop: Any) -> None:
-    """Begins a worker, which ends its training when `stop` is set."""
-    global _stop
-    _stop = stop
+def _obey(stop: Any, messages: Any) -> None:
+    """Begins a worker, which ends its training when `stop` is set, or at SIGTERM.
+
+    It does not outlive the process that began it.
+    """
+    global _stop, _messages
+    _stop, _messages = stop, messages
+    messages.cancel_join_thread()  # nobody reads the last ones of a training that is stopped
+    signal.signal(signal.SIGTERM, _terminate)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+
+
+def _follow_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _terminate(*_: Any) -> None:
+    """Handler that lets SIGTERM end a training as Ctrl-C does: its checkpoint is written first.
+
+    Raises:
+        SystemExit: Of status 143, as shells call a process that SIGTERM ended.
+    """
+    raise SystemExit(128 + signal.SIGTERM)
 
 
 def _deliver(messages: Any, progress: Callable[..., None] | None) -> None:
@@ -117,7 +135,7 @@ def _deliver(messages: Any, progress: Callable[..., None] | None) -> None:
             progress(*message)
 
 
-def _train(job: TrainingJob, threads: int, messages: Any) -> None:
+def _train(job: TrainingJob, threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
@@ -129,7 +147,7 @@ def _train(job: TrainingJob, threads: int, messages: Any) -> None:
             raise KeyboardInterrupt
         if done == total or done - last >= total // 200:
             last = done
-            messages.put((job.name, done, total, values))
+            _messages.put((job.name, done, total, values))
 
     if _stop is None or not _stop.is_set():
         train_agent(job.config, job.out, progress=report, device=job.device)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -22,12 +22,13 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from ae_env.grid import ExposureGrid
+from agents.history import History
 from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.ranges import check_ranges
 from agents.sb3_adapter import SB3VectorAdapter
-from agents.weights import describe_context, save_agent
+from agents.weights import MAX_WIDTH, describe_context, save_agent
 from simulator.checkpoint import Checkpoint
 
 
@@ -155,7 +156,7 @@ class PPOTraining:
             ent_coef=(0.0, 1e6),
             vf_coef=(0.0, 1e6),
             max_grad_norm=(1e-9, 1e9),
-            width=(1, 65536),
+            width=(1, MAX_WIDTH),
             seed=(0, 2**32 - 1),
         )
 
@@ -199,14 +200,17 @@ class _TrainingCallback(BaseCallback):
         self,
         training: PPOTraining,
         store: Checkpoint,
+        history: History,
         progress: Callable[[int, int, dict[str, float]], None] | None,
     ) -> None:
         super().__init__()
         self.training, self.store, self.progress = training, store, progress
-        self.updated = 0  # frames that the policy has learnt from
+        self.history = history
+        self.updated: int | None = None  # frames learnt from; None within an update
         self._rewards: list[float] = []
 
     def _on_step(self) -> bool:
+        self.history.add(self.locals["actions"])
         self._rewards.append(float(np.mean(self.locals["rewards"])))
         if self.progress is not None:
             recent = float(np.mean(self._rewards[-50:]))
@@ -216,8 +220,12 @@ class _TrainingCallback(BaseCallback):
     def _on_rollout_start(self) -> None:
         done = self.num_timesteps / self.training.total_timesteps
         self.model.ent_coef = self.training.ent_coef * (1.0 - 0.9 * min(done, 1.0))  # type: ignore[attr-defined]
+        self.history.mark(**_random_state(self.model.device))
         self.updated = self.num_timesteps
         self.store.save(self.updated)
+
+    def _on_rollout_end(self) -> None:
+        self.updated = None
 
 
 def train_ppo(
@@ -234,7 +242,8 @@ def train_ppo(
     Args:
         envs: Vector environments.
         training: Hyperparameters.
-        checkpoint: Where to keep the state of the training; a second run resumes there.
+        checkpoint: Where to keep the state of the training; a second run goes on there and ends
+            with the weights that the first would have ended with.
         progress: Called with frames done, frames in all, and the mean reward.
         device: Torch device of the network.
         identity: JSON value; the checkpoint of a training with another one is not resumed. By
@@ -262,25 +271,53 @@ def train_ppo(
         seed=training.seed,
         device=device,
     )
+    history = History(envs.num_envs)
     store = Checkpoint(
         checkpoint,
-        {"policy": model.policy, "optimiser": model.policy.optimizer},
+        {"policy": model.policy, "optimiser": model.policy.optimizer, "history": history},
         identity=identity or asdict(training),
     )
     done = store.restore()
     model.num_timesteps = done
-    if done:  # a resumed run sees other episodes than the first
-        model.env.seed(training.seed + done)  # type: ignore[union-attr]
     remaining = training.total_timesteps - done
     if remaining > 0:
-        callback = _TrainingCallback(training, store, progress)
+        if done:
+            _resume(model, history)
+        callback = _TrainingCallback(training, store, history, progress)
         try:
             model.learn(remaining, callback=callback, reset_num_timesteps=done == 0)
-        except KeyboardInterrupt:
-            store.save(callback.updated, force=True)
+        except (KeyboardInterrupt, SystemExit):
+            if callback.updated is not None:
+                store.save(callback.updated, force=True)
             raise
     store.save(model.num_timesteps, force=True)
     return model.policy  # type: ignore[return-value]
+
+
+def _resume(model: PPO, history: History) -> None:
+    """Takes the environments and the random generators to where the history was marked."""
+    envs = cast(SB3VectorAdapter, model.env)
+    observations, starts = envs.reset(), np.ones(envs.num_envs, dtype=bool)
+    for actions in history.actions:
+        observations, _, starts, _ = envs.step(actions)
+    model._last_obs, model._last_episode_starts = observations, starts
+    marked = history.marked
+    words = {"key": marked["numpy_key"].numpy().astype(np.uint32), "pos": marked["numpy_pos"]}
+    np.random.set_state({"bit_generator": "MT19937", "state": words})  # noqa: NPY002
+    torch.set_rng_state(marked["torch"])
+    if model.device.type == "cuda":
+        torch.cuda.set_rng_state(marked["cuda"], model.device)
+
+
+def _random_state(device: torch.device) -> dict[str, Any]:
+    """The global generators that SB3 draws from: torch's for actions, numpy's for batches."""
+    words: Any = np.random.get_state(legacy=False)["state"]  # type: ignore[call-overload]  # noqa: NPY002
+    state = {
+        "torch": torch.get_rng_state(),
+        "numpy_key": torch.from_numpy(words["key"].astype(np.int64)),
+        "numpy_pos": int(words["pos"]),
+    }
+    return state | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
 
 
 def save_ppo(

@@ -7,11 +7,12 @@ each weighted by the network's own confidence.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -20,11 +21,13 @@ from numpy.typing import NDArray
 from torch import nn
 
 from ae_env.grid import ExposureGrid
+from agents.history import History
 from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.ranges import check_ranges
-from agents.weights import describe_context, save_agent
+from agents.weights import MAX_WIDTH, describe_context, save_agent
+from simulator.checkpoint import Checkpoint
 
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
@@ -101,6 +104,15 @@ class RegressionPolicy(NetworkPolicy):
         self._precision += precision
         return masked_argmax(self._weighted / self._precision, action_masks)
 
+    @property
+    def accumulated(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What the episodes so far add up to, (N, S) each: weighted scores, and their weights."""
+        return self._weighted, self._precision
+
+    @accumulated.setter
+    def accumulated(self, values: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
+        self._weighted, self._precision = (np.array(own) for own in values)
+
     def forget(self, done: NDArray[np.bool_]) -> None:
         """Begins anew in those environments whose episode is over."""
         self._weighted[done] = 0.0
@@ -143,7 +155,7 @@ class RegressionTraining:
             replay=(0, 64),
             memory=(1, 1e9),
             explore=(0.0, 1.0),
-            width=(1, 65536),
+            width=(1, MAX_WIDTH),
             dropout=(0.0, 0.99),
             seed=(0, 2**63),
         )
@@ -163,8 +175,8 @@ def train_regression(
     Args:
         envs: Vector environments.
         training: Hyperparameters.
-        checkpoint: Where to keep the state of the training every half a minute or so; a second run
-            resumes there.
+        checkpoint: Where to keep the state of the training, three times a minute or so; a second
+            run goes on there and ends with the weights that the first would have ended with.
         progress: Called with frames done, frames in all, and losses.
         device: Torch device of the network.
         identity: JSON value; the checkpoint of a training with another one is not resumed. By
@@ -173,8 +185,6 @@ def train_regression(
     Returns:
         The trained network.
     """
-    from simulator.checkpoint import Checkpoint
-
     context = PolicyContext.from_envs(envs)
     with _seeded("cpu", training.seed):
         network = ScoreRegressor(
@@ -188,33 +198,41 @@ def train_regression(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, max_lr=training.learning_rate, total_steps=steps + 1, pct_start=0.1
     )
+    history = History(envs.num_envs)
     store = Checkpoint(
         checkpoint,
-        {"network": network, "optimiser": optimiser, "schedule": schedule},
+        {"network": network, "optimiser": optimiser, "schedule": schedule, "history": history},
         identity=identity or asdict(training),
     )
-    first = store.restore()
-    frames = _rollout(envs, RegressionPolicy(context, network=network), training, first)
-    replay = _Replay(training, np.random.default_rng([training.seed, first, 1]))
-    done = first
+    done = store.restore()
+    rollout = _Rollout(envs, RegressionPolicy(context, network=network), training, history)
+    if 0 < done < steps:
+        rollout.resume()
+    whole = True  # no step is half done
     try:
-        for step in range(first, steps):
-            observations, target = replay.batch(*next(frames))
+        while done < steps:
+            observations, target = rollout.batch()
             network.train()
-            with _seeded(device, training.seed, step):  # dropout draws from the global generator
+            with _seeded(device, training.seed, done):  # dropout draws from the global generator
                 loss, error = _loss(network, observations, target)
+            if not math.isfinite(error):
+                raise ValueError(f"the loss (={error}) must be finite; lower `learning_rate`")
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            whole = False
             optimiser.step()
             schedule.step()
-            done = step + 1
+            done += 1
+            rollout.mark()
+            whole = True
             network.eval()
             if progress is not None:
                 progress(done * envs.num_envs, steps * envs.num_envs, {"mse": error})
             store.save(done)
-    except KeyboardInterrupt:
-        store.save(done, force=True)
+    except (KeyboardInterrupt, SystemExit):
+        if whole:
+            store.save(done, force=True)
         raise
     store.save(steps, force=True)
     return network
@@ -259,7 +277,6 @@ class _Replay:
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
         """The new frames and some old ones."""
         new = {**observations, "target": target}
-        count = max(1, self.training.memory // len(target))
         parts = [new]
         for _ in range(min(self.training.replay, len(self.memory))):
             chosen = [self.memory[i] for i in self.rng.integers(len(self.memory), size=4)]
@@ -270,28 +287,83 @@ class _Replay:
             if self.rng.random() < 0.5:
                 mixed["raw"] = mixed["raw"][..., ::-1]
             parts.append(mixed)
-        self.memory = [*self.memory, new][-count:]
+        self.remember(observations, target)
         merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
         return merged, merged.pop("target")
 
+    def remember(self, observations: Observations, target: NDArray[np.float64]) -> None:
+        """Keeps the new frames, and forgets the oldest beyond the memory."""
+        count = self.batches(len(target))
+        self.memory = [*self.memory, {**observations, "target": target}][-count:]
 
-def _rollout(
-    envs: gym.vector.VectorEnv, policy: RegressionPolicy, training: RegressionTraining, first: int
-) -> Iterator[tuple[Observations, NDArray[np.float64]]]:
+    def batches(self, num_envs: int) -> int:
+        """How many steps of that many frames are remembered."""
+        return max(1, self.training.memory // num_envs)
+
+
+class _Rollout:
     """Frames and the scores of all states, from episodes that the policy itself drives."""
-    base: Any = envs.unwrapped
-    rng = np.random.default_rng([training.seed, first])
-    observations, _ = envs.reset(seed=int(rng.integers(2**31)))
-    policy.reset(envs.num_envs)
-    while True:
-        yield observations, base.expected_scores()
-        actions = policy.act(observations)
-        random = rng.random(envs.num_envs) < training.explore
-        actions = np.where(
-            random, rng.integers(len(policy.context.grid), size=len(actions)), actions
+
+    def __init__(
+        self,
+        envs: gym.vector.VectorEnv,
+        policy: RegressionPolicy,
+        training: RegressionTraining,
+        history: History,
+    ) -> None:
+        self.envs, self.policy, self.history = envs, policy, history
+        self.explore, self.base = training.explore, cast(Any, envs.unwrapped)
+        self.rng = np.random.default_rng([training.seed, 0])
+        self.replay = _Replay(training, np.random.default_rng([training.seed, 0, 1]))
+        self.observations: Observations | None = None
+
+    def batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
+        """The next frame of every episode, with its scores, and some earlier ones."""
+        if self.observations is None:
+            self._reset()
+        else:
+            actions = self.policy.act(self.observations)
+            random = self.rng.random(len(actions)) < self.explore
+            others = self.rng.integers(len(self.policy.context.grid), size=len(actions))
+            self.policy.forget(self._step(np.where(random, others, actions)))
+        return self.replay.batch(self._shown(), self.base.expected_scores())
+
+    def mark(self) -> None:
+        """Makes this moment the one that a checkpoint holds."""
+        weighted, precision = self.policy.accumulated
+        self.history.mark(
+            rng=self.rng.bit_generator.state,
+            replay_rng=self.replay.rng.bit_generator.state,
+            weighted=torch.tensor(weighted),
+            precision=torch.tensor(precision),
         )
-        observations, _, terminated, truncated, _ = envs.step(actions)
-        policy.forget(terminated | truncated)
+
+    def resume(self) -> None:
+        """Goes to the moment of the history's mark."""
+        past, marked = self.history.actions, self.history.marked
+        self.history.actions = []
+        self._reset()
+        for left in range(len(past), -1, -1):
+            if left < self.replay.batches(self.envs.num_envs):
+                self.replay.remember(self._shown(), self.base.expected_scores())
+            if left:
+                self._step(past[-left])
+        self.rng.bit_generator.state = marked["rng"]
+        self.replay.rng.bit_generator.state = marked["replay_rng"]
+        self.policy.accumulated = marked["weighted"].numpy(), marked["precision"].numpy()
+
+    def _reset(self) -> None:
+        self.observations, _ = self.envs.reset(seed=int(self.rng.integers(2**31)))
+        self.policy.reset(self.envs.num_envs)
+
+    def _step(self, actions: NDArray[Any]) -> NDArray[np.bool_]:
+        self.history.add(actions)
+        self.observations, _, terminated, truncated, _ = self.envs.step(actions)
+        return terminated | truncated
+
+    def _shown(self) -> Observations:
+        assert self.observations is not None
+        return self.observations
 
 
 def save_regression(

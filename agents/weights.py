@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from agents.policy import PolicyContext
-from simulator.files import sibling, write_atomically
+from simulator.files import sibling
+from simulator.weights import check_finite, read_pair, write_pair
 
 FORMAT_VERSION = 1
-#: What every card says.
-_ENTRIES = ("width", "context", "training", "aliases")
+#: What every card says, and of what type.
+_ENTRIES = {"width": int, "context": dict, "training": dict, "aliases": dict}
+#: Most hidden features of a network.
+MAX_WIDTH = 65536
 
 
 def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, Any]) -> None:
@@ -27,6 +29,9 @@ def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, 
         kind: ``"regression"`` or ``"ppo"``.
         module: Its state is stored.
         description: JSON values: what the agent expects to observe and how it was trained.
+
+    Raises:
+        ValueError: If the weights are not finite; nothing is written then.
     """
     tensors: dict[str, Tensor] = {}
     aliases: dict[str, str] = {}  # SB3's policies hold one features extractor under three names
@@ -37,9 +42,10 @@ def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, 
             tensors[name] = value.detach().cpu().contiguous()
         else:
             aliases[name] = source
-    write_atomically(sibling(path, ".safetensors"), save(tensors))
-    card = {"format": FORMAT_VERSION, "kind": kind, **description, "aliases": aliases}
-    write_atomically(sibling(path, ".json"), (json.dumps(card, indent=1) + "\n").encode())
+    check_finite(tensors, path)
+    content = save(tensors)
+    head = {"format": FORMAT_VERSION, "kind": kind, "sha256": hashlib.sha256(content).hexdigest()}
+    write_pair(path, content, {**head, **description, "aliases": aliases})
 
 
 def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -47,7 +53,8 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
 
     Raises:
         FileNotFoundError: If one of the two files is missing; the message says which.
-        ValueError: If a file is damaged, or holds another kind of agent.
+        ValueError: If a file is damaged or cannot be read, the two are not of one training, or they
+            hold another kind of agent.
     """
     card_path, tensor_path = sibling(path, ".json"), sibling(path, ".safetensors")
     for file in (tensor_path, card_path):
@@ -56,23 +63,29 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
                 f"`weights` (={str(path)!r}): there is no {file.name}; an agent is a .safetensors "
                 "and a .json file of the same name, as `ae-env train` writes them"
             )
-    try:
-        card = json.loads(card_path.read_text(encoding="utf-8"))
-        tensors = load(tensor_path.read_bytes())
-    except (ValueError, SafetensorError) as error:
-        raise ValueError(f"`weights` (={str(path)!r}) cannot be read: {error}") from error
-    if not isinstance(card, dict):
-        raise ValueError(f"`weights` (={str(path)!r}): {card_path.name} must hold a JSON object")
+    tensors, card = read_pair(path)
     if card.get("kind") != kind or card.get("format") != FORMAT_VERSION:
         raise ValueError(
             f"`weights` (={str(path)!r}) must be a {kind} agent of format {FORMAT_VERSION}, got "
             f"{card.get('kind')!r} of format {card.get('format')!r}"
         )
-    missing = [name for name in _ENTRIES if name not in card]
-    if missing:
-        raise ValueError(f"`weights` (={str(path)!r}): {card_path.name} lacks {missing}")
+    _check_entries(card, f"`weights` (={str(path)!r}): {card_path.name}")
     aliases = {name: source for name, source in card["aliases"].items() if source in tensors}
     return tensors | {name: tensors[source] for name, source in aliases.items()}, card
+
+
+def _check_entries(card: dict[str, Any], where: str) -> None:
+    missing = [name for name in _ENTRIES if name not in card]
+    if missing:
+        raise ValueError(f"{where} lacks {missing}")
+    for name, kind in _ENTRIES.items():
+        if not isinstance(card[name], kind) or isinstance(card[name], bool):
+            word = "an integer" if kind is int else "a JSON object"
+            raise ValueError(f"{where}: `{name}` (={card[name]!r}) must be {word}")
+    if not 1 <= card["width"] <= MAX_WIDTH:
+        raise ValueError(f"{where}: `width` (={card['width']}) must be in [1, {MAX_WIDTH}]")
+    if not all(isinstance(source, str) for source in card["aliases"].values()):
+        raise ValueError(f"{where}: `aliases` must map names to names")
 
 
 def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -> None:

@@ -37,11 +37,14 @@ class Kept:
         """What `make` returns, or has returned to an earlier run; JSON values."""
         key = zlib.crc32(json.dumps([*self._words, name]).encode())
         path = self._folder / f"{name.split()[0]}-{key:08x}.json"
-        if not path.is_file():
-            write_atomically(path, json.dumps(make()))
-        return json.loads(path.read_text(encoding="utf-8"))
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # not there, or damaged
+            text = json.dumps(make())
+        write_atomically(path, text)
+        return json.loads(text)
 
     def forget(self) -> None:
         """Removes everything that is kept, of earlier code too: the next run starts anew."""
         for path in self._folder.glob("*.json"):
-            path.unlink()
+            path.unlink(missing_ok=True)

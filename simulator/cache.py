@@ -34,13 +34,30 @@ _FILE = re.compile(r"\.?(bundled-.*-)?[0-9a-f]{24,32}\.(safetensors|npz)(\..*\.t
 #: A half-written file older than this was left by a killed process [s].
 _ABANDONED = 3600.0
 
+#: Folders of which it was logged that they cannot be used.
+_WARNED: set[Path] = set()
+
 Value = TypeVar("Value")
 
 
 def cache_dir() -> Path:
-    """The cache folder: the one named by ``AE_ENV_CACHE``, else the user's (not created here)."""
-    named = os.environ.get(CACHE_VARIABLE)
-    return Path(named).expanduser() if named else Path(platformdirs.user_cache_dir("ae-env"))
+    """The cache folder: the one named by ``AE_ENV_CACHE``, else the user's (not created here).
+
+    The user's, too, where the name begins with the home of somebody unknown.
+    """
+    named, own = os.environ.get(CACHE_VARIABLE), Path(platformdirs.user_cache_dir("ae-env"))
+    try:
+        return Path(named).expanduser() if named else own
+    except RuntimeError as error:
+        _warn_once(Path(str(named)), "%s (=%r): %s; using %s", CACHE_VARIABLE, named, error, own)
+        return own
+
+
+def _warn_once(folder: Path, message: str, *values: object) -> None:
+    """Logs what is wrong with a cache folder, as a warning the first time in this process."""
+    level = logging.DEBUG if folder in _WARNED else logging.WARNING
+    _LOGGER.log(level, message, *values)
+    _WARNED.add(folder)
 
 
 def cache_key(parts: Mapping[str, Any]) -> str:
@@ -135,8 +152,9 @@ class LruCache(Generic[Value]):
 class DiskCache:
     """Tensors in files between runs; several processes may share the folder.
 
-    Files are written whole or not at all, and read only if their content is what was written. A
-    file that is damaged, or a folder that cannot be written, is logged and costs time only.
+    Files are written whole or not at all, and read only if their content is what was written
+    under that key. A file that is damaged, or a folder that cannot be read or written (once in a
+    process), is logged and costs time only.
 
     Args:
         folder: By default `cache_dir()` at the time of each call.
@@ -149,7 +167,6 @@ class DiskCache:
             raise ValueError(f"`max_bytes` (={max_bytes}) must be at least 0")
         self._folder, self.max_bytes = folder, max_bytes
         self._unseen: int | None = None  # bytes written since the files were last counted
-        self._warned = False
 
     @property
     def folder(self) -> Path:
@@ -177,11 +194,17 @@ class DiskCache:
         try:
             content = path.read_bytes()  # at once: another process may remove it
             tensors = load(content)
-            if _stored_digest(content) != content_digest(tensors):
+            stored = _stored(content)
+            if stored.get("digest") != content_digest(tensors):
                 raise ValueError("its content is not what was written")
+            if stored.get("key", key) != key:  # earlier versions wrote none
+                raise ValueError(f"it was written as {stored['key']}")
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, SafetensorError, ValueError) as error:
+        except OSError as error:
+            _warn_once(self.folder, "cached file %s cannot be read: %s", path, error)
+            return None
+        except (SafetensorError, ValueError) as error:
             _LOGGER.warning("cached file %s is damaged (%s) and is made again", path, error)
             return None
         with suppress(OSError):
@@ -192,15 +215,13 @@ class DiskCache:
         """Keeps `tensors`; see `get`."""
         path = self.path(kind, key)
         own = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        content = save(own, {"digest": content_digest(own)})
+        content = save(own, {"digest": content_digest(own), "key": key})
         if len(content) > self.max_bytes:
             return
         try:
             write_atomically(path, content)
         except OSError as error:  # a full or read-only disk must not stop the run
-            level = logging.DEBUG if self._warned else logging.WARNING
-            _LOGGER.log(level, "%s could not be cached: %s", path, error)
-            self._warned = True
+            _warn_once(self.folder, "%s could not be cached: %s", path, error)
             return
         unseen = None if self._unseen is None else self._unseen + len(content)
         if unseen is None or unseen >= self.max_bytes // 16:
@@ -227,7 +248,10 @@ class DiskCache:
 
     def _files(self, kind: str) -> Iterator[tuple[Path, os.stat_result]]:
         folder = self.folder / kind
-        names = os.listdir(folder) if folder.is_dir() else []
+        try:
+            names = os.listdir(folder)
+        except OSError:  # not there, or nothing that can be listed
+            return
         for name in sorted(names):
             with suppress(OSError):  # removed by another process since
                 if _FILE.fullmatch(name):
@@ -251,7 +275,7 @@ class DiskCache:
                 total -= stat.st_size
 
 
-def _stored_digest(content: bytes) -> str | None:
-    """The digest in the header of a safetensors file: JSON after eight bytes of its length."""
+def _stored(content: bytes) -> dict[str, str]:
+    """What was written beside the tensors: in the header, JSON after eight bytes of its length."""
     length = int.from_bytes(content[:8], "little")
-    return json.loads(content[8 : 8 + length]).get("__metadata__", {}).get("digest")
+    return json.loads(content[8 : 8 + length]).get("__metadata__", {})

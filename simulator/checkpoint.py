@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import logging
 import time
@@ -14,11 +15,20 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from simulator.cache import content_digest
 from simulator.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: What reading a damaged file, or one of something else, ends in.
-_UNFIT = (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError)
+_UNFIT = (
+    SafetensorError,
+    OSError,
+    LookupError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RuntimeError,
+)
 
 
 class HasState(Protocol):
@@ -61,7 +71,10 @@ class Checkpoint:
         try:
             with safe_open(self.path, framework="pt") as stored:
                 tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-                structure = json.loads((stored.metadata() or {})["structure"])
+                metadata = stored.metadata() or {}
+            if metadata.get("digest", "") not in ("", _digest(metadata["structure"], tensors)):
+                raise ValueError("its content is not what was written")
+            structure = json.loads(metadata["structure"])
             step = int(structure["step"])
             if structure["identity"] != self._identity:
                 raise ValueError("it belongs to a training with other settings")
@@ -77,14 +90,32 @@ class Checkpoint:
         return step
 
     def save(self, step: int, *, force: bool = False) -> None:
-        """Writes the state after `step` steps, unless the last save is too recent."""
+        """Writes the state after `step` steps, unless the last save is too recent.
+
+        Where it cannot be written, as on a full disk, that is logged, the state before it stays,
+        and the training goes on.
+        """
         if self.path is None or not (force or time.monotonic() - self._saved > self.interval):
             return
         tensors: dict[str, torch.Tensor] = {}
         parts = {name: _flatten(part.state_dict(), tensors) for name, part in self.parts.items()}
         structure = json.dumps({"step": step, "identity": self._identity, "parts": parts})
-        write_atomically(self.path, save(tensors, metadata={"structure": structure}))
+        metadata = {"structure": structure, "digest": _digest(structure, tensors)}
+        try:
+            write_atomically(self.path, save(tensors, metadata=metadata))
+        except OSError as error:
+            _LOGGER.warning(
+                "checkpoint %s could not be written: %s; a training that is killed now goes on at "
+                "the one before",
+                self.path,
+                error,
+            )
         self._saved = time.monotonic()
+
+
+def _digest(structure: str, tensors: Mapping[str, torch.Tensor]) -> str:
+    text = f"{structure}{content_digest(tensors)}"
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _flatten(value: Any, tensors: dict[str, torch.Tensor]) -> Any:

@@ -71,7 +71,7 @@ class NetworkCache:
         if kept is not None and kept[1] == _changes(kept[0]):
             return kept[0]
         stored = None if self._disk is None else self._disk.get(kind, key)
-        if stored is not None:
+        if stored is not None and "result" in stored:
             tensor = stored["result"].to(device)
         else:
             tensor = make().contiguous()  # as it comes from disk: later sums round alike

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
-from torch import nn
+from torch import Tensor, nn
 
 from simulator.files import sibling, write_atomically
 from simulator.modules.build import PRESETS, build_modules
@@ -38,7 +39,11 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
         modules: Their state is stored.
         preset: What `simulator.modules.build.build_modules` makes them from.
         card: JSON values: how they were trained and what they score.
+
+    Raises:
+        ValueError: If the weights are not finite; nothing is written then.
     """
+    check_finite(modules.state_dict(), path)
     content = save({k: v.detach().cpu().contiguous() for k, v in modules.state_dict().items()})
     head = {
         "format": FORMAT_VERSION,
@@ -46,9 +51,64 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
         "sha256": hashlib.sha256(content).hexdigest(),
         "parameters": sum(p.numel() for p in modules.parameters()),
     }
+    write_pair(path, content, {**head, **card})
+
+
+def write_pair(path: Path, content: bytes, card: dict[str, Any]) -> None:
+    """Writes the card, then the weights whose hash it holds.
+
+    `read_pair` reads them the other way round: whatever other processes write in between, weights
+    never come with a card that is older than they are.
+    """
+    write_atomically(sibling(path, ".json"), json.dumps(card, indent=1) + "\n")
     write_atomically(sibling(path, ".safetensors"), content)
-    text = json.dumps({**head, **card}, indent=1) + "\n"
-    write_atomically(sibling(path, ".json"), text.encode())
+
+
+def read_pair(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors and the card that `write_pair` wrote; a card without a hash is not compared.
+
+    Raises:
+        ValueError: If a file cannot be read or is damaged, the card is no JSON object, or its hash
+            is not that of the weights.
+    """
+    card_file, file = sibling(path, ".json"), sibling(path, ".safetensors")
+    try:
+        content, text = file.read_bytes(), card_file.read_bytes()
+    except OSError as error:
+        raise ValueError(f"`weights` (={str(path)!r}) cannot be read: {error}") from error
+    try:
+        card = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"`weights` (={str(path)!r}): {card_file.name} is damaged: {error}; train them again"
+        ) from error
+    if not isinstance(card, dict):
+        raise ValueError(f"`weights` (={str(path)!r}): {card_file.name} must hold a JSON object")
+    digest = hashlib.sha256(content).hexdigest()
+    if card.get("sha256", digest) != digest:
+        raise ValueError(
+            f"`weights` (={str(path)!r}): the hash of {file.name} (={digest[:12]}...) must be that "
+            f"in {card_file.name} (={str(card['sha256'])[:12]}...): one of them is damaged or of "
+            "another training, or being written at this moment; train or copy both again"
+        )
+    try:
+        tensors = load(content)
+    except SafetensorError as error:
+        raise ValueError(
+            f"`weights` (={str(path)!r}): {file.name} cannot be read: {error}; train them again"
+        ) from error
+    check_finite(tensors, path)
+    return tensors, card
+
+
+def check_finite(tensors: Mapping[str, Tensor], path: str | Path) -> None:
+    """Raises a `ValueError` that names the first of `tensors` that holds a NaN or an infinity."""
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise ValueError(
+                f"`weights` (={str(path)!r}) must be finite: their training has failed ({name}); "
+                "train again with a lower learning_rate"
+            )
 
 
 def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
@@ -65,9 +125,9 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
         raise ValueError(f"`weights` (={name!r}) must be a name or a path")
     folder = resources.files("simulator").joinpath("pretrained")
     known = list_pretrained()
+    path: Any = name
     if str(name) in known:
-        card_text = folder.joinpath(f"{name}.json").read_text(encoding="utf-8")
-        content = folder.joinpath(f"{name}.safetensors").read_bytes()
+        path = folder.joinpath(str(name))
     else:
         files = sibling(name, ".json"), sibling(name, ".safetensors")
         missing = [f for f in files if not f.is_file()]
@@ -80,36 +140,27 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
                 f"`weights` (={str(name)!r}) must be one of {known} or the path of a .safetensors "
                 f"file with its .json; there is no {missing[0]}{hint}"
             )
-        card_text = files[0].read_text(encoding="utf-8", errors="replace")
-        content = files[1].read_bytes()
-    card = _checked_card(card_text, content, name)
+    tensors, card = read_pair(path)
+    _check_card(card, name)
     modules = build_modules(card["preset"])
     try:
-        tensors = load(content)
         modules.load_state_dict(tensors)
-    except (RuntimeError, SafetensorError) as error:
+    except RuntimeError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"`weights` (={str(name)!r}) do not fit the networks: {text}") from error
-    if not all(bool(torch.isfinite(t).all()) for t in tensors.values()):
-        raise ValueError(f"`weights` (={str(name)!r}) must be finite: their training has failed")
     return modules.eval().requires_grad_(False).to(memory_format=torch.channels_last), card  # type: ignore[call-overload, return-value]
 
 
-def _checked_card(text: str, content: bytes, name: str | Path) -> dict[str, Any]:
-    try:
-        card = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"`weights` (={str(name)!r}): the .json is damaged: {error}") from error
-    if not isinstance(card, dict) or card.get("format") != FORMAT_VERSION:
+def _check_card(card: dict[str, Any], name: str | Path) -> None:
+    if card.get("format") != FORMAT_VERSION:
         raise ValueError(
-            f"`weights` (={str(name)!r}): the .json must be a model card of format {FORMAT_VERSION}"
+            f"`weights` (={str(name)!r}): the .json must be a model card of format "
+            f"{FORMAT_VERSION}, got {card.get('format')!r}"
         )
-    digest = hashlib.sha256(content).hexdigest()
-    if card.get("sha256") != digest:
-        raise ValueError(
-            f"`weights` (={str(name)!r}): the hash of the .safetensors (={digest[:12]}...) must be "
-            f"the model card's (={str(card.get('sha256'))[:12]}...); the file is damaged or another"
-        )
+    if "sha256" not in card:
+        raise ValueError(f"`weights` (={str(name)!r}): the .json must hold the hash, `sha256`")
     if card.get("preset") not in PRESETS:
-        raise ValueError(f"`weights` (={str(name)!r}): unknown preset {card.get('preset')!r}")
-    return card
+        raise ValueError(
+            f"`weights` (={str(name)!r}): unknown preset {card.get('preset')!r} in the .json, the "
+            f"presets are {list(PRESETS)}"
+        )

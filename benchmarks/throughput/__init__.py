@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from ae_env.console import print_files, progress_bars
+from benchmarks.isolated import CORES, isolated
 from benchmarks.keeping import Kept
 from benchmarks.simulator.scenes import data_root
 from benchmarks.throughput import full_frame, growth
 from benchmarks.throughput.gpu import measure_gpu
-from benchmarks.throughput.isolated import CORES, isolated
 from benchmarks.throughput.noise_statistics import measure_noise
 from benchmarks.throughput.plots import draw
 from benchmarks.throughput.report import markdown

@@ -17,9 +17,9 @@ from typing import Any
 
 import rawpy
 
+from benchmarks.isolated import forget_peak, isolated, peak_memory, timed
 from benchmarks.keeping import Kept
 from benchmarks.throughput.frames import noisy_raw
-from benchmarks.throughput.isolated import forget_peak, isolated, peak_memory, timed
 from simulator import CameraSettings, CameraSimulator, read_raw, write_dng
 from simulator.dng_tags import SOFTWARE_NAME
 

@@ -17,9 +17,9 @@ import torch
 
 import ae_env  # noqa: F401  registers the environment
 from ae_env.scenes import Scene
+from benchmarks.isolated import forget_peak, isolated, median_seconds, peak_memory, timed
 from benchmarks.keeping import Kept
 from benchmarks.throughput.frames import noisy_raw
-from benchmarks.throughput.isolated import forget_peak, isolated, median_seconds, peak_memory, timed
 from benchmarks.throughput.kernel_limit import KernelLimit
 from simulator import CameraSettings, CameraSimulator, get_camera
 from simulator.frame_noise import Noise

@@ -6,8 +6,8 @@ import io
 from pathlib import Path
 from typing import Any
 
+from benchmarks.isolated import CORES
 from benchmarks.throughput.growth import MEMORY_FLOOR
-from benchmarks.throughput.isolated import CORES
 from benchmarks.throughput.steps import DIGITAL_KERNEL, KERNEL, LOOKUP
 from benchmarks.throughput.targets import SIZE, STEPS_PER_SECOND
 from simulator.files import write_atomically

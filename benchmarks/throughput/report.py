@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.isolated import CORES
+from benchmarks.markdown import table
 from benchmarks.throughput.full_frame import STAGES
-from benchmarks.throughput.isolated import CORES
 from benchmarks.throughput.noise_statistics import NAMES
 from benchmarks.throughput.steps import DIGITAL_KERNEL, KERNEL
 from benchmarks.throughput.targets import CASE, NUM_ENVS, SIZE, STEPS_PER_SECOND, step_row
@@ -39,16 +40,6 @@ def markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
         *_gpu(meta["gpu"]),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; columns but the first are aligned to the right."""
-    rule = "|---|" + "--:|" * (len(head) - 1)
-    return "\n".join([_line(head), rule, *(_line(cells) for cells in body)])
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 # -- findings -------------------------------------------------------------------------------------

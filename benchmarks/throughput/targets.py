@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from benchmarks.throughput.isolated import CORES
+from benchmarks.isolated import CORES
 
 #: Frame size and case that the targets for steps are about.
 SIZE, CASE, NUM_ENVS = 128, "vector env, cached scene", 64

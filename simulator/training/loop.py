@@ -98,7 +98,8 @@ def train_stage(
 ) -> Clock:
     """Trains `trained` until the stage's budget is used up.
 
-    A stage that was interrupted at any moment goes on at its last checkpoint, at most 20 s back.
+    A stage that was interrupted at any moment goes on at its last checkpoint, at most 20 s back,
+    and, where its budget is in steps, ends with the weights of one that was not.
 
     Args:
         name: Of the stage, for log and checkpoint.
@@ -121,6 +122,8 @@ def train_stage(
     optimiser = torch.optim.Adam(trained.parameters(), lr=stage.learning_rate)
     clock = Clock(stage, on_cpu=device.type == "cpu")
     parts: dict[str, HasState] = {"module": trained, "optimiser": optimiser, "clock": clock}
+    if accelerator.scaler is not None:  # float16: what the loss is multiplied by
+        parts["scaler"] = accelerator.scaler
     state = Checkpoint(checkpoint, parts, identity=[name, identity])
     state.restore()
     wrapped, stepper = accelerator.prepare(loss, optimiser)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -77,3 +80,35 @@ def test_an_error_in_a_job_is_raised(tmp_path: Path) -> None:
     )
     with pytest.raises(ValueError, match="must hold raws"):
         train_in_parallel([TrainingJob("bad", config, tmp_path / "bad")])
+
+
+def _train_for_long(folder: Path, pipe: Connection) -> None:
+    def report(*_: object) -> None:
+        pipe.send([process.pid for process in multiprocessing.active_children()])
+
+    train_in_parallel(jobs(folder, frames=40_000), progress=report)  # reports every 200
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
+def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    parent = context.Process(target=_train_for_long, args=(tmp_path, there))
+    parent.start()
+    workers = here.recv()
+    assert workers
+    assert all(_runs(pid) for pid in workers)
+    parent.kill()
+    parent.join()
+    end = time.monotonic() + 30
+    while any(_runs(pid) for pid in workers):
+        assert time.monotonic() < end, "they train on for nobody"
+        time.sleep(0.1)

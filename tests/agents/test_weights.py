@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -88,10 +90,11 @@ def test_missing_file(agent: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     ("suffix", "content", "message"),
     [
-        (".safetensors", b"\x10", "cannot be read"),
-        (".safetensors", b"{}" * 40, "cannot be read"),
-        (".json", b"{", "cannot be read"),
-        (".json", b"\xff\xfe", "cannot be read"),
+        (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
+        (".safetensors", b"{}" * 40, "the hash of regression-0.5.safetensors .* train or copy"),
+        (".json", b"{", "regression-0.5.json is damaged"),
+        (".json", b"\xff\xfe", "regression-0.5.json is damaged"),
+        (".json", b"[" * 10**6, "regression-0.5.json is damaged"),
         (".json", b"[1]", "must hold a JSON object"),
         (".json", b"{}", "must be a regression agent of format 1, got None"),
         (".json", b'{"kind": "regression", "format": 1}', r"lacks \['width', 'context'"),
@@ -107,7 +110,67 @@ def test_damaged_file(agent: Path, suffix: str, content: bytes, message: str) ->
 def test_file_cut_short(agent: Path) -> None:
     file = sibling(agent, ".safetensors")
     file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(ValueError, match="cannot be read"):
+    with pytest.raises(ValueError, match="the hash of"):
+        load_agent(agent, "regression")
+    change_card(agent, sha256=None)  # as agents of earlier versions are
+    with pytest.raises(ValueError, match=r"regression-0.5.safetensors cannot be read"):
+        load_agent(agent, "regression")
+
+
+def change_card(agent: Path, **entries: Any) -> None:
+    """Replaces entries of the card, or removes those that are None."""
+    card = json.loads(sibling(agent, ".json").read_text()) | entries
+    text = json.dumps({name: value for name, value in card.items() if value is not None})
+    sibling(agent, ".json").write_text(text)
+
+
+def test_card_of_an_earlier_version(agent: Path, context: PolicyContext) -> None:
+    change_card(agent, sha256=None)
+    assert make_policy(f"regression:{agent}", context).name == "regression"
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"aliases": 3}, r"regression-0.5.json: `aliases` \(=3\) must be a JSON object"),
+        ({"aliases": {"a": [1]}}, "`aliases` must map names to names"),
+        ({"context": []}, r"`context` \(=\[\]\) must be a JSON object"),
+        ({"training": "x"}, r"`training` \(='x'\) must be a JSON object"),
+        ({"width": "8"}, r"`width` \(='8'\) must be an integer"),
+        ({"width": True}, r"`width` \(=True\) must be an integer"),
+        ({"width": 10**9}, r"`width` \(=1000000000\) must be in \[1, 65536\]"),
+        ({"width": 9}, "do not fit the network"),
+        ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
+        ({"context": {"resolution": [4]}}, r"trained with resolution = \[4\]"),
+        ({"kind": ["regression"]}, r"must be a regression agent .* got \['regression'\]"),
+    ],
+)
+def test_wrong_types_in_the_card(
+    agent: Path, context: PolicyContext, entries: dict[str, Any], message: str
+) -> None:
+    change_card(agent, **entries)
+    with pytest.raises(ValueError, match=message):
+        make_policy(f"regression:{agent}", context)
+
+
+def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> None:
+    before = sibling(agent, ".safetensors").read_bytes()
+    network = make_network(context)
+    with torch.no_grad():
+        next(network.parameters()).fill_(float("nan"))
+    with pytest.raises(ValueError, match="must be finite: their training has failed"):
+        save_regression(agent, network, context, {})
+    assert sibling(agent, ".safetensors").read_bytes() == before
+    sibling(agent, ".safetensors").write_bytes(save(network.state_dict()))
+    change_card(agent, sha256=None)
+    with pytest.raises(ValueError, match="must be finite"):
+        load_agent(agent, "regression")
+
+
+def test_a_folder_is_no_file(agent: Path) -> None:
+    sibling(agent, ".safetensors").unlink()
+    sibling(agent, ".safetensors").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"there is no regression-0.5.safetensors"):
         load_agent(agent, "regression")
 
 
@@ -122,6 +185,7 @@ def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None
     name = next(iter(tensors))
     tensors[name] = torch.zeros(63, 7)
     file.write_bytes(save(tensors))
+    change_card(agent, sha256=hashlib.sha256(file.read_bytes()).hexdigest())
     message = rf"do not fit the network: .*{re.escape(name)}"
     with pytest.raises(ValueError, match=message) as caught:
         make_policy(f"regression:{agent}", context)

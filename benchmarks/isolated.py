@@ -17,7 +17,7 @@ from typing import Any
 
 from simulator.cache import CACHE_VARIABLE
 
-ROOT = Path(__file__).absolute().parents[2]
+ROOT = Path(__file__).absolute().parents[1]
 MIB = 2.0**20
 #: Threads of all that is not measured on one: the cores, of which two are what is aimed at.
 CORES = min(2, os.cpu_count() or 1)
