@@ -71,9 +71,15 @@ def train_simulator(out: Path, report: Callable[[], None]) -> None:
     )
 
 
+def heed_interrupts() -> None:
+    """What runs in the background of a shell ignores them."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def child(kind: str, out: Path, pipe: Connection) -> None:
     """What runs in the process that is killed; a checkpoint is written after every step."""
     logging.basicConfig(level=logging.WARNING)
+    heed_interrupts()
     torch.set_num_threads(1)
     save, restore = Checkpoint.save, Checkpoint.restore
 
@@ -161,6 +167,7 @@ def command(folder: Path, started: Any) -> None:
     """What runs as `ae-env train` in the process that is stopped."""
     from ae_env.cli import main
 
+    heed_interrupts()
     restore = Checkpoint.restore
 
     def told(self: Checkpoint) -> int:
