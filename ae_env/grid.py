@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
 from ae_env.checks import did_you_mean
 from simulator.settings import CameraSettings
+
+
+def plain(value: Any) -> Any:
+    """Numbers and lists for scalars and arrays of NumPy and torch; anything else is `value`."""
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def plain_list(value: Any) -> list[Any] | None:
+    """The entries of any iterable but a text, each as `plain` gives it; None for what is none.
+
+    >>> plain_list(np.array([1, 2])), plain_list(iter((3, np.int64(4)))), plain_list(np.array(5))
+    ([1, 2], [3, 4], None)
+    """
+    value = plain(value)
+    if isinstance(value, str | bytes) or not isinstance(value, Iterable):
+        return None
+    return [plain(entry) for entry in value]
 
 
 @dataclass(frozen=True)
@@ -41,8 +59,7 @@ class ExposureGrid:
     def __post_init__(self) -> None:
         for name in ("isos", "exposure_times", "f_numbers"):
             given = getattr(self, name)
-            listed = isinstance(given, Sequence | np.ndarray) and not isinstance(given, str | bytes)
-            values = tuple(given) if listed and np.ndim(given) == 1 else ()
+            values = tuple(plain_list(given) or ())
             numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in values)
             # What is out of range is refused by CameraSettings, NaN here.
             if not (values and numbers and all(a < b for a, b in pairwise(values))):
@@ -65,7 +82,7 @@ class ExposureGrid:
         return cls(isos, times, (4, 5.6, 8, 11))
 
     @classmethod
-    def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Sequence[float]]) -> ExposureGrid:
+    def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Iterable[float]]) -> ExposureGrid:
         """A grid from a name, ``"default"`` or ``"third_stop"``, or a mapping of its lists."""
         if isinstance(spec, ExposureGrid):
             return spec

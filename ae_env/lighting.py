@@ -8,14 +8,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from numbers import Integral, Real
 from typing import Any, ClassVar
 
 from ae_env.checks import check_integer, check_number, did_you_mean
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
+
+
+def _check_frame(name: str, value: Any, low: int, high: int) -> int:
+    """`value` as an int; a whole float, as some write JSON, is one too."""
+    number = isinstance(value, Real) and not isinstance(value, Integral)
+    if number and low <= value <= high and value % 1 == 0:
+        value = int(value)
+    return check_integer(name, value, low, high)
+
+
 #: Least and greatest value of each option, and what checks it.
-_FRAME = (-(2**31), 2**31, check_integer)
+_FRAME = (-(2**31), 2**31, _check_frame)
 _RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
     "stops": (-MAX_STOPS, MAX_STOPS, check_number),
     "stops_per_frame": (-MAX_STOPS, MAX_STOPS, check_number),
@@ -37,7 +48,8 @@ class Lighting:
         for option in fields(self):
             if option.name in _RANGES:
                 low, high, check = _RANGES[option.name]
-                check(f"lighting[{option.name!r}]", getattr(self, option.name), low, high)
+                value = check(f"lighting[{option.name!r}]", getattr(self, option.name), low, high)
+                object.__setattr__(self, option.name, value)
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """Mean relative light of an exposure.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
-from typing import Any, TypeGuard
+from collections.abc import Mapping, Sequence, Set
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 from ae_env.checks import check_actions, check_integer, check_seed, check_word
 from ae_env.core import EpisodeCore, Frames
 from ae_env.draws import check_options
-from ae_env.grid import ExposureGrid
+from ae_env.grid import ExposureGrid, plain, plain_list
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
@@ -116,7 +116,7 @@ class AutoExposureVectorEnv(
         Args:
             seed: Environment i is seeded with ``seed + i``, or with ``seed[i]``.
             options: ``scene``, ``state`` and ``frame`` as of `AutoExposureEnv`, each one value for
-                all or a sequence with one per environment; ``reset_mask`` (N,) bool.
+                all or a list, array or tensor with one per environment; ``reset_mask`` (N,) bool.
         """
         seeds = self._seeds(seed)
         options = check_options(options, "reset_mask")
@@ -255,11 +255,12 @@ class AutoExposureVectorEnv(
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if _is_list(seed):
-            if len(seed) != self.num_envs:
-                raise ValueError(f"`seed` (length {len(seed)}) must have {self.num_envs} entries")
-            return [check_seed(single, f"seed[{i}]") for i, single in enumerate(seed)]
-        first = check_integer("seed", seed, 0, more=f", or {self.num_envs} of them")
+        seeds = _entries(seed)
+        if seeds is not None:
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"`seed` (length {len(seeds)}) must have {self.num_envs} entries")
+            return [check_seed(single, f"seed[{i}]") for i, single in enumerate(seeds)]
+        first = check_integer("seed", plain(seed), 0, more=f", or {self.num_envs} of them")
         return list(range(first, first + self.num_envs))
 
     def _reset_mask(self, mask: Any) -> np.ndarray:
@@ -276,21 +277,23 @@ class AutoExposureVectorEnv(
     def _split_options(self, options: dict[str, Any]) -> list[dict[str, Any]]:
         split: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for name, value in options.items():
-            alike = not _is_list(value)
-            if not alike and len(value) != self.num_envs:
+            values = _entries(value)
+            if values is None:
+                values = [plain(value)] * self.num_envs
+            if len(values) != self.num_envs:
                 raise ValueError(
-                    f"`options[{name!r}]` (length {len(value)}) must have {self.num_envs} entries"
+                    f"`options[{name!r}]` (length {len(values)}) must have {self.num_envs} entries"
                 )
-            for i, single in enumerate(split):
-                single[name] = value if alike else value[i]
+            for single, own in zip(split, values, strict=True):
+                single[name] = own
         return split
 
 
-def _is_list(value: Any) -> TypeGuard[Sequence[Any]]:
-    """Whether `value` is one for each environment."""
-    if isinstance(value, np.ndarray):
-        return value.ndim > 0
-    return isinstance(value, Sequence) and not isinstance(value, str | bytes)
+def _entries(value: Any) -> list[Any] | None:
+    """One for each environment, of anything that has a length and an order; None for one of all."""
+    if isinstance(value, Mapping | Set) or not hasattr(value, "__len__"):
+        return None
+    return plain_list(value)
 
 
 def _taken(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:

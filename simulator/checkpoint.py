@@ -78,6 +78,11 @@ class Checkpoint:
             step = int(structure["step"])
             if structure["identity"] != self._identity:
                 raise ValueError("it belongs to a training with other settings")
+            lacking = [repr(name) for name in self.parts if name not in structure["parts"]]
+            if lacking:
+                raise ValueError(
+                    f"it lacks {', '.join(lacking)}, as those of an earlier version do"
+                )
             for name, part in self.parts.items():
                 part.load_state_dict(_unflatten(structure["parts"][name], tensors))
         except _UNFIT as error:

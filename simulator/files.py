@@ -18,8 +18,10 @@ RAW_SUFFIXES = (
 
 #: Pixels that a raw or a radiance map may claim: 268 million, beyond any camera with a Bayer array.
 MAX_PIXELS = 2**28
-#: And for each byte of the file: no compression gives more for pictures that are worth reading.
+#: And for each byte of a raw: a flat DNG in deflate has half of that.
 MAX_PIXELS_PER_BYTE = 1024
+#: And of a radiance map: a flat one in OpenEXR's DWAB compression has over 3000.
+MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
 
 
 def as_path(path: object) -> Path:
@@ -33,13 +35,14 @@ def as_path(path: object) -> Path:
     return Path(path)
 
 
-def refuse_bomb(height: int, width: int, size: int) -> str:
+def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
     """Why a picture must not be decoded, before memory is taken for it; empty where it may be.
 
     Args:
         height: Rows that the file claims.
         width: Columns that it claims.
         size: Length of the file [byte].
+        per_byte: Most pixels that each byte of it may stand for.
 
     >>> refuse_bomb(60_000, 60_000, 4096)
     'claims 60000 x 60000 pixels, where at most 268435456 are read'
@@ -47,10 +50,10 @@ def refuse_bomb(height: int, width: int, size: int) -> str:
     pixels = height * width
     if pixels > MAX_PIXELS:
         return f"claims {height} x {width} pixels, where at most {MAX_PIXELS} are read"
-    if pixels > MAX_PIXELS_PER_BYTE * size:
+    if pixels > per_byte * size:
         return (
             f"claims {height} x {width} pixels in {size} bytes, where at most "
-            f"{MAX_PIXELS_PER_BYTE} a byte are read"
+            f"{per_byte} a byte are read"
         )
     return ""
 
@@ -83,7 +86,8 @@ def write_atomically(
 
 def _replace(path: Path, content: bytes | str | Iterable[bytes | memoryview]) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    prefix = f".{path.name[:200]}."  # a file's name may have 255 bytes
+    start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")
+    prefix = f".{start}."  # a file's name may have 255 bytes
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=".tmp")
     content = content.encode() if isinstance(content, str) else content
     pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content

@@ -159,6 +159,28 @@ def _periods(
     Returns:
         Begin; whole periods of the exposure; what is left of one, in [0, 1).
     """
-    span = time * frequency
+    turns, missing = _product(start, frequency)
+    # Each exact: what is left of a day of periods must still tell where in one it is.
+    begin = np.mod(np.mod(turns, 1.0) + np.mod(phase, 1.0) + missing, 1.0)
+    span, missing = _product(time, frequency)
     whole = math.floor(span)
-    return np.mod(start * frequency + phase, 1.0), whole, span - whole
+    rest = float(span - whole + missing)
+    if rest < 0.0:
+        whole, rest = whole - 1, rest + 1.0
+    return begin, whole, rest
+
+
+def _product(values: ArrayLike, factor: float) -> tuple[np.ndarray, np.ndarray]:
+    """The product as float64 rounds it, and what the rounding left out (Dekker 1971)."""
+    values = np.asarray(values)
+    rounded = values * factor
+    (high, low), (factor_high, factor_low) = _halves(values), _halves(np.asarray(factor))
+    left_out = high * factor_high - rounded + high * factor_low + low * factor_high
+    return rounded, left_out + low * factor_low
+
+
+def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two numbers of 26 bits each that add up to each value (Veltkamp 1968)."""
+    scaled = values * (2.0**27 + 1.0)
+    high = scaled - (scaled - values)
+    return high, values - high

@@ -23,7 +23,7 @@ SUB_DIRECTORIES = (330, 34665)
 EXIF_DIRECTORY = 34665
 _STRIPS, _TILES = (273, 279), (324, 325)
 #: Beyond these a file is damaged, or made to take forever; camera files stay far below. Longer
-#: values (maker notes, previews) are passed over.
+#: values (maker notes, previews) are passed over, but for the places of strips and tiles.
 _MAX_DIRECTORIES, _MAX_ENTRIES, _MAX_VALUE, _MAX_VALUES = 64, 4096, 2**16, 2**22
 #: 42 is TIFF; the others are the same structure under Olympus' and Panasonic's own magic.
 _MAGIC = (42, 0x4F52, 0x5352, 0x55)
@@ -204,7 +204,8 @@ def _read_directory(
             continue
         size = length * struct.calcsize("=" + _FORMATS[kind])
         start = at + 8 if size <= 4 else unpack_at(f"{order}I", data, at + 8)[0]
-        if start + size <= len(data) and size <= min(_MAX_VALUE, room - used):
+        most = room - used if number in (*_STRIPS, *_TILES) else min(_MAX_VALUE, room - used)
+        if start + size <= len(data) and size <= most:
             tags[number] = _decode(kind, data[start : start + size], order)
             used += size
     following = unpack_at(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0

@@ -46,9 +46,9 @@ class FolderOptions:
         hard: Whether they count as hard.
         median_speed: Median image speed of a moving episode [frame heights / s].
         ev100: EV100 of the radiance maps, in place of the assumed one.
-        on_error: What a file that cannot be read does: ``"stop"`` raises an error that names it, so
-            that nothing goes missing unseen; ``"skip"`` leaves it out, and a warning in the log
-            says how many were and why.
+        on_error: What a file does that cannot be read, or is black without `illuminance`:
+            ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
+            ``"skip"`` leaves it out, and a warning in the log says how many were and why.
     """
 
     illuminance: float | Mapping[str, float] | None = None
@@ -187,6 +187,12 @@ class _Reader:
 
     def __call__(self, path: Path) -> tuple[list[Scene], Shot | None]:
         """The scenes of a file, and what tells the group of a raw that none is named for."""
+        scenes, shot = self._read(path)
+        for scene in scenes:
+            _ = scene.ev100  # refuses what is black in unknown light
+        return scenes, shot
+
+    def _read(self, path: Path) -> tuple[list[Scene], Shot | None]:
         name, group = self.names[path], self.named.get(path.resolve())
         grouped = group is not None or path.parent != self.base
         if group is None:

@@ -23,7 +23,7 @@ from ae_env.scenes.light_scale import mean_anchor
 from ae_env.scenes.procedural import NATIVE_SIZE
 from ae_env.scenes.scene import Crop, Resize, Scene
 from simulator.camera import CameraProfile
-from simulator.files import as_path, refuse_bomb
+from simulator.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +55,8 @@ def read_radiance(path: str | Path) -> np.ndarray:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
         ValueError: If the file cannot be read, is empty of light or is neither kind, or claims more
-            pixels than `simulator.files.MAX_PIXELS`, or than its length can hold.
+            pixels than `simulator.files.MAX_PIXELS`, or `MAX_RADIANCE_PIXELS_PER_BYTE` of them for
+            each byte of the file.
     """
     path = as_path(path)
     if not path.is_file():
@@ -255,7 +256,7 @@ def _hdr_size(content: bytes) -> tuple[int, int]:
 
 
 def _refuse_lies(path: Path, height: int, width: int, size: int) -> None:
-    bomb = refuse_bomb(height, width, size)
+    bomb = refuse_bomb(height, width, size, per_byte=MAX_RADIANCE_PIXELS_PER_BYTE)
     if bomb:
         raise ValueError(f"radiance map {str(path)!r} {bomb}")
 

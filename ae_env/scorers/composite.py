@@ -102,9 +102,10 @@ class CompositeScorer:
         return scores
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
-        """Total score from the parts' scores, tensors or arrays of any one shape."""
+        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
         total: Any = sum(weight * scores[name] for name, weight in self.weights.items())
-        return total.clip(0.0, 1.0)  # rounding
+        # Rounding.
+        return total.clip(0.0, 1.0) if torch.is_tensor(total) else np.clip(total, 0.0, 1.0)
 
     def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
         """`combine` of arrays of any one shape, checked: a class of the user's own may override it.
@@ -147,7 +148,7 @@ class Balanced(CompositeScorer):
         super().__init__(parts, weights)
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
-        """Total score from the parts' scores, tensors or arrays of any one shape."""
+        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
         blown = -Highlights.scale * _log(scores["highlights"])
         blocked = -Shadows.scale * _log(scores["shadows"])
         # A share of 1 may be rounded up.

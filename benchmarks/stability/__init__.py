@@ -65,7 +65,7 @@ def run(out: Path, seed: int = 0, quick: bool = False) -> None:
     with progress_bars() as progress, progress("cases") as task:
         for i, (name, measure) in enumerate(GROUPS.items()):
             task(i, len(GROUPS), name)
-            rows += kept(name, lambda m=measure: [row.json() for row in m(seed, quick)])
+            rows += _measured(name, measure, seed, quick, kept)
         task(1, 1)
     files = {
         "numbers": write_results(out / "stability.json", rows, meta),
@@ -74,3 +74,28 @@ def run(out: Path, seed: int = 0, quick: bool = False) -> None:
     }
     kept.forget()
     print_files(files)
+
+
+def _measured(
+    name: str,
+    measure: Callable[[int, bool], Iterator[Row]],
+    seed: int,
+    quick: bool,
+    kept: Callable[[str, Callable[[], list[dict[str, Any]]]], list[dict[str, Any]]],
+) -> list[dict[str, Any]]:
+    """The rows of a group; one that fails has those until then and the failure, and is not kept."""
+    rows: list[dict[str, Any]] = []
+
+    def collect() -> list[dict[str, Any]]:
+        for row in measure(seed, quick):
+            rows.append(row.json())
+        return rows
+
+    try:
+        return kept(name, collect)
+    except Exception as error:
+        note = " ".join(f"{type(error).__name__}: {error}".split())
+        return [
+            *rows,
+            Row(name, "the group itself", None, dtype="", finite=False, note=note).json(),
+        ]

@@ -17,8 +17,8 @@ class Row:
     Args:
         group: Group of cases that it belongs to.
         case: What was done.
-        max_error: Worst error against an independent float64 computation, in the unit of `error`;
-            None where there is nothing to compare with, or it is not finite.
+        max_error: Worst error in the unit of `error`, against float64 unless the case says what
+            else; None where there is nothing to compare with, or it is not finite.
         error: Unit of `max_error`, such as ``"relative"``.
         limit: Largest `max_error` that is right; None where `ok` is told by the other columns.
         dtype: Of the computation.
@@ -26,6 +26,7 @@ class Row:
         monotone: Whether more light never gave less; None where that is not asked.
         unbiased: Whether the mean was right within its standard error; None where not asked.
         time_ratio: Time of the case over that of the ordinary case; None where not timed.
+        time_limit: Largest `time_ratio` that is right; None where any is.
         declared: How a result that cannot be right is declared; empty where it is right.
         note: What else there is to say.
     """
@@ -40,6 +41,7 @@ class Row:
     monotone: bool | None = None
     unbiased: bool | None = None
     time_ratio: float | None = None
+    time_limit: float | None = None
     declared: str = ""
     note: str = ""
 
@@ -49,6 +51,8 @@ class Row:
         within = True
         if self.limit is not None:
             within = self.max_error is not None and self.max_error <= self.limit
+        if self.time_limit is not None and self.time_ratio is not None:
+            within &= self.time_ratio <= self.time_limit
         return within and self.finite and self.monotone is not False and self.unbiased is not False
 
     def json(self) -> dict[str, Any]:

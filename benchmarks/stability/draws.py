@@ -13,6 +13,7 @@ from scipy import stats
 from benchmarks.stability.case import Row, time_ratio
 from simulator import CameraProfile, CameraSettings, Latent, NoiseLevelFunction, get_camera
 from simulator.frame_noise import Noise
+from simulator.reference import ReferenceCamera
 
 GROUP = "noise draws"
 _STATE = CameraSettings(iso=100.0, exposure_time=1.0, f_number=4.0)
@@ -24,52 +25,15 @@ SAME = 0.05
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """The cases of this group."""
-    yield _where_the_gaussian_breaks()
-    for electrons in (0.1, 1.0, 3.0, 10.0, 100.0):
-        yield _poisson(electrons)
     size = 256 if quick else 1024
+    yield _where_the_gaussian_breaks()
+    for read in (_read_electrons(get_camera("nikon_z6"), 6400.0), 0.3):
+        for electrons in (0.1, 1.0, 3.0, 10.0, 100.0):
+            yield from _few(electrons, read, size, seed)
     for noise in ("exact", "bank"):
         for sigmas in (-3.0, -1.0, 0.0, 1.0, 3.0):
             yield _clipped("white", sigmas, noise, size, seed)
             yield _clipped("black", sigmas, noise, size, seed)
-
-
-def _distance(electrons: float, read: float) -> tuple[float, float, float]:
-    """Photons and read noise against a Gaussian of the same mean and variance.
-
-    Returns:
-        Largest distance of the distribution functions; what clipping at black, without a black
-        level, adds to the mean of each [electrons].
-    """
-    counts = np.arange(int(electrons + 40 * math.sqrt(electrons) + 60))
-    weights = stats.poisson.pmf(counts, electrons)
-    sigma = math.sqrt(electrons + read**2)
-    grid = np.linspace(-8 * sigma, electrons + 10 * sigma + 8, 8001)
-    exact = (weights[:, None] * stats.norm.cdf((grid - counts[:, None]) / read)).sum(axis=0)
-    distance = float(np.abs(exact - stats.norm.cdf((grid - electrons) / sigma)).max())
-    lifted = float((weights * _lift(counts, np.full(len(counts), read))).sum())
-    return distance, lifted, float(_lift(np.array(electrons), np.array(sigma)))
-
-
-def _lift(mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """What clipping at 0 adds to the mean of a Gaussian."""
-    z = mean / sigma
-    return sigma * stats.norm.pdf(z) - mean * stats.norm.cdf(-z)
-
-
-def _poisson(electrons: float) -> Row:
-    camera = get_camera("nikon_z6")
-    read = _read_electrons(camera, 6400.0)
-    distance, exact, gaussian = _distance(electrons, read)
-    return Row(
-        GROUP,
-        f"{electrons:g} electrons and the Z6's read noise at ISO 6400 ({read:.1f})",
-        distance,
-        error="of the distribution function",
-        dtype="float64",
-        declared="the noise model is Gaussian (docs/stability.md)" if distance > SAME else "",
-        note=f"clipping at black lifts the mean by {exact:.3f}, a Gaussian's by {gaussian:.3f}",
-    )
 
 
 def _read_electrons(camera: CameraProfile, iso: float) -> float:
@@ -77,22 +41,81 @@ def _read_electrons(camera: CameraProfile, iso: float) -> float:
     return math.sqrt(nlf.read[1]) / nlf.shot[1]
 
 
+def _poisson_cdf(grid: np.ndarray, electrons: float, read: float) -> np.ndarray:
+    """Distribution function of a photon count and Gaussian read noise [electrons]."""
+    counts = np.arange(int(electrons + 40 * math.sqrt(electrons) + 60))
+    weights = stats.poisson.pmf(counts, electrons)
+    return (weights[:, None] * stats.norm.cdf((grid - counts[:, None]) / read)).sum(axis=0)
+
+
+def _distance(electrons: float, read: float) -> float:
+    """Largest distance of that function and of a Gaussian's of the same mean and variance."""
+    sigma = math.sqrt(electrons + read**2)
+    grid = np.linspace(-8 * sigma, electrons + 10 * sigma + 8, 8001)
+    gaussian = stats.norm.cdf((grid - electrons) / sigma)
+    return float(np.abs(_poisson_cdf(grid, electrons, read) - gaussian).max())
+
+
 def _where_the_gaussian_breaks() -> Row:
-    """The worst of a sensor that reads without noise, and from where on it hardly matters."""
+    """The worst of a sensor that hardly has read noise, and from where on it matters little."""
     read = 0.3  # of the quietest sensors there are
     levels = np.geomspace(0.1, 1000.0, 41)
-    distances = [_distance(float(level), read)[0] for level in levels]
+    distances = [_distance(float(level), read) for level in levels]
     enough = levels[np.nonzero(np.array(distances) > SAME)[0].max() + 1]
     worst = int(np.argmax(distances))
     return Row(
         GROUP,
-        f"read noise of {read:g} electrons, 0.1 to 1000 electrons",
+        f"a Gaussian for photons, read noise of {read:g} electrons, 0.1 to 1000 electrons",
         distances[worst],
         error="of the distribution function",
         dtype="float64",
         declared="the noise model is Gaussian (docs/stability.md)",
         note=f"worst at {levels[worst]:.2g} electrons; below {SAME:.0%} from {enough:.0f} on",
     )
+
+
+def _few(electrons: float, read: float, size: int, seed: int) -> Iterator[Row]:
+    """Captures of a few electrons: the reference camera counts them, the simulator does not."""
+    well, black = 1000.0, 4096.0
+    nlf = NoiseLevelFunction((1.0 / well,) * 4, ((read / well) ** 2,) * 4)
+    camera = replace(
+        get_camera("nikon_z6"),
+        black_level=(black,) * 4,
+        white_level=2.0**16 - 1,
+        bit_depth=16,
+        nlf_by_iso={100.0: nlf},
+        segments=(),
+    )
+    light = torch.full((4, size, size), electrons / well)
+    span = camera.span[0]
+    # Between digital numbers [electrons]: a capture rounds to the nearest.
+    numbers = np.arange(2**16 - 1)
+    grid = (numbers + 0.5 - black) / span * well
+    sigma = math.sqrt(electrons + read**2)
+    gaussian = stats.norm.cdf((grid - electrons) / sigma)
+    latent = Latent(light, _STATE, camera, NoiseLevelFunction.zero())
+    captures = {
+        "reference camera against photons": (
+            ReferenceCamera(camera).record(light, 100.0, torch.Generator().manual_seed(seed)),
+            _poisson_cdf(grid, electrons, read),
+        ),
+        "simulator against its Gaussian": (latent.expose([_STATE], seed=seed)[0], gaussian),
+    }
+    for name, (frame, wanted) in captures.items():
+        counts = np.bincount((frame * span + black).round().long().flatten(), minlength=2**16)
+        found = np.cumsum(counts)[:-1] / frame.numel()
+        mean = float(frame.double().mean()) * well
+        yield Row(
+            GROUP,
+            f"{electrons:g} electrons, read noise of {read:.1f}: {name}",
+            float(np.abs(found - wanted).max()),
+            error="of the distribution function",
+            # Kolmogorov: exceeded by chance once in a million.
+            limit=2.7 / math.sqrt(frame.numel()),
+            finite=bool(torch.isfinite(frame).all()),
+            unbiased=abs(mean - electrons) < _SIGMAS * sigma / math.sqrt(frame.numel()),
+            note=f"the two distributions are {_distance(electrons, read):.3f} apart",
+        )
 
 
 def _clipped(end: str, sigmas: float, noise: Noise, size: int, seed: int) -> Row:

@@ -5,6 +5,7 @@ Every batch runs in a process of its own: what ends that is a fault, too.
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -20,9 +21,12 @@ from benchmarks.stability.case import Row
 
 GROUP = "fuzzing"
 #: Inputs of each kind, and of a process.
-INPUTS, QUICK_INPUTS, BATCH = 4000, 200, 400
+INPUTS, QUICK_INPUTS, BATCH = 2000, 200, 1000
 #: A file that takes longer than this to read or to refuse is a fault [s].
 _PATIENCE = 5.0
+#: And so is a batch that takes longer than this [s].
+_BATCH_PATIENCE = 600.0
+_KEY = "0" * 24
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -31,25 +35,30 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         inputs = QUICK_INPUTS if quick else INPUTS
         if kind == "real raw":
             inputs //= 10
-        yield _row(kind, inputs, seed)
+        row = _row(kind, inputs, seed)
+        if row is not None:
+            yield row
 
 
-def _row(kind: str, inputs: int, seed: int) -> Row:
+def _row(kind: str, inputs: int, seed: int) -> Row | None:
+    """The row of `kind`; None where there are no files of it (real ones, without AE_ENV_DATA)."""
     refused, read, faults, first = 0, 0, 0, ""
     for start in range(0, inputs, BATCH):
         count = min(BATCH, inputs - start)
+        batch: dict[str, Any] = {"kind": kind, "first": start, "count": count, "seed": seed}
         try:
-            found = isolated(
-                run_batch, num_threads=1, kind=kind, first=start, count=count, seed=seed
-            )
+            found = isolated(run_batch, num_threads=1, timeout=_BATCH_PATIENCE, **batch)
         except RuntimeError as error:  # the process died
             found = {"read": 0, "refused": 0, "faults": [str(error)]}
+        except subprocess.TimeoutExpired as error:
+            words = f"inputs from {start} on took more than {error.timeout:g} s"
+            found = {"read": 0, "refused": 0, "faults": [words]}
         read, refused = read + found["read"], refused + found["refused"]
         faults += len(found["faults"])
         first = first or next(iter(found["faults"]), "")
-    note = f"{read:,} read, {refused:,} refused" + (f"; first fault: {first}" if first else "")
     if not read + refused + faults:
-        inputs, note = 0, "not run: set AE_ENV_DATA to the folder of real files"
+        return None
+    note = f"{read:,} read, {refused:,} refused" + (f"; first fault: {first}" if first else "")
     return Row(
         GROUP,
         f"{kind}: {inputs:,} damaged files",
@@ -64,7 +73,8 @@ def _row(kind: str, inputs: int, seed: int) -> Row:
 def run_batch(kind: str, first: int, count: int, seed: int) -> dict[str, Any]:
     """Reads inputs `first` to ``first + count``: how many were read and refused, and the faults.
 
-    A fault is any error that is not a `ValueError`, and any input that takes too long.
+    A fault is any error that is not a `ValueError`, any input that is read as what no file says
+    (data that are not finite, or not those that were written), and any that takes too long.
     """
     make, read = KINDS[kind]
     found: dict[str, Any] = {"read": 0, "refused": 0, "faults": []}
@@ -77,16 +87,25 @@ def run_batch(kind: str, first: int, count: int, seed: int) -> dict[str, Any]:
             original = originals[number % len(originals)]
             path = Path(folder) / f"damaged{original.suffix}"
             path.write_bytes(damaged(original.read_bytes(), rng))
-            start = time.perf_counter()
-            try:
-                found["read"] += bool(read(path))
-            except ValueError:
-                found["refused"] += 1
-            except Exception as error:  # what the user would see as a traceback
-                found["faults"].append(f"input {number}: {type(error).__name__}: {error}")
-            if time.perf_counter() - start > _PATIENCE:
-                found["faults"].append(f"input {number}: took too long")
+            outcome = _outcome(path, read)
+            if outcome in ("read", "refused"):
+                found[outcome] += 1
+            else:
+                found["faults"].append(f"input {number}: {outcome}")
+    assert found["read"] + found["refused"] + len(found["faults"]) == count
     return found
+
+
+def _outcome(path: Path, read: Callable[[Path], bool]) -> str:
+    """``"read"``, ``"refused"``, or what is wrong."""
+    start = time.perf_counter()
+    try:
+        outcome = "read" if read(path) else "read as what it does not hold"
+    except ValueError:
+        outcome = "refused"
+    except Exception as error:  # what the user would see as a traceback
+        return f"{type(error).__name__}: {error}"
+    return outcome if time.perf_counter() - start <= _PATIENCE else "took too long"
 
 
 def damaged(content: bytes, rng: np.random.Generator) -> bytes:
@@ -171,9 +190,12 @@ def _cached(folder: Path) -> list[Path]:
     from simulator.cache import DiskCache
 
     cache = DiskCache(folder)
-    generator = torch.Generator().manual_seed(0)
-    cache.put("denoised", "0" * 24, {"light": torch.rand(4, 16, 16, generator=generator)})
-    return [cache.path("denoised", "0" * 24)]
+    cache.put("denoised", _KEY, _tensors())
+    return [cache.path("denoised", _KEY)]
+
+
+def _tensors() -> dict[str, torch.Tensor]:
+    return {"light": torch.rand(4, 16, 16, generator=torch.Generator().manual_seed(0))}
 
 
 def _read_raw(path: Path) -> bool:
@@ -201,16 +223,20 @@ def _read_config(path: Path) -> bool:
 
 
 def _read_cached(path: Path) -> bool:
-    """What a cache finds under a damaged file's name; a damaged one counts as refused."""
+    """Whether a cache finds what was written; where it finds nothing, that counts as refused."""
     from simulator.cache import DiskCache
 
-    cache = DiskCache(path.parent)
-    target = cache.path("denoised", "1" * 24)
-    target.parent.mkdir(exist_ok=True)
+    cache = DiskCache(path.parent / "damaged")  # the original stays
+    target = cache.path("denoised", _KEY)
+    target.parent.mkdir(parents=True, exist_ok=True)
     path.replace(target)
-    if cache.get("denoised", "1" * 24) is None:
+    found, written = cache.get("denoised", _KEY), _tensors()
+    if found is None:
         raise ValueError("damaged")
-    return True
+    return found.keys() == written.keys() and all(
+        found[name].dtype == tensor.dtype and torch.equal(found[name], tensor)
+        for name, tensor in written.items()
+    )
 
 
 #: By kind: the files that are damaged, made in a folder, and what reads them.

@@ -18,30 +18,32 @@ GROUP = "stiff light"
 LIMIT = 1e-9
 #: Exposure times [s].
 TIMES = (1 / 8000, 1 / 1000, 1 / 120, 1 / 60, 1 / 4, 4.0)
+#: A frame may take this much longer in the longest exposure than in the shortest.
+_TIME_LIMIT = 2.0
 #: Rows of a sensor that are timed, and the time from one to the next [s].
 _ROWS, _ROW_TIME = 4000, 11e-6
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """The cases of this group."""
-    starts = np.random.default_rng(seed).random(2 if quick else 8).tolist()
+    rng = np.random.default_rng(seed)
+    # In the first second, and an hour and a day later.
+    starts = [*rng.random(2 if quick else 8).tolist(), 3600.1, 86_400.7]
     for frequency in (100.0, 120.0):
         lamp = MainsLamp(frequency)
-        yield _row(f"mains, {frequency:g} Hz", lamp, _mains_error(lamp, starts))
-    for frequency in (1_000, 20_000):
+        yield _row(f"mains, {frequency:g} Hz", lamp, _mains_error(lamp, starts[:-2]))
+    for pulsed_frequency in (1_000, 20_000):
         for duty in (0.01, 0.5, 0.99):
-            lamp = PulsedLamp(frequency, duty)
-            yield _row(
-                f"pulse-width modulation, {frequency:,} Hz, {duty:.0%} on",
-                lamp,
-                _pulse_error(lamp, starts),
-            )
+            pulsed = PulsedLamp(pulsed_frequency, duty)
+            name = f"pulse-width modulation, {pulsed_frequency:,} Hz, {duty:.0%} on"
+            yield _row(name, pulsed, _pulse_error(pulsed, starts))
     strobe = PulsedLamp(25.0, 25.0 * 10e-6)
     yield _row("strobe, 25 Hz, 10 microseconds", strobe, _pulse_error(strobe, starts))
+    yield _rows_error(PulsedLamp(1_000, 0.1))
     for decay in (1e-6, 100e-6):
-        lamp = Flash(at=0.25, decay=decay, energy=0.01)
+        flash = Flash(at=0.25, decay=decay, energy=0.01)
         name = f"lightning, decay {decay * 1e6:g} microseconds"
-        yield _row(name, lamp, _flash_error(lamp, starts))
+        yield _row(name, flash, _flash_error(flash, starts[:-2]))
 
 
 def _row(case: str, lamp: Lamp, error: float) -> Row:
@@ -59,8 +61,20 @@ def _row(case: str, lamp: Lamp, error: float) -> Row:
         dtype="float64",
         finite=bool(np.isfinite(light).all() and (light >= 0.0).all()),
         time_ratio=time_ratio(lambda: frame(TIMES[-1]), lambda: frame(TIMES[0])),
+        time_limit=_TIME_LIMIT,
         note=f"bands of {light.min():.3g} to {light.max():.3g} times the mean light",
     )
+
+
+def _rows_error(lamp: PulsedLamp) -> Row:
+    """Bands of a rolling shutter, every row against exact fractions."""
+    time, start, row_time = 1 / 2000, 0.1, 2.0**-16  # rows begin at exact moments
+    found = lamp.row_light(start, time, _ROWS // 2, row_time)
+    exact = [_exact_mean(lamp, start + row_time * row, time) for row in range(_ROWS)]
+    wanted = np.array(exact).reshape(-1, 2).mean(axis=1)
+    error = float((np.abs(found - wanted) / np.maximum(wanted, 1e-3)).max())
+    name = f"rolling shutter, {_ROWS:,} sensor rows, 1,000 Hz, 10% on, 1/2000 s"
+    return Row(GROUP, name, error, limit=LIMIT, dtype="float64")
 
 
 def _mains_error(lamp: MainsLamp, starts: list[float]) -> float:
@@ -81,8 +95,9 @@ def _flash_error(lamp: Flash, starts: list[float]) -> float:
     """Against SciPy's adaptive quadrature; 60 times the decay after the flash nothing is left."""
 
     def light(t: float) -> float:
-        flash = lamp.energy / lamp.decay * math.exp(-(t - lamp.at) / lamp.decay)
-        return 1.0 + flash if t >= lamp.at else 1.0
+        if t < lamp.at:
+            return 1.0
+        return 1.0 + lamp.energy / lamp.decay * math.exp(-(t - lamp.at) / lamp.decay)
 
     def pieces(start: float, time: float) -> list[float]:
         edges = [lamp.at + lamp.decay * n for n in range(61)]
@@ -110,18 +125,21 @@ def _quadrature_error(lamp, light, starts, pieces) -> float:  # type: ignore[no-
 def _pulse_error(lamp: PulsedLamp, starts: list[float]) -> float:
     """Against exact fractions: a quadrature would step over pulses.
 
-    Absolute where hardly any pulse is seen, relative elsewhere.
+    Relative, to a thousandth of the mean light where hardly any pulse is seen.
     """
     worst = 0.0
-    frequency, duty = Fraction(lamp.frequency), Fraction(lamp.duty)
     for time in TIMES:
         for start in starts:
-            begin = Fraction(start) * frequency
-            on = _on_before(begin + Fraction(time) * frequency, duty) - _on_before(begin, duty)
-            wanted = float(on / (duty * Fraction(time) * frequency))
+            wanted = _exact_mean(lamp, start, time)
             found = float(lamp.mean_light(start, time))
-            worst = max(worst, abs(found - wanted) / max(wanted, 1.0))
+            worst = max(worst, abs(found - wanted) / max(wanted, 1e-3))
     return worst
+
+
+def _exact_mean(lamp: PulsedLamp, start: float, time: float) -> float:
+    frequency, duty = Fraction(lamp.frequency), Fraction(lamp.duty)
+    begin, span = Fraction(start) * frequency, Fraction(time) * frequency
+    return float((_on_before(begin + span, duty) - _on_before(begin, duty)) / (duty * span))
 
 
 def _on_before(periods: Fraction, duty: Fraction) -> Fraction:

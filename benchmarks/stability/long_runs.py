@@ -173,18 +173,29 @@ def _killed(agent: str, signals: Sequence[int], seed: int) -> Row:
             process.communicate()
             killed += process.returncode != 0
         last = _start(agent, out)
-        hashes = [process.communicate()[0].strip() for process in (whole, last)]
+        results = [_result(process.communicate()[0]) for process in (whole, last)]
         failed = whole.returncode or last.returncode
+    (expected, _), (found, step) = results
     names = ", ".join(signal.Signals(number).name for number in signals)
     return Row(
         GROUP,
         f"{agent} training, killed by {names} and resumed",
-        float(hashes[0] != hashes[1]),
+        float(found != expected),
         error="weights that differ",
         limit=0.0,
-        finite=not failed and killed == len(signals),
-        note=f"ended by {killed} of {len(signals)} signals, a checkpoint after every step",
+        finite=not failed and killed == len(signals) and step > 0,
+        note=f"ended by {killed} of {len(signals)} signals, a checkpoint after every step; the "
+        f"last run went on at step {step}",
     )
+
+
+def _result(printed: str) -> tuple[str, int]:
+    """Hash and step that `train` returned; those of nothing where it failed."""
+    try:
+        result = json.loads(printed.strip().splitlines()[-1])
+    except (IndexError, ValueError):
+        return "", 0
+    return result["hash"], result["step"]
 
 
 def _changed(file: Path) -> int:
@@ -207,8 +218,12 @@ def _start(agent: str, out: Path) -> subprocess.Popen[str]:
     )
 
 
-def train(agent: str, out: str) -> str:
-    """Trains an agent with a checkpoint after every step; hash of its weights."""
+def train(agent: str, out: str) -> dict[str, Any]:
+    """Trains an agent with a checkpoint after every step.
+
+    Returns:
+        Hash of its weights, and the step that it was resumed at, 0 where it was not.
+    """
     import agents.ppo
     import agents.regression
     from agents.training import AgentConfig, train_agent
@@ -216,8 +231,18 @@ def train(agent: str, out: str) -> str:
 
     # What runs in the background of a shell ignores interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    often: Any = functools.partial(Checkpoint, interval=-1.0)
-    agents.ppo.Checkpoint = agents.regression.Checkpoint = often  # type: ignore[misc]
+    steps: list[int] = []
+
+    class Often(Checkpoint):
+        def save(self, step: int, *, force: bool = False) -> None:
+            if step > steps[-1]:  # a kill after it comes after some learning
+                super().save(step, force=True)
+
+        def restore(self) -> int:
+            steps.append(super().restore())
+            return steps[-1]
+
+    agents.ppo.Checkpoint = agents.regression.Checkpoint = Often  # type: ignore[misc]
     training: dict[str, dict[str, Any]] = {
         "regression": {"frames": _FRAMES, "width": 16},
         "ppo": {"total_timesteps": _FRAMES, "n_steps": 8, "batch_size": 64, "width": 16},
@@ -229,4 +254,4 @@ def train(agent: str, out: str) -> str:
         training=training[agent],
     )
     path = train_agent(config, Path(out)).with_suffix(".safetensors")
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return {"hash": hashlib.sha256(path.read_bytes()).hexdigest(), "step": max(steps, default=0)}

@@ -88,7 +88,7 @@ def _extrapolated(camera: CameraProfile, case: str, isos: list[float]) -> Row:
         worst,
         limit=LIMIT,
         dtype="float64",
-        finite=finite,
+        finite=finite and declared,
         declared="`NoiseLevelFunction.extrapolated`" if declared else "",
     )
 

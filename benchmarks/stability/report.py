@@ -26,9 +26,9 @@ def markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
         "![Largest error of each case](stability.png)",
         "## Findings",
         "\n".join(f"- {line}" for line in findings),
-        "Errors are the largest against an independent computation in float64 (closed forms, exact "
-        "fractions, SciPy); *time* is that of the extreme case over the ordinary one's. A case "
-        "that cannot be right says how the result is declared.",
+        "Errors are the largest, against closed forms, exact fractions, SciPy or the same steps in "
+        "float64, unless the case names another reference; *time* is that of the extreme case over "
+        "the ordinary one's. A case that cannot be right says how the result is declared.",
     ]
     for group in dict.fromkeys(row["group"] for row in rows):
         own = [row for row in rows if row["group"] == group]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
 
+from ae_env.checks import UserCodeError
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.score_table import ScoreTable, ScoreTables
@@ -18,6 +19,7 @@ from simulator import CameraProfile, CameraSettings, get_camera
 GROUP = "scores"
 _REFERENCE = CameraSettings(iso=100.0, exposure_time=1.0 / 128.0, f_number=4.0)
 _EPISODES = ({}, {"speed": 100.0, "defocus": 8.0}, {"gain": 2.0**-20}, {"gain": 2.0**20})
+_EXTREMES = "1e-6 to 1e9 lux, +-20 stops, 100 frame heights a second"
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -26,8 +28,18 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     signals = extreme_signals(seed)
     ordinary = _scene("ordinary", 0.05 + 0.4 * torch.rand(4, 48, 48), camera, 1000.0)
     for name in list_scorers():
-        yield _finite(name, signals, ordinary, camera)
-    yield _balanced_parts(signals, camera)
+        case = f"{name}: {len(signals)} signals, {_EXTREMES}"
+        yield _told(case, lambda c=case, n=name: _finite(c, n, signals, ordinary, camera))
+    case = "balanced against float64"
+    yield _told(case, lambda: _balanced_parts(case, signals, camera))
+
+
+def _told(case: str, measure: Callable[[], Row]) -> Row:
+    """What `measure` finds; a scorer that leaves its range is refused, which is a finding too."""
+    try:
+        return measure()
+    except UserCodeError as error:
+        return Row(GROUP, case, None, limit=0.0, dtype="float64", finite=False, note=str(error))
 
 
 def _scene(
@@ -57,7 +69,11 @@ def _tables(name: str, camera: CameraProfile) -> ScoreTables:
 
 
 def _finite(
-    name: str, signals: dict[str, torch.Tensor], ordinary: Scene, camera: CameraProfile
+    case: str,
+    name: str,
+    signals: dict[str, torch.Tensor],
+    ordinary: Scene,
+    camera: CameraProfile,
 ) -> Row:
     tables = _tables(name, camera)
     finite, out_of_range = True, 0.0
@@ -69,7 +85,7 @@ def _finite(
     extreme = _scene("30 stops in one frame", signals["30 stops in one frame"], camera, 1e9)
     return Row(
         GROUP,
-        f"{name}: {len(signals)} signals, 1e-6 to 1e9 lux, +-20 stops, 100 frame heights a second",
+        case,
         float(out_of_range),
         error="outside [0, 1]",
         limit=0.0,
@@ -87,14 +103,14 @@ def _values(table: ScoreTable) -> list[np.ndarray]:
     return [table.mean, *table.parts.values()]
 
 
-def _balanced_parts(signals: dict[str, torch.Tensor], camera: CameraProfile) -> Row:
+def _balanced_parts(case: str, signals: dict[str, torch.Tensor], camera: CameraProfile) -> Row:
     """The default scorer against its formulas (docs/scorers) in float64."""
     tables, grid = _tables("balanced", camera), ExposureGrid.default()
     worst = 0.0
     for scene in _scenes(signals, camera):
         wanted = np.array([_balanced(scene, state, camera) for state in grid])
         worst = max(worst, float(np.abs(tables.table(scene).mean - wanted).max()))
-    return Row(GROUP, "balanced against float64", worst, error="of a score", limit=1e-5)
+    return Row(GROUP, case, worst, error="of a score", limit=1e-5)
 
 
 def _balanced(scene: Scene, state: CameraSettings, camera: CameraProfile) -> float:

@@ -12,9 +12,10 @@ import torch
 from benchmarks.stability.case import Row, time_ratio
 from simulator import CameraProfile, CameraSettings, Latent, NoiseLevelFunction, get_camera
 from simulator.blur import disc_blur, motion_blur
-from simulator.blur_shapes import disc_kernel
-from simulator.capture import top_up
+from simulator.blur_shapes import disc_kernel, motion_kernel
+from simulator.capture import add_noise
 from simulator.exposure import Exposure
+from simulator.frame_noise import FrameNoise
 
 GROUP = "signals"
 EPS32 = 2.0**-24
@@ -29,13 +30,20 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     camera = get_camera("nikon_z6")
     ordinary = _ordinary(seed)
     for name, light in extreme_signals(seed).items():
-        yield _recorded(name, light, ordinary, camera)
+        for device in devices():
+            yield _recorded(name, light.to(device), ordinary.to(device), camera)
     for name, light in extreme_signals(seed).items():
         if name in _BLURRED:
             yield _blurred(name, light, ordinary)
+    yield _shapes()
     yield _monotone(camera)
     for exponent in range(-12, 1, 3):
         yield _variance(10.0**exponent, seed, 4 if quick else 32)
+
+
+def devices() -> list[str]:
+    """Torch devices that are at hand."""
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 
 def _ordinary(seed: int) -> torch.Tensor:
@@ -76,11 +84,12 @@ def _recorded(name: str, light: torch.Tensor, ordinary: torch.Tensor, camera: Ca
     """Without noise, against float64: the recorded number less the exact one before rounding."""
     clean = replace(camera, nlf_by_iso={100.0: NoiseLevelFunction.zero()}, segments=())
     latent = Latent(light, _REFERENCE, clean, NoiseLevelFunction.zero())
-    frames = latent.expose([_exposed(stops) for stops in STOPS]).numpy().astype(np.float64)
+    frames = latent.expose([_exposed(stops) for stops in STOPS]).cpu().numpy().astype(np.float64)
+    exact_light = light.cpu().numpy().astype(np.float64)
     span, black = (np.array(v)[:, None, None] for v in (camera.span, camera.black_level))
     worst = 0.0
     for stops, frame in zip(STOPS, frames, strict=True):
-        exact = np.clip(light.numpy().astype(np.float64) * 2.0**stops * span + black, 0.0, None)
+        exact = np.clip(exact_light * 2.0**stops * span + black, 0.0, None)
         exact = np.minimum(exact, camera.white_level)
         worst = max(worst, float(np.abs(frame * span + black - exact).max()))
     states = [_exposed(stops) for stops in STOPS]
@@ -93,6 +102,7 @@ def _recorded(name: str, light: torch.Tensor, ordinary: torch.Tensor, camera: Ca
         error="digital numbers",
         # Rounding to whole numbers, and float32 products of numbers of 14 bits.
         limit=0.5 + 4 * EPS32 * 2**14,
+        dtype="float32" if light.device.type == "cpu" else f"float32, {light.device.type}",
         finite=bool(np.isfinite(frames).all()),
         time_ratio=time_ratio(lambda: latent.expose(states), lambda: usual.expose(states)),
         declared="clipped highlights: `info['clipped_high']`, `Latent.saturated`" * clipped,
@@ -100,16 +110,16 @@ def _recorded(name: str, light: torch.Tensor, ordinary: torch.Tensor, camera: Ca
 
 
 def _blurred(name: str, light: torch.Tensor, ordinary: torch.Tensor) -> Row:
-    """A streak and a disc, against sums in float64, relative to the brightest light near by."""
-    worst, finite, exact_light = 0.0, True, light.double()
+    """A streak and a disc, against the weights times shifted copies in float64."""
+    worst, finite = 0.0, True
     for extent in (0.3, 5.0, 40.0):
         found = motion_blur(light, extent)
         finite &= bool(torch.isfinite(found).all())
-        worst = max(worst, _relative(found, motion_blur(exact_light, extent), light))
+        worst = max(worst, _relative(found, _weighted(light, motion_kernel(extent)[None]), light))
     for diameter in (0.5, 6.0, 20.0):
         found = disc_blur(light, diameter)
         finite &= bool(torch.isfinite(found).all())
-        worst = max(worst, _relative(found, _disc_sum(exact_light, diameter), light))
+        worst = max(worst, _relative(found, _weighted(light, disc_kernel(diameter)), light))
     return Row(
         GROUP,
         f"{name}, blurred",
@@ -121,20 +131,34 @@ def _blurred(name: str, light: torch.Tensor, ordinary: torch.Tensor) -> Row:
     )
 
 
-def _relative(found: torch.Tensor, wanted: torch.Tensor, light: torch.Tensor) -> float:
-    return float((found.double() - wanted).abs().max() / max(float(light.abs().max()), 1e-30))
+def _relative(found: torch.Tensor, wanted: np.ndarray, light: torch.Tensor) -> float:
+    difference = np.abs(found.numpy().astype(np.float64) - wanted).max()
+    return float(difference / max(float(light.abs().max()), 1e-30))
 
 
-def _disc_sum(light: torch.Tensor, diameter: float) -> torch.Tensor:
-    """The disc's weights times shifted copies, in float64."""
-    weights = disc_kernel(diameter)
-    radius = len(weights) // 2
-    padded = np.pad(light.numpy(), ((0, 0), (radius, radius), (radius, radius)), mode="edge")
+def _weighted(light: torch.Tensor, weights: np.ndarray) -> np.ndarray:
+    """Sum of copies of `light` shifted by each weight's place, borders repeated."""
+    rows, columns = (size // 2 for size in weights.shape)
+    exact = light.numpy().astype(np.float64)
+    padded = np.pad(exact, ((0, 0), (rows, rows), (columns, columns)), mode="edge")
     total = np.zeros(light.shape)
-    for i, row in enumerate(weights):
-        for j, weight in enumerate(row):
-            total += weight * padded[:, i : i + light.shape[1], j : j + light.shape[2]]
-    return torch.from_numpy(total)
+    for i, j in np.ndindex(weights.shape):
+        total += weights[i, j] * padded[:, i : i + light.shape[1], j : j + light.shape[2]]
+    return total
+
+
+def _shapes() -> Row:
+    """Energy and second moment of streaks (extent^2 / 12) and discs (diameter^2 / 16)."""
+    worst = 0.0
+    for extent in np.geomspace(0.01, 1000.0, 26):
+        streak, disc = motion_kernel(extent), disc_kernel(min(extent, 30.0)).sum(axis=0)
+        for weights, moment in ((streak, extent**2 / 12), (disc, min(extent, 30.0) ** 2 / 16)):
+            offsets = np.arange(len(weights)) - len(weights) // 2
+            worst = max(worst, abs(weights.sum() - 1.0))
+            if moment > 1e-4:  # less blurs nothing
+                worst = max(worst, abs((weights * offsets**2).sum() / moment - 1.0))
+    name = "streaks of 0.01 to 1000 pixels, discs of 0.01 to 30: energy and second moment"
+    return Row(GROUP, name, float(worst), limit=0.01, dtype="float64")
 
 
 def _monotone(camera: CameraProfile) -> Row:
@@ -152,23 +176,20 @@ def _monotone(camera: CameraProfile) -> Row:
 
 
 def _variance(variance: float, seed: int, frames: int) -> Row:
-    """Noise of a given variance on a light of 0.5, before the clip: variance and mean."""
+    """Noise of a given variance before the clip, on black, where float32 resolves the smallest."""
     nlf = NoiseLevelFunction((0.0,) * 4, (variance,) * 4)
     exposure = Exposure(ratio=1.0, source=NoiseLevelFunction.zero(), target=nlf)
-    generator = torch.Generator().manual_seed(seed)
-    # Of a light of 0, so that float32 resolves the smallest of them.
+    noises = [FrameNoise(seed * frames + i, "exact") for i in range(frames)]
     light = torch.zeros(frames, 4, 128, 128)
-    normals = torch.randn(light.shape, generator=generator)
-    noisy = top_up(light, [exposure] * frames, normals)[0].double()
-    wanted = normals.double() * math.sqrt(variance)
-    error = float((noisy - wanted).abs().max() / math.sqrt(variance))
+    noisy = add_noise(light, [exposure] * frames, noises)[0].double()
+    measured = float(noisy.square().mean()) / variance
     standard_error = math.sqrt(variance / noisy.numel())
     return Row(
         GROUP,
         f"noise of variance {variance:.0e}",
-        error,
-        error="standard deviations",
-        limit=16 * EPS32,
+        abs(measured - 1.0),
+        error="of the variance",
+        limit=5.0 * math.sqrt(2.0 / noisy.numel()),  # five standard errors
         finite=bool(torch.isfinite(noisy).all()),
-        unbiased=abs(float(noisy.mean())) < 5 * standard_error,
+        unbiased=abs(float(noisy.mean())) < 5.0 * standard_error,
     )

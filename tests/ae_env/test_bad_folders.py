@@ -35,9 +35,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def write_exr(path: Path, image: np.ndarray) -> None:
+def write_exr(path: Path, image: np.ndarray, compression: str = "ZIP") -> None:
     exr = pytest.importorskip("OpenEXR")
-    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    header = {"compression": getattr(exr, f"{compression}_COMPRESSION")}
+    header["type"] = exr.scanlineimage
     exr.File(header, dict.fromkeys("RGB", image.astype(np.float32))).write(str(path))
 
 
@@ -107,6 +108,16 @@ def test_a_map_is_skipped_as_a_whole(folder: Path) -> None:
     assert ids(scenes) == ["good1", "good2", "good3", "good4"]
 
 
+def test_a_black_frame_stops_or_is_skipped(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    settings = CameraSettings(100, 0.01, 4)
+    write_dng(folder / "black.dng", RawImage(torch.zeros(4, 64, 64), settings, CAMERA))
+    with pytest.raises(ValueError, match=r"scene file '.*black\.dng': `light` is 0 .*'skip'"):
+        load(folder)
+    assert ids(load(folder, on_error="skip")) == ["good1", "good2", "good3", "good4"]
+    assert "1 of 5 scene files skipped (black.dng: `light` is 0" in caplog.text
+    assert len(load(folder, illuminance=100.0)) == 5  # then its exposure is known
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -145,7 +156,7 @@ def test_names_that_no_system_has(name: str) -> None:
     ("size", "words"),
     [
         (b"-Y 60000 +X 60000", "claims 60000 x 60000 pixels, where at most 268435456"),
-        (b"-Y 8000 +X 8000", "claims 8000 x 8000 pixels in .* bytes, where at most 1024 a byte"),
+        (b"-Y 8000 +X 8000", "claims 8000 x 8000 pixels in .* bytes, where at most 8192 a byte"),
         (b"-Y 99999999999 +X 4", "claims 99999999999 x 4"),
         (b"-Y 17 +X 32", "complete"),
         (b"-Y 0 +X 0", "complete"),
@@ -165,7 +176,7 @@ def test_lying_and_cut_exr_files(tmp_path: Path) -> None:
     write_exr(path, np.random.default_rng(0).random((32, 64)))
     whole = path.read_bytes()
     window = whole.index(b"dataWindow\0box2i\0") + 21
-    for corner, words in (((59_999, 59_999), "60000 x 60000"), ((19_999, 9_999), "1024 a byte")):
+    for corner, words in (((59_999, 59_999), "60000 x 60000"), ((19_999, 12_999), "8192 a byte")):
         content = bytearray(whole)
         struct.pack_into("<2i", content, window + 8, *corner)
         path.write_bytes(content)
@@ -178,6 +189,13 @@ def test_lying_and_cut_exr_files(tmp_path: Path) -> None:
     for bad in (None, 3, b"a.exr"):
         with pytest.raises(ValueError, match="must be a file's name"):
             read_radiance(bad)  # type: ignore[arg-type]
+
+
+def test_a_flat_map_that_is_packed_most_densely(tmp_path: Path) -> None:
+    path = tmp_path / "flat.exr"
+    write_exr(path, np.full((2048, 3072), 0.5), "DWAB")
+    assert 2048 * 3072 / path.stat().st_size > 1024
+    np.testing.assert_allclose(read_radiance(path)[:, ::64, ::64], 0.5, rtol=1e-2)
 
 
 @pytest.mark.parametrize("scale", [2.0**-100, 2.0**110])

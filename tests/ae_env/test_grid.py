@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import torch
 
 from ae_env.grid import ExposureGrid
 
@@ -77,6 +78,17 @@ def test_spec_forms_are_equal() -> None:
     assert ExposureGrid.from_spec("default") == ExposureGrid.default()
 
 
+@pytest.mark.parametrize(
+    "make",
+    [torch.tensor, np.array, iter, tuple, dict.fromkeys, lambda own: dict.fromkeys(own).keys()],
+)
+def test_axes_are_any_numbers(make) -> None:
+    lists = ([100, 200], [0.125, 0.25], [2.0, 4.0])
+    grid = ExposureGrid(*map(make, lists))
+    assert grid == ExposureGrid(*map(tuple, lists))
+    assert {type(value) for value in grid.isos} == {float}
+
+
 @pytest.mark.parametrize("spec", ["defalt", {"isos": [100]}, 5, None])
 def test_bad_specs_are_refused(spec: object) -> None:
     with pytest.raises(ValueError, match="`grid`"):
@@ -91,6 +103,8 @@ def test_bad_specs_are_refused(spec: object) -> None:
         ((100,), (0.1, 0.1), (4,), "exposure_times"),
         ((100,), (0.1,), (0.0,), "f_number"),
         ((-1, 100), (0.1,), (4,), "iso"),
+        (np.array(100), (0.1,), (4,), "isos"),
+        (torch.tensor([[100, 200]]), (0.1,), (4,), "isos"),
     ],
 )
 def test_bad_lists_are_refused(isos: tuple, times: tuple, f_numbers: tuple, name: str) -> None:

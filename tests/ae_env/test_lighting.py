@@ -63,6 +63,13 @@ def test_the_most_stops_are_finite_in_float32(name: str, stops: int) -> None:
     assert ((gains >= 2.0**-MAX_STOPS) & (gains <= 2.0**MAX_STOPS)).all()
 
 
+@pytest.mark.parametrize("frame", [5.0, np.float32(5), np.int64(5)])
+def test_whole_numbers_are_frames(frame: float) -> None:
+    lighting = make_lighting({"kind": "step", "at": frame})
+    assert lighting == StepLighting(at=5)
+    assert type(lighting.at) is int  # type: ignore[attr-defined]
+
+
 def test_own_lightings_are_checked_too() -> None:
     with pytest.raises(ValueError, match="stops"):
         StepLighting(stops=math.inf)
@@ -80,6 +87,9 @@ def test_own_lightings_are_checked_too() -> None:
         ({"kind": "step", "stops": [4]}, r"`lighting\['stops'\]`"),
         ({"kind": "step", "at": True}, r"`lighting\['at'\]` \(=True\) must be an integer"),
         ({"kind": "step", "at": 1.5}, r"`lighting\['at'\]` \(=1.5\) must be an integer"),
+        ({"kind": "step", "at": math.inf}, r"`lighting\['at'\]` \(=inf\) must be an integer"),
+        ({"kind": "step", "at": math.nan}, r"`lighting\['at'\]` \(=nan\) must be an integer"),
+        ({"kind": "step", "at": 2.0**32}, r"`lighting\['at'\]`"),
         ({"kind": "sine", "period": 0}, r"`lighting\['period'\]` \(=0\)"),
         ({"kind": "sine", "period": -4}, r"`lighting\['period'\]` \(=-4\)"),
         ({"kind": "ramp", "stops_per_frame": math.inf}, r"`lighting\['stops_per_frame'\]`"),

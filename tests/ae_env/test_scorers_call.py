@@ -215,6 +215,12 @@ def test_weighted_means_stay_in_their_range() -> None:
         assert float(scorer.combine({n: np.ones(1) for n in names})[0]) <= 1.0
 
 
+def test_numbers_are_combined_too() -> None:
+    assert make_scorer({"noise": 1, "shadows": 1}).combine({"noise": 0.5, "shadows": 0.5}) == 0.5
+    scorer = Balanced()
+    assert 0.0 < scorer.combine(dict.fromkeys(scorer.parts, 0.9)) < 1.0
+
+
 @pytest.mark.parametrize("total", [math.nan, math.inf, -0.1, 1.1])
 @pytest.mark.parametrize("part", ["noise", "own"])
 def test_a_combination_of_ones_own_is_checked(total: float, part: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -232,6 +233,12 @@ def test_reset_options_per_environment() -> None:
     _, info = envs.reset(options={"scene": ids[1], "state": 9})
     assert info["scene_id"].tolist() == [ids[1]] * 3
     assert info["state"].tolist() == [9, 9, 9]
+    states = torch.tensor([4, 5, 6])
+    for given in (states, list(states), deque([4, 5, 6])):
+        envs.reset(options={"state": given})
+        np.testing.assert_array_equal(envs.unwrapped.states, [4, 5, 6])
+    envs.reset(options={"state": states[0]})
+    np.testing.assert_array_equal(envs.unwrapped.states, [4, 4, 4])
 
 
 def test_scores_masks_and_pictures_of_every_environment() -> None:

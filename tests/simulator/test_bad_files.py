@@ -5,13 +5,16 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import subprocess
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from skimage.io import imsave
 
 from benchmarks.stability import fuzz
@@ -35,7 +38,7 @@ def own_dng(tmp_path: Path) -> Path:
     return path
 
 
-def fields(content: bytes) -> Iterator[tuple[int, int, int, int]]:
+def fields(content: bytes | bytearray) -> Iterator[tuple[int, int, int, int]]:
     """Tag, type, place of the entry, place of the value (TIFF 6.0); the EXIF directory's, too."""
     pending = [struct.unpack_from("<I", content, 4)[0]]
     for offset in pending:
@@ -252,6 +255,21 @@ def test_bombs_are_refused_before_they_are_decoded(
             read_raw(path, settings=SETTINGS, nlf=NLF)
 
 
+def test_a_table_of_very_many_strips_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, mosaic = tmp_path / "a.dng", np.full((17_000, 64), 1000, np.uint16)
+    monkeypatch.setattr(tifffile, "imwrite", partial(tifffile.imwrite, rowsperstrip=1))
+    write_sample_dng(path, mosaic)
+    (tags,) = read_directories(path.read_bytes())
+    assert len(tags[273]) == len(tags[279]) == 17_000
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    np.testing.assert_array_equal(raw.to_mosaic(), mosaic)
+    os.truncate(path, path.stat().st_size - 1)
+    with pytest.raises(RawFileError, match="names 1 bytes beyond its end"):
+        read_raw(path, settings=SETTINGS, nlf=NLF)
+
+
 def test_structures_that_never_end_are_left() -> None:
     start = time.perf_counter()
     # A directory of 4096 fields, each of a value of 2**18 bytes that overlap, which is its own
@@ -276,6 +294,30 @@ def test_damaged_files_are_read_or_refused(kind: str) -> None:
     found = fuzz.run_batch(kind, 0, 100, seed=5)
     assert found["faults"] == []
     assert found["refused"] > 20
+    assert found["read"] == 100 - found["refused"]
+
+
+def test_what_the_fuzzing_counts_as_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    make, _ = fuzz.KINDS["cache entry"]
+    with monkeypatch.context() as patched:
+        patched.setattr(fuzz, "damaged", lambda content, _: content)
+        found = fuzz.run_batch("cache entry", 0, 3, seed=0)
+        assert found == {"read": 3, "refused": 0, "faults": []}
+        patched.setitem(fuzz.KINDS, "cache entry", (make, lambda _: False))
+        found = fuzz.run_batch("cache entry", 0, 3, seed=0)
+        assert found["faults"][2] == "input 2: read as what it does not hold"
+
+    def late(*_: Any, timeout: float, **__: Any) -> Any:
+        raise subprocess.TimeoutExpired("python", timeout)
+
+    monkeypatch.setattr(fuzz, "isolated", late)
+    monkeypatch.setattr(fuzz, "KINDS", {"DNG": fuzz.KINDS["DNG"]})
+    (row,) = fuzz.rows(0, quick=True)
+    assert (row.max_error, row.ok) == (1.0, False)
+    assert "took more than 600 s" in row.note
+    nothing = {"read": 0, "refused": 0, "faults": []}
+    monkeypatch.setattr(fuzz, "isolated", lambda *_, **__: nothing)
+    assert list(fuzz.rows(0, quick=True)) == []  # no real files: no row
 
 
 def full_disk(*_: Any) -> Iterator[bytes]:
@@ -305,5 +347,5 @@ def test_targets_that_cannot_be_written(tmp_path: Path, own_dng: Path) -> None:
             write_dng(target, read_raw(own_dng))
         assert str(target) in str(caught.value)
         assert ".tmp" not in str(caught.value)
-    name = "y" * 246 + ".dng"  # as long as a name may be
-    assert write_atomically(tmp_path / name, b"1").read_bytes() == b"1"
+    for name in ("y" * 246 + ".dng", "\u5b57" * 84 + ".d"):  # as long as a name may be
+        assert write_atomically(tmp_path / name, b"1").read_bytes() == b"1"

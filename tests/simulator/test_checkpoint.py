@@ -135,6 +135,15 @@ def test_another_network_leaves_no_trace(tmp_path: Path, caplog) -> None:
     assert run.steps(0, 3) == Run(None).steps(0, 3)
 
 
+def test_one_of_an_earlier_version_says_what_it_lacks(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "run"
+    run = Run(path)
+    Checkpoint(path, {"module": run.module}, identity="a").save(5, force=True)
+    with caplog.at_level(logging.WARNING):
+        assert run.store.restore() == 0
+    assert "it lacks 'optimiser', 'schedule', as those of an earlier version do" in caplog.text
+
+
 def test_another_training_is_not_resumed(tmp_path: Path, caplog) -> None:
     path = tmp_path / "run"
     one = Run(path, identity={"seed": 0, "rate": (1, 2)})

@@ -13,6 +13,8 @@ from simulator.lamps import Flash, Lamp, MainsLamp, PulsedLamp
 
 TIMES = (1 / 8000, 1 / 1000, 1 / 120, 0.01, 1 / 60, 0.35)
 STARTS = (0.0, 0.0013, 0.00499999, 3.7)
+#: An hour and a day on: the phase must be known as well as in the first second.
+LATER = (3600.123, 86_400.7, -1e6 / 3)
 
 
 @pytest.mark.parametrize("time", TIMES)
@@ -44,10 +46,10 @@ def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 1000, 1 / 60])
 def test_pulsed_light_is_the_exact_overlap(frequency: int, duty: float, time: float) -> None:
     lamp = PulsedLamp(frequency, duty)
-    for start in STARTS:
+    for start in (*STARTS, *LATER):
         exact = _pulses(Fraction(start), Fraction(time), Fraction(frequency), Fraction(duty))
         found = float(lamp.mean_light(start, time))
-        assert found == pytest.approx(float(exact), rel=1e-9, abs=1e-9)
+        assert found == pytest.approx(float(exact), rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])

@@ -296,7 +296,7 @@ def test_tolerance_0_leaves_out_only_what_changes_no_pixel(
     defocus: float,
     seed: int,
 ) -> None:
-    """Against every step run one by one, and with a tolerance within what the plan says."""
+    """Against every step run one by one; the numbers of a plan are finite at any tolerance."""
     nlf = camera.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
     fields = {"image_speed": image_speed, "defocus": defocus}
     source = latent(light, reference, camera, nlf, **fields, tolerance=0.0)
