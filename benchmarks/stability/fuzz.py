@@ -21,7 +21,7 @@ from benchmarks.stability.case import Row
 
 GROUP = "fuzzing"
 #: Inputs of each kind, and of a process.
-INPUTS, QUICK_INPUTS, BATCH = 2000, 200, 1000
+INPUTS, QUICK_INPUTS, BATCH = 1000, 200, 1000
 #: A file that takes longer than this to read or to refuse is a fault [s].
 _PATIENCE = 5.0
 #: And so is a batch that takes longer than this [s].
