@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from simulator.camera import BayerPattern, NoiseLevelFunction
+from simulator.camera import VARIANCE_LIMIT, BayerPattern, NoiseLevelFunction
 from simulator.exif import SOFTWARE
 from simulator.settings import CameraSettings
 from simulator.tiff import Content, Directory, numbers
@@ -134,7 +134,7 @@ def read_noise_profile(directories: list[Directory]) -> NoiseLevelFunction | Non
     The tag holds pairs (S, O), one for all colour planes or one per plane in the order of
     CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
     (DNG specification 1.4). Values that cannot be a noise profile are ignored: negative slopes, and
-    variances beyond 1, the square of the whole range.
+    variances that no capture has.
     """
     values = first_numbers(directories, NOISE_PROFILE)
     colours = first_numbers(directories, CFA_PLANE_COLOUR) or (0, 1, 2)
@@ -142,7 +142,7 @@ def read_noise_profile(directories: list[Directory]) -> NoiseLevelFunction | Non
         values = tuple(values) * len(colours)
     if len(values) != 2 * len(colours) or sorted(colours) != [0, 1, 2]:
         return None
-    if any(abs(v) > 1 for v in values) or any(v < 0 for v in values[::2]):
+    if any(abs(v) > VARIANCE_LIMIT for v in values) or any(v < 0 for v in values[::2]):
         return None
     slots = [tuple(colours).index(c) for c in (0, 1, 1, 2)]
     return NoiseLevelFunction(

@@ -80,7 +80,15 @@ class Lamp:
 
         Returns:
             (rows,) float64.
+
+        Raises:
+            ValueError: If there are no rows, or too many, or time goes backwards.
         """
+        for name, value, most in (("rows", rows, 2**20), ("sensor_rows", sensor_rows, 2**12)):
+            if not isinstance(value, int | np.integer) or not 1 <= value <= most:
+                raise ValueError(f"`{name}` (={value!r}) must be an integer in [1, {most}]")
+        if not 0.0 <= row_time <= _LONGEST:
+            raise ValueError(f"`row_time` (={row_time!r}) must be in [0, {_LONGEST:g}] s")
         begins = start + row_time * np.arange(rows * sensor_rows)
         return self.mean_light(begins, exposure_time).reshape(rows, sensor_rows).mean(axis=1)
 

@@ -217,7 +217,9 @@ def _read_all(
             own, shot = reader(path)
         except (ValueError, OSError) as error:  # it may also have vanished since it was listed
             if reader.options.on_error == "stop":
-                hint = "; 'on_error': 'skip' leaves such files out" if len(files) > 1 else ""
+                hint = ""
+                if len(files) > 1:
+                    hint = "; in Python or YAML, {'path': ..., 'on_error': 'skip'} leaves it out"
                 raise ValueError(f"scene file {str(path)!r}: {error}{hint}") from error
             skipped[path] = error
             continue

@@ -107,7 +107,7 @@ def run(
 ) -> tuple[int, list[int]]:
     """Runs a training, killed `kill[1]` seconds after so many reports: exit code, resumed steps."""
     here, there = context.Pipe()
-    process = context.Process(target=child, args=(kind, out, there))
+    process = context.Process(target=child, args=(kind, out, there), daemon=True)
     process.start()
     there.close()
     resumed: list[int] = []
@@ -192,7 +192,7 @@ def test_a_stopped_command(number: int, status: int, context: Any, tmp_path: Pat
         " training: {frames: 1000000, width: 8}}"
     )
     started = context.Event()
-    process = context.Process(target=command, args=(tmp_path, started))
+    process = context.Process(target=command, args=(tmp_path, started), daemon=True)
     process.start()
     assert started.wait(120)
     os.kill(process.pid, number)

@@ -270,3 +270,14 @@ def test_data_in_any_order_of_memory_gives_the_same_file(tmp_path: Path) -> None
     for name, raw in (("plain", plain), ("turned", turned)):
         write_dng(tmp_path / f"{name}.dng", raw)
     assert (tmp_path / "turned.dng").read_bytes() == (tmp_path / "plain.dng").read_bytes()
+
+
+def test_noise_beyond_the_whole_range_comes_back(tmp_path: Path) -> None:
+    nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))  # ISO 409600, exposed
+    settings = CameraSettings(409_600, 4.0, 1.0)
+    write_dng(
+        tmp_path / "noise.dng",
+        RawImage(torch.ones(4, 8, 8), settings, camera=get_camera("nikon_z6"), nlf=nlf),
+    )
+    back = read_raw(tmp_path / "noise.dng")
+    assert (back.noise.shot, back.noise.read) == (nlf.shot, nlf.read)

@@ -114,6 +114,8 @@ def test_extremes_stay_finite_and_in_range(time: float) -> None:
         (lambda: Flash(decay=0.0), "`decay` \\(=0.0\\) must be in"),
         (lambda: Flash(energy=-1.0), "`energy` \\(=-1.0\\) must be in"),
         (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` \\(=0.0\\) must be in"),
+        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` \\(=0\\) must be an integer"),
+        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` \\(=-1e-05\\) must be in"),
         (lambda: Lamp().mean_light(math.inf, 1.0), "`start` must be finite"),
     ],
 )
