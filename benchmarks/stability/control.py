@@ -22,7 +22,7 @@ DELAYS = (0, 1, 2, 4)
 #: Frame of the step, and how many of the last frames tell whether it has come to rest.
 _STEP, _LAST = 12, 12
 #: Frames of an episode: an agent that averages over all of it takes long to forget.
-_FRAMES, _FRAMES_LEARNT = 48, 200
+_FRAMES, _FRAMES_LEARNT = 72, 200
 #: Scenes that an agent is shown.
 _SCENES_LEARNT = 8
 #: Largest swing at the end [EV]: none without noise, one state of the grid with it; an agent, two.
