@@ -27,7 +27,7 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> Path:
         axis.plot([error, row["limit"]], [place, place], lw=0.8, color=colour, alpha=0.5)
         axis.plot(error, place, "o", ms=4, color=colour if row["ok"] else "red")
         axis.plot(row["limit"], place, "|", ms=8, color="black")
-    axis.set_yticks(range(len(shown)), [f"{r['case']} ({r['dtype']})" for r in shown], fontsize=7)
+    axis.set_yticks(range(len(shown)), [_label(row) for row in shown], fontsize=7)
     axis.set_ylim(len(shown), -1)
     axis.set_xlabel("largest error (dot) and what is allowed (bar), each in its own unit")
     for group in groups:
@@ -36,3 +36,7 @@ def draw(path: Path, rows: list[dict[str, Any]]) -> Path:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return write_atomically(path, buffer.getvalue())
+
+
+def _label(row: dict[str, Any]) -> str:
+    return f"{row['case']} ({row['dtype']})" if row["dtype"] else row["case"]

@@ -17,7 +17,7 @@ def markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
     findings = [
         f"{len(rows)} cases, {len(rows) - len(wrong)} of them right"
         + (f", of which {len(declared)} are limits that are declared." if declared else "."),
-        *(f"Defect: {row['group']}, {row['case']} ({row['dtype']})." for row in wrong),
+        *(f"Defect: {row['group']}, {row['case']}." for row in wrong),
     ]
     parts = [
         "# Stability",
