@@ -43,3 +43,9 @@ def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.M
     """Cached scenes and score tables of the tests live in the test run's own folder."""
     folder = tmp_path_factory.getbasetemp() / "cache"
     monkeypatch.setenv("AE_ENV_CACHE", str(folder))
+
+
+@pytest.fixture(autouse=True)
+def the_same_random_numbers() -> None:
+    """A test that draws from torch's own generator draws the same on every run, in any order."""
+    torch.manual_seed(0)

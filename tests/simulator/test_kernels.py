@@ -27,7 +27,7 @@ def random_light(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) -> torch.Tensor:
-    """The capture in float64, from the formulas of the noise top-up."""
+    """The capture in float64, from the formulas of the noise top-up: numbers before rounding."""
     x = (light.double() * exposure.ratio).clamp(-1e6, 1e6)
     source, target = exposure.source_noise, exposure.target
 
@@ -37,7 +37,13 @@ def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) ->
 
     left = 1.0 if exposure.remaining is None else exposure.remaining.double()
     missing = (variance(target) - left * variance(source)).clamp(min=0.0)
-    return clip_and_quantise((x + missing.sqrt() * normals.double()).float(), Z6)
+    return in_numbers(x + missing.sqrt() * normals.double()).clamp(0.0, Z6.white_level)
+
+
+def in_numbers(signal: torch.Tensor) -> torch.Tensor:
+    """Digital numbers of `signal` (4, H, W), in float64 and not rounded."""
+    span, black = (torch.tensor(v, dtype=torch.float64) for v in (Z6.span, Z6.black_level))
+    return signal.double() * span[:, None, None] + black[:, None, None]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 3), (37, 53), (16, 16), (128, 128), (300, 500)])
@@ -52,14 +58,15 @@ def test_captures_are_those_of_the_reference(
         ratio=0.4,
         source=Z6.nlf(1600) if noisy_source else CLEAN,
         target=Z6.nlf(400),
-        remaining=torch.rand(size) if blurred else None,
+        remaining=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
     )
     noise = FrameNoise(int(noise_keys(5, 3)[0]), kind)
     normals = torch.from_numpy(noise.normals((4, *size)))
-    found = record_capture(light, exposure, Z6, noise=noise)
-    difference = (found - reference(light, exposure, normals)).abs()
-    assert float(difference.max()) < 1.01 / 14512.0  # one digital number, where rounding is close
-    assert float((difference > 1e-6).float().mean()) < 1e-3
+    numbers = in_numbers(record_capture(light, exposure, Z6, noise=noise))
+    assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 holds 14 bits to 0.001
+    # The nearest number, where float32 may be off by a hundredth of one before it rounds.
+    rounding = (numbers.round() - reference(light, exposure, normals)).abs()
+    assert float(rounding.max()) <= 0.51
 
 
 @pytest.mark.parametrize("camera", list_cameras())
