@@ -7,8 +7,9 @@ from typing import Any, ClassVar
 
 from torch import nn
 
+from ae_env.grid import ExposureGrid
 from agents.policy import Policy, PolicyContext
-from agents.weights import check_context, load_agent, load_into
+from agents.weights import check_context, load_agent, load_into, trained_grid
 
 
 class NetworkPolicy(Policy):
@@ -21,8 +22,8 @@ class NetworkPolicy(Policy):
         device: Torch device for `weights`.
 
     Raises:
-        ValueError: If the weights were trained for another grid or observation, or not exactly one
-            of `weights` and `network` is given.
+        ValueError: If the weights were trained for another observation, or for a grid whose ranges
+            the context's leaves, or not exactly one of `weights` and `network` is given.
     """
 
     #: What `agents.weights` calls this sort of agent.
@@ -42,13 +43,21 @@ class NetworkPolicy(Policy):
         if network is None:
             tensors, card = load_agent(str(weights), self.kind)
             check_context(card, context)
-            network = self.make_network(context, card["width"])
+            network = self.make_network(context, card["width"], trained_grid(card))
             load_into(network, tensors, str(weights))
             network.to(device)
         self.network: Any = network.eval()
         self.reset(0)
 
     @staticmethod
-    def make_network(context: PolicyContext, width: int) -> nn.Module:
-        """The untrained network that the weights of an agent of this kind fit."""
+    def make_network(
+        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
+    ) -> nn.Module:
+        """The untrained network that the weights of an agent of this kind fit.
+
+        Args:
+            context: What the agent decides for.
+            width: Hidden features.
+            trained_on: Grid that the weights come from; by default that of the context.
+        """
         raise NotImplementedError("a learnt policy must implement `make_network`")

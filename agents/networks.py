@@ -101,11 +101,18 @@ def _absolute(signal: torch.Tensor, ev100: torch.Tensor) -> torch.Tensor:
     return (luminance - _LUMINANCE_CENTRE) / _LUMINANCE_SCALE
 
 
+def _apex_table(grid: ExposureGrid) -> torch.Tensor:
+    """EV100, Av, Tv and Sv of every state, (S, 4)."""
+    apex = [[s.aperture_value, s.time_value, s.speed_value] for s in grid]
+    ev100 = torch.tensor(grid.ev100, dtype=torch.float32)[:, None]
+    return torch.cat([ev100, torch.tensor(apex)], dim=1)
+
+
 class StateHead(nn.Module):
     """Values of every exposure state, by one small network that all states share.
 
     A state enters as its EV100, Av, Tv and Sv, and as the blur that the sensors foretell for it;
-    what is learnt about one state so serves its neighbours, and any grid.
+    what is learnt about one state so serves its neighbours, and any grid within the same ranges.
 
     Args:
         grid: The states.
@@ -113,6 +120,8 @@ class StateHead(nn.Module):
         has_sensors: Whether image speed and defocus are observed.
         outputs: Values per state.
         width: Hidden units.
+        trained_on: Grid that the weights come from, on whose scale the states enter; by default
+            `grid`.
     """
 
     def __init__(
@@ -122,16 +131,16 @@ class StateHead(nn.Module):
         has_sensors: bool,
         outputs: int = 1,
         width: int = 64,
+        trained_on: ExposureGrid | None = None,
     ) -> None:
         super().__init__()
         self.has_sensors = has_sensors
-        apex = [[s.aperture_value, s.time_value, s.speed_value] for s in grid]
-        ev100 = torch.tensor(grid.ev100, dtype=torch.float32)[:, None]
-        table = torch.cat([ev100, torch.tensor(apex)], dim=1)  # (S, 4)
+        table = _apex_table(grid)
+        known = table if trained_on is None else _apex_table(trained_on)
         self.states: torch.Tensor
         self.log2_time: torch.Tensor
         self.log2_opening: torch.Tensor
-        normalised = (table - table.mean(dim=0)) / table.std(dim=0).clamp(min=1.0)
+        normalised = (table - known.mean(dim=0)) / known.std(dim=0).clamp(min=1.0)
         self.register_buffer("states", normalised, persistent=False)
         self.register_buffer("log2_time", -table[:, 2], persistent=False)
         self.register_buffer("log2_opening", 2.0 - 0.5 * table[:, 1], persistent=False)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
 import inspect
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ae_env.user_code import find_attribute, load_from_file
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -27,8 +26,9 @@ Observations = Mapping[str, NDArray[Any]]
 METERS = ("average", "centre_weighted", "matrix", "spot")
 PROGRAMS = ("P", "A", "S", "tuned", "tuned_blind")
 _SIMPLE = {"best_fixed": "BestFixed", "oracle": "Oracle", "random": "Random"}
-#: Agents that come with the package: training seed 0 of ``ae-env bench agents``.
+#: Agents that come with the package: the training seeds of ``ae-env bench agents``.
 PRETRAINED = Path(__file__).parent / "pretrained"
+PRETRAINED_SEEDS = (0, 1, 2)
 _TRAINED = {"ppo": "PPOPolicy", "regression": "RegressionPolicy"}
 
 
@@ -156,12 +156,35 @@ def make_policy(
         return _construct(cls, name, context, {"meter": head, "program": tail or "P", **options})
     if head in _TRAINED:
         if "network" not in options:
-            weights = tail or str(PRETRAINED / head)
+            weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
             options = {"weights": weights, "device": device, **options}
         return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)
     if tail and (head not in METERS and head not in _SIMPLE):
         return _construct(_class_in_module(head, tail, name), name, context, options)
     raise ValueError(_unknown(name))
+
+
+def training_seeds(name: str) -> list[str]:
+    """The names under which `make_policy` knows the training seeds of a learnt agent.
+
+    Args:
+        name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
+            ``"ppo:runs/ppo-*"`` for the files that fit; anything else stands for itself.
+
+    Raises:
+        ValueError: If no file fits a pattern.
+
+    >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
+    (['0', '1', '2'], ['spot:P'])
+    """
+    head, _, tail = str(name).partition(":")
+    if head not in _TRAINED or (tail and "*" not in tail):
+        return [name]
+    pattern = Path(tail or PRETRAINED / f"{head}-*").expanduser()
+    files = sorted(pattern.parent.glob(f"{pattern.name.removesuffix('.safetensors')}.safetensors"))
+    if not files:
+        raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {str(pattern)!r}")
+    return [f"{head}:{file.with_suffix('')}" for file in files]
 
 
 def _unknown(name: str) -> str:
@@ -189,7 +212,7 @@ def _class_in_module(module: str, name: str, policy: str) -> Any:
         if missing is not None and (module == missing or module.startswith(f"{missing}.")):
             raise ValueError(f"{_unknown(policy)} (there is no module {missing!r})") from None
         raise ValueError(_broken(policy, f"{module} cannot be imported", error)) from error
-    return _attribute(loaded, name, policy)
+    return find_attribute(loaded, name, f"`policy` (={policy!r})")
 
 
 def _broken(policy: str, what: str, error: BaseException) -> str:
@@ -197,38 +220,7 @@ def _broken(policy: str, what: str, error: BaseException) -> str:
 
 
 def _class_in_file(path: str, name: str, policy: str) -> Any:
-    if not name:
-        raise ValueError(f"`policy` (={policy!r}) must name a class of the file: '{path}:MyPolicy'")
-    file = Path(path).expanduser()
-    if not file.is_file():
-        raise ValueError(f"`policy` (={policy!r}): there is no file {path!r}")
-    key = f"ae_env_user_policy_{file.stem}_{abs(hash(str(file.resolve())))}"
-    spec = importlib.util.spec_from_file_location(key, file)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"`policy` (={policy!r}): {path!r} cannot be loaded as Python")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[key] = module  # dataclasses look their module up while it loads
-    try:
-        spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:  # a script, for example, ends the program
-        del sys.modules[key]
-        raise ValueError(_broken(policy, f"{path} cannot be loaded", error)) from error
-    return _attribute(module, name, policy)
-
-
-def _attribute(module: ModuleType, name: str, policy: str) -> Any:
-    try:
-        return getattr(module, name)
-    except AttributeError:
-        own = [
-            key
-            for key, value in vars(module).items()
-            if inspect.isclass(value) and value.__module__ == module.__name__
-        ]
-        found = ", ".join(own) or "no class at all"
-        raise ValueError(
-            f"`policy` (={policy!r}): no class {name!r} there; found {found}"
-        ) from None
+    return load_from_file(path, name, f"`policy` (={policy!r})", example="MyPolicy")
 
 
 def _construct(cls: Any, name: str, context: PolicyContext, options: dict[str, Any]) -> Policy:

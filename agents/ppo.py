@@ -53,10 +53,12 @@ class ExposureExtractor(BaseFeaturesExtractor):
 class _StateLogits(nn.Module):
     """Logit of each state from what `ExposureExtractor` gives."""
 
-    def __init__(self, grid: ExposureGrid, width: int, has_sensors: bool) -> None:
+    def __init__(
+        self, grid: ExposureGrid, width: int, has_sensors: bool, trained_on: ExposureGrid | None
+    ) -> None:
         super().__init__()
         self.width = width
-        self.head = StateHead(grid, width, has_sensors)
+        self.head = StateHead(grid, width, has_sensors, trained_on=trained_on)
         nn.init.orthogonal_(self.head.values.weight, 0.01)  # begin with all states alike
         nn.init.zeros_(self.head.values.bias)
 
@@ -75,6 +77,7 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         lr_schedule: As SB3 calls it.
         grid: The exposure states.
         width: Features that describe a frame.
+        trained_on: See `StateHead`.
         kwargs: Further arguments of SB3's policy.
     """
 
@@ -86,9 +89,10 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         *,
         grid: ExposureGrid,
         width: int = 256,
+        trained_on: ExposureGrid | None = None,
         **kwargs: Any,
     ) -> None:
-        self.grid, self.width = grid, width
+        self.grid, self.width, self.trained_on = grid, width, trained_on
         super().__init__(
             observation_space,
             action_space,
@@ -103,7 +107,7 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
         has_sensors = self.features_dim > self.width
-        self.action_net = _StateLogits(self.grid, self.width, has_sensors)
+        self.action_net = _StateLogits(self.grid, self.width, has_sensors, self.trained_on)
         rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
@@ -176,11 +180,17 @@ class PPOPolicy(NetworkPolicy):
     kind = "ppo"
 
     @staticmethod
-    def make_network(context: PolicyContext, width: int) -> ExposureActorCritic:
+    def make_network(
+        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
+    ) -> ExposureActorCritic:
         """See `NetworkPolicy`."""
-        actions = gym.spaces.Discrete(len(context.grid))
         return ExposureActorCritic(
-            context.observation_space, actions, lambda _: 0.0, grid=context.grid, width=width
+            context.observation_space,
+            gym.spaces.Discrete(len(context.grid)),
+            lambda _: 0.0,
+            grid=context.grid,
+            width=width,
+            trained_on=trained_on,
         )
 
     def act(

@@ -1,18 +1,18 @@
 """The regression agent: predict the score of every state from one frame, take the best.
 
 After the auto-exposure application of Ouyang et al. (CVPR 2021): a small CNN learns from score
-tables that the simulator makes for free. Predictions are accumulated over the frames of an episode,
-each weighted by the network's own confidence.
+tables that the simulator makes for free. Predictions are accumulated over the frames of the same
+light, each weighted by the network's own confidence.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,15 +22,22 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.history import History
+from agents.metering import make_meter
 from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.ranges import check_ranges
+from agents.regression_rollout import Rollout
 from agents.weights import MAX_WIDTH, describe_context, save_agent
 from simulator.checkpoint import Checkpoint
 
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
+#: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
+#: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
+SAME_LIGHT_EV = 0.35
+#: What is known of the frames so far; see `RegressionPolicy.accumulated`.
+_ACCUMULATED = ("weighted", "precision", "light", "frames")
 
 
 class ScoreRegressor(nn.Module):
@@ -41,6 +48,7 @@ class ScoreRegressor(nn.Module):
         grid: The exposure states.
         width: Features that describe a frame.
         dropout: Share of the features that a training step leaves out.
+        trained_on: See `StateHead`.
     """
 
     def __init__(
@@ -49,12 +57,14 @@ class ScoreRegressor(nn.Module):
         grid: ExposureGrid,
         width: int = 256,
         dropout: float = 0.0,
+        trained_on: ExposureGrid | None = None,
     ) -> None:
         super().__init__()
         self.width = width
         self.features = ExposureFeatures(observation_space, width)
         self.dropout = nn.Dropout(dropout)
-        self.states = StateHead(grid, width, "sensors" in observation_space.spaces, outputs=2)
+        has_sensors = "sensors" in observation_space.spaces
+        self.states = StateHead(grid, width, has_sensors, outputs=2, trained_on=trained_on)
 
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
@@ -81,21 +91,35 @@ class RegressionPolicy(NetworkPolicy):
 
     kind = "regression"
 
+    def __init__(
+        self,
+        context: PolicyContext,
+        weights: str | Path | None = None,
+        network: nn.Module | None = None,
+        device: str = "cpu",
+    ) -> None:
+        self._meter = make_meter("average", context.camera)
+        super().__init__(context, weights, network, device)
+
     @staticmethod
-    def make_network(context: PolicyContext, width: int) -> ScoreRegressor:
+    def make_network(
+        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
+    ) -> ScoreRegressor:
         """See `NetworkPolicy`."""
-        return ScoreRegressor(context.observation_space, context.grid, width)
+        return ScoreRegressor(context.observation_space, context.grid, width, trained_on=trained_on)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forgets the frames so far."""
         super().reset(num_envs, seed)
         self._weighted = np.zeros((num_envs, len(self.context.grid)))
         self._precision = np.zeros_like(self._weighted)
+        self._light, self._frames = np.zeros((2, num_envs))
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
-        """Best state (N,) after this frame and those before it."""
+        """Best state (N,) after this frame and those before it in the same light."""
+        self._forget_other_light(observations)
         device = next(self.network.parameters()).device
         with torch.inference_mode():
             scores, log_variance = self.network(*observation_tensors(observations, device))
@@ -104,19 +128,31 @@ class RegressionPolicy(NetworkPolicy):
         self._precision += precision
         return masked_argmax(self._weighted / self._precision, action_masks)
 
+    def _forget_other_light(self, observations: Observations) -> None:
+        """Forgets the frames before where the metered light is no longer theirs."""
+        ev100 = self._meter(observations).ev100
+        self.forget((self._frames > 0) & (np.abs(ev100 - self._light) > SAME_LIGHT_EV))
+        self._frames += 1.0
+        self._light += (ev100 - self._light) / self._frames
+
     @property
-    def accumulated(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What the episodes so far add up to, (N, S) each: weighted scores, and their weights."""
-        return self._weighted, self._precision
+    def accumulated(self) -> dict[str, NDArray[np.float64]]:
+        """What the episodes so far add up to.
+
+        ``weighted`` scores and their weights ``precision``, (N, S), of the ``frames`` (N,) whose
+        mean metered EV100 is ``light`` (N,).
+        """
+        return {name: getattr(self, f"_{name}") for name in _ACCUMULATED}
 
     @accumulated.setter
-    def accumulated(self, values: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
-        self._weighted, self._precision = (np.array(own) for own in values)
+    def accumulated(self, values: Mapping[str, NDArray[np.float64]]) -> None:
+        for name in _ACCUMULATED:
+            setattr(self, f"_{name}", np.array(values[name]))
 
     def forget(self, done: NDArray[np.bool_]) -> None:
         """Begins anew in those environments whose episode is over."""
-        self._weighted[done] = 0.0
-        self._precision[done] = 0.0
+        for name in _ACCUMULATED:
+            getattr(self, f"_{name}")[done] = 0.0
 
 
 @dataclass(frozen=True)
@@ -205,7 +241,7 @@ def train_regression(
         identity=identity or asdict(training),
     )
     done = store.restore()
-    rollout = _Rollout(envs, RegressionPolicy(context, network=network), training, history)
+    rollout = Rollout(envs, RegressionPolicy(context, network=network), training, history)
     if 0 < done < steps:
         rollout.resume()
     whole = True  # no step is half done
@@ -263,107 +299,6 @@ def _seeded(device: str, *seeds: int) -> Iterator[None]:
         if cuda:
             torch.cuda.manual_seed(number)
         yield
-
-
-class _Replay:
-    """The last frames and their scores, to be seen again mirrored or not."""
-
-    def __init__(self, training: RegressionTraining, rng: np.random.Generator) -> None:
-        self.training, self.rng = training, rng
-        self.memory: list[dict[str, NDArray[Any]]] = []
-
-    def batch(
-        self, observations: Observations, target: NDArray[np.float64]
-    ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
-        """The new frames and some old ones."""
-        new = {**observations, "target": target}
-        parts = [new]
-        for _ in range(min(self.training.replay, len(self.memory))):
-            chosen = [self.memory[i] for i in self.rng.integers(len(self.memory), size=4)]
-            rows = self.rng.integers(len(target), size=(4, max(1, len(target) // 4)))
-            mixed = {
-                k: np.concatenate([c[k][r] for c, r in zip(chosen, rows, strict=True)]) for k in new
-            }
-            if self.rng.random() < 0.5:
-                mixed["raw"] = mixed["raw"][..., ::-1]
-            parts.append(mixed)
-        self.remember(observations, target)
-        merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
-        return merged, merged.pop("target")
-
-    def remember(self, observations: Observations, target: NDArray[np.float64]) -> None:
-        """Keeps the new frames, and forgets the oldest beyond the memory."""
-        count = self.batches(len(target))
-        self.memory = [*self.memory, {**observations, "target": target}][-count:]
-
-    def batches(self, num_envs: int) -> int:
-        """How many steps of that many frames are remembered."""
-        return max(1, self.training.memory // num_envs)
-
-
-class _Rollout:
-    """Frames and the scores of all states, from episodes that the policy itself drives."""
-
-    def __init__(
-        self,
-        envs: gym.vector.VectorEnv,
-        policy: RegressionPolicy,
-        training: RegressionTraining,
-        history: History,
-    ) -> None:
-        self.envs, self.policy, self.history = envs, policy, history
-        self.explore, self.base = training.explore, cast(Any, envs.unwrapped)
-        self.rng = np.random.default_rng([training.seed, 0])
-        self.replay = _Replay(training, np.random.default_rng([training.seed, 0, 1]))
-        self.observations: Observations | None = None
-
-    def batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
-        """The next frame of every episode, with its scores, and some earlier ones."""
-        if self.observations is None:
-            self._reset()
-        else:
-            actions = self.policy.act(self.observations)
-            random = self.rng.random(len(actions)) < self.explore
-            others = self.rng.integers(len(self.policy.context.grid), size=len(actions))
-            self.policy.forget(self._step(np.where(random, others, actions)))
-        return self.replay.batch(self._shown(), self.base.expected_scores())
-
-    def mark(self) -> None:
-        """Makes this moment the one that a checkpoint holds."""
-        weighted, precision = self.policy.accumulated
-        self.history.mark(
-            rng=self.rng.bit_generator.state,
-            replay_rng=self.replay.rng.bit_generator.state,
-            weighted=torch.tensor(weighted),
-            precision=torch.tensor(precision),
-        )
-
-    def resume(self) -> None:
-        """Goes to the moment of the history's mark."""
-        past, marked = self.history.actions, self.history.marked
-        self.history.actions = []
-        self._reset()
-        for left in range(len(past), -1, -1):
-            if left < self.replay.batches(self.envs.num_envs):
-                self.replay.remember(self._shown(), self.base.expected_scores())
-            if left:
-                self._step(past[-left])
-        self.rng.bit_generator.state = marked["rng"]
-        self.replay.rng.bit_generator.state = marked["replay_rng"]
-        self.policy.accumulated = marked["weighted"].numpy(), marked["precision"].numpy()
-
-    def _reset(self) -> None:
-        self.observations, _ = self.envs.reset(seed=int(self.rng.integers(2**31)))
-        self.policy.reset(self.envs.num_envs)
-
-    def _step(self, actions: NDArray[Any]) -> NDArray[np.bool_]:
-        self.history.add(actions)
-        self.observations, _, terminated, truncated, _ = self.envs.step(actions)
-        return terminated | truncated
-
-    def _shown(self) -> Observations:
-        assert self.observations is not None
-        return self.observations
 
 
 def save_regression(

@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from ae_env.grid import ExposureGrid
 from agents.policy import PolicyContext
 from simulator.files import sibling
 from simulator.weights import check_finite, read_pair, write_pair
@@ -17,6 +18,10 @@ from simulator.weights import check_finite, read_pair, write_pair
 FORMAT_VERSION = 1
 #: What every card says, and of what type.
 _ENTRIES = {"width": int, "context": dict, "training": dict, "aliases": dict}
+#: What describes the grid in a card.
+_GRID = ("isos", "exposure_times", "f_numbers")
+#: Nominal values are rounded: 1/1000 s stands for 1/1024 s.
+_ROUNDED = 0.03
 #: Most hidden features of a network.
 MAX_WIDTH = 65536
 
@@ -114,12 +119,33 @@ def describe_context(context: PolicyContext) -> dict[str, Any]:
     }
 
 
+def trained_grid(card: dict[str, Any]) -> ExposureGrid:
+    """The grid that an agent was trained on, from its `card`.
+
+    Raises:
+        ValueError: If the card does not describe one.
+    """
+    return ExposureGrid.from_spec({name: card["context"].get(name, ()) for name in _GRID})
+
+
 def check_context(card: dict[str, Any], context: PolicyContext) -> None:
-    """Raises a `ValueError` that names what `context` has other than the agent was trained for."""
+    """Raises a `ValueError` that names what `context` has other than the agent was trained for.
+
+    Another grid is well if none of its values lies outside of the range of the trained one: the
+    agent then reads its states off between those that it knows.
+    """
     for name, here in describe_context(context).items():
         trained = card["context"].get(name)
-        if trained != here:
+        if trained == here:
+            continue
+        if name not in _GRID:
             raise ValueError(
                 f"`weights`: the agent was trained with {name} = {trained}, "
                 f"the environment has {here}"
+            )
+        known = getattr(trained_grid(card), name)
+        if here[0] < known[0] * (1.0 - _ROUNDED) or here[-1] > known[-1] * (1.0 + _ROUNDED):
+            raise ValueError(
+                f"`weights`: the agent was trained with {name} from {known[0]:g} to {known[-1]:g}, "
+                f"the environment has {here[0]:g} to {here[-1]:g}"
             )

@@ -14,9 +14,9 @@ from agents.regression import (
     RegressionPolicy,
     RegressionTraining,
     ScoreRegressor,
-    _Replay,
     train_regression,
 )
+from agents.regression_rollout import Replay
 
 TRAINING = RegressionTraining(frames=160, width=16, seed=5)
 
@@ -129,6 +129,33 @@ def test_episodes_do_not_mix(context: PolicyContext, frame) -> None:
     assert policy.act(frame).tolist() == [9, 9]
 
 
+def test_frames_of_other_light_are_forgotten(context: PolicyContext, photograph) -> None:
+    """The first camera's light falls by a stop, the second's stays."""
+    first, second = np.full((2, 64), 0.1), np.full((2, 64), 0.1)
+    first[:, 3], second[:, 9] = 0.9, 0.8
+    sure = np.full((2, 64), -2.0)
+    policy = RegressionPolicy(context, network=Stub([(first, sure), (second, sure)]))
+    policy.reset(2)
+    states = [20, 20]
+    assert policy.act(photograph(np.ones((64, 64)), 8.0, states)).tolist() == [3, 3]
+    darker, same = (photograph(np.full((64, 64), light), 8.0, [20]) for light in (0.5, 1.0))
+    frames = {name: np.concatenate([darker[name], same[name]]) for name in same}
+    assert policy.act(frames).tolist() == [9, 3]
+
+
+def test_other_settings_in_the_same_light_are_remembered(context, photograph) -> None:
+    known, other = np.full((1, 64), 0.1), np.full((1, 64), 0.1)
+    known[:, 3], other[:, 9] = 0.9, 0.8
+    sure = np.full((1, 64), -2.0)
+    policy = RegressionPolicy(context, network=Stub([(known, sure), (other, sure)]))
+    policy.reset(1)
+    ev100 = context.grid.ev100
+    near = [int(np.abs(ev100 - ev).argmin()) for ev in (8.0, 9.0)]  # neither clips
+    for state in near:
+        chosen = policy.act(photograph(np.ones((64, 64)), 8.0, [state]))
+        assert chosen.tolist() == [3]
+
+
 def test_masked_states_are_not_chosen(context: PolicyContext, frame) -> None:
     scores = np.tile(np.linspace(0, 1, 64), (2, 1))
     masks = np.ones((2, 64), bool)
@@ -163,7 +190,7 @@ def test_network_predicts_scores(context: PolicyContext, photograph) -> None:
 
 @pytest.mark.parametrize("memory", [1, 4, 10])
 def test_replay_memory_is_bounded(memory: int) -> None:
-    replay = _Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
+    replay = Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
     for step in range(12):
         new = {"raw": np.full((4, 4, 2, 2), step, np.uint8), "settings": np.zeros((4, 3))}
         batch, target = replay.batch(new, np.full((4, 64), float(step)))

@@ -192,10 +192,53 @@ def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None
     assert "\n" not in str(caught.value)
 
 
-def test_other_grid(agent: Path, context: PolicyContext) -> None:
-    grid = ExposureGrid((100, 200), (0.01, 0.1), (4.0, 8.0))
-    with pytest.raises(ValueError, match=r"trained with isos = \[100\.0, 400\.0.*has \[100"):
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"isos": (50, 200)}, "trained with isos from 100 to 6400, the environment has 50 to 200"),
+        ({"exposure_times": (0.01, 1.0)}, "exposure_times from 0.001 to 0.5.* has 0.01 to 1"),
+        ({"f_numbers": (4.0, 16.0)}, "trained with f_numbers from 4 to 11.* has 4 to 16"),
+    ],
+)
+def test_a_grid_beyond_the_trained_range(
+    agent: Path, context: PolicyContext, values: dict[str, Any], message: str
+) -> None:
+    inside = {"isos": (100, 200), "exposure_times": (0.01, 0.1), "f_numbers": (4.0, 8.0)}
+    grid = ExposureGrid(**{**inside, **values})
+    with pytest.raises(ValueError, match=message):
         make_policy(f"regression:{agent}", replace(context, grid=grid))
+
+
+@pytest.mark.parametrize("name", ["regression", "ppo"])
+def test_a_finer_grid_gives_known_states_their_values(name: str, context: PolicyContext) -> None:
+    """The states' scale is that of the training: it is not worked out anew from the grid."""
+    coarse = context.grid
+    finer = ExposureGrid(
+        tuple(sorted({*coarse.isos, 200.0, 3200.0})),
+        tuple(sorted({*coarse.exposure_times, 1 / 30})),
+        coarse.f_numbers[:3],
+    )
+    generator = torch.Generator().manual_seed(4)
+    frame = {
+        "raw": torch.rand(2, 4, 64, 64, generator=generator),
+        "settings": torch.rand(2, 3, generator=generator) * 2 - 1,
+        "sensors": torch.rand(2, 2, generator=generator) * 2 - 1,
+    }
+    values = []
+    for grid in (coarse, finer):
+        network = make_policy(name, replace(context, grid=grid)).network
+        with torch.inference_mode():
+            if name == "ppo":
+                codes = {**frame, "raw": frame["raw"] * 255}
+                values.append(network.get_distribution(codes).distribution.logits)
+            else:
+                values.append(network(*frame.values())[0])
+    pairs = [(i, finer.states.index(s)) for i, s in enumerate(coarse) if s.f_number < 11]
+    first, second = (list(index) for index in zip(*pairs, strict=True))
+    known, found = values[0][:, first], values[1][:, second]
+    if name == "ppo":  # logits are known up to their norm
+        known, found = known - known[:, :1], found - found[:, :1]
+    torch.testing.assert_close(found, known, rtol=1e-5, atol=1e-5)
 
 
 def test_other_observation(agent: Path, context: PolicyContext) -> None:
