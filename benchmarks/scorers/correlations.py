@@ -1,7 +1,5 @@
 """Do the scorers tell good captures from bad ones? Their correlation with a reference picture.
 
-    ae-env bench scorers
-
 For every bundled test scene, with a motion and a defocus drawn as in an episode, the 64 states are
 simulated and compared with the reference: the same scene noise-free, blur-free and exposed for its
 incident light. Each pixel carries the noise of one sensor pixel.
@@ -9,9 +7,7 @@ incident light. Each pixel carries the noise of one sensor pixel.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,14 +16,12 @@ from scipy.stats import pearsonr, spearmanr
 from skimage.metrics import structural_similarity
 
 from ae_env.core import EpisodeCore
-from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.score_table import scene_latent
 from ae_env.scorers import make_scorer
+from benchmarks.markdown import table
 from simulator import CameraProfile, develop
 from simulator.capture import clip_and_quantise
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
 
 SCORERS = ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced")
 #: What each scorer alone is about, measured on captures with no other fault than that one.
@@ -48,10 +42,8 @@ WHITE = 0.97
 NEAR_EV = 0.75
 
 
-def run(out: Path, seed: int = 0, quick: bool = False) -> None:
-    """Measures and writes ``scorers.json`` and ``scorers.md`` under `out`."""
-    options = EnvOptions(scenes="bundled:small" if quick else "bundled", split="test")
-    core = EpisodeCore(options, num_envs=1)
+def rows(core: EpisodeCore, seed: int) -> list[dict[str, Any]]:
+    """A row per scorer and reference."""
     # Score tables of the composite hold its parts: one table serves all six scorers.
     names = list(make_scorer("balanced").parts)
     samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
@@ -64,11 +56,7 @@ def run(out: Path, seed: int = 0, quick: bool = False) -> None:
             for target in ("rmse", "ssim", "exposed", f"aspect:{scorer}"):
                 pair = _correlations(scores[scorer], closeness[target])
                 samples.setdefault((scorer, target.partition(":")[0]), []).append(pair)
-    rows = [_row(scorer, target, pairs) for (scorer, target), pairs in samples.items()]
-    meta = result_meta(f"ae-env bench scorers{' --quick' * quick}", seed)
-    meta |= {"scenes": len(core.scenes), "states": len(core.grid), "aspects": ASPECTS}
-    write_results(out / "scorers.json", rows, meta)
-    write_atomically(out / "scorers.md", _markdown(rows, meta))
+    return [_row(scorer, target, pairs) for (scorer, target), pairs in samples.items()]
 
 
 def _closeness(
@@ -156,33 +144,14 @@ def _row(scorer: str, target: str, pairs: list[tuple[float, float]]) -> dict[str
     }
 
 
-def _markdown(rows: list[dict[str, Any]], meta: Mapping[str, Any]) -> str:
-    table = {(row["scorer"], row["reference"]): row for row in rows}
+def section(rows: list[dict[str, Any]], states: int, scenes: int) -> str:
+    """The part of the page that shows `rows`."""
+    known = {(row["scorer"], row["reference"]): row for row in rows}
 
     def cell(scorer: str, target: str, kind: str) -> str:
-        row = table[scorer, target]
+        row = known[scorer, target]
         return f"{row[kind]:.2f} ± {row[f'{kind}_sd']:.2f}"
 
-    lines = [
-        "# Do the scorers discriminate?",
-        "",
-        f"`{meta['command']}`, {meta['date'][:10]}. Over the {meta['states']} states of each of "
-        f"{meta['scenes']} bundled test scenes, with motion and defocus drawn as in an episode: "
-        "the correlation of each scorer with the closeness of the developed capture to the "
-        "reference, the same scene noise-free, blur-free and exposed for its incident light. Mean "
-        "and standard deviation over the scenes.",
-        "",
-        "*Whole picture*: all faults together, as minus the RMSE of the sRGB values and as SSIM. "
-        "*Own aspect*: minus an error on captures that have no other fault, because a scorer of "
-        "one aspect should not follow the others: bright shadows cost blown highlights. "
-        f"*Well exposed*: whole picture over the states within {NEAR_EV:g} EV of the incident "
-        "light only, where the split between the controls decides.",
-        "",
-        "| scorer | whole picture, -RMSE: Spearman | Pearson | whole picture, SSIM: Spearman "
-        "| well exposed, -RMSE: Spearman | own aspect: Spearman | Pearson "
-        "| scenes with a positive one |",
-        "|---|--:|--:|--:|--:|--:|--:|--:|",
-    ]
     columns = (
         ("rmse", "spearman"),
         ("rmse", "pearson"),
@@ -191,10 +160,29 @@ def _markdown(rows: list[dict[str, Any]], meta: Mapping[str, Any]) -> str:
         ("aspect", "spearman"),
         ("aspect", "pearson"),
     )
+    head = ["scorer", "whole picture, -RMSE: Spearman", "Pearson", "whole picture, SSIM: Spearman"]
+    head += ["well exposed, -RMSE: Spearman", "own aspect: Spearman", "Pearson"]
+    body = []
     for name in SCORERS:
         cells = [cell(name, target, kind) for target, kind in columns]
-        cells.append(f"{table[name, 'aspect']['positive']:.0%}")
-        lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    lines += ["", "| scorer | error of its own aspect |", "|---|---|"]
-    lines += [f"| `{name}` | {text} |" for name, text in ASPECTS.items()]
-    return "\n".join(lines) + "\n"
+        body.append([f"`{name}`", *cells, f"{known[name, 'aspect']['positive']:.0%}"])
+    aspects = [[f"`{name}`", text] for name, text in ASPECTS.items()]
+    return "\n".join(
+        [
+            f"Over the {states} states of each of {scenes} bundled test scenes, with motion and "
+            "defocus drawn as in an episode: the correlation of the default scorer and its parts "
+            "with the closeness of the developed capture to the reference, the same scene "
+            "noise-free, blur-free and exposed for its incident light. Mean and standard deviation "
+            "over the scenes.",
+            "",
+            "*Whole picture*: all faults together, as minus the RMSE of the sRGB values and as "
+            "SSIM. *Own aspect*: minus an error on captures that have no other fault, because a "
+            "scorer of one aspect should not follow the others: bright shadows cost blown "
+            f"highlights. *Well exposed*: whole picture over the states within {NEAR_EV:g} EV of "
+            "the incident light only, where the split between the controls decides.",
+            "",
+            table([*head, "scenes with a positive one"], body),
+            "",
+            table(["scorer", "error of its own aspect"], aspects),
+        ]
+    )

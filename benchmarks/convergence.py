@@ -1,0 +1,161 @@
+"""How many frames after a jump of the light do policies need, on a grid of third stops?
+
+    ae-env bench convergence
+
+Every small bundled test scene is watched for 90 frames, and its light jumps at the 30th. A policy
+has settled when its EV100 stays within a third of a stop of where it ends, and is right when it
+stays within a third of a stop of a state whose expected score is within 0.01 of the best.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+from agents import PolicyContext, evaluate, make_policy
+from agents.episodes import make_envs
+from agents.evaluation_result import EvaluationResult
+from agents.metrics import THIRD_EV
+from benchmarks.markdown import table
+from simulator.files import write_atomically
+from simulator.results import result_meta, write_results
+
+#: Policies, and the frames that the published filter of the Raspberry Pi's AGC implies by stops.
+POLICIES = ("rpi_agc", "centre_weighted:P", "matrix:P", "highlight_weighted:P", "regression", "ppo")
+FILTER_FRAMES = {-4.0: 11, 4.0: 24, 6.0: 30}
+STOPS = (-6.0, -4.0, -2.0, 2.0, 4.0, 6.0)
+FRAMES, STEP = 90, 30
+#: Frames at the end whose mean is where a policy ends.
+_LAST = 12
+
+
+def run(out: Path, seed: int = 0, quick: bool = False) -> None:
+    """Measures and writes ``convergence.json``, ``.md`` and ``.png`` under `out`."""
+    rows: list[dict[str, Any]] = []
+    curves: dict[float, dict[str, np.ndarray]] = {}
+    for stops in track(STOPS[1::3] if quick else STOPS, "steps of the light"):
+        result = _watched(stops, seed)
+        curves[stops] = {name: _departure(result, name) for name in POLICIES}
+        rows += _rows(result, stops)
+    meta = result_meta(f"ae-env bench convergence{' --quick' * quick}", seed)
+    meta |= {"grid": "third_stop", "frames": FRAMES, "step": STEP}
+    meta |= {"scenes": len(set(result.scene_ids.tolist())), "filter_frames": FILTER_FRAMES}
+    write_results(out / "convergence.json", rows, meta)
+    write_atomically(out / "convergence.png", _plot(curves))
+    write_atomically(out / "convergence.md", _markdown(rows, meta))
+
+
+def _watched(stops: float, seed: int) -> EvaluationResult:
+    options: dict[str, Any] = {
+        "scenes": "bundled:small",
+        "split": "test",
+        "resolution": 64,
+        "grid": "third_stop",
+        "lighting": {"kind": "step", "stops": stops, "at": STEP},
+    }
+    envs = make_envs(options, num_envs=1, frames=1)
+    context = PolicyContext.from_envs(envs)
+    envs.close()
+    policies = {name: make_policy(name, context) for name in POLICIES}
+    return evaluate(policies, options, frames=FRAMES, seed=seed, batch=20)
+
+
+def _departure(result: EvaluationResult, policy: str) -> np.ndarray:
+    """(E, T) EV100 of every frame less that of where the episode ends."""
+    evs = result.grid.ev100[result.tracks[policy].states[0]]
+    departure: np.ndarray = evs - evs[:, -_LAST:].mean(axis=1, keepdims=True)
+    return departure
+
+
+def _since_step(outside: np.ndarray) -> np.ndarray:
+    """Frames from the step until the last one that is outside, (E,); 0 where none is."""
+    after = outside[:, STEP - 1 :]  # the first action is seen in frame 1
+    last = after.shape[1] - np.argmax(after[:, ::-1], axis=1)
+    return np.where(after.any(axis=1), last, 0)
+
+
+def _rows(result: EvaluationResult, stops: float) -> Iterator[dict[str, Any]]:
+    for policy in result.tracks:
+        settled = _since_step(np.abs(_departure(result, policy)) > THIRD_EV)
+        error = result.episode_metrics(policy)["ev_error"][0]
+        right = _since_step(error > THIRD_EV)
+        known = right <= FRAMES - STEP  # right at last
+        yield {
+            "policy": policy,
+            "stops": stops,
+            "frames_to_settle_median": float(np.median(settled)),
+            "frames_to_settle_p90": float(np.percentile(settled, 90)),
+            "filter_frames": FILTER_FRAMES.get(stops) if policy == "rpi_agc" else None,
+            "right_at_last": float(known.mean()),
+            "frames_to_be_right_median": float(np.median(right[known])) if known.any() else None,
+            "final_ev_error": float(error[:, -_LAST:].mean()),
+            "ms_per_decision": result.tracks[policy].ms_per_decision,
+            "num_scenes": len(settled),
+        }
+
+
+def _plot(curves: dict[float, dict[str, np.ndarray]]) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(3.6 * len(curves), 3.2), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
+    for axes, (stops, by_policy) in zip(panels, curves.items(), strict=True):
+        for name, departure in by_policy.items():
+            frames = np.arange(1, FRAMES + 1) - STEP
+            axes.plot(frames, np.median(departure, axis=0), lw=1.4, label=name)
+        axes.axhspan(-THIRD_EV, THIRD_EV, color="0.92")
+        axes.set(title=f"light {stops:+g} EV", xlabel="frames since the step", xlim=(-5, 40))
+    panels[0].set_ylabel("EV100 less the final one (median)")
+    panels[-1].legend(fontsize=7)
+    buffer = io.BytesIO()
+    canvas.print_png(buffer)
+    return buffer.getvalue()
+
+
+def _markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
+    body = [
+        [
+            f"{row['stops']:+g}",
+            f"`{row['policy']}`",
+            f"{row['frames_to_settle_median']:.0f}",
+            f"{row['frames_to_settle_p90']:.0f}",
+            "" if row["filter_frames"] is None else f"{row['filter_frames']}",
+            f"{row['right_at_last']:.0%}",
+            _cell(row["frames_to_be_right_median"]),
+            f"{row['final_ev_error']:.2f}",
+            f"{row['ms_per_decision']:.2f}",
+        ]
+        for row in rows
+    ]
+    head = ["light [EV]", "policy", "frames to settle (median)", "P90", "implied by the filter"]
+    head += ["right at last", "frames to be right (median)", "final EV error", "ms per decision"]
+    return "\n".join(
+        [
+            "# Convergence after a jump of the light",
+            "",
+            f"`{meta['command']}`, {meta['date'][:10]}. {meta['scenes']} small bundled test "
+            f"scenes with motion and defocus as in an episode, a grid of third stops (2128 "
+            f"states), {FRAMES} frames, the light jumps at frame {STEP}. *Settled*: EV100 stays "
+            "within a third of a stop of its mean over the last 12 frames. *Right*: it stays "
+            "within a third of a stop of a state whose expected score is within 0.01 of the best; "
+            "its frames are those of the scenes in which the policy is right at last. *Implied by "
+            "the filter*: frames until the Raspberry Pi's AGC is within 2 % of its target, from "
+            "its published filter alone, before clipping.",
+            "",
+            "![EV100 over time](convergence.png)",
+            "",
+            table(head, body),
+            "",
+        ]
+    )
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
