@@ -8,7 +8,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -27,10 +27,9 @@ from ae_env.console import (
     progress_bars,
     torch_device,
 )
+from ae_env.evaluation_commands import evaluate, print_scores
+from ae_env.scorer_commands import convert_nima, scorers
 from ae_env.simulator_commands import simulate, sweep, train_simulator
-
-if TYPE_CHECKING:
-    from agents.evaluation_result import EvaluationResult
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -41,13 +40,11 @@ app = typer.Typer(
     epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
 )
 BENCHMARKS = (
-    *("agents", "brackets", "colour_checker", "scorers", "simulator", "stability"),
+    *("agents", "brackets", "colour_checker", "defects", "scorers", "simulator", "stability"),
     *("throughput", "work-precision"),
 )
-#: Source groups in one table on the terminal.
-_GROUPS_ABREAST = 4
 #: Commands that go on where they were stopped.
-_RESUMING = ("quickstart", "train", "train-simulator", "bench")
+_RESUMING = ("quickstart", "train", "train-simulator", "evaluate", "bench")
 #: Errors about what the user gave.
 _USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 #: Exit status after Ctrl-C, and after SIGTERM.
@@ -127,7 +124,7 @@ def quickstart(
     if done.zero_shot:
         text = f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes"
         console.print(text, soft_wrap=True, markup=False)
-    _print_scores(done.result)
+    print_scores(done.result)
     print_files(done.files)
     console.print("\nTry next:")
     for line in next_commands(scenes, out, done.agents):
@@ -137,6 +134,8 @@ def quickstart(
 app.command()(simulate)
 app.command()(sweep)
 app.command()(train_simulator)
+app.command()(scorers)
+app.command()(convert_nima)
 
 
 @app.command()
@@ -174,62 +173,7 @@ def train(
     console.print(f"next: {command}", highlight=False, soft_wrap=True, markup=False)
 
 
-@app.command()
-def evaluate(
-    policy: Annotated[list[str], typer.Option(help="A policy; give the option several times.")],
-    scenes: Scenes = "bundled",
-    split: Annotated[str, typer.Option(help="train, test or all.")] = "test",
-    grid: Annotated[str, typer.Option(help="default or third_stop.")] = "default",
-    lighting: Annotated[str, typer.Option(help="static, step, ramp, sine, tunnel...")] = "static",
-    delay: Annotated[int, typer.Option(help="Frames from a decision to its frame.", min=0)] = 0,
-    sensors: Annotated[bool, typer.Option(help="Whether speed and defocus are observed.")] = True,
-    resolution: Annotated[int, typer.Option(help="Packed pixels a side.")] = 64,
-    episodes: Annotated[int, typer.Option(help="Episodes per scene.", min=1)] = 2,
-    frames: Annotated[int, typer.Option(help="Frames per episode.", min=1)] = 8,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("evaluation"),
-    seed: Seed = 0,
-    device: Device = "cpu",
-) -> None:
-    """Compare policies on the same episodes: scores, regret, convergence, flicker.
-
-    Example: `ae-env evaluate --policy matrix:tuned --policy my_policy.py:MyPolicy`
-    """
-    from agents import PolicyContext, fit_policies, make_policy, write_report
-    from agents import evaluate as run
-    from agents.episodes import make_envs
-    from agents.quickstart import training_scenes
-
-    options: dict[str, Any] = {
-        "scenes": scenes,
-        "split": split,
-        "grid": grid,
-        "lighting": lighting,
-        "delay": delay,
-        "sensors": sensors,
-        "resolution": resolution,
-    }
-    device = torch_device(device)
-    envs = make_envs(options, num_envs=1, frames=1)
-    context = PolicyContext.from_envs(envs)
-    policies = {name: make_policy(name, context, device=device) for name in policy}
-    make_folder(out)
-    training = {**options, "scenes": training_scenes(scenes)[0], "lighting": "static", "delay": 0}
-    with progress_bars() as progress:
-        with progress("fitting on training scenes") as task:
-            fit_policies(policies, training, seed=seed, progress=task)
-            task(1, 1)
-        with progress("evaluation") as task:
-            result = run(
-                policies,
-                options,
-                episodes_per_scene=episodes,
-                frames=frames,
-                seed=seed,
-                progress=task,
-            )
-    files = write_report(result, out, command=command_line(), source=scenes, split=split)
-    _print_scores(result)
-    print_files(files)
+app.command()(evaluate)
 
 
 @app.command()
@@ -283,43 +227,3 @@ def cache(
         table.add_row(kind.replace("_", " "), f"{files:,}", f"{size:,}")
     console.print(table)
     console.print(f"folder: {disk.folder}", highlight=False, soft_wrap=True, markup=False)
-
-
-# -- what the commands share ------------------------------------------------------------------
-
-
-def _print_scores(result: EvaluationResult) -> None:
-    from rich.table import Table
-
-    from agents.report import group_values
-    from agents.result_table import result_rows
-    from agents.statistics import MIN_GROUPS
-
-    rows = result_rows(result, source="", split="", resamples=2000)
-    conditions = result.conditions
-    table = Table(title="normalised score: 0 is random, 1 the best state of every frame")
-    table.add_column("policy")
-    for condition in conditions:
-        table.add_column(condition, justify="right")
-    table.add_column("95 % interval (all)", justify="right")
-    by_policy: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        by_policy.setdefault(row["policy"], {})[row["condition"]] = row
-    for policy, own in by_policy.items():
-        pair = own["all"]["ci95"]
-        interval = f"{pair[0]:.3f} to {pair[1]:.3f}" if pair else "too few groups"
-        scores = [f"{own[c]['normalised_score']:.3f}" for c in conditions]
-        table.add_row(policy, *scores, interval)
-    console.print(table)
-    if rows[0]["num_groups"] < MIN_GROUPS:
-        head, body = group_values(result)
-        for first in range(0, len(body), _GROUPS_ABREAST):
-            own_groups = body[first : first + _GROUPS_ABREAST]
-            values = Table(title="mean score of every source group")
-            for i, column in enumerate(zip(head, *own_groups, strict=True)):
-                if i == 0:
-                    for name in column:
-                        values.add_column(name, justify="left" if name == head[0] else "right")
-                else:
-                    values.add_row(*column)
-            console.print(values)

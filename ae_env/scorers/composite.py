@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 from typing import Any, get_args
@@ -13,7 +13,7 @@ import torch
 
 from ae_env.checks import UserCodeError
 from ae_env.scorers.call import ROUNDING, describe_range, scores_of
-from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
+from ae_env.scorers.protocol import Captures, ColourMatrix, DependsOn, Domain, Scorer
 from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
 from simulator.isp import develop
 
@@ -67,6 +67,11 @@ class CompositeScorer:
         """Names of the parts that depend on one of `kinds`."""
         return [name for name, part in self.parts.items() if depends_on(part) in kinds]
 
+    def subset(self, names: Collection[str]) -> CompositeScorer | None:
+        """The parts of `names` alone, equally weighted; None if there are none."""
+        parts = {name: part for name, part in self.parts.items() if name in names}
+        return CompositeScorer(parts) if parts else None
+
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of raw `images` (B, 4, H, W) in [0, 1]."""
         return self.combine(self.score_parts(images, captures))
@@ -92,7 +97,8 @@ class CompositeScorer:
                 view = images
                 if part.domain == "srgb":
                     if srgb is None:
-                        srgb = _developed(images, captures)
+                        gains, matrices = captures.white_balance, captures.colour_matrices
+                        srgb = developed(images, gains, matrices)
                     view = srgb
                 if (
                     len(self.names("image")) > 1
@@ -158,12 +164,19 @@ class Balanced(CompositeScorer):
         return score
 
 
-def _developed(images: torch.Tensor, captures: Captures) -> torch.Tensor:
-    """sRGB (B, 3, H, W), each image with the colours of its own scene's camera."""
-    kinds = set(captures.colour_matrices)
-    if len(kinds) == 1:
-        return develop(images, captures.white_balance, kinds.pop())
-    pairs = zip(images, captures.white_balance, captures.colour_matrices, strict=True)
+def developed(
+    images: torch.Tensor, white_balance: torch.Tensor, matrices: Sequence[ColourMatrix | None]
+) -> torch.Tensor:
+    """sRGB (B, 3, H, W), each image with the colours of its own scene's camera.
+
+    Args:
+        images: (B, 4, H, W) raws.
+        white_balance: (B, 3) gains of R, G, B.
+        matrices: XYZ (D65) to camera RGB of each, B long; None where unknown.
+    """
+    if len(set(matrices)) == 1:
+        return develop(images, white_balance, matrices[0])
+    pairs = zip(images, white_balance, matrices, strict=True)
     return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
 
 

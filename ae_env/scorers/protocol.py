@@ -36,6 +36,14 @@ class Scorer(Protocol):
         """Scores (B,) of the images."""
 
 
+def reads_pixels(scorer: Scorer) -> bool:
+    """Whether `scorer` looks at images or at the light of a scene; True unless it says otherwise.
+
+    Those with ``reads_pixels = False`` see the settings, the exposure and the blur only.
+    """
+    return getattr(scorer, "reads_pixels", True)
+
+
 @dataclass(frozen=True, eq=False)
 class Captures:
     """What is known about a batch of B captures besides their pixels.
@@ -52,6 +60,9 @@ class Captures:
         white_balance: (B, 3) gains of R, G, B.
         colour_matrices: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where
             unknown.
+        row_gain: (B, H) float64, light of each row relative to the frame's mean, which is in
+            `ratio` and `proper_ev`: the bands of flickering light. None where every row of every
+            capture has the same.
     """
 
     settings: Sequence[CameraSettings]
@@ -63,6 +74,7 @@ class Captures:
     blur_px: torch.Tensor
     white_balance: torch.Tensor
     colour_matrices: Sequence[ColourMatrix | None]
+    row_gain: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -70,13 +82,19 @@ class Captures:
     @cached_property
     def light(self) -> torch.Tensor:
         """(B, 4, H, W) noise-free signal at the settings, before blur and clip; white is 1."""
-        return self.scene_light * self.ratio.to(self.scene_light.dtype)[:, None, None, None]
+        light = self.scene_light * self.ratio.to(self.scene_light.dtype)[:, None, None, None]
+        if self.row_gain is None:
+            return light
+        return light * self.row_gain.to(light.dtype)[:, None, :, None]
 
     @cached_property
     def log2_light(self) -> torch.Tensor:
         """log2 of `light`, with 2**-40 in place of zero."""
         base = self.scene_light.clamp(min=2.0**-40).log2()
-        return base + self.ratio.log2().to(base.dtype)[:, None, None, None]
+        light = base + self.ratio.log2().to(base.dtype)[:, None, None, None]
+        if self.row_gain is None:
+            return light
+        return light + self.row_gain.log2().to(base.dtype)[:, None, :, None]
 
     @cached_property
     def ev100(self) -> torch.Tensor:

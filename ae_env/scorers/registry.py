@@ -7,16 +7,36 @@ import importlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
 from ae_env.checks import did_you_mean
+from ae_env.scorers.brisque import Brisque
 from ae_env.scorers.composite import Balanced, CompositeScorer
+from ae_env.scorers.defects import (
+    AnalyticBlur,
+    AnalyticExposure,
+    AnalyticHaze,
+    AnalyticNoise,
+    AnalyticSaturation,
+    AnalyticWhiteBalance,
+    Defects,
+)
+from ae_env.scorers.detail import Shim, Shin, Zhang
+from ae_env.scorers.exposure import Clipping, DynamicRange, Entropy, MidGrey, WellExposedness
+from ae_env.scorers.keypoints import Keypoints, Matches
+from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
+from ae_env.scorers.niqe import Niqe
+from ae_env.scorers.noise_level import BlindNoise, SignalToNoise
 from ae_env.scorers.protocol import Scorer
-from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
+from ae_env.scorers.pyiqa_adapter import PyiqaMetric
+from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
+from ae_env.user_code import load_from_file, split_file_name
 
 ENTRY_POINT_GROUP = "ae_env.scorers"
+#: ``pyiqa:NAME`` is the metric NAME of the package pyiqa.
+PYIQA = "pyiqa"
 Factory = TypeVar("Factory", bound=Callable[[], Any])
 
 _REGISTRY: dict[str, Callable[[], Any]] = {
@@ -26,6 +46,31 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "shadows": Shadows,
     "noise": Noise,
     "sharpness": Sharpness,
+    "banding": Banding,
+    # What follows needs files or packages of the user's own.
+    "brisque": Brisque,
+    "keypoints": Keypoints,
+    "matches": Matches,
+    "nima_aesthetic": NimaAesthetic,
+    "nima_technical": NimaTechnical,
+    "niqe": Niqe,
+    "mid_grey": MidGrey,
+    "clipping": Clipping,
+    "dynamic_range": DynamicRange,
+    "well_exposedness": WellExposedness,
+    "entropy": Entropy,
+    "shim": Shim,
+    "zhang": Zhang,
+    "shin": Shin,
+    "snr": SignalToNoise,
+    "blind_noise": BlindNoise,
+    "defects": Defects,
+    "analytic_exposure": AnalyticExposure,
+    "analytic_noise": AnalyticNoise,
+    "analytic_white_balance": AnalyticWhiteBalance,
+    "analytic_saturation": AnalyticSaturation,
+    "analytic_haze": AnalyticHaze,
+    "analytic_blur": AnalyticBlur,
 }
 
 
@@ -58,18 +103,44 @@ def register_scorer(name: str) -> Callable[[Factory], Factory]:
     return register
 
 
-def list_scorers() -> list[str]:
-    """Names of all known scorers, those of installed packages included."""
-    return sorted({*_REGISTRY, *(point.name for point in entry_points(group=ENTRY_POINT_GROUP))})
+def list_scorers(*, self_contained: bool = False) -> list[str]:
+    """Names of all known scorers, those of installed packages included.
+
+    Args:
+        self_contained: Leave out those that need a file of the user's own or an optional package.
+    """
+    names = {*_REGISTRY, *(point.name for point in scorer_entry_points())}
+    if self_contained:
+        names -= {name for name, made in _REGISTRY.items() if getattr(made, "needs", "")}
+    return sorted(names)
+
+
+def scorer_entry_points() -> list[EntryPoint]:
+    """Entry points of installed packages in the group ``ae_env.scorers``, not yet loaded."""
+    return list(entry_points(group=ENTRY_POINT_GROUP))
+
+
+def registered_scorer(name: str) -> Callable[[], Any] | None:
+    """The class that is registered as `name`, or None."""
+    return _REGISTRY.get(name)
 
 
 def _find_scorer(name: str) -> Scorer:
-    if name in _REGISTRY:
-        return _loaded(name, _REGISTRY[name])
-    for point in entry_points(group=ENTRY_POINT_GROUP):
+    factory = _REGISTRY.get(name)
+    if factory is not None:
+        # Those of this package say themselves what is missing.
+        own = factory.__module__.startswith("ae_env.scorers.")
+        return factory() if own else _loaded(name, factory)
+    for point in scorer_entry_points():
         if point.name == name:
             return _instantiate(name, _loaded(name, point.load))
+    in_file = split_file_name(name)
+    if in_file is not None:
+        found = load_from_file(*in_file, f"`scorer` (={name!r})", example="MyScore")
+        return _instantiate(name, found)
     module_name, _, attribute = name.partition(":")
+    if attribute and module_name == PYIQA:
+        return PyiqaMetric(attribute)
     if attribute:
 
         def load() -> Any:
@@ -78,14 +149,17 @@ def _find_scorer(name: str) -> Scorer:
         return _instantiate(name, _loaded(name, load))
     known = list_scorers()
     hint = did_you_mean(name, known)
-    raise ValueError(f"`scorer` (={name!r}) must be one of {known} or 'package.module:name'{hint}")
+    raise ValueError(
+        f"`scorer` (={name!r}) must be one of {known}, 'package.module:name', 'my_file.py:name' "
+        f"or 'pyiqa:metric'{hint}"
+    )
 
 
 def _loaded(name: str, load: Callable[[], Any]) -> Any:
     """What `load` returns; it runs code of the user's own, or of another package."""
     try:
         return load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(
             f"`scorer` (={name!r}) cannot be loaded: {type(error).__name__}: {error}"
         ) from error
@@ -99,16 +173,18 @@ def make_scorer(spec: str | Mapping[str, float] | Scorer) -> CompositeScorer:
     """A scorer from a name, a mapping of names to weights, or a callable.
 
     Args:
-        spec: A registered name, ``"package.module:attribute"``, a mapping such as
-            ``{"noise": 0.5, "highlights": 0.5}`` (weighted mean), or a callable
-            ``(images, captures) -> (B,)``.
+        spec: A registered name, ``"package.module:name"``, ``"path/to/my_file.py:name"``,
+            ``"pyiqa:metric"``, a mapping such as ``{"noise": 0.5, "my_file.py:MyScore": 0.5}``
+            (weighted mean), or a callable ``(images, captures) -> (B,)``.
 
     Returns:
         A composite of one or more parts.
 
     Raises:
         ValueError: If a name is unknown (the nearest is proposed) or cannot be loaded (the cause is
-            chained), a weight is not positive, or the callable has no domain.
+            chained), a model file that it needs is not there, a weight is not positive, or the
+            callable has no domain.
+        ImportError: If it needs an optional package that is not installed.
     """
     if isinstance(spec, CompositeScorer):
         return spec

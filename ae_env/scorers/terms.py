@@ -1,6 +1,6 @@
-"""The five built-in scorers, each with a closed form on the noise-free light.
+"""The built-in scorers that have a closed form on the noise-free light.
 
-Their constants were frozen before any agent was trained.
+The constants of the five that `balanced` is made of were frozen before any agent was trained.
 """
 
 from __future__ import annotations
@@ -14,16 +14,42 @@ class Brightness:
     """Exposure against the incident light: snow stays white and night stays dark.
 
     ``exp(-(sqrt(1 + e^2) - 1))`` with e the stops of over-exposure: EV of the incident light minus
-    EV of the settings. Where the light is unknown, e is against a mean of 0.12 of white.
+    EV of the settings. Where the light is unknown, e is against a mean of 0.12 of white. In
+    flickering light, the mean over the rows, each with its own e.
     """
 
     domain: Domain = "raw"
     depends_on: DependsOn = "light"
+    reads_pixels = False
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
         error = captures.proper_ev - captures.ev100
-        return torch.exp(1.0 - torch.sqrt(1.0 + error**2))
+        if captures.row_gain is None:
+            return torch.exp(1.0 - torch.sqrt(1.0 + error**2))
+        error = error[:, None] + captures.row_gain.log2()  # (B, H)
+        return torch.exp(1.0 - torch.sqrt(1.0 + error**2)).mean(dim=1)
+
+
+class Banding:
+    """Bands of flickering light on a rolling shutter: ``1 / (1 + (s / s0)^2)``.
+
+    s is the standard deviation over the rows of log2 of their light [stops]; s0 is 0.1 stop, that
+    of a sinusoidal band of +-10 % of the light. 1 where all rows have the same light.
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+    reads_pixels = False
+    scale = 0.1
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        if captures.row_gain is None:
+            return torch.ones(len(captures), dtype=torch.float64)
+        stops = captures.row_gain.clamp(min=2.0**-64).log2()  # dark between pulses
+        spread = stops.std(dim=1, correction=0)
+        return 1.0 / (1.0 + (spread / self.scale) ** 2)
 
 
 class Highlights:
@@ -85,6 +111,7 @@ class Sharpness:
 
     domain: Domain = "raw"
     depends_on: DependsOn = "blur"
+    reads_pixels = False
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""

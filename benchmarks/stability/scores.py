@@ -27,7 +27,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     camera = get_camera("nikon_z6")
     signals = extreme_signals(seed)
     ordinary = _scene("ordinary", 0.05 + 0.4 * torch.rand(4, 48, 48), camera, 1000.0)
-    for name in list_scorers():
+    for name in list_scorers(self_contained=True):
         case = f"{name}: {len(signals)} signals, {_EXTREMES}"
         yield _told(case, lambda c=case, n=name: _finite(c, n, signals, ordinary, camera))
     case = "balanced against float64"

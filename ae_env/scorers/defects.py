@@ -1,0 +1,249 @@
+"""Severity of six photographic defects, by weight-free measures of the developed picture.
+
+The defects, and that saturation has a sign, are those of N. Yu, X. Shen, Z. Lin, R. Mech and
+C. Barnes, "Learning to detect multiple photographic defects", WACV 2018 (without bad composition),
+who trained a network on people's labels. These measures are no such network: each is one number of
+the picture (`ae_env.scorers.defect_signs`) and a monotone map to the severity that was rendered,
+fitted on bundled training scenes. How far to trust them: docs/results/defects.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from ae_env.scorers import defect_signs
+from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.protocol import Captures, Domain
+
+#: Knots (sign, severity) of the fitted maps, straight in between and constant beyond. Written by
+#: ``ae-env bench defects``, which prints them, on 128 x 128 renderings of bundled training scenes.
+KNOTS: dict[str, tuple[tuple[float, float], ...]] = {
+    "over_exposure": (
+        (0.0, 0.012),
+        (0.0005, 0.0339),
+        (0.0028, 0.0339),
+        (0.0112, 0.4485),
+        (0.1141, 0.4986),
+        (0.5049, 0.4986),
+        (0.9896, 0.8505),
+    ),
+    "under_exposure": (
+        (0.0, 0.0269),
+        (0.0068, 0.0817),
+        (0.1934, 0.1037),
+        (0.366, 0.2062),
+        (0.5434, 0.4392),
+        (0.6914, 0.7221),
+        (0.932, 1.0),
+    ),
+    "noise": (
+        (0.451, 0.0),
+        (3.1916, 0.0848),
+        (5.0607, 0.2326),
+        (7.2827, 0.4025),
+        (9.3818, 0.5758),
+        (11.5345, 0.6423),
+        (14.2874, 0.7418),
+        (17.5376, 0.8368),
+        (23.9982, 1.0),
+    ),
+    "white_balance": (
+        (0.0, 0.1066),
+        (0.2152, 0.1066),
+        (0.4814, 0.2148),
+        (0.7756, 0.3664),
+        (1.0776, 0.5102),
+        (1.4275, 0.6447),
+        (1.7751, 0.7735),
+        (2.3059, 0.8743),
+        (7.3837, 1.0),
+    ),
+    "saturation": (
+        (0.0, -0.7655),
+        (1.7307, -0.7491),
+        (4.3428, -0.3677),
+        (6.9906, -0.0639),
+        (10.0612, 0.1381),
+        (13.9106, 0.2304),
+        (19.5304, 0.3291),
+        (28.9142, 0.5512),
+        (125.7316, 1.0),
+    ),
+    "haze": (
+        (0.0003, 0.0),
+        (0.2808, 0.0866),
+        (0.4464, 0.2576),
+        (0.5758, 0.3879),
+        (0.6847, 0.5399),
+        (0.767, 0.6529),
+        (0.8346, 0.7574),
+        (0.8989, 0.8592),
+        (0.9882, 0.9136),
+    ),
+    "blur": (
+        (0.1892, 0.0074),
+        (0.2799, 0.1337),
+        (0.3263, 0.2171),
+        (0.3758, 0.3505),
+        (0.432, 0.5291),
+        (0.4878, 0.6752),
+        (0.5444, 0.7796),
+        (0.6124, 0.8314),
+        (0.8107, 0.9583),
+    ),
+}
+#: What each map is of.
+SIGNS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+    "over_exposure": defect_signs.white_share,
+    "under_exposure": defect_signs.missing_highlights,
+    "noise": defect_signs.noise_sigma,
+    "white_balance": defect_signs.colour_cast,
+    "saturation": defect_signs.colourfulness,
+    "haze": defect_signs.veil,
+    "blur": defect_signs.blur_effect,
+}
+#: The defects whose severity is estimated.
+DEFECTS = ("exposure", "noise", "white_balance", "saturation", "haze", "blur")
+
+
+def severity(defect: str, images: torch.Tensor) -> torch.Tensor:
+    """Estimated severity (B,) float64 of a defect; what 1 stands for is in each scorer's docstring.
+
+    Args:
+        defect: One of `DEFECTS`.
+        images: (B, 3, H, W) sRGB in [0, 1].
+
+    Returns:
+        In [0, 1]; for ``"saturation"`` in [-1, 1], negative where the colours are too weak.
+    """
+    if defect != "exposure":
+        return mapped(defect, SIGNS[defect](images))
+    sides = ("over_exposure", "under_exposure")
+    over, under = (mapped(side, SIGNS[side](images)) for side in sides)
+    return torch.maximum(over, under)
+
+
+def mapped(name: str, sign: torch.Tensor) -> torch.Tensor:
+    """Severity (B,) float64 by the map `name` of `KNOTS`, of signs (B,)."""
+    x, y = (torch.tensor(v, dtype=torch.float64) for v in zip(*KNOTS[name], strict=True))
+    x, y = x.to(sign.device), y.to(sign.device)
+    sign = sign.double().clamp(x[0], x[-1])
+    right = torch.bucketize(sign, x).clamp_(1, len(x) - 1)
+    share = (sign - x[right - 1]) / (x[right] - x[right - 1])
+    return y[right - 1] + share * (y[right] - y[right - 1])
+
+
+class AnalyticExposure:
+    """1 - severity of wrong exposure, told from white pixels or missing highlights.
+
+    The larger of two maps: of the share of the pixels whose luma is above 0.98, and of 1 minus the
+    99th percentile of the luma. 1 stands for 4 EV too much or too little. Night without lamps looks
+    under-exposed to it, snow and lamps over-exposed: `brightness` knows the light, this does not.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity("exposure", images)
+
+
+class AnalyticNoise:
+    """1 - severity of noise, told from Immerkaer's estimate on the luma.
+
+    1 stands for photon noise of half the signal of an 18 % card (4 photons a pixel). Fine texture
+    counts as noise, blur hides it.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity("noise", images)
+
+
+class AnalyticWhiteBalance:
+    """1 - severity of a wrong white balance, told from the median colour ratios.
+
+    1 stands for gains of red and blue that are each a stop off. A scene of one colour (grass, a
+    sunset) looks off balance to it.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity("white_balance", images)
+
+
+class AnalyticSaturation:
+    """1 - |severity| of weak or strong colours, told from Hasler and Suesstrunk's colourfulness.
+
+    -1 stands for a grey picture, 1 for twice the distance of every pixel from its luma.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity("saturation", images).abs_()
+
+
+class AnalyticHaze:
+    """1 - severity of haze, told from the light in the darkest pixels (dark channel).
+
+    1 stands for a picture that is 80 % airlight. Pictures without dark pixels (snow, an even
+    surface, over-exposure) look hazy to it.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity("haze", images)
+
+
+class AnalyticBlur:
+    """1 - severity of blur, told from Crete's blur effect on the luma.
+
+    1 stands for a disc of 8 pixels of the frame. Noise hides blur; smooth scenes look blurred.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity("blur", images)
+
+
+class Defects(CompositeScorer):
+    """A picture is nearly as bad as its worst defect: the six `analytic_*` measures together.
+
+    ``1 - (0.75 max + 0.25 mean)`` of the six \\|severities\\|. A mean alone would forgive a useless
+    picture five sixths of its one fault; a maximum alone would not see the other five.
+    """
+
+    worst_share = 0.75
+
+    def __init__(self) -> None:
+        parts: dict[str, Any] = {
+            "analytic_exposure": AnalyticExposure(),
+            "analytic_noise": AnalyticNoise(),
+            "analytic_white_balance": AnalyticWhiteBalance(),
+            "analytic_saturation": AnalyticSaturation(),
+            "analytic_haze": AnalyticHaze(),
+            "analytic_blur": AnalyticBlur(),
+        }
+        super().__init__(parts)
+
+    def combine(self, scores: Mapping[str, Any]) -> Any:
+        """Total score from the parts' scores: tensors or arrays of any one shape."""
+        values = [scores[name] for name in self.parts]
+        worst, mean = values[0], sum(values) / len(values)
+        for value in values[1:]:
+            worst = worst - (worst - value).clip(0.0, None)  # the smaller, of arrays or tensors
+        total = self.worst_share * worst + (1.0 - self.worst_share) * mean
+        return total.clip(0.0, 1.0)

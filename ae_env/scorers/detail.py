@@ -1,0 +1,218 @@
+"""How much a picture shows: histogram entropy and the gradient metrics of auto-exposure papers.
+
+The functions take luma (B, H, W) in [0, 1], gamma-encoded as in an 8-bit picture, and return (B,)
+float64 in the units of the papers, which are those of 8-bit grey levels. They read noise as detail:
+at fixed brightness all but `shin_metric` rise with the gain. Pair them with a measure of noise.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch.nn.functional import adaptive_avg_pool2d
+
+from ae_env.scorers.luma import SCHARR, SOBEL, check_luma, luma_of, squared_gradient
+from ae_env.scorers.noise_level import immerkaer_response, immerkaer_sigma
+from ae_env.scorers.protocol import Captures, Domain
+
+LEVELS = 256
+#: Largest squared Sobel gradient that Shim's metric assumes, of luma in [0, 1]: 4^2 + 4^2.
+_LARGEST_SOBEL = 32.0
+#: Scharr's filter sums to this on each side: with it, gradients are grey levels per pixel.
+_SCHARR_SUM = 32.0
+
+
+def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
+    """Entropy of the histogram of 256 grey levels [bit], in [0, 8].
+
+    ``-sum p log2 p`` (C. E. Shannon, 1948) over the levels ``round(255 luma)``.
+
+    Args:
+        luma: (B, H, W) in [0, 1].
+
+    Returns:
+        (B,) float64.
+
+    >>> histogram_entropy(torch.tensor([[[0.0, 1.0], [0.0, 1.0]]])).item()
+    1.0
+    """
+    count = len(check_luma(luma))
+    codes = luma.mul(LEVELS - 1.0).round_().clamp_(0, LEVELS - 1).long().reshape(count, -1)
+    codes += LEVELS * torch.arange(count, device=luma.device)[:, None]
+    bins = torch.bincount(codes.flatten(), minlength=LEVELS * count).reshape(count, LEVELS)
+    shares = bins.double() / codes.shape[1]
+    return torch.special.entr(shares).sum(dim=1).div_(math.log(2.0)).clamp_(min=0.0)
+
+
+def shim_response(
+    luma: torch.Tensor, *, threshold: float = 0.06, slope: float = 1000.0
+) -> torch.Tensor:
+    """Shim's logarithmic response (B, H, W) in [0, 1] to the gradient of each pixel.
+
+    With m = \\|Sobel\\| / sqrt(32), of luma in [0, 1], delta the `threshold` and lambda the
+    `slope`: ``log(lambda (m - delta) + 1) / log(lambda (1 - delta) + 1)`` where m >= delta, else 0.
+    """
+    gradient = squared_gradient(check_luma(luma), SOBEL).mul_(1.0 / _LARGEST_SOBEL).sqrt_()
+    excess = gradient.sub_(threshold).clamp_(min=0.0).mul_(slope)
+    return excess.log1p_().mul_(1.0 / math.log1p(slope * (1.0 - threshold)))
+
+
+def shim_gradient(
+    luma: torch.Tensor, *, threshold: float = 0.06, slope: float = 1000.0
+) -> torch.Tensor:
+    """Shim's gradient information: mean over the pixels of `shim_response`, in [0, 1].
+
+    The paper sums over the pixels; the mean does not depend on the size.
+
+    Args:
+        luma: (B, H, W) in [0, 1].
+        threshold: delta, gradients below it count as noise, in [0, 1).
+        slope: lambda > 0; the larger, the more weak gradients count.
+
+    Returns:
+        (B,) float64.
+
+    Source: I. Shim, J.-Y. Lee, I. S. Kweon, "Auto-adjusting camera exposure for outdoor robotics
+    using gradient information", IROS 2014; delta 0.06, lambda 1000.
+    """
+    response = shim_response(luma, threshold=threshold, slope=slope)
+    return response.mean(dim=(1, 2), dtype=torch.float64)
+
+
+def zhang_gradient(luma: torch.Tensor, *, p: float = 0.7, k: float = 5.0) -> torch.Tensor:
+    """Zhang's soft percentile of the squared gradient [(grey levels of 255 per pixel)^2], >= 0.
+
+    The squared gradients G (Scharr's filter over 32) of the S pixels are sorted, ascending, and
+    averaged with weights ``sin(pi/2 i / (n - 1))^k`` for i < n and
+    ``sin(pi/2 - pi/2 (i - n + 1) / (S - n))^k`` above, n = floor(p S), i from 0.
+
+    Args:
+        luma: (B, H, W) in [0, 1].
+        p: Percentile that counts most, in (0, 1).
+        k: Concentration around it, > 0.
+
+    Returns:
+        (B,) float64; at most 2 * 127.5^2.
+
+    Source: Z. Zhang, C. Forster, D. Scaramuzza, "Active exposure control for robust visual odometry
+    in HDR environments", ICRA 2017; p 0.7, k 5.
+    """
+    squares = squared_gradient(check_luma(luma), SCHARR).flatten(1)
+    weights = _percentile_weights(squares.shape[1], p, k).to(squares)
+    scale = (255.0 / _SCHARR_SUM) ** 2
+    return (_ascending(squares) * weights).sum(dim=1, dtype=torch.float64).mul_(scale)
+
+
+def _ascending(rows: torch.Tensor) -> torch.Tensor:
+    if rows.device.type == "cpu":  # numpy sorts several times as fast
+        return torch.from_numpy(np.sort(rows.detach().numpy(), axis=1))
+    return rows.sort(dim=1).values
+
+
+def _percentile_weights(samples: int, p: float, k: float) -> torch.Tensor:
+    """(samples,) float64 weights of Zhang's metric; they sum to 1, or are 0 for one sample."""
+    index, split = torch.arange(samples, dtype=torch.float64), math.floor(p * samples)
+    rising = index / max(split - 1, 1)
+    falling = 1.0 - (index - split + 1.0) / (samples - split)
+    angle = torch.where(index < split, rising, falling) * (0.5 * math.pi)
+    weights = angle.sin().clamp_(min=0.0) ** k
+    return weights / weights.sum().clamp(min=1e-300)
+
+
+def shin_metric(
+    luma: torch.Tensor,
+    *,
+    alpha: float = 0.4,
+    beta: float = 0.4,
+    gradient_gain: float = 2.0,
+    entropy_gain: float = 0.125,
+) -> torch.Tensor:
+    """Shin's noise-aware metric: ``alpha K_g L_grad + (1 - alpha) K_e H - beta L_noise``.
+
+    L_grad is mean over standard deviation (of a sample) of the means of `shim_response` in a grid
+    of 10 x 10 cells, 0 where there is no gradient and at most 1000; H is `histogram_entropy`;
+    L_noise is `shin_noise`.
+
+    Args:
+        luma: (B, H, W) in [0, 1].
+        alpha: Weight of the gradient against the entropy, in [0, 1].
+        beta: Weight of the noise, >= 0.
+        gradient_gain: K_g.
+        entropy_gain: K_e [1 / bit].
+
+    Returns:
+        (B,) float64, about -10 to 3.
+
+    Source: U. Shin, J. Park, G. Shim, F. Rameau, I. S. Kweon, "Camera exposure control for robust
+    robot vision with noise-aware image quality assessment", IROS 2019, with the factor of 1/6 in
+    the noise that the authors' code adds.
+    """
+    cells = adaptive_avg_pool2d(shim_response(luma).double(), 10).flatten(1)  # (B, 100)
+    mean, deviation = cells.mean(dim=1), cells.std(dim=1)
+    uniformity = (mean / deviation.clamp(min=1e-12)).clamp_(max=1000.0)
+    detail = alpha * gradient_gain * uniformity
+    detail += (1.0 - alpha) * entropy_gain * histogram_entropy(luma)
+    return detail - beta * shin_noise(luma)
+
+
+def shin_noise(luma: torch.Tensor) -> torch.Tensor:
+    """Shin's noise estimate (B,) float64 [grey levels of 255]: Immerkaer's on flat pixels.
+
+    Over the pixels in 15 to 235 grey levels whose squared Sobel gradient is at or below the 10th
+    percentile; over all pixels where fewer than one in 10,000 are such.
+    """
+    count = len(check_luma(luma))
+    squares = squared_gradient(luma, SOBEL).reshape(count, -1)
+    samples = squares.shape[1]
+    percentile = squares.kthvalue(max(1, round(0.1 * samples)), dim=1, keepdim=True).values
+    levels = (255.0 * luma).reshape(count, -1)
+    used = (squares <= percentile) & (levels >= 15.0) & (levels <= 235.0)
+    number = used.sum(dim=1)
+    response = (immerkaer_response(luma).reshape(count, -1) * used).sum(dim=1, dtype=torch.float64)
+    masked = response * (255.0 * math.sqrt(0.5 * math.pi) / 6.0) / number.clamp(min=1)
+    return torch.where(number < 1e-4 * samples, immerkaer_sigma(luma), masked)
+
+
+class Shim:
+    """Shim's gradient information (2014), weak gradients included: higher with more detail.
+
+    The mean of `shim_response` as it is, in [0, 1]: see `shim_gradient`.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return shim_gradient(luma_of(images))
+
+
+class Zhang:
+    """Zhang's soft percentile of the squared gradient (2017): higher with more contrast.
+
+    ``g / (g + 16^2)``, g from `zhang_gradient`: 0.5 where the gradient at the percentile is 16 grey
+    levels of 255 per pixel.
+    """
+
+    domain: Domain = "srgb"
+    half = 256.0
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        gradient = zhang_gradient(luma_of(images))
+        return gradient / (gradient + self.half)
+
+
+class Shin:
+    """Shin's noise-aware metric (2019): even detail and entropy, less the noise.
+
+    ``(1 + f / (1 + |f|)) / 2``, f from `shin_metric`: 0.5 at 0, 0.75 at 1, 0.11 at -3.5.
+    """
+
+    domain: Domain = "srgb"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        metric = shin_metric(luma_of(images))
+        return 0.5 + 0.5 * metric / (1.0 + metric.abs())

@@ -1,0 +1,58 @@
+"""Pictures and captures that the tests of the scorers share."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ae_env.captures import describe_captures
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scorers import make_scorer
+from ae_env.scorers.protocol import Captures
+from simulator import CameraSettings, get_camera
+
+CAMERA = get_camera("nikon_z6")
+#: Height and width of pictures that filters could trip over.
+SIZES = [(1, 1), (1, 7), (2, 2), (3, 1), (5, 9), (13, 11), (36, 36)]
+
+
+def random_pictures(count: int = 5, height: int = 23, width: int = 17, seed: int = 0):
+    """(B, C, H, W) in [0, 1], C = 4: noise over a smooth slope, each at a brightness of its own."""
+    rng = np.random.default_rng(seed)
+    slope = np.linspace(0.1, 0.9, width) * np.linspace(0.5, 1.0, height)[:, None]
+    frames = slope * np.geomspace(0.3, 1.5, count)[:, None, None, None]
+    frames = frames + 0.08 * rng.normal(size=(count, 4, height, width))
+    return torch.from_numpy(frames.clip(0.0, 1.0).astype(np.float32))
+
+
+def check_image_scorer(name: str) -> None:
+    """Scores are (B,) in [0, 1] for any size and value, and the same alone and in a batch."""
+    scorer = next(iter(make_scorer(name).parts.values()))
+    channels = 3 if scorer.domain == "srgb" else 4
+    pictures = random_pictures()[:, :channels].contiguous()
+    before = pictures.clone()
+    scores = scorer(pictures, None)
+    assert torch.equal(pictures, before)
+    assert scores.shape == (5,)
+    assert scores.dtype == torch.float64
+    assert torch.equal(scores, scorer(pictures, None))
+    alone = torch.cat([scorer(picture[None], None) for picture in pictures])
+    torch.testing.assert_close(alone, scores, rtol=0.0, atol=1e-6)
+    for height, width in SIZES:
+        extremes = torch.zeros(3, channels, height, width)
+        extremes[1] = 1.0
+        extremes[2] = random_pictures(1, height, width)[:, :channels]
+        values = scorer(extremes, None)
+        assert bool(torch.isfinite(values).all()), (height, width)
+        assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
+
+
+def captures_of(light: np.ndarray, states: list[CameraSettings]) -> Captures:
+    """Captures of `light` (4, H, W), which is what ISO 100, f/4, 1/64 s records."""
+    scene = Scene.from_array(
+        light.astype(np.float32), reference_settings(10.0), CAMERA, scene_id="x", illuminance=2560.0
+    )
+    zeros, count = np.zeros(len(states)), len(states)
+    return describe_captures(
+        [scene] * count, states, CAMERA, speed=zeros, defocus=zeros, gain=zeros + 1.0
+    )

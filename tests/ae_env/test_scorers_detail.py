@@ -1,0 +1,138 @@
+"""Gradient metrics of exposure papers, against SciPy, loops, and what was measured beforehand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import skimage.data
+import torch
+from skimage.measure import shannon_entropy
+
+from ae_env.scorers import make_scorer
+from ae_env.scorers.detail import histogram_entropy, shim_gradient, shin_metric, zhang_gradient
+from tests.ae_env.scorer_images import check_image_scorer, random_pictures
+
+
+@pytest.mark.parametrize("name", ["shim", "zhang", "shin"])
+def test_any_picture_has_a_score(name: str) -> None:
+    check_image_scorer(name)
+
+
+def _levels(count: int = 3, height: int = 40, width: int = 60) -> np.ndarray:
+    """8-bit grey levels (B, H, W)."""
+    return np.round(255.0 * random_pictures(count, height, width)[:, 0].double().numpy())
+
+
+def _sobel(picture: np.ndarray) -> np.ndarray:
+    x, y = (scipy.ndimage.sobel(picture, axis=axis, mode="nearest") for axis in (1, 0))
+    return np.hypot(x, y)
+
+
+def _shim_pixels(picture: np.ndarray) -> np.ndarray:
+    m = _sobel(picture) / math.sqrt(2 * 16 * 255**2)
+    response = np.log(1000 * np.maximum(m - 0.06, 0) + 1) / np.log(1000 * (1 - 0.06) + 1)
+    return np.where(m >= 0.06, response, 0.0)
+
+
+def test_shim_is_the_mean_of_the_logarithmic_response() -> None:
+    levels = _levels()
+    expected = [_shim_pixels(picture).mean() for picture in levels]
+    assert min(expected) > 0.05
+    got = shim_gradient(torch.from_numpy(levels / 255.0))
+    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
+
+
+def test_a_black_and_white_edge_by_hand() -> None:
+    """A step of 1: gx is 4 on both sides, m = 4 / sqrt(32); a fifth of 10 columns has it."""
+    luma = torch.zeros(1, 6, 10, dtype=torch.float64)
+    luma[..., 5:] = 1.0
+    m = 4 / math.sqrt(32)
+    response = math.log(1000 * (m - 0.06) + 1) / math.log(941)
+    assert shim_gradient(luma).item() == pytest.approx(0.2 * response)
+    # Sorted, the top 12 of 60 squared gradients are (255 / 2)^2; n = 42; weights by hand.
+    weights = [math.sin(math.pi / 2 * i / 41) ** 5 for i in range(42)]
+    weights += [math.sin(math.pi / 2 * (1 - (i - 41) / 18)) ** 5 for i in range(42, 60)]
+    share = sum(weights[48:]) / sum(weights)
+    assert zhang_gradient(luma).item() == pytest.approx(share * 127.5**2, rel=1e-9)
+
+
+def test_zhang_is_the_weighted_mean_of_sorted_squared_gradients() -> None:
+    levels = _levels(height=21, width=33)
+    kernel = np.array([[3, 0, -3], [10, 0, -10], [3, 0, -3]]) / 32
+    expected = []
+    for picture in levels:
+        x, y = (scipy.ndimage.convolve(picture, k, mode="nearest") for k in (kernel, kernel.T))
+        ordered = sorted((x**2 + y**2).ravel())
+        size, n = len(ordered), int(0.7 * len(ordered))
+        weights = []
+        for i in range(size):
+            angle = math.pi / 2 * i / (n - 1)
+            if i >= n:
+                angle = math.pi / 2 - math.pi / 2 * (i - n + 1) / (size - n)
+            weights.append(math.sin(angle) ** 5)
+        expected.append(np.dot(weights, ordered) / sum(weights))
+    got = zhang_gradient(torch.from_numpy(levels / 255.0))
+    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
+    scores = make_scorer("zhang").parts["zhang"](torch.from_numpy(levels[:, None] / 255.0).float()
+                                                 .expand(-1, 3, -1, -1), None)  # fmt: skip
+    np.testing.assert_allclose(scores, np.array(expected) / (np.array(expected) + 256), rtol=1e-4)
+
+
+def _shin(picture: np.ndarray) -> float:
+    """The metric in the words of the paper, for sizes that 10 divides."""
+    height, width = picture.shape
+    response = _shim_pixels(picture)
+    rows, columns = height // 10, width // 10
+    cells = [
+        response[rows * i : rows * (i + 1), columns * j : columns * (j + 1)].mean()
+        for i in range(10)
+        for j in range(10)
+    ]
+    gradient = 2 * np.mean(cells) / np.std(cells, ddof=1)
+    entropy = shannon_entropy(np.round(picture)) / 8
+    squared = _sobel(picture) ** 2
+    flat = squared <= np.sort(squared.ravel())[round(0.1 * picture.size) - 1]
+    used = flat & (picture >= 15) & (picture <= 235)
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
+    response = np.abs(scipy.ndimage.convolve(picture, kernel, mode="nearest"))
+    noise = math.sqrt(math.pi / 2) / (6 * used.sum()) * response[used].sum()
+    return 0.4 * gradient + 0.6 * entropy - 0.4 * noise
+
+
+def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
+    # Not whole levels, of which many gradients would tie at the percentile.
+    levels = 255.0 * random_pictures(3, 40, 60)[:, 0].double().numpy()
+    expected = np.array([_shin(picture) for picture in levels])
+    got = shin_metric(torch.from_numpy(levels / 255.0))
+    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
+    pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
+    scores = make_scorer("shin").parts["shin"](pictures, None)
+    mapped = np.where(expected > 0, 1 - 0.5 / (1 + expected), 0.5 / (1 - np.minimum(expected, 0)))
+    np.testing.assert_allclose(scores, mapped, atol=1e-2)  # a level may round the other way
+
+
+def test_noise_counts_as_detail_but_for_shin() -> None:
+    """At one brightness, six stops of gain raise entropy, Shim and Zhang, and lower Shin."""
+    clean = skimage.data.camera()[::2, ::2] / 255.0
+    normals = np.random.default_rng(0).normal(size=clean.shape)
+    quiet, noisy = (np.clip(clean + sigma * normals, 0, 1) for sigma in (0.01, 0.08))
+    luma = torch.from_numpy(np.stack([quiet, noisy]))
+    rising: list[Callable[[torch.Tensor], torch.Tensor]]
+    rising = [histogram_entropy, shim_gradient, zhang_gradient]
+    for metric in rising:
+        first, second = metric(luma).tolist()
+        assert second > first * 1.005, metric
+    first, second = shin_metric(luma).tolist()
+    assert second < first - 3.0
+
+
+def test_pictures_without_gradient_have_none() -> None:
+    for value in (0.0, 0.4, 1.0):
+        flat = torch.full((2, 12, 14), value)
+        assert shim_gradient(flat).tolist() == [0.0, 0.0]
+        assert zhang_gradient(flat).tolist() == [0.0, 0.0]
+        assert shin_metric(flat).tolist() == [0.0, 0.0]

@@ -1,0 +1,116 @@
+"""Brightness, clipping and histogram scorers, against hand arithmetic and other libraries."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.color import rgb2gray
+from skimage.measure import shannon_entropy
+
+from ae_env.scorers import make_scorer
+from ae_env.scorers.detail import histogram_entropy
+from simulator import CameraSettings, develop
+from tests.ae_env.scorer_images import CAMERA, captures_of, check_image_scorer, random_pictures
+
+IMAGE_SCORERS = ("mid_grey", "clipping", "well_exposedness", "entropy")
+
+
+def _score(name: str, images: torch.Tensor) -> list[float]:
+    return next(iter(make_scorer(name).parts.values()))(images, None).tolist()
+
+
+@pytest.mark.parametrize("name", IMAGE_SCORERS)
+def test_any_picture_has_a_score(name: str) -> None:
+    check_image_scorer(name)
+
+
+def _encoded(linear: float) -> float:
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+
+
+@pytest.mark.parametrize(
+    ("linear", "score"), [(0.18, 1.0), (0.36, 0.5), (0.09, 0.5), (0.0018, 0.01), (1.0, 0.18)]
+)
+def test_mid_grey_is_halved_by_every_stop(linear: float, score: float) -> None:
+    picture = torch.full((1, 3, 4, 5), _encoded(linear))
+    assert _score("mid_grey", picture) == pytest.approx([score], rel=1e-4)
+
+
+def test_mid_grey_takes_the_mean_of_linear_luminance() -> None:
+    pictures = random_pictures(3, 40, 50)[:, :3]
+    encoded = pictures.numpy().astype(np.float64)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    means = [rgb2gray(p.transpose(1, 2, 0)).mean() for p in linear]  # 0.2125, 0.7154, 0.0721
+    expected = [2.0 ** -abs(math.log2(mean / 0.18)) for mean in means]
+    np.testing.assert_allclose(_score("mid_grey", pictures), expected, rtol=2e-3)
+
+
+def test_mid_grey_is_1_for_a_card_in_incident_light_exposure() -> None:
+    card = torch.full((1, 4, 3, 3), 0.18 * 0.6635)
+    assert _score("mid_grey", develop(card)) == pytest.approx([1.0], abs=1e-4)
+
+
+def test_clipping_counts_samples_of_all_planes() -> None:
+    raw = torch.full((2, 4, 2, 5), 0.5)  # 40 samples each
+    raw[0, 0, 0, :3] = 1.0
+    raw[0, 3, 1, :2] = 0.0
+    raw[1, 1, 0, 0] = 2.0**-9  # the black end itself
+    raw[1, 2, 0, 0] = 2.0**-8
+    raw[1, 2, 1, 0] = 16382 / 16383  # the code below white
+    assert _score("clipping", raw) == pytest.approx([1 - 5 / 40, 1 - 1 / 40])
+
+
+def test_dynamic_range_is_the_stops_between_percentiles_over_14() -> None:
+    light = np.full((4, 10, 10), 0.5)
+    light[:, :5] = 0.5 / 2**6
+    bright = CameraSettings(iso=100, exposure_time=1 / 4, f_number=4)  # 8 and 1/8 of white
+    dark = CameraSettings(iso=100, exposure_time=1 / 64 / 2**10, f_number=4)
+    base = CameraSettings(iso=100, exposure_time=1 / 64, f_number=4)
+    scorer = make_scorer("dynamic_range")
+    scores = scorer(None, captures_of(light, [base, bright, dark])).tolist()
+    nlf = CAMERA.nlf(100)
+    floor = np.roots([1.0, -nlf.shot[1], -nlf.read[1]]).max()  # where x = sqrt(shot x + read)
+    below = math.log2(0.5 / 2**10 / floor)
+    assert scores == pytest.approx([6 / 14, 3 / 14, below / 14], rel=1e-3)
+    assert below < 6  # so the floor did decide
+
+
+def test_dynamic_range_falls_with_gain_at_one_brightness() -> None:
+    light = 0.12 * np.exp(np.random.default_rng(0).normal(0.0, 4.0, (4, 40, 40)))
+    states = [CameraSettings(100 * 4**i, 1 / 64 / 4**i, 4) for i in range(5)]
+    scores = make_scorer("dynamic_range")(None, captures_of(light, states))
+    assert bool((scores.diff() <= 0).all())
+    assert float(scores[0] - scores[-1]) > 0.05
+
+
+def test_well_exposedness_is_mertens_product() -> None:
+    pictures = random_pictures(2, 7, 5)[:, :3]
+    for picture, score in zip(pictures.tolist(), _score("well_exposedness", pictures), strict=True):
+        total = 0.0
+        for row in range(7):
+            for column in range(5):
+                product = 1.0
+                for channel in range(3):
+                    product *= math.exp(-((picture[channel][row][column] - 0.5) ** 2) / 0.08)
+                total += product
+        assert score == pytest.approx(total / 35, rel=1e-5)
+
+
+def test_entropy_is_that_of_the_grey_levels() -> None:
+    rng = np.random.default_rng(1)
+    codes = np.stack([rng.integers(0, top, (31, 29)) for top in (2, 17, 200, 256)])
+    luma = torch.from_numpy(codes / 255.0)
+    expected = [shannon_entropy(picture, base=2) for picture in codes]
+    np.testing.assert_allclose(histogram_entropy(luma).numpy(), expected, rtol=1e-9)
+    every = torch.arange(256.0).reshape(1, 16, 16) / 255.0
+    assert _score("entropy", every[:, None].expand(-1, 3, -1, -1)) == pytest.approx([1.0])
+
+
+def test_bad_luma_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"`luma` \(=\(2, 3\)"):
+        histogram_entropy(torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="floating point"):
+        histogram_entropy(torch.zeros(1, 2, 3, dtype=torch.uint8))
