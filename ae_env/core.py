@@ -12,16 +12,18 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from ae_env.draws import Draws
 from ae_env.episode import Episode, Episodes
+from ae_env.frame_light import FrameLight
 from ae_env.lighting import Lighting
 from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
 from ae_env.options import COSTS, EnvOptions
+from ae_env.part_scores import PartScores
 from ae_env.recorder import Recorder
-from ae_env.score_table import ScoreTable, ScoreTables, describe_captures
-from ae_env.scorers.protocol import DependsOn
+from ae_env.scenes.scene import Scene
+from ae_env.scenes.sequence import sequence_bounds
+from ae_env.score_table import ScoreTable, ScoreTables
 from simulator.modules.disc_bank import DIAMETERS
 from simulator.noise_bank import single_normals
 
@@ -72,7 +74,9 @@ class EpisodeCore:
             tolerance=options.tolerance,
         )
         self.episodes = Episodes(num_envs, int(options.delay))
-        self._draws = Draws(options, self.scenes, len(self.grid))
+        # First and last frame of the sequence that each scene is a frame of.
+        self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
+        self._draws = Draws(options, self.first_scenes, len(self.grid))
         self._scene_ids = np.array([scene.scene_id for scene in self.scenes], object)
         states = self.grid.states
         apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
@@ -82,20 +86,16 @@ class EpisodeCore:
         self._static = type(self.lighting) is Lighting
         has_map = np.array([scene.defocus_map is not None for scene in self.scenes])
         self._shareable = self._static & ~has_map
-        # In static light, by slot and state: scores of the parts that have a closed form, the last
-        # column those of the whole where it has one; and which slots have them.
-        slots = len(self.scenes) + num_envs
-        self._closed = self.scorer.names("light", "blur") if self._static else []
-        self._closed_columns = [f"score:{name}" for name in self._closed]
-        self._scores = np.zeros((slots, len(states), len(self._closed) + 1))
-        self._scored = np.zeros(slots, bool)
+        self._light = FrameLight(
+            self.lighting, self.episodes, self.scenes, self.camera, options.resolution
+        )
+        self._part_scores = PartScores(self.tables, self.scenes, self.episodes, static=self._static)
         self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
         frame_bytes = 16 * options.resolution**2
         keep = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
         self.recorder = Recorder(
             options, self.grid, self.camera, self.scenes, self.episodes, keep=keep
         )
-        self._scores_images = not self.scorer.closed_form
 
     def _kept_frames(self) -> int:
         """Blurred frames that an episode keeps at most."""
@@ -127,6 +127,13 @@ class EpisodeCore:
         """(S,) bool: states that may be chosen. Every aperture is exact here, so all of them."""
         return np.ones(len(self.grid), dtype=bool)
 
+    @property
+    def first_scenes(self) -> list[Scene]:
+        """Scenes that episodes draw from: of a sequence, its first frame."""
+        if self._sequence is None:
+            return self.scenes
+        return [self.scenes[i] for i in np.unique(self._sequence[0])]
+
     # -- life of an episode -------------------------------------------------------------------
 
     def start(self, place: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
@@ -141,15 +148,44 @@ class EpisodeCore:
     ) -> None:
         """Draws episodes for `places` (K,), where others may end; see `Draws.draw`."""
         drawn = self._draws.draw(rngs, options)
+        if self._sequence is not None:
+            first = np.unique(self._sequence[0])[drawn["scene"]]
+            drawn["scene"] = self._shown_at(first, drawn["frame"])
+        self._forget(places)
+        slots = self._slots(places, drawn["scene"], drawn["speed"], drawn["defocus"])
+        self.episodes.begin(places, drawn, slots)
+
+    def _forget(self, places: np.ndarray) -> None:
+        """Lets go of what was worked out for the scenes that are shown at `places`."""
         self.recorder.end(places)
-        own = len(self.scenes) + places
-        # At rest, its light and its scores are those of every episode that shows its scene.
-        moves = (drawn["speed"] > 0.0) | (drawn["defocus"] > 0.0)
-        shared = ~moves & self._shareable[drawn["scene"]]
-        self.episodes.begin(places, drawn, np.where(shared, drawn["scene"], own))
-        self._scored[own] = False
+        self._part_scores.forget(len(self.scenes) + places)
         for place in places.tolist():
             self._tables[place] = None
+
+    def _slots(
+        self, places: np.ndarray, scenes: np.ndarray, speed: np.ndarray, defocus: np.ndarray
+    ) -> np.ndarray:
+        """(K,) slots, see `Episodes`."""
+        # At rest, its light and its scores are those of every episode that shows its scene.
+        moves = (speed > 0.0) | (defocus > 0.0)
+        return np.where(~moves & self._shareable[scenes], scenes, len(self.scenes) + places)
+
+    def _shown_at(self, scenes: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Scenes that the sequences of `scenes` show in `frames`; the last one stays."""
+        assert self._sequence is not None
+        first, last = self._sequence
+        return np.minimum(first[scenes] + frames, last[scenes])
+
+    def _show_next(self, places: np.ndarray) -> None:
+        """Shows the scene of the current frame at each of `places`."""
+        episodes = self.episodes
+        now = self._shown_at(episodes.scene[places], episodes.frame[places])
+        changes = now != episodes.scene[places]
+        places, now = places[changes], now[changes]
+        self._forget(places)
+        episodes.scene[places] = now
+        speed, defocus = episodes.speed[places], episodes.defocus[places]
+        episodes.slot[places] = self._slots(places, now, speed, defocus)
 
     def episode(self, place: int) -> Episode:
         """The episode at `place` as it is now."""
@@ -175,29 +211,30 @@ class EpisodeCore:
         if wrong.any():
             raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {len(self.grid)})")
         self.episodes.act(places, actions)
-
-    def gain(self, episode: Episode, exposure_time: float) -> float:
-        """Light of an exposure in the current frame relative to the scene's own."""
-        return self.lighting.gain(episode.frame, exposure_time, episode.phase)
-
-    def _gains(self, places: np.ndarray) -> np.ndarray:
-        """(B,) `gain` of the current exposures."""
-        if self._static:
-            return np.ones(len(places))
-        times = self._bounds[1, self.episodes.state[places]]
-        pairs = zip(places.tolist(), times.tolist(), strict=True)
-        return np.array([self.gain(self.episodes[place], time) for place, time in pairs])
+        if self._sequence is not None:
+            self._show_next(places)
 
     def expected_scores(self, place: int) -> ScoreTable:
         """Scores of all states in the current frame of the episode at `place`."""
         episode = self.episode(place)
-        gain = self.gain(episode, 0.0)
+        gain: float | np.ndarray = 1.0
+        rows = None
+        if self.lighting.within_frame:
+            key: float = episode.frame
+        else:
+            key = gain = self._light.of(place, 0.0)[0]
         known = self._tables[place]
-        if known is None or known[0] != gain:
+        if known is None or known[0] != key:
+            if self.lighting.within_frame:
+                gain, rows = self._light.of_states(place, self._bounds[1])
             table = self.tables.table(
-                self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus, gain=gain
+                self.scenes[episode.scene],
+                speed=episode.speed,
+                defocus=episode.defocus,
+                gain=gain,
+                row_gain=rows,
             )
-            known = self._tables[place] = (gain, table)
+            known = self._tables[place] = (key, table)
         return known[1]
 
     # -- what the camera records --------------------------------------------------------------
@@ -230,96 +267,51 @@ class EpisodeCore:
 
     def _totals(self, parts: dict[str, np.ndarray], places: np.ndarray) -> np.ndarray:
         """(B,) float64 scores before costs."""
-        states = self.episodes.state[places]
-        if self._static and self.scorer.closed_form:
-            return self._scores[self.episodes.slot[places], states, -1]
-        if self.options.reward == "expected":
-            pairs = zip(places.tolist(), states.tolist(), strict=True)
+        if self.options.reward == "expected" and not self._part_scores.are_expected:
+            pairs = zip(places.tolist(), self.episodes.state[places].tolist(), strict=True)
             return np.array([self.expected_scores(place).mean[state] for place, state in pairs])
-        return self.scorer.totals(parts)
+        return self._part_scores.totals(parts, places)
 
     def _capture_all(self, places: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Observations of `raw` and the info columns, worked out chunk by chunk."""
         size = self.options.resolution
         raw = np.empty((len(places), 4, size, size), _RAW_DTYPES[self.options.observation])
-        gains = self._gains(places)
+        gains, rows = np.ones(len(places)), None
+        if not self._static:
+            gains, rows = self._light.of_each(places, self._bounds[1, self.episodes.state[places]])
         self.recorder.prepare(places, gains)
-        # Only in static light, scored without its pixels, is no float of every sample made.
-        few = self._scores_images or not self._static
+        # Only where no part of the score needs it is no float of every sample made.
+        few = self._part_scores.reads_pixels or rows is not None
         step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(places)
         if step >= len(places):
-            return raw, self._capture(places, gains, raw)
+            return raw, self._capture(places, gains, rows, raw)
         chunks = []
         for start in range(0, len(places), step):
             part = slice(start, start + step)
-            chunks.append(self._capture(places[part], gains[part], raw[part]))
+            some = None if rows is None else rows[part]
+            chunks.append(self._capture(places[part], gains[part], some, raw[part]))
         return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
 
     def _capture(
-        self, places: np.ndarray, gains: np.ndarray, raw: np.ndarray
+        self, places: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
     ) -> dict[str, np.ndarray]:
         """Info columns of the episodes at `places`; their observations are written to `raw`."""
         outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
-        if self._scores_images:
+        if self._part_scores.reads_images:
             outputs.setdefault("signals", np.empty(raw.shape, np.float32))
         if "flicker" in self.options.costs:
             outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
-        columns = self.recorder.record(places, **outputs)
+        columns = self.recorder.record(places, row_gain=rows, **outputs)
         key = columns.pop("noise_key")
         if self.options.sensors:
             columns["sensor_noise"] = single_normals(key, 2)
-        columns |= self._part_scores(places, outputs.get("signals"), gains)
+        columns |= self._part_scores.of(places, outputs.get("signals"), gains, rows)
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         if "flicker" in self.options.costs:
             codes = outputs["codes"].reshape(len(raw), -1)
             columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
         return columns
-
-    def _part_scores(
-        self, places: np.ndarray, frames: np.ndarray | None, gains: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        episodes, scores = self.episodes, {}
-        slots, states = episodes.slot[places], episodes.state[places]
-        if self._static:
-            if not self._scored[slots].all():
-                self._score(places)
-            known = self._scores[slots, states].T
-            scores = dict(zip(self._closed_columns, known, strict=False))
-        kinds: list[DependsOn] = [] if self.scorer.closed_form else ["image"]
-        if not self._static:
-            kinds += ["light", "blur"]
-        if kinds:
-            captures = describe_captures(
-                [self.scenes[scene] for scene in episodes.scene[places].tolist()],
-                [self.grid[state] for state in states.tolist()],
-                self.camera,
-                speed=episodes.speed[places],
-                defocus=episodes.defocus[places],
-                gain=gains,
-            )
-            images = None if frames is None else torch.from_numpy(frames).clamp(0.0, 1.0)
-            for name, values in self.scorer.score_parts(images, captures, tuple(kinds)).items():
-                scores[f"score:{name}"] = values.numpy()
-        return scores
-
-    def _score(self, places: np.ndarray) -> None:
-        """Works out all scores that have a closed form, in the slots of `places` that lack them."""
-        slots, first = np.unique(self.episodes.slot[places], return_index=True)
-        missing = ~self._scored[slots]
-        slots, first = slots[missing], first[missing]
-        for slot, place in zip(slots.tolist(), places[first].tolist(), strict=True):
-            episode = self.episodes[place]
-            parts = self.tables.closed_parts(
-                self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
-            )
-            for column, name in enumerate(self._closed):
-                self._scores[slot, :, column] = parts[name]
-        if self.scorer.closed_form:
-            columns = np.moveaxis(self._scores[slots], -1, 0).copy()
-            totals = self.scorer.totals(dict(zip(self._closed, columns, strict=False)))
-            self._scores[slots, :, -1] = totals
-        self._scored[slots] = True
 
     def _costs(self, places: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
         """(B,) each; 0 in the first frame of an episode."""

@@ -33,13 +33,15 @@ class Draws:
 
     Args:
         options: The environment's arguments.
-        scenes: What episodes choose from.
+        scenes: What episodes choose from; of sequences, the first frames.
         num_states: Number of exposure states.
     """
 
     def __init__(self, options: EnvOptions, scenes: Sequence[Scene], num_states: int) -> None:
         self._options, self._num_states = options, num_states
         self._index = {scene.scene_id: i for i, scene in enumerate(scenes)}
+        if options.in_sequences:  # which have a name of their own
+            self._index |= {scene.group: i for i, scene in enumerate(scenes)}
         self._ids = [scene.scene_id for scene in scenes]
         self._speeds = np.array([scene.median_speed for scene in scenes])
         self._own_blur = np.array([s.own_blur(4.0) * 64.0 / options.resolution for s in scenes])

@@ -64,7 +64,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
     log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
     defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
-    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses.
+    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses; of a recorded sequence, `frame` is the raw that it begins with.
 
     ## Episode End
 
@@ -74,10 +74,10 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
 
     | name | default | meaning |
     |---|---|---|
-    | `scenes` | `"bundled"` | name, path, glob, mapping, `"package.module:name"` or list of `Scene` |
+    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene` |
     | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
     | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
-    | `scorer` | `"balanced"` | name, mapping of names to weights, `"package.module:name"`, or a callable |
+    | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
     | `costs` | `{}` | weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
     | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
     | `sensors` | `True` | whether `sensors` is observed |
@@ -85,7 +85,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |
     | `motion` | `"random"` | `"random"`, `"none"`, or a speed [frame heights/s] |
     | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4 |
-    | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, or a mapping with options |
+    | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
     | `delay` | 0 | frames between an action and the first capture that has it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
@@ -121,8 +121,8 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
 
     @property
     def scenes(self) -> list[Scene]:
-        """Scenes that episodes draw from."""
-        return self.core.scenes
+        """Scenes that episodes draw from; of a sequence, its first frame."""
+        return self.core.first_scenes
 
     @property
     def state(self) -> int:

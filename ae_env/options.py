@@ -10,6 +10,7 @@ from ae_env.checks import check_flag, check_integer, check_number, check_word, d
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, make_lighting
 from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.loading import is_sequence
 from ae_env.scenes.networks import (
     DEFAULT_SIMULATOR,
     SceneNetworks,
@@ -122,8 +123,16 @@ class EnvOptions:
         """How the light changes."""
         return make_lighting(self.lighting)
 
+    @property
+    def in_sequences(self) -> bool:
+        """Whether the scenes are frames of sequences, which follow each other in an episode."""
+        return is_sequence(self.scenes)
+
     def load_scenes(self) -> list[Scene]:
-        """The scenes of the split at this resolution; kept for the next environment like this."""
+        """The scenes of the split at this resolution; kept for the next environment like this.
+
+        Of sequences, all frames (`ae_env.scenes.sequence`).
+        """
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
         key = (

@@ -12,7 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
+from ae_env.bands import in_bands, remaining_in_bands
 from ae_env.episode import Episodes
 from ae_env.grid import ExposureGrid
 from ae_env.kept_light import Buffers, KeptLight, Plans
@@ -178,6 +180,7 @@ class Recorder:
         self,
         places: np.ndarray,
         *,
+        row_gain: np.ndarray | None = None,
         codes: np.ndarray | None = None,
         numbers: np.ndarray | None = None,
         signals: np.ndarray | None = None,
@@ -186,6 +189,8 @@ class Recorder:
 
         Args:
             places: (B,) of the episodes.
+            row_gain: (B, R) light of each row relative to the gain that was prepared for; None
+                where all rows have the same. `excess_noise` is that of this gain.
             codes: (B, 4, R, R) uint8, as observed.
             numbers: (B, 4, R, R) uint16, digital numbers.
             signals: (B, 4, R, R) float32, on the scale where white is 1.
@@ -197,15 +202,19 @@ class Recorder:
         seeds, frames = self.episodes.noise_seed[places], self.episodes.frame[places]
         keys = noise_keys(seeds, frames.astype(np.float64))
         flat = (len(rows), 4, self._samples)
-        blurred = plans.blurs[rows].any()  # else all of the source's variance remains
+        light, remaining = plans.light[rows], None
+        if plans.blurs[rows].any():  # else all of the source's variance remains
+            remaining = plans.remaining[rows]
+        if row_gain is not None:
+            light, remaining = self._in_bands(rows, row_gain)
         counts = record_frames(
-            addresses(plans.light[rows]),
+            addresses(light),
             self._samples,
             plans.table[rows],
             self.camera,
             keys=None if self.options.noise is False else keys,
             noise="exact" if self.options.noise == "exact" else "bank",
-            remaining=addresses(plans.remaining[rows]) if blurred else None,
+            remaining=None if remaining is None else addresses(remaining),
             codes=None if codes is None else codes.reshape(flat),
             numbers=None if numbers is None else numbers.reshape(flat),
             signals=None if signals is None else signals.reshape(flat),
@@ -217,6 +226,19 @@ class Recorder:
             "modules": plans.modules[rows],
             "noise_key": keys,
         }
+
+    def _in_bands(
+        self, rows: np.ndarray, row_gain: np.ndarray
+    ) -> tuple[list[torch.Tensor], list[torch.Tensor | None]]:
+        """Light and remaining variance (`Plans`) of frames whose rows have light of their own."""
+        plans, size = self._plans, self.options.resolution
+        light, remaining = list(plans.light[rows]), list(plans.remaining[rows])
+        noisy = plans.table[rows, 3:].reshape(len(rows), -1).max(axis=1) > 0.0  # of the source
+        for i in np.flatnonzero(row_gain.max(axis=1) > row_gain.min(axis=1)).tolist():
+            light[i] = in_bands(light[i], row_gain[i])
+            if noisy[i]:
+                remaining[i] = remaining_in_bands(remaining[i], row_gain[i], size)
+        return light, remaining
 
 
 def _without_wide_discs(blurs: list[Blur]) -> list[Blur]:

@@ -10,22 +10,25 @@ from __future__ import annotations
 import weakref
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 
+from ae_env.bands import expected_in_bands, expose_in_bands
+from ae_env.captures import SceneCaptures
 from ae_env.checks import check_integer
 from ae_env.grid import ExposureGrid
+from ae_env.light_scores import LightScores
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.call import is_own
 from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.protocol import Captures, DependsOn
+from ae_env.scorers.protocol import DependsOn, reads_pixels
 from ae_env.scorers.registry import scorer_fingerprint
 from simulator.cache import DiskCache, LruCache, cache_key
 from simulator.camera import CameraProfile
 from simulator.capture import clip_and_quantise
 from simulator.latent import Latent
-from simulator.settings import CameraSettings, exposure_ratio
 from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
 
 #: Bumped when the way that scores are computed changes.
@@ -95,57 +98,6 @@ def in_episode(
     return replace(latent, image_speed=speed, defocus=pixels, gain=gain)
 
 
-def describe_captures(
-    scenes: list[Scene],
-    settings: list[CameraSettings],
-    camera: CameraProfile,
-    *,
-    speed: np.ndarray,
-    defocus: np.ndarray,
-    gain: np.ndarray,
-    light: torch.Tensor | None = None,
-) -> Captures:
-    """`Captures` of one state each of `scenes`, all (B,) long.
-
-    Args:
-        scenes: Scene of each capture.
-        settings: Settings of each capture.
-        camera: The body.
-        speed: (B,) image speed [frame heights per second].
-        defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
-        gain: (B,) light relative to the scenes' own.
-        light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
-    """
-    height = scenes[0].light.shape[-2]
-    times = np.array([s.exposure_time for s in settings])
-    openings = np.array([4.0 / s.effective_f_number for s in settings])
-    blur = np.hypot(speed * times * height, defocus * openings * height / 64.0)
-    own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
-    blur = np.hypot(blur, own)  # exactly `blur` where they are 0
-    ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
-    return Captures(
-        settings=settings,
-        scene_ids=[c.scene_id for c in scenes],
-        scene_light=torch.stack([c.clean_light for c in scenes]) if light is None else light,
-        ratio=torch.from_numpy(np.array(ratios) * gain),
-        nlf=[camera.nlf(s.iso) for s in settings],
-        proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
-        blur_px=torch.from_numpy(blur),
-        white_balance=torch.tensor([c.white_balance for c in scenes]),
-        colour_matrices=[c.camera.colour_matrix for c in scenes],
-    )
-
-
-@dataclass(frozen=True)
-class _AtRest:
-    """Captures of a scene at rest, without its light, and what their blur is worked out from."""
-
-    scene: weakref.ref[Scene]
-    captures: Captures
-    times: np.ndarray
-    openings: np.ndarray
-
-
 class ScoreTables:
     """Score tables of scenes under one scorer, camera and grid.
 
@@ -178,21 +130,38 @@ class ScoreTables:
         fingerprint = scorer_fingerprint(scorer) if use_cache else None
         self._fingerprint = fingerprint
         # Scorers of one's own get a copy of the light, lest they write to the scene.
-        self._copies = is_own(scorer)
+        self._captures = SceneCaptures(camera, MEMORY_BYTES, copies=is_own(scorer))
         self._disk = DiskCache()
         self._light_parts: LruCache[_LightParts] = LruCache(MEMORY_BYTES)
-        self._at_rest: LruCache[_AtRest] = LruCache(MEMORY_BYTES)
+        self.light_scores = LightScores(scorer)
+        #: All other parts, for light that changes; None if there are none.
+        self.others = scorer.subset(set(scorer.parts) - set(self.light_scores.parts))
 
     def table(
-        self, scene: Scene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+        self,
+        scene: Scene,
+        *,
+        speed: float = 0.0,
+        defocus: float = 0.0,
+        gain: float | np.ndarray = 1.0,
+        row_gain: np.ndarray | None = None,
     ) -> ScoreTable:
-        """Expected scores of all states of `scene` in an episode (see `scene_latent`)."""
-        parts = self.closed_parts(scene, speed=speed, defocus=defocus, gain=gain)
+        """Expected scores of all states of `scene` in an episode.
+
+        Args:
+            scene: The scene.
+            speed: See `scene_latent`.
+            defocus: See `scene_latent`.
+            gain: Light relative to the scene's own; (S,) where it depends on the state, as in
+                flickering light.
+            row_gain: (S, H) light of each row relative to that, see `Captures`.
+        """
+        parts = self.closed_parts(scene, speed=speed, defocus=defocus, gain=gain, row_gain=row_gain)
         if self.scorer.closed_form:
             parts = {name: parts[name] for name in self.scorer.parts}
             mean = self.scorer.totals(parts)
             return ScoreTable(mean, np.zeros(len(self.grid)), parts)
-        samples = self._samples(scene, speed, defocus, gain)
+        samples = self._samples(scene, speed, defocus, gain, row_gain)
         totals = self.scorer.totals({**parts, **samples})  # (seeds, S)
         if not self.noise:
             error = np.zeros(len(self.grid))
@@ -206,119 +175,130 @@ class ScoreTables:
         )
 
     def closed_parts(
-        self, scene: Scene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+        self,
+        scene: Scene,
+        *,
+        speed: float = 0.0,
+        defocus: float = 0.0,
+        gain: float | np.ndarray = 1.0,
+        row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        """Scores (S,) of those parts of the scorer that have a closed form."""
-        blur_parts = self._parts(scene, ("blur",), speed=speed, defocus=defocus, gain=gain)
-        return {**self._scene_parts(scene, gain), **blur_parts}
+        """Scores (S,) of those parts of the scorer that have a closed form; see `table`."""
+        if not isinstance(gain, np.ndarray) and gain == 1.0:
+            blur_parts = self._parts(self.scorer, scene, ("blur",), speed, defocus)
+            return {**self._scene_parts(scene, gain), **blur_parts}
+        states = self.grid.states
+        light: Any = {"gain": gain, "row_gain": row_gain}
+        captures = self._captures.describe(scene, states, speed=speed, defocus=defocus, **light)
+        parts = self.light_scores.scores([scene] * len(states), captures)
+        if self.others is None:
+            return parts
+        if isinstance(gain, np.ndarray):  # of one moment that hardly comes again
+            parts |= self._parts(self.others, scene, ("light",), **light)
+        else:
+            parts |= self._scene_parts(scene, gain)
+        return parts | self._parts(self.others, scene, ("blur",), speed, defocus, **light)
 
     def _scene_parts(self, scene: Scene, gain: float) -> dict[str, np.ndarray]:
+        """Scores that the scene and its light decide; of changed light, those of `others`."""
         known = self._light_parts.get((id(scene), gain))
         if known is not None and known.scene() is scene:  # an id may be given out again
             return known.parts
-        names = self.scorer.names("light")
-        key = self._key(scene) if names and gain == 1.0 else None
-        stored = None if key is None else self._disk.get("score_tables", key)
-        if stored is not None and set(stored) == set(names):
-            parts = {name: stored[name].numpy() for name in names}
+        if gain == 1.0:
+            parts = self._own_parts(scene)
         else:
-            parts = self._parts(scene, ("light",), speed=0.0, defocus=0.0, gain=gain)
-            if key is not None:
-                kept = {name: torch.from_numpy(values) for name, values in parts.items()}
-                self._disk.put("score_tables", key, kept)
+            assert self.others is not None
+            parts = self._parts(self.others, scene, ("light",), gain=gain)
         size = sum(values.nbytes for values in parts.values())
         self._light_parts.put(
             (id(scene), gain), _LightParts(weakref.ref(scene), parts), size + _ENTRY_BYTES
         )
         return parts
 
+    def _own_parts(self, scene: Scene) -> dict[str, np.ndarray]:
+        """Scores of the scene's own light, from the disk where they have been made before."""
+        names = self.scorer.names("light")
+        key = self._key(scene) if names else None
+        stored = None if key is None else self._disk.get("score_tables", key)
+        if stored is not None and set(stored) == set(names):
+            return {name: stored[name].numpy() for name in names}
+        parts = self._parts(self.scorer, scene, ("light",))
+        if key is not None:
+            kept = {name: torch.from_numpy(values) for name, values in parts.items()}
+            self._disk.put("score_tables", key, kept)
+        return parts
+
     def _parts(
         self,
+        scorer: CompositeScorer,
         scene: Scene,
         kinds: tuple[DependsOn, ...],
+        speed: float = 0.0,
+        defocus: float = 0.0,
         *,
-        speed: float,
-        defocus: float,
-        gain: float,
+        gain: float | np.ndarray = 1.0,
+        row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        if not self.scorer.names(*kinds):
+        names = scorer.names(*kinds)
+        if not names:
             return {}
-        chunks = []
-        size = max(_CHUNK, _BLUR_SAMPLES // scene.light.numel()) if kinds == ("blur",) else _CHUNK
-        for states in _chunks(list(self.grid.states), size):
-            if kinds == ("blur",) and gain == 1.0:
-                captures = self._blurred_captures(scene, states, speed, defocus)
-            else:
-                captures = self._captures(scene, states, speed, defocus, gain)
-            scores = self.scorer.score_parts(None, captures, kinds)
+        size, chunks = _CHUNK, []
+        if kinds == ("blur",):
+            size = max(size, _BLUR_SAMPLES // scene.light.numel())
+        elif not any(reads_pixels(scorer.parts[name]) for name in names):
+            size = len(self.grid)
+        for part in _slices(len(self.grid), size):
+            captures = self._captures.describe(
+                scene,
+                self.grid.states[part],
+                speed=speed,
+                defocus=defocus,
+                gain=gain[part] if isinstance(gain, np.ndarray) else gain,
+                row_gain=None if row_gain is None else row_gain[part],
+            )
+            scores = scorer.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
 
-    def _captures(
-        self, scene: Scene, states: list[CameraSettings], speed: float, defocus: float, gain: float
-    ) -> Captures:
-        count = len(states)
-        return describe_captures(
-            [scene] * count,
-            states,
-            self.camera,
-            speed=np.full(count, speed),
-            defocus=np.full(count, defocus),
-            gain=np.full(count, gain),
-            light=self._light(scene, count),
-        )
-
-    def _blurred_captures(
-        self, scene: Scene, states: list[CameraSettings], speed: float, defocus: float
-    ) -> Captures:
-        """`_captures` at a gain of 1: what does not depend on the blur is kept."""
-        key = (id(scene), states[0])
-        known = self._at_rest.get(key)
-        if known is None or known.scene() is not scene or len(known.times) != len(states):
-            known = self._described(scene, states)
-            self._at_rest.put(key, known, _ENTRY_BYTES * len(states))
-        height = scene.light.shape[-2]
-        blur = np.hypot(speed * known.times * height, defocus * known.openings * height / 64.0)
-        return replace(
-            known.captures,
-            scene_light=self._light(scene, len(states)),
-            blur_px=torch.from_numpy(np.hypot(blur, known.captures.blur_px.numpy())),
-        )
-
-    def _light(self, scene: Scene, count: int) -> torch.Tensor:
-        light = scene.clean_light.clone() if self._copies else scene.clean_light
-        return light.expand(count, -1, -1, -1)
-
-    def _described(self, scene: Scene, states: list[CameraSettings]) -> _AtRest:
-        captures = self._captures(scene, states, 0.0, 0.0, 1.0)
-        return _AtRest(
-            weakref.ref(scene),
-            replace(captures, scene_light=torch.empty(0)),  # keeps no scene alive
-            np.array([s.exposure_time for s in states]),
-            np.array([4.0 / s.effective_f_number for s in states]),
-        )
-
     def _samples(
-        self, scene: Scene, speed: float, defocus: float, gain: float
+        self,
+        scene: Scene,
+        speed: float,
+        defocus: float,
+        gain: float | np.ndarray,
+        row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
-        latent = scene_latent(scene, self.camera, speed=speed, defocus=defocus, gain=gain)
-        latent = replace(latent, tolerance=self.tolerance)
+        changes = isinstance(gain, np.ndarray)
+        latent = replace(
+            scene_latent(scene, self.camera, speed=speed, defocus=defocus),
+            tolerance=self.tolerance,
+            gain=1.0 if isinstance(gain, np.ndarray) else gain,
+        )
         names = self.scorer.names("image")
         samples = {name: np.zeros((self.noise_seeds, len(self.grid))) for name in names}
-        start = 0
-        for states in _chunks(list(self.grid.states)):
-            captures = self._captures(scene, states, speed, defocus, gain)
+        for part in _slices(len(self.grid), _CHUNK):
+            states = self.grid.states[part]
+            gains = gain[part] if isinstance(gain, np.ndarray) else gain
+            rows = None if row_gain is None else row_gain[part]
+            captures = self._captures.describe(
+                scene, states, speed=speed, defocus=defocus, gain=gains, row_gain=rows
+            )
+            latents = [latent] * len(states)
+            if isinstance(gains, np.ndarray):
+                latents = [replace(latent, gain=value) for value in gains.tolist()]
             for seed in range(self.noise_seeds):
-                if self.noise:
-                    images = latent.expose(states, seed=seed)
+                if not self.noise:
+                    images = clip_and_quantise(
+                        expected_in_bands(latents, states, rows), self.camera
+                    )
+                elif changes:
+                    images = expose_in_bands(latents, states, rows, seed=seed)
                 else:
-                    light = torch.stack([latent.expected(state) for state in states])
-                    images = clip_and_quantise(light, self.camera)
+                    images = latent.expose(states, seed=seed)
                 images = images.clamp_(0.0, 1.0)
                 for name, values in self.scorer.score_parts(images, captures, ("image",)).items():
-                    samples[name][seed, start : start + len(states)] = values.numpy()
-            start += len(states)
+                    samples[name][seed, part] = values.numpy()
         return samples
 
     def _key(self, scene: Scene) -> str | None:
@@ -350,5 +330,5 @@ class _LightParts:
     parts: dict[str, np.ndarray]
 
 
-def _chunks(states: list[CameraSettings], size: int = _CHUNK) -> list[list[CameraSettings]]:
-    return [states[i : i + size] for i in range(0, len(states), size)]
+def _slices(count: int, size: int) -> list[slice]:
+    return [slice(i, min(i + size, count)) for i in range(0, count, size)]

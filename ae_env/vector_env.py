@@ -88,8 +88,8 @@ class AutoExposureVectorEnv(
 
     @property
     def scenes(self) -> list[Scene]:
-        """Scenes that episodes draw from."""
-        return self.core.scenes
+        """Scenes that episodes draw from; of a sequence, its first frame."""
+        return self.core.first_scenes
 
     @property
     def states(self) -> np.ndarray:

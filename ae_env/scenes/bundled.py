@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -49,6 +49,10 @@ SMALL_GROUPS = 2
 #: How many times the training groups of "bundled" there are in "bundled:large"; same test groups.
 LARGE_FACTOR = 4
 Size = Literal["small", "normal", "large"]
+#: Kinds of the bundled scenes; those of scikit-image's photographs last.
+KINDS = (*GROUPS_PER_KIND, "photograph")
+#: Name of the hard kinds together.
+HARD = "hard"
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ def bundled_scenes(
     crop: Crop = "box",
     *,
     size: Size = "normal",
+    part: str | None = None,
 ) -> list[Scene]:
     """The bundled scenes of `split`, from the cache where they have been made before.
 
@@ -75,26 +80,33 @@ def bundled_scenes(
         crop: See `Scene.resized`.
         size: ``"small"``: only `SMALL_GROUPS` groups of each kind and split; ``"large"``:
             `LARGE_FACTOR` times the procedural training groups, and the same test groups.
+        part: Only those of one of `KINDS`, or the hard ones (`HARD`); None for all.
     """
-    parts = ["train", "test"] if split == "all" else [split]
+    kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
     scenes: list[Scene] = []
-    for part in parts:
-        path = _cache_path(part, camera, resolution, crop, size)
+    for name in ["train", "test"] if split == "all" else [split]:
+        path = _cache_path(name, camera, resolution, crop, size, part)
         loaded = _read_cache(path, camera)
         if loaded is None:
-            loaded = [_rounded(s) for s in _make(part, camera, resolution, crop, size)]
+            loaded = [_rounded(s) for s in _make(name, camera, resolution, crop, size, kinds)]
             _write_cache(path, loaded)
         scenes += loaded
     return scenes
 
 
 def _make(
-    split: str, camera: CameraProfile, resolution: int | None, crop: Crop, size: Size
+    split: str,
+    camera: CameraProfile,
+    resolution: int | None,
+    crop: Crop,
+    size: Size,
+    kinds: Sequence[str],
 ) -> Iterator[Scene]:
     logger.info("making the bundled scenes of split %r for camera %s", split, camera.name)
     for entry in _entries(split, size):
-        yield _procedural_scene(entry, camera).resized(resolution, crop)
-    photographs = [p for p in PHOTOGRAPHS if p.split == split]
+        if entry.kind in kinds:
+            yield _procedural_scene(entry, camera).resized(resolution, crop)
+    photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
         for scene in photograph_scenes(photograph, camera):
             yield scene.resized(resolution, crop)
@@ -143,7 +155,12 @@ _FIELDS = (
 
 
 def _cache_path(
-    split: str, camera: CameraProfile, resolution: int | None, crop: str, size: Size
+    split: str,
+    camera: CameraProfile,
+    resolution: int | None,
+    crop: str,
+    size: Size,
+    part: str | None,
 ) -> Path:
     key = cache_key(
         {
@@ -158,6 +175,7 @@ def _cache_path(
             "crop": crop,
             "size": size if split == "train" or size == "small" else "normal",
         }
+        | ({} if part is None else {"part": part})
     )
     return cache_dir() / "scenes" / f"bundled-{split}-{resolution}-{key}.safetensors"
 

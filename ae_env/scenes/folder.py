@@ -161,19 +161,19 @@ def folder_scenes(
     options = FolderOptions() if options is None else options
     base, files = find_files(spec)
     named = named_groups(sorted({base, *(p.parent for p in files)}))
-    names = _scene_names(base, files)
+    names = scene_names(base, files)
     if split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
-        raise _too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    reader = _Reader(base, names, named, options, camera, resolution, crop, resize)
-    scenes, shots = _read_all(spec, files, reader)
+        raise too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
+    reader = Reader(base, names, named, options, camera, resolution, crop, resize)
+    scenes, shots = read_all(spec, files, reader)
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
     scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
     log_groups(str(spec), {s.scene_id: s.group for s in scenes})
-    return _of_split(spec, scenes, split)
+    return of_split(spec, scenes, split)
 
 
 @dataclass(frozen=True)
-class _Reader:
+class Reader:
     """Makes scenes of one file after the other; see `folder_scenes`."""
 
     base: Path
@@ -206,9 +206,10 @@ class _Reader:
         return list(radiance_scenes(path, self.camera, name=name, group=group, **fields)), None
 
 
-def _read_all(
-    spec: str | Path, files: list[Path], reader: _Reader
+def read_all(
+    spec: str | Path, files: list[Path], reader: Reader
 ) -> tuple[list[Scene], dict[str, Shot]]:
+    """The scenes of all `files`, and what tells the groups of those that none is named for."""
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}
     skipped: dict[Path, Exception] = {}
@@ -258,16 +259,18 @@ def _report_skipped(spec: str | Path, skipped: Mapping[Path, Exception], total: 
     )
 
 
-def _of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
+def of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
+    """Those of `scenes` whose source group is in `split`."""
     if split == "all":
         return scenes
     parts = split_groups([scene.group for scene in scenes])
     if split == "train" and "train" not in parts.values():
-        raise _too_few_groups(spec, str(len(parts)))
+        raise too_few_groups(spec, str(len(parts)))
     return [scene for scene in scenes if parts[scene.group] == split]
 
 
-def _too_few_groups(spec: str | Path, number: str) -> ValueError:
+def too_few_groups(spec: str | Path, number: str) -> ValueError:
+    """What to raise where `spec` has only `number` source groups to train on."""
     return ValueError(
         f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that some "
         f"can be held out; {str(spec)!r} has {number}. Train on scenes='bundled' and use these "
@@ -284,7 +287,7 @@ def _raw_scene(path: Path, name: str, group: str, fields: dict[str, Any]) -> tup
     return scene, describe(raw)
 
 
-def _scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
+def scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
     """Scene ids: the path below `base` without its ending, with it where two would be equal."""
     stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
     times = Counter(stems)

@@ -12,9 +12,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
 
-from ae_env.scenes.bundled import Size, Split, bundled_scenes
+from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene
+from ae_env.scenes.sequence import sequence_scenes
 from simulator.camera import CameraProfile
 
 #: Names of the scenes that come with the package.
@@ -23,6 +24,8 @@ BUNDLED: dict[str, Size] = {
     "bundled:small": "small",
     "bundled:large": "large",
 }
+#: Those of one kind, or of the hard part.
+BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
@@ -42,11 +45,14 @@ def load_scenes(
 
             - ``"bundled"``; ``"bundled:small"``: the first two source groups of each kind;
               ``"bundled:large"``: four times the training groups, the same test groups;
+              ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
             - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
             - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
               given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
             - a list of `Scene`;
-            - a mapping ``{"path": file, folder or glob, ...}`` with any fields of `FolderOptions`.
+            - a mapping ``{"path": file, folder or glob, ...}`` with any fields of `FolderOptions`;
+            - a mapping ``{"sequence": folder or glob, ...}`` likewise: the raws of each folder are
+              the frames of one scene over time (`ae_env.scenes.sequence`).
 
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
@@ -68,8 +74,9 @@ def load_scenes(
     if split not in get_args(Split):
         raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
     if isinstance(spec, Mapping):
+        load = sequence_scenes if is_sequence(spec) else folder_scenes
         path, options = _options(spec)
-        scenes = folder_scenes(path, split, camera, resolution, crop, options, resize)
+        scenes = load(path, split, camera, resolution, crop, options, resize)
     elif isinstance(spec, Path):
         scenes = folder_scenes(spec, split, camera, resolution, crop, resize=resize)
     elif isinstance(spec, str):
@@ -84,6 +91,11 @@ def load_scenes(
     return scenes
 
 
+def is_sequence(spec: object) -> bool:
+    """Whether `spec` asks for scenes whose frames are raws of their own."""
+    return isinstance(spec, Mapping) and "sequence" in spec
+
+
 def _by_name(
     spec: str,
     split: Split,
@@ -92,42 +104,47 @@ def _by_name(
     crop: Crop,
     resize: Resize,
 ) -> list[Scene]:
-    if spec in BUNDLED:
+    if spec in BUNDLED or spec in BUNDLED_PARTS:
+        size, part = BUNDLED.get(spec, "normal"), BUNDLED_PARTS.get(spec)
         if resize is Scene.resized:
-            return bundled_scenes(split, camera, resolution, crop, size=BUNDLED[spec])
-        finest = bundled_scenes(split, camera, None, size=BUNDLED[spec])
+            return bundled_scenes(split, camera, resolution, crop, size=size, part=part)
+        finest = bundled_scenes(split, camera, None, size=size, part=part)
         return [resize(scene, resolution, crop) for scene in finest]
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             known = {"split": split, "camera": camera, "resolution": resolution}
             found = _checked(_attribute(spec, known), spec)
             return [resize(scene, resolution, crop) for scene in found]
-        near = difflib.get_close_matches(spec, BUNDLED, n=1, cutoff=0.7)
-        if near:
+        known_names = [*BUNDLED, *BUNDLED_PARTS]
+        near = difflib.get_close_matches(spec, known_names, n=1, cutoff=0.7)
+        if near or spec.startswith("bundled:"):
+            hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(
-                f"`scenes` (={spec!r}) must be one of {list(BUNDLED)}, an existing file, folder or "
-                f"glob, or 'pkg.mod:attr'; did you mean {near[0]!r}?"
+                f"`scenes` (={spec!r}) must be one of {known_names}, an existing file, folder or "
+                f"glob, or 'pkg.mod:attr'{hint}"
             )
     return folder_scenes(spec, split, camera, resolution, crop, resize=resize)
 
 
 def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
+    where = "sequence" if is_sequence(spec) else "path"
     known = [field.name for field in fields(FolderOptions)]
-    if not isinstance(spec.get("path"), str | Path):
+    if not isinstance(spec.get(where), str | Path):
         raise ValueError(
-            f"`scenes` (={dict(spec)!r}) must have a 'path'; the other fields are {known}"
+            f"`scenes` (={dict(spec)!r}) must have a 'path' or a 'sequence'; the other fields are "
+            f"{known}"
         )
     for name in spec:
-        if name != "path" and name not in known:
+        if name != where and name not in known:
             near = difflib.get_close_matches(str(name), known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"`scenes` field {name!r} must be one of {['path', *known]}{hint}")
-    if spec["path"] in BUNDLED:
+            raise ValueError(f"`scenes` field {name!r} must be one of {[where, *known]}{hint}")
+    if spec[where] in (*BUNDLED, *BUNDLED_PARTS):
         raise ValueError(
-            f"`scenes` (={dict(spec)!r}): 'path' must be a file, folder or glob; give the name "
-            f"{spec['path']!r} itself for the bundled scenes"
+            f"`scenes` (={dict(spec)!r}): {where!r} must be a file, folder or glob; give the name "
+            f"{spec[where]!r} itself for the bundled scenes"
         )
-    return spec["path"], FolderOptions(**{k: v for k, v in spec.items() if k != "path"})
+    return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 
 def _attribute(spec: str, known: Mapping[str, Any]) -> Any:

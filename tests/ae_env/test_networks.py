@@ -17,11 +17,12 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 
 import ae_env  # noqa: F401  (registers the environment)
+from ae_env.captures import describe_captures
 from ae_env.observation import decode_sensors
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.networks import SceneNetworks
-from ae_env.score_table import ScoreTables, describe_captures
+from ae_env.score_table import ScoreTables
 from ae_env.scorers import make_scorer
 from simulator import CameraSettings, CameraSimulator, Latent, get_camera
 from simulator.modules.aperture import DEAD_ZONE

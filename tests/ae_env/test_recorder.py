@@ -69,7 +69,7 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
                 core.camera,
                 speed=episode.speed,
                 defocus=episode.defocus,
-                gain=core.gain(episode, state.exposure_time),
+                gain=core.lighting.gain(episode.frame, state.exposure_time, episode.phase),
             )
             latent = replace(latent, tolerance=tolerance)
             exposure = latent.exposure(state)
@@ -255,14 +255,13 @@ def test_batches_in_changing_light_are_worked_out_in_chunks(
 ) -> None:
     monkeypatch.setattr(core_module, "CHUNK_SAMPLES", 2 * 4 * 40 * 40)
     sizes: list[int] = []
-    describe = core_module.describe_captures
 
-    def described(scenes: list[Any], *args: Any, **kwargs: Any) -> Any:
-        sizes.append(len(scenes))
-        return describe(scenes, *args, **kwargs)
+    def light(images: Any, captures: Any) -> torch.Tensor:
+        sizes.append(len(captures))
+        return captures.light.mean(dim=(1, 2, 3)).clamp(0.0, 1.0)
 
-    monkeypatch.setattr(core_module, "describe_captures", described)
-    _vector(lighting="sine").reset(seed=0)
+    light.domain, light.depends_on = "raw", "light"  # type: ignore[attr-defined]
+    _vector(lighting="sine", scorer=light).reset(seed=0)
     assert sizes == [2, 2, 1]
 
 

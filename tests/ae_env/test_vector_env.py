@@ -19,6 +19,7 @@ import ae_env  # noqa: F401  (registers the environment)
 ID = "ae_env/AutoExposure-v0"
 ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
 NUM_ENVS = 3
+PAIRED = {"balanced": 0.7, "banding": 0.3}
 
 
 def _native(num_envs: int = NUM_ENVS, **arguments: Any) -> gym.vector.VectorEnv:
@@ -98,6 +99,51 @@ def test_parity_with_sync_vector_env(mode: AutoresetMode, extra: dict[str, Any])
         mine, theirs = envs.step(actions), reference.step(actions)
         _assert_same(mine, theirs, f"step {step}")
         finished = mine[3]
+
+
+LIGHTINGS: list[Any] = [
+    "static",
+    {"kind": "step", "stops": 2, "at": 1},
+    {"kind": "ramp", "stops_per_frame": 1},
+    "sine",
+    {"kind": "tunnel", "enter": 0, "leave": 2},
+    {"kind": "lens_cap", "on": 1, "off": 2},
+    "flicker",
+    {"kind": "flicker", "frequency": 500, "duty": 0.2},
+    {"kind": "schedule", "ev": [0, 1, -1]},
+]
+
+
+@pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
+@pytest.mark.parametrize("delay", [0, 2, 4])
+def test_parity_in_every_light_at_every_delay(lighting: Any, delay: int) -> None:
+    extra = {"lighting": lighting, "delay": delay, "with_oracle": True, "scorer": PAIRED}
+    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=3, **extra)
+    reference = _reference(AutoresetMode.SAME_STEP, [3] * NUM_ENVS, **extra)
+    _assert_same(envs.reset(seed=5), reference.reset(seed=5), "reset")
+    rng = np.random.default_rng(1)
+    for step in range(4):
+        actions = rng.integers(64, size=NUM_ENVS)
+        _assert_same(envs.step(actions), reference.step(actions), f"step {step}")
+
+
+@pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
+@pytest.mark.parametrize("delay", [0, 1, 4])
+def test_delayed_settings_meet_the_light_of_their_frame(lighting: Any, delay: int) -> None:
+    """The light of a frame does not wait; `info` and the score are of the settings in force."""
+    extra = {"lighting": lighting, "motion": "none", "depth": "far", "max_episode_steps": None}
+    delayed, direct = _native(delay=delay, **extra), _native(**extra)
+    start = np.array([3, 20, 41])
+    delayed.reset(seed=9, options={"state": start})
+    direct.reset(seed=9, options={"state": start})
+    actions = np.random.default_rng(2).integers(64, size=(7, NUM_ENVS))
+    in_force = np.concatenate([np.tile(start, (delay, 1)), actions])
+    for frame in range(7):
+        mine, theirs = delayed.step(actions[frame]), direct.step(in_force[frame])
+        np.testing.assert_array_equal(mine[4]["state"], in_force[frame])
+        times = [delayed.unwrapped.grid[s].exposure_time for s in in_force[frame]]
+        np.testing.assert_array_equal(mine[4]["exposure_time"], times)
+        _assert_same(mine, theirs, f"frame {frame}")
 
 
 def test_parity_when_episodes_end_one_by_one() -> None:

@@ -1,0 +1,155 @@
+"""Scores with a closed form, of captures in light that changes.
+
+`Highlights`, `Shadows` and `Noise` see the light and nothing else of a scene: what they need of its
+pixels is worked out once, and each capture is a pass of a fused kernel over them. Their torch
+versions are the reference; both agree within 1e-6.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ae_env.scenes.scene import Scene
+from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.protocol import Captures
+from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
+from simulator.cache import LruCache
+from simulator.camera import NoiseLevelFunction
+from simulator.threads import in_shares
+
+#: Memory for what is known of scenes' pixels [byte].
+_BYTES = 2**27
+#: Pixels times exposures from which another thread is worth waking.
+_WORTH_A_THREAD = 2**17
+#: Columns of `light_means`, and parts that need none.
+_COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
+_WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pixels:
+    """What `light_means` takes of a scene, (4, H, W) and (H, W)."""
+
+    scene: weakref.ref[Scene]
+    light: np.ndarray
+    dark: np.ndarray
+    bright: np.ndarray
+
+
+class LightScores:
+    """The parts of a scorer that are made of the built-in closed forms.
+
+    That is those which read the pixels of the light, those which read none, and composites of them.
+
+    Args:
+        scorer: What they are parts of.
+
+    Attributes:
+        parts: Those parts by name.
+    """
+
+    def __init__(self, scorer: CompositeScorer) -> None:
+        self.parts = {name: part for name, part in scorer.parts.items() if _is_known(part)}
+        self._reads_pixels = any(_has_pixels(part) for part in self.parts.values())
+        self._pixels: LruCache[_Pixels] = LruCache(_BYTES)
+
+    def scores(self, scenes: Sequence[Scene], captures: Captures) -> dict[str, np.ndarray]:
+        """Scores (B,) float64 by part.
+
+        Args:
+            scenes: Scene of each of the B captures; captures of one follow each other.
+            captures: The captures; `Captures.scene_light` is not looked at.
+        """
+        if not self.parts:
+            return {}
+        means = self._all_means(scenes, captures) if self._reads_pixels else np.empty((0, 3))
+        return {name: _score(part, means, captures) for name, part in self.parts.items()}
+
+    def _all_means(self, scenes: Sequence[Scene], captures: Captures) -> np.ndarray:
+        """(B, 3) of `light_means`."""
+        ratios = captures.ratio.numpy()
+        rows = None if captures.row_gain is None else captures.row_gain.numpy()
+        # Frames without bands are rounded alike whether or not others of the batch have some.
+        banded = np.zeros(len(scenes), bool) if rows is None else (rows != 1.0).any(axis=1)
+        kinds = list(zip(map(id, scenes), banded.tolist(), strict=True))
+        begins = [i for i, kind in enumerate(kinds) if i == 0 or kind != kinds[i - 1]]
+        means = np.empty((len(scenes), 3))
+        for first, last in pairwise([*begins, len(scenes)]):
+            part = slice(first, last)
+            gains = rows[part] if rows is not None and banded[first] else None
+            means[part] = self._means(scenes[first], ratios[part], captures.nlf[part], gains)
+        return means
+
+    def _means(
+        self,
+        scene: Scene,
+        ratios: np.ndarray,
+        noises: Sequence[NoiseLevelFunction],
+        row_gain: np.ndarray | None,
+    ) -> np.ndarray:
+        from ae_env.scorers.light_kernels import light_means  # numba: only where light changes
+
+        pixels = self._known(scene)
+        rows = 1 if row_gain is None else pixels.light.shape[1]
+        gains = ratios[:, None] if row_gain is None else ratios[:, None] * row_gain  # (S, R)
+        with np.errstate(over="ignore", under="ignore"):
+            stops = np.log2(gains)
+            fixed = (
+                pixels.light.reshape(4, rows, -1),
+                pixels.dark.reshape(4, rows, -1),
+                pixels.bright.reshape(rows, -1),
+                gains.astype(np.float32),
+                np.exp(stops).astype(np.float32),
+                np.exp(stops / 0.12),
+                np.array([n.shot for n in noises], np.float32),
+                np.array([n.read for n in noises], np.float32),
+            )
+        means = np.empty((len(ratios), 3))
+        least = max(1, _WORTH_A_THREAD // pixels.light.size)
+        in_shares(lambda a, b: light_means(a, b, *fixed, means), len(ratios), least=least)
+        return means
+
+    def _known(self, scene: Scene) -> _Pixels:
+        known = self._pixels.get(id(scene))
+        if known is not None and known.scene() is scene:  # an id may be given out again
+            return known
+        light = np.ascontiguousarray(scene.clean_light.numpy())
+        stops = np.log2(np.maximum(light, 2.0**-40).astype(np.float64))
+        with np.errstate(over="ignore"):
+            dark = np.exp(2.0 * (stops + 9.0)).astype(np.float32)
+        bright = np.exp(stops.max(axis=0) / 0.12)
+        known = _Pixels(weakref.ref(scene), light, dark, bright)
+        size = dark.nbytes + bright.nbytes
+        self._pixels.put(id(scene), known, size)
+        return known
+
+
+def _is_known(part: Any) -> bool:
+    # Subclasses may compute something else.
+    if isinstance(part, CompositeScorer):
+        known = type(part).__module__.startswith("ae_env.")
+        return known and all(map(_is_known, part.parts.values()))
+    return type(part) in (*_COLUMNS, *_WITHOUT_PIXELS)
+
+
+def _has_pixels(part: Any) -> bool:
+    if isinstance(part, CompositeScorer):
+        return any(map(_has_pixels, part.parts.values()))
+    return type(part) in _COLUMNS
+
+
+def _score(part: Any, means: np.ndarray, captures: Captures) -> np.ndarray:
+    if isinstance(part, CompositeScorer):
+        scores = {name: _score(inner, means, captures) for name, inner in part.parts.items()}
+        return part.totals(scores)
+    column = _COLUMNS.get(type(part))
+    if column is None:
+        return part(None, captures).numpy()
+    values = means[:, column]
+    return np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0)

@@ -1,0 +1,32 @@
+"""How the light of a scene changes during an episode.
+
+A lighting gives, for each frame, the factor by which the scene's light differs from its own; where
+it changes within a frame (`FlickerLighting`), one for each row.
+"""
+
+from ae_env.lighting.base import MAX_STOPS, Lighting, RollingShutter
+from ae_env.lighting.changes import (
+    LensCapLighting,
+    RampLighting,
+    SineLighting,
+    StepLighting,
+    TunnelLighting,
+)
+from ae_env.lighting.flicker import FlickerLighting
+from ae_env.lighting.making import KINDS, make_lighting
+from ae_env.lighting.schedule import ScheduleLighting
+
+__all__ = [
+    "KINDS",
+    "MAX_STOPS",
+    "FlickerLighting",
+    "LensCapLighting",
+    "Lighting",
+    "RampLighting",
+    "RollingShutter",
+    "ScheduleLighting",
+    "SineLighting",
+    "StepLighting",
+    "TunnelLighting",
+    "make_lighting",
+]

@@ -1,0 +1,97 @@
+"""Light that changes from frame to frame, by a rule."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ae_env.lighting.base import Lighting
+
+
+@dataclass(frozen=True)
+class StepLighting(Lighting):
+    """The light changes by `stops` at frame `at` and stays."""
+
+    name: ClassVar[str] = "step"
+    stops: float = -4.0
+    at: int = 4
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        return 2.0**self.stops if frame >= self.at else 1.0
+
+
+@dataclass(frozen=True)
+class RampLighting(Lighting):
+    """The light changes by `stops_per_frame` each frame, up to `stops` in all."""
+
+    name: ClassVar[str] = "ramp"
+    stops: float = -4.0
+    stops_per_frame: float = 0.5
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        change = min(abs(self.stops), abs(self.stops_per_frame) * frame)
+        return 2.0 ** math.copysign(change, self.stops)
+
+
+@dataclass(frozen=True)
+class SineLighting(Lighting):
+    """The light swings by +- `stops` with a period of `period` frames, at the episode's phase."""
+
+    name: ClassVar[str] = "sine"
+    stops: float = 2.0
+    period: float = 16.0
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        return 2.0 ** (self.stops * math.sin(2.0 * math.pi * (frame / self.period + phase)))
+
+
+@dataclass(frozen=True)
+class TunnelLighting(Lighting):
+    """Into a tunnel `stops` darker at frame `enter`, over `edge` frames, and out at `leave`."""
+
+    name: ClassVar[str] = "tunnel"
+    stops: float = -6.0
+    enter: int = 3
+    leave: int = 10
+    edge: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "enter", "leave")
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        edge = max(self.edge, 1)
+        inside = min(max((frame - self.enter) / edge, 0.0), 1.0)
+        outside = min(max((frame - self.leave) / edge, 0.0), 1.0)
+        return 2.0 ** (self.stops * (inside - outside))
+
+
+@dataclass(frozen=True)
+class LensCapLighting(Lighting):
+    """The lens is covered (`stops` darker) from frame `on` to before frame `off`."""
+
+    name: ClassVar[str] = "lens_cap"
+    stops: float = -20.0
+    on: int = 2
+    off: int = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "on", "off")
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        return 2.0**self.stops if self.on <= frame < self.off else 1.0
+
+
+def _check_order(lighting: Lighting, first: str, last: str) -> None:
+    begin, end = getattr(lighting, first), getattr(lighting, last)
+    if end < begin:
+        raise ValueError(
+            f"`lighting[{last!r}]` (={end!r}) must not be before `lighting[{first!r}]` (={begin!r})"
+        )

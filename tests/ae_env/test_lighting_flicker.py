@@ -1,0 +1,109 @@
+"""Flickering light, against sums over finely divided exposures."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from ae_env.lighting import FlickerLighting, RollingShutter, make_lighting
+
+SHUTTER = RollingShutter(rows=40, row_time=2e-5, sensor_rows=8)
+
+
+def _sampled(light, start: float, time: float, steps: int = 40_001) -> float:
+    """Mean of `light` over an exposure by the midpoint rule."""
+    moments = start + time * (np.arange(steps) + 0.5) / steps
+    return float(light(moments).mean())
+
+
+def _mains(t: np.ndarray) -> np.ndarray:
+    return 1.0 + 0.8 * np.cos(2.0 * np.pi * (100.0 * t + 0.3))
+
+
+def _pulsed(t: np.ndarray) -> np.ndarray:
+    """400 Hz, on for a quarter of the period, half of the light steady."""
+    return 0.5 + 0.5 * 4.0 * ((400.0 * t + 0.3) % 1.0 < 0.25)
+
+
+@pytest.mark.parametrize(
+    ("spec", "light"),
+    [
+        ({}, _mains),
+        ({"frequency": 400, "duty": 0.25, "depth": 0.5}, _pulsed),
+    ],
+)
+@pytest.mark.parametrize("time", [1 / 1000, 1 / 320, 1 / 30])
+def test_rows_are_integrated_over_their_own_exposures(spec, light, time: float) -> None:
+    lighting = make_lighting({"kind": "flicker", "frame_rate": 24, **spec})
+    gain, rows = lighting.rows(7, time, 0.3, SHUTTER)
+    assert rows is not None
+    starts = 7 / 24 + 2e-5 * np.arange(320)
+    wanted = np.array([_sampled(light, start, time) for start in starts[:160]])
+    wanted = wanted.reshape(20, 8).mean(axis=1)
+    np.testing.assert_allclose((gain * rows)[:20], wanted, atol=2e-4)
+    assert rows.mean() == pytest.approx(1.0, abs=1e-12)
+    assert rows.shape == (40,)
+    assert lighting.gain(7, time, 0.3) == pytest.approx(_sampled(light, 7 / 24, time), abs=2e-4)
+
+
+@pytest.mark.parametrize("spec", [{}, {"duty": 0.2}, {"duty": 0.2, "depth": 0.6}, {"depth": 1.0}])
+def test_light_over_all_phases_is_the_scenes_own(spec: dict[str, float]) -> None:
+    lighting = make_lighting({"kind": "flicker", **spec})
+    phases = np.arange(200) / 200
+    for time in (1 / 1000, 1 / 125, 1 / 15):
+        gains = [lighting.rows(5, time, phase, SHUTTER)[0] for phase in phases]
+        assert np.mean(gains) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "times"), [(100, (1 / 100, 1 / 50, 1 / 25, 1 / 2)), (120, (1 / 120, 1 / 60))]
+)
+@pytest.mark.parametrize("duty", [None, 0.1])
+def test_whole_periods_have_no_bands(frequency: float, times, duty: float | None) -> None:
+    lighting = make_lighting({"kind": "flicker", "frequency": frequency, "duty": duty})
+    for time in times:
+        for frame, phase in ((0, 0.0), (3, 0.37), (100_000, 0.9)):
+            assert lighting.rows(frame, time, phase, SHUTTER) == (1.0, None)
+    assert lighting.rows(0, 1 / 90, 0.0, SHUTTER)[1] is not None
+
+
+def test_frames_are_at_their_place_in_the_period() -> None:
+    """At 30 frames per second, 100 Hz is back after three frames, and a third of a period later
+    in each."""
+    lighting = FlickerLighting()
+    gains = [lighting.gain(frame, 1e-6, 0.0) for frame in range(4)]
+    wanted = [1.0 + 0.8 * math.cos(2.0 * math.pi * frame / 3.0) for frame in range(4)]
+    assert gains == pytest.approx(wanted, abs=1e-3)
+
+
+def test_dark_between_pulses_has_a_logarithm() -> None:
+    lighting = make_lighting({"kind": "flicker", "frequency": 1, "duty": 0.01})
+    gain, rows = lighting.rows(0, 1e-4, 0.5, SHUTTER)
+    assert (gain, rows) == (2.0**-64, None)
+
+
+def test_options_are_checked() -> None:
+    assert make_lighting(json.loads('{"kind": "flicker", "duty": null}')) == FlickerLighting()
+    assert FlickerLighting(depth=0) == FlickerLighting(depth=0.0)
+    assert make_lighting({"kind": "flicker", "depth": 0}).rows(1, 0.001, 0.2, SHUTTER)[1] is None
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ({"frequency": 0}, r"`lighting\['frequency'\]` \(=0\) must be a number in \[0.001, 1e\+06"),
+        ({"frequency": math.nan}, "frequency"),
+        ({"frequency": None}, "frequency"),
+        ({"depth": 1.5}, r"`lighting\['depth'\]` \(=1.5\) must be a number in \[0, 1\]"),
+        ({"duty": 0}, "duty"),
+        ({"duty": True}, "duty"),
+        ({"frame_rate": 0.0}, "frame_rate"),
+        ({"frequencey": 50}, "did you mean 'frequency'"),
+    ],
+)
+def test_bad_options_are_refused(spec: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_lighting({"kind": "flicker", **spec})
