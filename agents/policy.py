@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.checks import did_you_mean
 from ae_env.user_code import find_attribute, load_from_file
+from agents.policy_name import split_name
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -23,8 +25,16 @@ if TYPE_CHECKING:
 
 Observations = Mapping[str, NDArray[Any]]
 
-METERS = ("average", "centre_weighted", "matrix", "spot")
-PROGRAMS = ("P", "A", "S", "tuned", "tuned_blind")
+#: Light meters that weigh pixels or zones.
+CLASSIC_METERS = ("average", "centre_weighted", "matrix", "spot")
+#: All light meters; those after the classic ones look at the histogram or at gradients.
+METERS = (*CLASSIC_METERS, "highlight_weighted", "skewness", "entropy", "shim", "zhang")
+#: The programs that nothing has to be learnt for, and all.
+MANUAL_PROGRAMS = ("P", "A", "S", "M")
+PROGRAMS = (*MANUAL_PROGRAMS, "tuned", "tuned_blind")
+#: A controller with a meter of its own, modelled on a camera's.
+RPI_AGC = "rpi_agc"
+_RECORDED = "recorded"
 _SIMPLE = {"best_fixed": "BestFixed", "oracle": "Oracle", "random": "Random"}
 #: Agents that come with the package: the training seeds of ``ae-env bench agents``.
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -122,7 +132,17 @@ def masked_argmax(
 
 def list_policies() -> list[str]:
     """Names of the built-in policies that need no file."""
-    return sorted([*_SIMPLE, *_TRAINED, *(f"{m}:{p}" for m in METERS for p in PROGRAMS)])
+    metering = [f"{m}:{p}" for m in METERS for p in PROGRAMS]
+    return sorted([*_SIMPLE, *_TRAINED, *metering, *(f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS)])
+
+
+def is_metering(name: str) -> bool:
+    """Whether `name`, with or without a program and options, is that of a metering policy.
+
+    >>> is_metering("spot?compensation=1"), is_metering("rpi_agc:A"), is_metering("random")
+    (True, True, False)
+    """
+    return split_name(name)[0].partition(":")[0] in (*METERS, RPI_AGC)
 
 
 def make_policy(
@@ -132,19 +152,33 @@ def make_policy(
 
     Args:
         name: ``"random"``, ``"best_fixed"``, ``"oracle"``; a meter and a program such as
-            ``"centre_weighted:P"`` (the program defaults to P); ``"regression"`` and ``"ppo"``, the
+            ``"centre_weighted:P"`` (the program defaults to P); ``"rpi_agc"``, alone or with a
+            program; ``"recorded:FOLDER"``; ``"regression"`` and ``"ppo"``, the
             agents that come with the package, or ``"regression:PATH"`` and ``"ppo:PATH"`` with
             weights of one's own; ``"package.module:Class"`` or
-            ``"path/to/file.py:Class"`` for a policy of one's own.
+            ``"path/to/file.py:Class"`` for a policy of one's own. Options may follow:
+            ``"centre_weighted:P?compensation=-1&damping=0.5"``.
         context: What the policy is told about the camera.
         device: Torch device of a learnt agent's network.
-        options: Passed to the class.
+        options: Passed to the class, with those of the name.
 
     Raises:
-        ValueError: If there is no such policy, its file cannot be loaded (the cause is chained), or
-            the class found is not a policy.
+        ValueError: If there is no such policy, its file cannot be loaded (the cause is chained),
+            the class found is not a policy or does not take an option.
     """
-    head, _, tail = str(name).rpartition(":") if ".py:" in str(name) else name.partition(":")
+    base, named = split_name(name)
+    for key in options:
+        if key in named:
+            raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
+    policy = _make(base, context, device, {**options, **named})
+    if named:
+        policy.name = name
+    return policy
+
+
+def _make(name: str, context: PolicyContext, device: str, options: dict[str, Any]) -> Policy:
+    """The policy of a name without options."""
+    head, _, tail = name.rpartition(":") if ".py:" in name else name.partition(":")
     if not tail:
         head = head or name
     if head.endswith(".py"):
@@ -153,13 +187,19 @@ def make_policy(
         return _construct(_class_in("agents.simple", _SIMPLE[head]), name, context, options)
     if head in METERS and tail in ("", *PROGRAMS):
         cls = _class_in("agents.programs", "MeteringPolicy")
-        return _construct(cls, name, context, {"meter": head, "program": tail or "P", **options})
+        return _construct(cls, name, context, options, meter=head, program=tail or "P")
+    if head == RPI_AGC and tail in ("", *MANUAL_PROGRAMS):
+        cls = _class_in("agents.rpi_agc", "RpiAgc")
+        return _construct(cls, name, context, options, program=tail or "P")
+    if head == _RECORDED:
+        cls = _class_in("agents.recorded", "Recorded")
+        return _construct(cls, name, context, options, path=tail)
     if head in _TRAINED:
         if "network" not in options:
             weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
             options = {"weights": weights, "device": device, **options}
         return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)
-    if tail and (head not in METERS and head not in _SIMPLE):
+    if tail and head not in (*METERS, *_SIMPLE, RPI_AGC):
         return _construct(_class_in_module(head, tail, name), name, context, options)
     raise ValueError(_unknown(name))
 
@@ -188,13 +228,15 @@ def training_seeds(name: str) -> list[str]:
 
 
 def _unknown(name: str) -> str:
-    known = [*METERS, *list_policies(), *(f"{t}:PATH" for t in _TRAINED)]
+    known = [*METERS, RPI_AGC, *list_policies(), *(f"{t}:PATH" for t in (*_TRAINED, _RECORDED))]
     near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return (
         f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
         f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
-        f"regression or ppo, alone or with :PATH; package.module:Class or path.py:Class{hint}"
+        f"{RPI_AGC}, alone or with {', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
+        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; "
+        f"package.module:Class or path.py:Class{hint}"
     )
 
 
@@ -223,7 +265,10 @@ def _class_in_file(path: str, name: str, policy: str) -> Any:
     return load_from_file(path, name, f"`policy` (={policy!r})", example="MyPolicy")
 
 
-def _construct(cls: Any, name: str, context: PolicyContext, options: dict[str, Any]) -> Policy:
+def _construct(
+    cls: Any, name: str, context: PolicyContext, options: dict[str, Any], **fixed: Any
+) -> Policy:
+    """A `cls` with `options` of the caller's and those that the name has `fixed`."""
     if not inspect.isclass(cls):
         raise ValueError(f"`policy` (={name!r}) must name a class, not a {type(cls).__name__}")
     missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
@@ -235,6 +280,8 @@ def _construct(cls: Any, name: str, context: PolicyContext, options: dict[str, A
             f"`policy` (={name!r}): {cls.__name__} is not a policy, it has no {methods}; "
             "derive it from agents.Policy"
         )
+    _check_options(cls, name, options, fixed)
+    options = {**fixed, **options}
     try:
         inspect.signature(cls).bind(context, **options)
     except TypeError as error:
@@ -248,3 +295,18 @@ def _construct(cls: Any, name: str, context: PolicyContext, options: dict[str, A
         return cls(context, **options)
     except Exception as error:
         raise ValueError(_broken(name, f"{cls.__name__} cannot be made", error)) from error
+
+
+def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str, Any]) -> None:
+    """Raises a `ValueError` if `cls` does not take one of the `options`."""
+    parameters = list(inspect.signature(cls).parameters.values())[1:]  # the first is the context
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        return
+    known = [p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and p.name not in fixed]
+    for option in options:
+        if option not in known:
+            takes = f"it takes {', '.join(known)}" if known else "it takes none"
+            raise ValueError(
+                f"`policy` (={name!r}): {cls.__name__} does not take the option {option!r}; "
+                f"{takes}{did_you_mean(option, known)}"
+            )

@@ -1,4 +1,4 @@
-"""From a metered EV to one state of the grid: the programs P, A and S, and the tuned ones."""
+"""From a metered EV to one state of the grid: the programs P, A, S and M, and the tuned ones."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
 from agents.episodes import episode_batches, expected_scores, scenes_of
-from agents.metering import EVTracker, make_meter
-from agents.metrics import SAME_EV
+from agents.ev_tracker import EVTracker
+from agents.metering import make_meter
 from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
+from agents.reference_frames import ReferenceFrames
+from agents.state_choice import ProgramOptions, StateChooser, check_program
 from agents.tuned import ScoreRegression
 
 if TYPE_CHECKING:
@@ -23,10 +25,12 @@ if TYPE_CHECKING:
 HANDHELD_LIMIT = 1 / 60
 #: With sensors: blur that programs accept, in frame heights (one pixel of a 64-pixel frame).
 BLUR_LIMIT = 1 / 64
-#: Aperture of program A, aperture that P tends to, and shutter of program S.
+#: Aperture of programs A and M, aperture that P tends to, and shutter of programs S and M.
 PRIORITY_F_NUMBER, PROGRAM_F_NUMBER, PRIORITY_TIME = 8.0, 5.6, 1 / 125
-#: A program keeps its EV while the metered one is this near [EV]: half a grid step and a bit.
-HYSTERESIS_EV = 0.6
+#: Meters whose reading is the most exposure that may be given: no state above it is chosen.
+CEILING_METERS = ("highlight_weighted",)
+#: Meters that try other exposures on a frame, and so need one that shows the scene well.
+SEARCH_METERS = ("skewness", "entropy", "shim", "zhang")
 #: Advantage of the last state in a tuned program [score].
 HYSTERESIS_SCORE = 0.002
 #: Episodes (in all, at least one per scene and pass) and frames per episode from which a tuned
@@ -43,12 +47,15 @@ class MeteringPolicy(Policy):
 
     Args:
         context: The camera, the grid and the observation.
-        meter: ``"average"``, ``"centre_weighted"``, ``"spot"`` or ``"matrix"``.
-        program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"tuned"`` or
-            ``"tuned_blind"`` (never uses the sensors).
+        meter: One of `agents.policy.METERS`, such as ``"average"``.
+        program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
+            and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
         compensation: Exposure compensation [EV], positive is brighter.
-        f_number: Aperture that A keeps.
-        exposure_time: Shutter that S keeps [s].
+        damping: Share of the distance to the metered EV that is kept per frame, in [0, 1).
+        shutter_cap: Longest exposure time that may be used [s].
+        f_number: Aperture that A and M keep.
+        exposure_time: Shutter that S and M keep [s].
+        iso: ISO speed that M keeps; None: it follows the meter.
         weights: File of a tuned program, as `save` writes it.
 
     Raises:
@@ -62,33 +69,36 @@ class MeteringPolicy(Policy):
         program: str = "P",
         *,
         compensation: float = 0.0,
+        damping: float = 0.0,
+        shutter_cap: float | None = None,
         f_number: float = PRIORITY_F_NUMBER,
         exposure_time: float = PRIORITY_TIME,
+        iso: float | None = None,
         weights: str | os.PathLike[str] | None = None,
     ) -> None:
         super().__init__(context)
-        if program not in PROGRAMS:
-            raise ValueError(f"`program` (={program!r}) must be one of {', '.join(PROGRAMS)}")
-        for key, value in (("f_number", f_number), ("exposure_time", exposure_time)):
-            if not value > 0:
-                raise ValueError(f"`{key}` (={value!r}) must be > 0")
+        self.program = check_program(program, PROGRAMS)
+        self.options = ProgramOptions(
+            compensation, damping, shutter_cap, f_number, exposure_time, iso
+        )
         self.meter = make_meter(meter, context.camera)
+        self._meter_name = meter
         self.name = f"{meter}:{program}"
-        self.program = program
-        self.compensation = compensation
-        self.f_number, self.exposure_time = f_number, exposure_time
         self.uses_sensors = context.has_sensors and program != "tuned_blind"
         self.regression = None if weights is None else ScoreRegression.load(weights)
-        self._apex = np.array(
-            [(s.aperture_stop / 3.0, s.time_value, s.speed_value) for s in context.grid.states]
-        )
+        self._chooser = StateChooser(context.grid, program, self.options)
+        # The nearest state to half a step darker is never brighter than the reading.
+        self._ceiling = 0.5 * self._chooser.step if meter in CEILING_METERS else 0.0
         self.reset(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forget the past of `num_envs` cameras."""
         super().reset(num_envs, seed)
         ev100 = self.context.grid.ev100
-        self._tracker = EVTracker(num_envs, (float(ev100.min()), float(ev100.max())))
+        ev_range = (float(ev100.min()), float(ev100.max()))
+        self._tracker = EVTracker(num_envs, ev_range, self.options.damping)
+        searches = self._meter_name in SEARCH_METERS
+        self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))
         self._frames = 0
         self._previous: NDArray[np.int64] | None = None
@@ -111,7 +121,9 @@ class MeteringPolicy(Policy):
         The sensors are averaged, in stops, over the frames of the episode.
         """
         self._frames += 1
-        ev = self._tracker.update(self.meter(observations))
+        metered = observations if self._reference is None else self._reference.update(observations)
+        held = np.clip(self._tracker.ev100, *self._tracker.ev_range)  # no farther than can be set
+        ev = self._tracker.update(self.meter(metered, held))
         if not self.uses_sensors:
             return ev[:, None]
         speed, defocus = decode_sensors(observations["sensors"])
@@ -120,27 +132,20 @@ class MeteringPolicy(Policy):
         return np.concatenate([ev[:, None], self._sensor_sum / self._frames], axis=1)
 
     def _program_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Minus the cost of each state; the order of the terms is the program's priority."""
-        target = readings[:, :1] - self.compensation
-        if self._previous is not None:
-            kept = self.context.grid.ev100[self._previous][:, None]
-            target = np.where(np.abs(target - kept) < HYSTERESIS_EV, kept, target)
-        distance = np.abs(self.context.grid.ev100[None] - target)  # (N, S)
-        # Nominal values are rounded (1/15 s for 1/16 s): states this near are the same exposure.
-        distance = np.maximum(distance - distance.min(axis=1, keepdims=True) - SAME_EV, 0.0)
-        aperture, time, speed = self._apex.T
-        slow = np.maximum(self._shutter_limit(readings) - time[None], 0.0)  # stops too slow
-        gain = speed - speed.min()
-        if self.program == "A":
-            off = np.abs(aperture - 2.0 * np.log2(self.f_number))
-            return -(1e6 * _excess(off)[None] + 1e3 * distance + 1e1 * slow + 1e-1 * gain[None])
-        if self.program == "S":
-            off = np.abs(time + np.log2(self.exposure_time))
-            return -(1e6 * _excess(off)[None] + 1e3 * distance + 1e-1 * gain[None])
-        wide = np.maximum(self._aperture_limit(readings) - aperture[None], 0.0)
-        line = np.abs(aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))
-        cost = slow**2 + 0.5 * wide**2 + 0.25 * gain[None] ** 2 + 0.05 * line[None] ** 2
-        return -(1e3 * distance + cost)
+        """Minus the cost of each state, by the program's priorities."""
+        chooser = self._chooser
+        target = readings[:, 0] - self.options.compensation + self._ceiling
+        slow = np.maximum(self._shutter_limit(readings) - chooser.time[None], 0.0)  # stops too slow
+        gain = (chooser.speed - chooser.speed.min())[None]
+        if self.program in ("S", "M"):
+            cost = 0.1 * gain
+        elif self.program == "A":
+            cost = 10.0 * slow + 0.1 * gain
+        else:
+            wide = np.maximum(self._aperture_limit(readings) - chooser.aperture[None], 0.0)
+            line = np.abs(chooser.aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))[None]
+            cost = slow**2 + 0.5 * wide**2 + 0.25 * gain**2 + 0.05 * line**2
+        return chooser.utility(chooser.kept(target, self._previous), cost)
 
     def _shutter_limit(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Tv of the slowest shutter that keeps motion blur within the limit, ``(N, 1)``."""
@@ -167,7 +172,8 @@ class MeteringPolicy(Policy):
                 f"policy {self.name!r} was fitted on {self.regression.features.shape[1]} readings "
                 f"but sees {readings.shape[1]}: the environments must agree on `sensors`"
             )
-        scores = self.regression.predict(readings)
+        compensated = readings - np.eye(1, readings.shape[1]) * self.options.compensation
+        scores = self.regression.predict(compensated) - 10.0 * self._chooser.over_cap
         if self._previous is not None:
             scores[np.arange(len(scores)), self._previous] += HYSTERESIS_SCORE
         return scores
@@ -221,9 +227,3 @@ class MeteringPolicy(Policy):
             groups.append(batch.groups[batch.valid])
         self.reset(0)
         return np.concatenate(features), np.concatenate(scores), np.concatenate(groups)
-
-
-def _excess(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How far each value is above the least one."""
-    excess: NDArray[np.float64] = values - values.min()
-    return excess

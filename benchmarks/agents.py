@@ -16,7 +16,7 @@ from rich.progress import Progress
 from agents.episodes import make_envs
 from agents.evaluation import evaluate, fit_policies
 from agents.parallel import TrainingJob, train_in_parallel
-from agents.policy import METERS, PROGRAMS, PolicyContext, make_policy
+from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
 from agents.quickstart import prepare_tables
 from agents.report import write_report
 from agents.training import load_config
@@ -52,7 +52,8 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     test = {"scenes": "bundled", "split": "test", "resolution": 64}
     envs = make_envs(test, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
-    meters = [f"{meter}:{program}" for meter in METERS for program in PROGRAMS]
+    programs = [program for program in PROGRAMS if program != "M"]
+    meters = [f"{meter}:{program}" for meter in CLASSIC_METERS for program in programs]
     names = ["random", "best_fixed", *(meters if not quick else meters[:1])]
     policies = {name: make_policy(name, context) for name in names}
     with Progress() as display:

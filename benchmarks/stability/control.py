@@ -10,14 +10,14 @@ import numpy as np
 
 from agents import PolicyContext, make_policy
 from agents.episodes import make_envs
-from agents.policy import METERS, Policy
+from agents.policy import CLASSIC_METERS, Policy
 from benchmarks.stability.case import Row
 
 GROUP = "stiff control"
 #: The agents that come with the package: learnt in steady light, in episodes of eight frames.
 LEARNT = ("regression", "ppo")
-#: Meters and the hand-made programs, and the agents.
-POLICIES = (*(f"{m}:{p}" for m in METERS for p in ("P", "A", "S")), *LEARNT)
+#: The classic meters and the hand-made programs, and the agents.
+POLICIES = (*(f"{m}:{p}" for m in CLASSIC_METERS for p in ("P", "A", "S")), *LEARNT)
 DELAYS = (0, 1, 2, 4)
 #: Frame of the step, and how many of the last frames tell whether it has come to rest.
 _STEP, _LAST = 12, 12

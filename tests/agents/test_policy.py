@@ -2,17 +2,26 @@ from __future__ import annotations
 
 import importlib
 import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import agents
-from agents.policy import METERS, PROGRAMS, Policy, list_policies, make_policy, masked_argmax
+from agents.policy import (
+    METERS,
+    PROGRAMS,
+    Policy,
+    is_metering,
+    list_policies,
+    make_policy,
+    masked_argmax,
+)
 
 
 def test_every_listed_name_makes_a_policy(context):
     names = list_policies()
-    assert len(names) == len(set(names)) == 5 + len(METERS) * len(PROGRAMS)
+    assert len(names) == len(set(names)) == 5 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
     for name in set(names) - {"ppo", "regression"}:  # they come at one resolution: test_pretrained
         policy = make_policy(name, context)
         assert policy.name == name
@@ -39,6 +48,61 @@ def test_every_listed_name_makes_a_policy(context):
 def test_bad_names_say_what_is_wrong(context, name, message):
     with pytest.raises(ValueError, match=message):
         make_policy(name, context)
+
+
+@pytest.mark.parametrize("name", [3, None, ["spot"], b"spot"])
+def test_what_is_no_name_is_refused(context, name):
+    with pytest.raises(ValueError, match=r"`policy` \(=.*must be a name, such as 'matrix:P'"):
+        make_policy(name, context)
+
+
+def test_options_in_a_name(context):
+    policy = make_policy("centre_weighted:P?compensation=-1&damping=0.5&shutter_cap=1/60", context)
+    assert policy.name == "centre_weighted:P?compensation=-1&damping=0.5&shutter_cap=1/60"
+    assert (policy.options.compensation, policy.options.damping) == (-1.0, 0.5)
+    assert policy.options.shutter_cap == pytest.approx(1 / 60)
+    assert make_policy("spot?compensation=1", context).program == "P"
+    assert make_policy("rpi_agc:M?iso=400&mode=long", context).options.iso == 400.0
+    assert make_policy("average:A", context, f_number=4).options.f_number == 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("spot?compensatio=1", r"does not take the option 'compensatio'.*did you mean 'compensat"),
+        ("spot?meter=matrix", r"does not take the option 'meter'"),
+        ("rpi_agc?program=A", r"does not take the option 'program'"),
+        ("oracle?state=3", r"does not take the option 'state'; it takes none"),
+        ("spot?compensation=.nan", r"`compensation` \(=nan\) must be a number in \[-32, 32\]"),
+        ("spot?compensation=dark", r"`compensation` \(='dark'\) must be a number"),
+        ("spot?compensation=true", r"`compensation` \(=True\) must be a number"),
+        ("spot?damping=1", r"`damping` \(=1\) must be below 1"),
+        ("spot?shutter_cap=0", r"`shutter_cap` \(=0\) must be a number in"),
+        ("spot:A?iso=100", r"`iso` \(=100(\.0)?\) is set by hand in program M only"),
+        ("spot?", r"options are written name\?key=value&key=value, not ''"),
+        ("spot?damping", r"not 'damping'"),
+        ("spot?damping=[1]", r"option 'damping' \(='\[1\]'\) must be a YAML scalar"),
+        ("spot?damping=0&damping=0", r"option 'damping' is given twice"),
+        ("rpi_agc:tuned", r"must be one of .*rpi_agc, alone or with :P, :A, :S, :M"),
+        ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\).*did you mean 'shadows'"),
+        ("rpi-agc", r"did you mean 'rpi_agc'"),
+        ("recorded", r"must be a folder of raws: 'recorded:FOLDER'"),
+    ],
+)
+def test_bad_options_say_what_is_wrong(context, name, message):
+    with pytest.raises(ValueError, match=message):
+        make_policy(name, context)
+
+
+def test_an_option_is_given_once(context):
+    with pytest.raises(ValueError, match="option 'damping' is given twice"):
+        make_policy("spot?damping=0", context, damping=0.5)
+
+
+def test_metering_policies_are_known_by_name():
+    found = [is_metering(n) for n in ("zhang", "matrix:tuned", "rpi_agc?mode=long", "spot:P?iso=1")]
+    assert all(found)
+    assert not any(is_metering(n) for n in ("random", "ppo:spot", "mine.py:spot", "spotty"))
 
 
 def test_unknown_option_is_refused_by_name(context):
@@ -79,6 +143,9 @@ def test_own_file(context, photograph, tmp_path):
     policy = make_policy(f"{file}:Constant", context, state=9)
     policy.reset(2)
     assert policy.name == "Constant"
+    optional = make_policy(f"{file}:Constant?state=11", context)
+    optional.reset(2)
+    assert optional.act(frame).tolist() == [11, 11]
     assert policy.act(frame).tolist() == [9, 9]
     with pytest.raises(ValueError, match=r"no class 'Mine' there; found Helper, Constant"):
         make_policy(f"{file}:Mine", context)
@@ -86,6 +153,22 @@ def test_own_file(context, photograph, tmp_path):
         make_policy(f"{file}:Forgetful", context)
     with pytest.raises(ValueError, match=r"Duck is not a policy, it has no `act`"):
         make_policy(f"{file}:Duck", context)
+
+
+def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "policies.md").read_text(encoding="utf-8")
+    code = page.partition("```python\n")[2].partition("```")[0]
+    file = tmp_path / "my_policy.py"
+    file.write_text(code)
+    policy = make_policy(f"{file}:HalfGrey", context)
+    policy.reset(2)
+    states = np.array([0, 63])
+    for _ in range(6):
+        states = policy.act(photograph(np.ones((64, 64)), 9.0, states))
+    np.testing.assert_allclose(context.grid.ev100[states], 9.0, atol=0.2)
+    masks = np.ones((2, len(context.grid)), bool)
+    masks[:, states[0]] = False
+    assert policy.act(photograph(np.ones((64, 64)), 9.0, states), masks)[0] != states[0]
 
 
 def test_an_error_inside_the_users_file_is_not_hidden(context, tmp_path):

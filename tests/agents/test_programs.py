@@ -138,3 +138,22 @@ def test_arguments_are_checked(context):
     with pytest.raises(ValueError, match="`f_number`"):
         MeteringPolicy(context, f_number=0.0)
     assert {p.partition(":")[2] for p in (f"a:{q}" for q in PROGRAMS)} == set(PROGRAMS)
+
+
+def test_compensation_moves_the_reading_of_a_tuned_program(context, photograph, tmp_path):
+    """Above EV 8 the best ISO is 100, below 6400: at EV 9, 2 EV brighter is looked up at 7."""
+    _fitted(context).save(tmp_path / "tuned.safetensors")
+    weights = tmp_path / "tuned.safetensors"
+    for compensation, iso in ((0.0, 100.0), (2.0, 6400.0)):
+        policy = make_policy("average:tuned", context, weights=weights, compensation=compensation)
+        path = _run(policy, photograph, 9.0, speed=2.0, defocus=4.0, start=20)
+        assert context.grid[path[-1]].iso == iso
+
+
+def test_shutter_cap_holds_in_a_tuned_program(context, photograph, tmp_path):
+    _fitted(context).save(tmp_path / "tuned.safetensors")
+    policy = make_policy(
+        "average:tuned?shutter_cap=1/100", context, weights=tmp_path / "tuned.safetensors"
+    )
+    path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
+    assert all(context.grid[s].exposure_time <= 1 / 100 for s in path)
