@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 _EXPORTS = {
+    "EvaluationPlan": "evaluation_plan",
     "EvaluationResult": "evaluation_result",
     "MeteringPolicy": "programs",
     "Policy": "policy",
@@ -13,8 +14,10 @@ _EXPORTS = {
     "evaluate": "evaluation",
     "fit_policies": "evaluation",
     "list_policies": "policy",
+    "load_plan": "evaluation_plan",
     "make_policy": "policy",
     "result_rows": "result_table",
+    "run_plan": "plan_jobs",
     "write_report": "report",
 }
 __all__ = sorted(_EXPORTS)
@@ -22,7 +25,10 @@ __all__ = sorted(_EXPORTS)
 if TYPE_CHECKING:
     from agents.evaluation import evaluate as evaluate
     from agents.evaluation import fit_policies as fit_policies
+    from agents.evaluation_plan import EvaluationPlan as EvaluationPlan
+    from agents.evaluation_plan import load_plan as load_plan
     from agents.evaluation_result import EvaluationResult as EvaluationResult
+    from agents.plan_jobs import run_plan as run_plan
     from agents.policy import Policy as Policy
     from agents.policy import PolicyContext as PolicyContext
     from agents.policy import list_policies as list_policies

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +33,7 @@ class Track:
         ms_per_decision: Time in `act` per camera and frame [ms], in batches.
         captures_per_decision: Frames taken for one decision.
         privileged: Whether it saw what no camera sees.
+        ms_alone: Time in `act` for one camera alone [ms]; None where it was not measured.
     """
 
     states: Ints
@@ -41,6 +43,7 @@ class Track:
     ms_per_decision: float
     captures_per_decision: float
     privileged: bool
+    ms_alone: float | None = None
 
 
 @dataclass(frozen=True)
@@ -73,12 +76,12 @@ class EvaluationResult:
     seed: int
     delay: int = 0
 
-    @property
+    @cached_property
     def oracle(self) -> Floats:
         """Mean q of the oracle over the frames, ``(E,)``."""
         return metrics.oracle_score(self.scores, self.allowed[:, None]).mean(axis=-1)
 
-    @property
+    @cached_property
     def delayed_oracle(self) -> Floats:
         """Mean q of the oracle that decides `delay` frames earlier, ``(E,)``."""
         per_frame = metrics.delayed_oracle_score(
@@ -86,12 +89,12 @@ class EvaluationResult:
         )
         return per_frame.mean(axis=-1)
 
-    @property
+    @cached_property
     def random(self) -> Floats:
         """Exact mean q of a random policy over the frames, ``(E,)``."""
         return metrics.random_score(self.scores, self.allowed[:, None]).mean(axis=-1)
 
-    @property
+    @cached_property
     def oracle_states(self) -> Ints:
         """The oracle's state in the last frame, ties to the lower index, ``(E,)``."""
         last = np.where(self.allowed, self.scores[:, -1], -np.inf)
@@ -102,11 +105,26 @@ class EvaluationResult:
 
         `ev_error` is per frame, ``(K, E, T)``: its median and percentiles are over frames.
         """
+        if policy not in self._metrics:
+            self._metrics[policy] = self._measured(policy)
+        return self._metrics[policy]
+
+    @cached_property
+    def _metrics(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Metrics that were asked for, by policy."""
+        return {}
+
+    @cached_property
+    def settling(self) -> Ints:
+        """Frame from which an episode's convergence counts, ``(E,)``; see `metrics.settling`."""
+        return metrics.settling(self.scores)
+
+    def _measured(self, policy: str) -> dict[str, NDArray[Any]]:
         track = self.tracks[policy]
         ev100, allowed = self.grid.ev100, self.allowed[:, None]
         score = metrics.score_of(self.scores, track.states).mean(axis=-1)
         errors = metrics.ev_error(self.scores, track.states, ev100, allowed)
-        frames, converged = metrics.frames_to_converge(errors)
+        frames, converged = metrics.frames_to_converge(errors, since=self.settling)
         start = np.broadcast_to(self.start_states[:, None], (*track.states.shape[:-1], 1))
         evs = ev100[np.concatenate([start, track.states], axis=-1)]
         static = np.all(self.scores[:, 1:] == self.scores[:, :-1], axis=-1)  # (E, T - 1)
@@ -119,7 +137,8 @@ class EvaluationResult:
             "ev_error": errors,
             "frames_to_converge": frames,
             "converged": converged,
-            "overshoot": metrics.overshoot(evs),
+            "overshoot": metrics.overshoot(evs, since=self.settling),
+            "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
             "reversals": metrics.reversals(evs),
             "flicker": metrics.flicker(track.image_mean, static),
             "clipped_high": track.clipped_high.mean(axis=-1),

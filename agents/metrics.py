@@ -20,6 +20,8 @@ SCORE_TOLERANCE = 0.01
 THIRD_EV = 1.0 / 3.0 + 1e-6
 #: EVs nearer than this are the same exposure: 1/15 s stands for 1/16 s, 0.09 EV from it.
 SAME_EV = 1.0 / 6.0
+#: Light that rests for fewer frames at the end of an episode is not waited for.
+MIN_REST = 4
 
 
 def score_of(scores: Floats, states: Ints) -> Floats:
@@ -83,16 +85,43 @@ def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bo
     return error
 
 
-def frames_to_converge(errors: Floats, tolerance: float = THIRD_EV) -> tuple[Ints, Any]:
+def settling(scores: Floats) -> Ints:
+    """Frame from which convergence counts: the first that a policy takes knowing the final light.
+
+    Where the light changed and then rests to the end, that is the frame after the last change,
+    which is the first that a policy has seen of the final light. 0 where the light never changes
+    (the reset frame shows it), and where it rests for fewer than `MIN_REST` frames at the end.
+
+    Args:
+        scores: q of every state after each action, ``(E, T, S)``: equal while the light rests.
+
+    Returns:
+        ``(E,)``.
+
+    >>> settling(np.array([[[1.0], [1.0], [2.0], [2.0], [2.0], [2.0], [2.0]]])).tolist()
+    [3]
+    """
+    frames = scores.shape[1]
+    changed = np.any(scores[:, 1:] != scores[:, :-1], axis=-1)  # (E, T - 1)
+    last = np.where(changed.any(-1), frames - 1 - np.argmax(changed[:, ::-1], axis=-1), -1)
+    since = last + 1
+    return np.where(frames - since >= MIN_REST, since, 0).astype(np.int64)
+
+
+def frames_to_converge(
+    errors: Floats, tolerance: float = THIRD_EV, since: Ints | int = 0
+) -> tuple[Ints, Any]:
     """First frame from which the EV error stays within `tolerance` until the episode's end.
 
     Args:
         errors: EV errors after each action, ``(..., T)``.
         tolerance: Largest error that counts as converged [EV].
+        since: Frame that counts as the first, such as that after a step of the light; broadcastable
+            to the leading axes of `errors`.
 
     Returns:
-        Frames, ``(...)``, 1 for the first; censored at T where the error never stays within; and
-        whether it converged.
+        Frames, ``(...)``, 1 for the first; censored at those that there are, T - `since`, where the
+        error never stays within; and whether it converged.
 
     >>> frames, _ = frames_to_converge(np.array([[2.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 2.0]]))
     >>> frames.tolist()
@@ -101,14 +130,17 @@ def frames_to_converge(errors: Floats, tolerance: float = THIRD_EV) -> tuple[Int
     outside = errors > tolerance
     frames = errors.shape[-1]
     last_outside = np.where(outside.any(-1), frames - np.argmax(outside[..., ::-1], axis=-1), 0)
-    return np.minimum(last_outside + 1, frames), last_outside < frames
+    counted = np.maximum(last_outside - since, 0) + 1
+    return np.minimum(counted, frames - np.asarray(since)), last_outside < frames
 
 
-def overshoot(evs: Floats) -> Floats:
+def overshoot(evs: Floats, since: Ints | int = 0) -> Floats:
     """How far the exposure passes beyond where it ends, in the direction it came from [EV].
 
     Args:
         evs: EV100 of the start state and after each action, ``(..., T + 1)``.
+        since: Index in `evs` of the state that the approach begins from; broadcastable to the
+            leading axes.
 
     Returns:
         ``(...)``, >= 0; where start and end are equal, the largest excursion to either side.
@@ -116,8 +148,11 @@ def overshoot(evs: Floats) -> Floats:
     >>> overshoot(np.array([[0.0, 5.0, 3.0], [0.0, 2.0, 3.0]])).tolist()
     [2.0, 0.0]
     """
+    begin = np.broadcast_to(np.asarray(since), evs.shape[:-1])[..., None]
+    first = np.take_along_axis(evs, begin, axis=-1)
+    evs = np.where(np.arange(evs.shape[-1]) < begin, first, evs)
     final = evs[..., -1:]
-    direction = np.sign(final - evs[..., :1])
+    direction = np.sign(final - first)
     beyond = evs - final
     along = np.where(direction == 0, np.abs(beyond), beyond * direction)
     return np.maximum(along.max(axis=-1), 0.0)

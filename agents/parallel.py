@@ -58,43 +58,95 @@ def train_in_parallel(
         SystemExit: Of status 143, where a worker gets SIGTERM; likewise.
     """
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
-    if not waiting:
+    run_in_parallel(_train, waiting, workers=workers, progress=progress)
+
+
+def run_in_parallel(
+    work: Callable[[Any], object],
+    jobs: Sequence[Any],
+    *,
+    workers: int | None = None,
+    progress: Callable[..., None] | None = None,
+) -> None:
+    """Calls ``work(job)`` for every job, in processes of their own.
+
+    Args:
+        work: A function of a module, which reports with `tell`.
+        jobs: Values that can be sent to another process.
+        workers: Processes at a time, each with its share of the cores; by default one per core.
+        progress: Called with what `tell` is called with.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C, when every job has ended at its next `tell`.
+        SystemExit: Of status 143, where a worker gets SIGTERM.
+    """
+    if not jobs:
         return
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    workers = min(workers or cores, len(waiting))
+    cores = core_count()
+    workers = min(workers or cores, len(jobs))
     threads = max(1, cores // workers)
     context = multiprocessing.get_context("spawn")
     stop, messages = context.Event(), context.Queue()
     with ProcessPoolExecutor(
         workers, mp_context=context, initializer=_obey, initargs=(stop, messages)
     ) as executor:
-        with _interrupts_ignored():
-            running: set[Future[None]] = {executor.submit(_train, job, threads) for job in waiting}
+        with _ignored(signal.SIGINT):
+            running: set[Future[None]] = {
+                executor.submit(_with_threads, work, job, threads) for job in jobs
+            }
         try:
             while running:
                 done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
                 _deliver(messages, progress)
                 for future in done:
                     future.result()
+            _deliver(messages, progress)
         except BaseException:
             stop.set()
-            executor.shutdown(wait=True, cancel_futures=True)
+            # `timeout` and the like send SIGTERM twice: a shutdown cut short hangs at exit.
+            with _ignored(signal.SIGTERM):
+                executor.shutdown(wait=True, cancel_futures=True)
             raise
 
 
+def core_count() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def tell(*message: object) -> None:
+    """In a worker: sends progress to the process that waits.
+
+    Raises:
+        KeyboardInterrupt: If the worker is to end.
+    """
+    check_stop()
+    _messages.put(message)
+
+
+def check_stop() -> None:
+    """In a worker: see `tell`; elsewhere nothing.
+
+    Raises:
+        KeyboardInterrupt: If the worker is to end.
+    """
+    if _stop is not None and _stop.is_set():
+        raise KeyboardInterrupt
+
+
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Processes started within leave Ctrl-C to this one."""
+def _ignored(signal_number: int) -> Iterator[None]:
+    """Within, a signal does nothing; of SIGINT, processes started within leave it to this one."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = signal.signal(signal_number, signal.SIG_IGN)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal_number, before)
 
 
 def _obey(stop: Any, messages: Any) -> None:
@@ -135,19 +187,22 @@ def _deliver(messages: Any, progress: Callable[..., None] | None) -> None:
             progress(*message)
 
 
-def _train(job: TrainingJob, threads: int) -> None:
+def _with_threads(work: Callable[[Any], object], job: Any, threads: int) -> None:
     import torch
 
     torch.set_num_threads(threads)
+    if _stop is None or not _stop.is_set():
+        work(job)
+
+
+def _train(job: TrainingJob) -> None:
     last = 0
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
         nonlocal last
-        if _stop is not None and _stop.is_set():
-            raise KeyboardInterrupt
+        check_stop()
         if done == total or done - last >= total // 200:
             last = done
-            _messages.put((job.name, done, total, values))
+            tell(job.name, done, total, values)
 
-    if _stop is None or not _stop.is_set():
-        train_agent(job.config, job.out, progress=report, device=job.device)
+    train_agent(job.config, job.out, progress=report, device=job.device)

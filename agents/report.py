@@ -70,7 +70,7 @@ def write_report(
     folder = Path(out)
     rows = result_rows(result, source=source, split=split)
     best = best_meter(result)
-    differences = [] if best is None else _differences(result, best)
+    differences = [] if best is None else differences_to(result, best)
     meta = {
         **result_meta(command, result.seed),
         "episodes": len(result.scene_ids),
@@ -91,14 +91,16 @@ def write_report(
     }
 
 
-def _differences(result: EvaluationResult, best: str) -> list[dict[str, Any]]:
+def differences_to(
+    result: EvaluationResult, best: str, *, resamples: int = 10_000
+) -> list[dict[str, Any]]:
     """Every other policy minus the best meter, in each condition that has scenes."""
     rows = []
     for condition in result.conditions:
         for policy in result.tracks:
             if policy == best:
                 continue
-            interval = difference(result, policy, best, condition)
+            interval = difference(result, policy, best, condition, resamples=resamples)
             rows.append(
                 {
                     "policy": policy,
@@ -129,51 +131,55 @@ def report_markdown(
         f"{groups} source groups, {meta['episodes']} episodes of {meta['frames']} frames, seed "
         f"{result.seed}. Normalised score: 0 is a random policy, 1 the oracle, which knows the "
         "expected score of every state. Intervals: paired bootstrap over source groups"
-        f"{_seeds_note(result)}. How everything is defined: `docs/evaluation.md`.",
+        f"{seeds_note(result)}. How everything is defined: `docs/evaluation.md`.",
         "![Scores](scores.png)",
     ]
     for condition in result.conditions:
         own = [r for r in rows if r["condition"] == condition]
-        parts += [f"## Scenes: {condition} ({own[0]['num_groups']} groups)", _table(own)]
+        parts += [f"## Scenes: {condition} ({own[0]['num_groups']} groups)", score_table(own)]
     if groups < MIN_GROUPS:
         parts += [
             "## Every source group",
             f"Fewer than {MIN_GROUPS} source groups: no intervals, but every value (mean score).",
-            _markdown(*group_values(result)),
+            markdown_table(*group_values(result)),
         ]
     if differences:
         parts += [
             f"## Difference to the best meter, `{differences[0]['minus']}`",
             "Paired on the same episodes: difference of the normalised scores.",
-            _difference_table(differences),
+            difference_table(differences),
         ]
     parts += [
         "## What the oracle chooses",
         "Share of the episodes; where one value dominated, the control would not matter.",
-        _histogram_table(meta["oracle_histogram"]),
+        histogram_table(meta["oracle_histogram"]),
     ]
     if next_commands:
         parts += ["## Next", "```\n" + "\n".join(next_commands) + "\n```"]
     return "\n\n".join(parts) + "\n"
 
 
-def _seeds_note(result: EvaluationResult) -> str:
+def seeds_note(result: EvaluationResult) -> str:
+    """End of a sentence on what is resampled."""
     seeds = max(len(track.states) for track in result.tracks.values())
     return f" and {seeds} training seeds" if seeds > 1 else " (one training seed each)"
 
 
-def _markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; columns but the first are aligned to the right."""
     rule = ["---", *["---:"] * (len(head) - 1)]
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, rule, *body))
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> str:
+def score_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows of one condition with every metric, the best first."""
     order = sorted(rows, key=lambda r: -r["normalised_score"])
-    body = [[_cell(r[key], form) for _, key, form in _TABLE] for r in order]
-    return _markdown([title for title, _, _ in _TABLE], body)
+    body = [[cell(r[key], form) for _, key, form in _TABLE] for r in order]
+    return markdown_table([title for title, _, _ in _TABLE], body)
 
 
-def _cell(value: Any, form: str) -> str:
+def cell(value: Any, form: str) -> str:
+    """A number, a pair or nothing as text."""
     if value is None:
         return "-"
     if isinstance(value, list):
@@ -181,12 +187,13 @@ def _cell(value: Any, form: str) -> str:
     return f"{value:{form}}"
 
 
-def _difference_table(differences: Sequence[Mapping[str, Any]]) -> str:
+def difference_table(differences: Sequence[Mapping[str, Any]]) -> str:
+    """Differences to one policy as a table."""
     body = [
-        [d["policy"], d["condition"], f"{d['difference']:+.3f}", _cell(d["ci95"], "+.3f")]
+        [d["policy"], d["condition"], f"{d['difference']:+.3f}", cell(d["ci95"], "+.3f")]
         for d in differences
     ]
-    return _markdown(["policy", "scenes", "difference", "95 % interval"], body)
+    return markdown_table(["policy", "scenes", "difference", "95 % interval"], body)
 
 
 def group_values(result: EvaluationResult) -> tuple[list[str], list[list[str]]]:
@@ -200,7 +207,8 @@ def group_values(result: EvaluationResult) -> tuple[list[str], list[list[str]]]:
     return ["source group", *columns], body
 
 
-def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
+def histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
+    """How often each value of each control is the oracle's, as a table."""
     labels = {
         "iso": lambda v: f"ISO {v:g}",
         "exposure_time": format_exposure_time,
@@ -215,7 +223,7 @@ def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
         ]
         for name, shares in histogram.items()
     ]
-    return _markdown(["control", "share"], body)
+    return markdown_table(["control", "share"], body)
 
 
 def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from agents import metrics
 from agents.evaluation_result import EvaluationResult
-from agents.policy import METERS
+from agents.policy import is_metering
 from agents.statistics import Interval, difference_interval, score_interval
 
 #: Metrics that are averaged over the episodes of a source group, then over source groups.
@@ -39,7 +40,12 @@ SCENE_COLUMNS = (
 
 
 def result_rows(
-    result: EvaluationResult, *, source: str, split: str, resamples: int = 10_000
+    result: EvaluationResult,
+    *,
+    source: str,
+    split: str,
+    resamples: int = 10_000,
+    conditions: Sequence[str] | None = None,
 ) -> list[dict[str, Any]]:
     """A row per policy and condition (see `EvaluationResult.conditions`).
 
@@ -48,6 +54,7 @@ def result_rows(
         source: Where the scenes come from, such as ``"bundled"``.
         split: ``"test"``, ``"train"`` or ``"all"``.
         resamples: Bootstrap resamples of the interval.
+        conditions: Of those, the ones to give; all by default.
 
     Returns:
         Rows with the columns of the project's result files. `ci95` is the 95 % interval of
@@ -56,7 +63,7 @@ def result_rows(
     """
     return [
         _row(result, policy, condition, source, split, resamples)
-        for condition in result.conditions
+        for condition in conditions or result.conditions
         for policy in result.tracks
     ]
 
@@ -121,7 +128,7 @@ def difference(
 
 def best_meter(result: EvaluationResult) -> str | None:
     """The metering policy with the best score over all scenes evaluated; None if there is none."""
-    meters = [name for name in result.tracks if name.partition(":")[0] in METERS]
+    meters = [name for name in result.tracks if is_metering(name)]
     return max(meters, key=lambda name: result.group_gains(name)[0].sum(1).mean(), default=None)
 
 

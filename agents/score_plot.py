@@ -11,8 +11,13 @@ from typing import Any
 from simulator.files import write_atomically
 
 #: Okabe and Ito's colour-blind-safe palette, and a shape for print without colour.
-_STYLE = {"all": ("#000000", "o"), "hard": ("#D55E00", "v"), "rest": ("#0072B2", "^")}
-_OFFSET = {"all": 0.0, "hard": 0.22, "rest": -0.22}
+_STYLE = {
+    "all": ("#000000", "o"),
+    "hard": ("#D55E00", "v"),
+    "rest": ("#0072B2", "^"),
+    "all conditions": ("#009E73", "s"),
+}
+_OFFSET = {"all": 0.0, "hard": 0.2, "rest": -0.2, "all conditions": 0.38}
 
 
 def plot_scores(
@@ -22,7 +27,7 @@ def plot_scores(
 
     Args:
         path: File to write.
-        rows: As `result_rows` returns them.
+        rows: As `result_rows` returns them; those of other conditions are left out.
         title: Text above the figure.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -40,11 +45,11 @@ def plot_scores(
         offset = _OFFSET[condition] if len(conditions) > 1 else 0.0
         groups = next(iter(own.values()))["num_groups"]
         for i, name in enumerate(names):
-            if own[name]["ci95"] is not None:
+            if name in own and own[name]["ci95"] is not None:
                 axes.plot(own[name]["ci95"], [i + offset] * 2, color=colour, lw=1.6, alpha=0.6)
         axes.plot(
-            [own[name]["normalised_score"] for name in names],
-            [i + offset for i in range(len(names))],
+            [own[name]["normalised_score"] for name in names if name in own],
+            [i + offset for i, name in enumerate(names) if name in own],
             color=colour,
             marker=marker,
             linestyle="none",
@@ -52,7 +57,7 @@ def plot_scores(
             label=f"{condition} ({groups} groups)",
         )
     axes.axvline(1.0, color="0.35", lw=1.0)
-    axes.text(1.0, 1.0, "oracle ", ha="right", va="bottom", transform=axes.get_xaxis_transform())
+    axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
     axes.axvline(0.0, color="0.75", lw=1.0, ls=":")
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(-0.6, len(names) - 0.4)
@@ -60,7 +65,7 @@ def plot_scores(
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=3, frameon=False)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=4, frameon=False)
     if title:
         figure.suptitle(title, fontsize=11)
     picture = io.BytesIO()

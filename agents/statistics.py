@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,20 +105,48 @@ def difference_interval(
     seeds = max(len(first), len(second))
     if groups < MIN_GROUPS:
         return Interval(value, None, None, groups, seeds)
-    rng = np.random.default_rng(seed)
-    weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)  # (R, G)
-    difference = _seed_means(first, resamples, rng) - _seed_means(second, resamples, rng)
-    statistic = (weights * difference).sum(axis=1) / (weights @ span)
+    rng = np.random.default_rng([seed, 1])
+    weights = group_weights(groups, resamples, seed)
+    totals = _resampled(first, weights, rng) - _resampled(second, weights, rng)
+    statistic = totals / (weights @ span)
     tail = 50.0 * (1.0 - level)
     low, high = np.percentile(statistic, [tail, 100.0 - tail])
     return Interval(value, float(low), float(high), groups, seeds)
 
 
-def _seed_means(values: Floats, resamples: int, rng: np.random.Generator) -> Floats:
-    """Mean over training seeds drawn with replacement, ``(R, G)`` or ``(1, G)`` for one seed."""
+@lru_cache(maxsize=16)
+def group_weights(groups: int, resamples: int, seed: int) -> Floats:
+    """How often each group is drawn, ``(R, G)``; the same for all that are compared."""
+    rng = np.random.default_rng(seed)
+    weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)
+    found = weights.astype(np.float64)
+    found.setflags(write=False)
+    return found
+
+
+def resampled_scores(
+    gains: Floats, span: Floats, *, resamples: int = RESAMPLES, seed: int = 0, stream: int = 0
+) -> Floats:
+    """Normalised score of a policy in every resample, ``(R,)``.
+
+    Args:
+        gains: ``(K, G)`` or ``(G,)``, as of `score_interval`.
+        span: ``(G,)``.
+        resamples: Number of resamples.
+        seed: Policies compared under one seed see the same groups.
+        stream: Of the draws of training seeds: another for each policy compared.
+    """
+    weights = group_weights(len(span), resamples, seed)
+    rng = np.random.default_rng([seed, 1, stream])
+    return _resampled(np.atleast_2d(gains), weights, rng) / (weights @ span)
+
+
+def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Floats:
+    """Sums over the groups drawn of the mean over training seeds drawn with replacement, (R,)."""
+    sums: Floats = weights @ values.T  # (R, K)
     count = len(values)
     if count == 1:
-        return values
-    weights = rng.multinomial(count, np.full(count, 1 / count), size=resamples) / count
-    means: Floats = weights @ values
-    return means
+        return sums[:, 0]
+    drawn = rng.multinomial(count, np.full(count, 1 / count), size=len(weights)) / count
+    totals: Floats = (sums * drawn).sum(axis=1)
+    return totals

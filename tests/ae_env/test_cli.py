@@ -47,8 +47,10 @@ def test_every_command_is_there() -> None:
     assert COMMANDS == [
         "bench",
         "cache",
+        "convert-nima",
         "evaluate",
         "quickstart",
+        "scorers",
         "simulate",
         "sweep",
         "train",
@@ -62,8 +64,9 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert result.exit_code == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", result.output)
     assert re.search(rf"Example: \W?ae-env {command} ", text)
-    if command != "cache":
+    if command not in ("cache", "scorers"):
         assert "--out" in text
+    if command not in ("cache", "scorers", "convert-nima"):
         assert "--seed" in text
 
 
@@ -139,7 +142,8 @@ def test_evaluate(ae_env, tmp_path: Path) -> None:
     assert code == 0
     assert "centre_weighted:P" in text
     folder = tmp_path / "result"
-    names = {"results.json", "scenes.csv", "report.md", "scores.png"}
+    names = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html"}
+    names |= {"scores.png", "ev_error.png", "cost.png", "contact_sheet.png", "parts"}
     assert {path.name for path in folder.iterdir()} == names
     content = json.loads((folder / "results.json").read_text())
     assert set(content) == {"meta", "rows"}

@@ -138,7 +138,7 @@ class Counts(Unfit):
     ("name", "status", "message"),
     [
         ("Raises", 1, "`act` raised KeyError: 'lost'"),
-        ("Rows", 1, "`act` must return 64 integers, one per camera, not list"),
+        ("Rows", 1, "integers, one per camera, not list"),
         ("Outside", 1, "state 64 is not in [0, 64)"),
         ("Unfit", 1, "`fit` raised RuntimeError: nothing learnt"),
         ("Resets", 1, "`reset` raised OSError: [Errno 28]"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from agents import metrics
+from agents.result_table import weighted_quantile
 
 EV = np.array([4.0, 4.05, 5.0, 6.0, 8.0])
 # One episode, two frames, five states.
@@ -73,6 +74,73 @@ def test_overshoot_and_reversals(evs, over, turns):
     evs = np.array([evs], float)
     np.testing.assert_allclose(metrics.overshoot(evs), [over], atol=1e-12)
     assert metrics.reversals(evs).tolist() == [turns]
+
+
+def test_convergence_after_a_step_counts_from_the_step():
+    # The light steps in frame 4 (index 3), which is the first that shows it: the answer to it is
+    # frame 5. It is right for good from frame 7 on: the third frame that knows.
+    light = np.array([[0, 0, 0, 1, 1, 1, 1, 1, 1, 1]], float)[..., None]
+    errors = np.array([[2, 0, 0, 4, 2, 1, 0, 0, 0, 0]], float)
+    since = metrics.settling(light)
+    assert since.tolist() == [4]
+    frames, converged = metrics.frames_to_converge(errors, since=since)
+    assert (frames.tolist(), converged.tolist()) == ([3], [True])
+    at_once = np.where(np.arange(10) == 3, 4.0, 0.0)[None]
+    assert metrics.frames_to_converge(at_once, since=since)[0].tolist() == [1]
+    # Never: as many frames as there are after the step, not T.
+    frames, converged = metrics.frames_to_converge(np.ones((1, 10)), since=since)
+    assert (frames.tolist(), converged.tolist()) == ([6], [False])
+
+
+@pytest.mark.parametrize(
+    ("light", "since"),
+    [
+        ([1, 1, 1, 1, 1, 1], 0),  # static: from the reset frame on
+        ([1, 2, 3, 3, 3, 3, 3], 3),  # a ramp that ends
+        ([1, 0, 0, 1, 1, 1, 1, 1], 4),  # a lens cap: from its removal
+        ([1, 2, 1, 2, 1, 2, 1, 2], 0),  # never at rest
+        ([1, 1, 1, 1, 1, 2, 2, 2], 0),  # too short to wait for
+    ],
+)
+def test_settling_is_the_frame_after_the_last_change(light, since):
+    scores = np.array(light, float)[None, :, None] * np.array([0.1, 0.2])
+    assert metrics.settling(scores).tolist() == [since]
+
+
+def test_overshoot_after_a_step_is_that_of_the_answer_to_it():
+    # 9 -> 5 before the step; then 5 -> 8 by way of 10: two beyond. Counted from the start, the
+    # way down from 9 would make it 2 in the other direction: 8 - 5 = 3.
+    evs = np.array([[9.0, 5.0, 5.0, 5.0, 10.0, 8.0]])
+    assert metrics.overshoot(evs, since=np.array([3])).tolist() == [2.0]
+    assert metrics.overshoot(evs).tolist() == [3.0]
+
+
+def test_ev_error_percentiles_and_share_of_a_known_trajectory():
+    # Only the state at 6 EV is good; the trajectory is 4, 2, 1, 1/3, 0 ... EV away from it.
+    ev100 = np.array([2.0, 4.0, 5.0, 6.0, 17.0 / 3.0])
+    scores = np.array([0.1, 0.2, 0.3, 0.9, 0.4])
+    states = np.array([[0, 1, 2, 4, 3, 3, 3, 3, 3, 3]])
+    allowed = np.ones(5, bool)
+    errors = metrics.ev_error(np.broadcast_to(scores, (1, 10, 5)), states, ev100, allowed)
+    np.testing.assert_allclose(errors, [[4, 2, 1, 1 / 3, 0, 0, 0, 0, 0, 0]], atol=1e-12)
+    weights = np.full(errors.shape, 0.1)
+    assert weighted_quantile(errors, weights, 0.95) == 4.0  # the tenth of ten values
+    assert weighted_quantile(errors, weights, 0.9) == 2.0
+    assert weighted_quantile(errors, weights, 0.5) == 0.0
+    assert (errors <= metrics.THIRD_EV).mean() == pytest.approx(0.7)
+
+
+def test_regret_delayed_subtracts_what_the_delay_alone_costs():
+    # Best states 0, 1, 1, 1 with q 1, others 0; start state 1; delay 1: the delayed oracle shows 1
+    # (the start), 0, 1, 1 and scores 0, 0, 1, 1; a policy stuck at 1 scores 0, 1, 1, 1.
+    scores = np.zeros((1, 4, 2))
+    for frame, best in enumerate((0, 1, 1, 1)):
+        scores[0, frame, best] = 1.0
+    oracle = metrics.delayed_oracle_score(scores, np.ones((1, 2), bool), np.array([1]), 1)
+    stuck = metrics.score_of(scores, np.ones((1, 4), np.int64))
+    assert oracle.tolist() == [[0.0, 0.0, 1.0, 1.0]]
+    assert float((oracle - stuck).mean()) == pytest.approx(-0.25)
+    assert float((metrics.oracle_score(scores, np.ones(2, bool)) - stuck).mean()) == 0.25
 
 
 def test_flicker_counts_frames_of_the_same_light_only():
