@@ -20,9 +20,9 @@ from ae_env.console import (
 )
 
 if TYPE_CHECKING:
-    from agents.evaluation_plan import EvaluationPlan
-    from agents.evaluation_result import EvaluationResult
-    from agents.ranking import Rank
+    from agents.evaluation.plan import EvaluationPlan
+    from agents.evaluation.ranking import Rank
+    from agents.evaluation.result import EvaluationResult
 
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
@@ -86,12 +86,12 @@ def evaluate(
 
     Example: `ae-env evaluate --preset quick --policy matrix:tuned --policy my_policy.py:MyPolicy`
     """
-    from agents.ae_bench import append_results, check_hash
-    from agents.evaluation_report import write_plan_report
-    from agents.evaluation_tables import overall_ranking, static_condition
-    from agents.plan_episodes import plan_scenes
-    from agents.plan_jobs import run_plan
-    from agents.plan_run import PlanRun
+    from agents.evaluation.ae_bench import append_results, check_hash
+    from agents.evaluation.plan_episodes import plan_scenes
+    from agents.evaluation.plan_jobs import run_plan
+    from agents.evaluation.plan_run import PlanRun
+    from agents.report.of_plan import write_plan_report
+    from agents.report.tables import overall_ranking, static_condition
 
     given = {
         "scenes": scenes,
@@ -134,8 +134,8 @@ def _plan(
     preset: str | None, env: str | None, policies: list[str], given: Mapping[str, Any]
 ) -> EvaluationPlan:
     """The plan of the options that were given."""
-    from agents.ae_bench import refuse_changes
-    from agents.evaluation_plan import EvaluationPlan, load_plan
+    from agents.evaluation.ae_bench import refuse_changes
+    from agents.evaluation.plan import EvaluationPlan, load_plan
 
     base = None if preset is None else load_plan(preset)
     if base is not None and base.hash is not None:
@@ -210,7 +210,7 @@ def print_scores(result: EvaluationResult) -> None:
     """Scores of one condition as a table; every source group's where they are few."""
     from rich.table import Table
 
-    from agents.result_table import result_rows
+    from agents.evaluation.result_table import result_rows
 
     rows = result_rows(result, source="", split="", resamples=2000)
     conditions = result.conditions
@@ -259,8 +259,8 @@ def _print_ranking(
 def _print_groups(result: EvaluationResult, groups: int) -> None:
     from rich.table import Table
 
-    from agents.report import group_values
-    from agents.statistics import MIN_GROUPS
+    from agents.evaluation.statistics import MIN_GROUPS
+    from agents.report.of_evaluation import group_values
 
     if groups >= MIN_GROUPS:
         return

@@ -6,36 +6,36 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 _EXPORTS = {
-    "EvaluationPlan": "evaluation_plan",
-    "EvaluationResult": "evaluation_result",
-    "MeteringPolicy": "programs",
+    "EvaluationPlan": "evaluation.plan",
+    "EvaluationResult": "evaluation.result",
+    "MeteringPolicy": "metering.programs",
     "Policy": "policy",
     "PolicyContext": "policy",
-    "evaluate": "evaluation",
-    "fit_policies": "evaluation",
+    "evaluate": "evaluation.protocol",
+    "fit_policies": "evaluation.protocol",
     "list_policies": "policy",
-    "load_plan": "evaluation_plan",
+    "load_plan": "evaluation.plan",
     "make_policy": "policy",
-    "result_rows": "result_table",
-    "run_plan": "plan_jobs",
-    "write_report": "report",
+    "result_rows": "evaluation.result_table",
+    "run_plan": "evaluation.plan_jobs",
+    "write_report": "report.of_evaluation",
 }
 __all__ = sorted(_EXPORTS)
 
 if TYPE_CHECKING:
-    from agents.evaluation import evaluate as evaluate
-    from agents.evaluation import fit_policies as fit_policies
-    from agents.evaluation_plan import EvaluationPlan as EvaluationPlan
-    from agents.evaluation_plan import load_plan as load_plan
-    from agents.evaluation_result import EvaluationResult as EvaluationResult
-    from agents.plan_jobs import run_plan as run_plan
+    from agents.evaluation.plan import EvaluationPlan as EvaluationPlan
+    from agents.evaluation.plan import load_plan as load_plan
+    from agents.evaluation.plan_jobs import run_plan as run_plan
+    from agents.evaluation.protocol import evaluate as evaluate
+    from agents.evaluation.protocol import fit_policies as fit_policies
+    from agents.evaluation.result import EvaluationResult as EvaluationResult
+    from agents.evaluation.result_table import result_rows as result_rows
+    from agents.metering.programs import MeteringPolicy as MeteringPolicy
     from agents.policy import Policy as Policy
     from agents.policy import PolicyContext as PolicyContext
     from agents.policy import list_policies as list_policies
     from agents.policy import make_policy as make_policy
-    from agents.programs import MeteringPolicy as MeteringPolicy
-    from agents.report import write_report as write_report
-    from agents.result_table import result_rows as result_rows
+    from agents.report.of_evaluation import write_report as write_report
 
 
 def __getattr__(name: str) -> Any:

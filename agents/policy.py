@@ -186,10 +186,10 @@ def _make(name: str, context: PolicyContext, device: str, options: dict[str, Any
     if head in _SIMPLE and not tail:
         return _construct(_class_in("agents.simple", _SIMPLE[head]), name, context, options)
     if head in METERS and tail in ("", *PROGRAMS):
-        cls = _class_in("agents.programs", "MeteringPolicy")
+        cls = _class_in("agents.metering.programs", "MeteringPolicy")
         return _construct(cls, name, context, options, meter=head, program=tail or "P")
     if head == RPI_AGC and tail in ("", *MANUAL_PROGRAMS):
-        cls = _class_in("agents.rpi_agc", "RpiAgc")
+        cls = _class_in("agents.metering.rpi_agc", "RpiAgc")
         return _construct(cls, name, context, options, program=tail or "P")
     if head == _RECORDED:
         cls = _class_in("agents.recorded", "Recorded")

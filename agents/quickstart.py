@@ -11,11 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from agents.evaluation import evaluate, fit_policies
-from agents.evaluation_result import EvaluationResult
+from agents.evaluation.protocol import evaluate, fit_policies
+from agents.evaluation.result import EvaluationResult
 from agents.parallel import TrainingJob, train_in_parallel
 from agents.policy import Policy, PolicyContext, make_policy
-from agents.report import write_report
+from agents.report.of_evaluation import write_report
 from agents.training import AgentConfig
 from simulator.files import write_atomically
 

@@ -22,7 +22,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.history import History
-from agents.metering import make_meter
+from agents.metering.meters import make_meter
 from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, PolicyContext, masked_argmax

@@ -19,8 +19,8 @@ from rich.progress import track
 
 from agents import PolicyContext, evaluate, make_policy
 from agents.episodes import make_envs
-from agents.evaluation_result import EvaluationResult
-from agents.metrics import THIRD_EV
+from agents.evaluation.metrics import THIRD_EV
+from agents.evaluation.result import EvaluationResult
 from benchmarks.markdown import table
 from simulator.files import write_atomically
 from simulator.results import result_meta, write_results

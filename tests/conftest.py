@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -38,11 +39,12 @@ def data_dir() -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(autouse=True, scope="session")
+def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Cached scenes and score tables of the tests live in the test run's own folder."""
-    folder = tmp_path_factory.getbasetemp() / "cache"
-    monkeypatch.setenv("AE_ENV_CACHE", str(folder))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AE_ENV_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+        yield
 
 
 @pytest.fixture(autouse=True)

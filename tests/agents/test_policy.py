@@ -39,8 +39,11 @@ def test_every_listed_name_makes_a_policy(context):
         ("", r"must be one of"),
         ("no_such_pkg.mod:Class", r"no module 'no_such_pkg'"),
         ("agents.simple:Rundom", r"no class 'Rundom' there; found Random, BestFixed, Oracle"),
-        ("agents.metrics:flicker", r"must name a class, not a function"),
-        ("agents.statistics:Interval", r"Interval is not a policy, it has no `reset` and `act`"),
+        ("agents.evaluation.metrics:flicker", r"must name a class, not a function"),
+        (
+            "agents.evaluation.statistics:Interval",
+            r"Interval is not a policy, it has no `reset` and `act`",
+        ),
         ("nowhere/mine.py:Mine", r"there is no file 'nowhere/mine.py'"),
         ("mine.py", r"must name a class of the file"),
     ],

@@ -1,0 +1,1 @@
+"""The protocol that compares policies: episodes, metrics, intervals, rankings, plans."""

@@ -1,0 +1,248 @@
+"""AE-Bench: a fixed plan with the hash of its scenes, and the table that others add to."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.evaluation import metrics
+from agents.evaluation.plan import EvaluationPlan, digest
+from agents.evaluation.ranking import Rank
+from agents.evaluation.result import EvaluationResult
+from agents.report.of_evaluation import markdown_table
+from agents.report.tables import static_condition
+from simulator.files import write_atomically
+from simulator.results import machine, versions
+
+if TYPE_CHECKING:
+    from ae_env.scenes import Scene
+
+logger = logging.getLogger(__name__)
+
+#: The scenes' light is hashed as means of so many blocks a side, to so many EV: a scene that was
+#: made otherwise is noticed, the last bit of another processor's arithmetic is not.
+BLOCKS, STEP_EV = 4, 0.1
+COLUMNS = (
+    *("policy", "author", "date", "normalised_score", "ci95_low", "ci95_high", "static"),
+    *("hard", "regret", "ev_within_third", "frames_to_converge", "converged", "clipped_high"),
+    *("clipped_low", "ms_alone", "cpu", "training_seeds", "version", "hash"),
+)
+
+
+def scene_signature(scene: Scene) -> list[Any]:
+    """JSON values of what a scene is: its names, its right exposure, its light in blocks.
+
+    Args:
+        scene: At the resolution of the plan.
+    """
+    light = scene.light.double().clamp(min=2.0**-20).numpy()  # (4, H, W)
+    height, width = (size // BLOCKS * BLOCKS for size in light.shape[1:])
+    shape = (4, BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS)
+    means = light[:, :height, :width].reshape(shape).mean(axis=(2, 4))
+    exposed = np.log2(means) - scene.reference.log2_exposure
+    codes = np.rint(exposed / STEP_EV).astype(int)
+    ev = round(scene.ev100, 2)
+    return [scene.scene_id, scene.group, scene.kind, bool(scene.hard), ev, codes.tolist()]
+
+
+def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
+    """sha256 of the plan and of its scenes' light."""
+    return digest(plan.protocol(), [scene_signature(scene) for scene in scenes])
+
+
+def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
+    """Checks that a benchmark is what it was when its hash was written down.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if plan.hash is None:
+        return
+    found = bench_hash(plan, scenes)
+    if found != plan.hash:
+        raise ValueError(
+            f"`hash` of {plan.name!r} is {plan.hash}, but the plan and the light of its scenes "
+            f"give {found}: the plan or what makes the scenes has changed, so results would not "
+            "compare with the published ones; a changed benchmark needs a new name and hash"
+        )
+
+
+def refuse_changes(plan: EvaluationPlan, options: Sequence[str]) -> None:
+    """Raises a `ValueError` where options would change a benchmark.
+
+    Args:
+        plan: The benchmark.
+        options: Names of the options given that change a plan.
+    """
+    if options:
+        raise ValueError(
+            f"`preset` (={plan.name!r}) is a fixed benchmark: it does not take "
+            f"{', '.join('--' + name for name in options)}"
+        )
+
+
+def append_results(
+    table: Path,
+    plan: EvaluationPlan,
+    results: Mapping[str, EvaluationResult],
+    ranking: Sequence[Rank],
+    *,
+    author: str,
+) -> dict[str, Path]:
+    """Adds a row per policy to a benchmark's table, and writes its page anew.
+
+    A policy of the same name is replaced.
+
+    Args:
+        table: CSV with `COLUMNS`; made where missing.
+        plan: The benchmark.
+        results: By condition.
+        ranking: Over all conditions.
+        author: Who made the policies.
+
+    Returns:
+        The files by name.
+
+    Raises:
+        ValueError: If the table has other columns, or rows of another hash.
+    """
+    rows = {row["policy"]: row for row in read_table(table)}
+    for name, row in rows.items():
+        if row["hash"] != plan.hash:
+            raise ValueError(
+                f"{table}: policy {name!r} was measured under the hash {row['hash']}, this run "
+                f"under {plan.hash}: they do not compare"
+            )
+    for one in ranking:
+        rows[one.policy] = _row(plan, results, one, author)
+    ordered = sorted(rows.values(), key=lambda row: -float(row["normalised_score"]))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(ordered)
+    page = page_of(table)
+    return {
+        table.name: write_atomically(table, text.getvalue()),
+        page.name: write_atomically(page, table_page(plan, ordered, table)),
+    }
+
+
+def read_table(table: Path) -> list[dict[str, str]]:
+    """Rows of a benchmark's table; none where there is no file.
+
+    Raises:
+        ValueError: If its columns are not `COLUMNS`.
+    """
+    if not table.is_file():
+        return []
+    with table.open(encoding="utf-8", newline="") as stream:
+        reader = csv.DictReader(stream)
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ValueError(f"{table}: its columns must be {', '.join(COLUMNS)}")
+        return list(reader)
+
+
+def page_of(table: Path) -> Path:
+    """The page of a table: ``docs/ae-bench/v1.csv`` has ``docs/ae-bench.md``.
+
+    >>> page_of(Path("docs/ae-bench/v1.csv")).as_posix(), page_of(Path("mine.csv")).as_posix()
+    ('docs/ae-bench.md', 'mine.md')
+    """
+    if table.parent.name == "ae-bench":
+        return table.parent.with_suffix(".md")
+    return table.with_suffix(".md")
+
+
+def _row(
+    plan: EvaluationPlan, results: Mapping[str, EvaluationResult], one: Rank, author: str
+) -> dict[str, str]:
+    name, static = one.policy, results[static_condition(plan)]
+    track = static.tracks[name]
+
+    def mean(key: str) -> float:
+        """Over all conditions, source groups with the same weight."""
+        values = [
+            metrics.group_means(r.episode_metrics(name)[key], r.groups)[0].mean()
+            for r in results.values()
+        ]
+        return float(np.mean(values))
+
+    def score(part: str) -> float:
+        gains, span = static.group_gains(name, part)
+        return float(gains.mean(axis=0).sum() / span.sum())
+
+    low, high = one.score.pair or (None, None)
+    numbers = {
+        "normalised_score": one.score.value,
+        "ci95_low": low,
+        "ci95_high": high,
+        "static": score("all"),
+        "hard": score("hard") if static.hard.any() else None,
+        **{key: mean(key) for key in COLUMNS[8:14]},
+        "ms_alone": track.ms_alone,
+    }
+    return {
+        "policy": name,
+        "author": author,
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        **{key: "" if value is None else f"{value:.4f}" for key, value in numbers.items()},
+        "cpu": str(machine()["cpu"]),
+        "training_seeds": str(len(track.states)),
+        "version": versions().get("ae-env", ""),
+        "hash": plan.hash or "",
+    }
+
+
+def _shown(table: Path) -> str:
+    """The table's path as a reader has it: a full path is of one machine only."""
+    return table.name if table.is_absolute() else table.as_posix()
+
+
+def table_page(plan: EvaluationPlan, rows: Sequence[Mapping[str, str]], table: Path) -> str:
+    """The page of a benchmark's table as Markdown."""
+    body = [
+        [
+            f"`{row['policy']}`",
+            row["normalised_score"],
+            f"{row['ci95_low']} to {row['ci95_high']}" if row["ci95_low"] else "-",
+            *(row[key] for key in ("static", "hard", "regret")),
+            f"{float(row['ev_within_third']):.0%}",
+            f"{float(row['frames_to_converge']):.1f}",
+            f"{float(row['converged']):.0%}",
+            f"{float(row['clipped_high']):.2%}",
+            *(row["ms_alone"] or "-", row["training_seeds"]),
+            *(row[key].replace("|", "/") for key in ("author", "date", "version")),
+        ]
+        for row in rows
+    ]
+    head = [
+        *("policy", "score", "95 % interval", "static", "static, hard", "regret"),
+        *("within 1/3 EV", "frames to converge", "converged", "white", "ms alone", "seeds"),
+        *("author", "date", "version"),
+    ]
+    conditions = ", ".join(f"`{name}`" for name in plan.all_conditions)
+    lines = [
+        f"# {plan.name}",
+        "<!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->",
+        f"{len(plan.scene_ids)} bundled scenes that nothing was trained on, conditions "
+        f"{conditions}; starts {', '.join(plan.starts)}; {plan.frames} frames; scorer "
+        f"`{plan.environment.get('scorer', 'balanced')}`. Score: normalised score over all "
+        "conditions, each with the same weight; 0 is a random policy, 1 an oracle that is told the "
+        "best state of the last frame's light in every frame. What the columns mean: "
+        "[evaluation.md](evaluation.md). Times are those of each row's own machine (`cpu` in the "
+        "CSV file).",
+        "Add your own policy with one command, and send the two files that it changes:",
+        f"    ae-env evaluate --preset ae_bench_v1 --policy my.py:Mine \\\n"
+        f'        --append {_shown(table)} --author "Your name"',
+        f"The plan and the light of its scenes have the hash `{plan.hash}`, which every row "
+        "carries; a run under another one is refused.",
+        markdown_table(head, body),
+    ]
+    return "\n\n".join(lines) + "\n"

@@ -1,0 +1,169 @@
+"""Everything that an evaluation measured, per episode and frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.evaluation import metrics
+
+if TYPE_CHECKING:
+    from ae_env.grid import ExposureGrid
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CONDITIONS = ("all", "hard", "rest")
+
+
+@dataclass(frozen=True)
+class Track:
+    """What one policy did. Leading axis K: training seeds (1 where there is nothing to train).
+
+    Args:
+        states: States of the frames after each action, ``(K, E, T)``; with a delay those that
+            were chosen earlier.
+        image_mean: Mean linear signal of each frame after an action, ``(K, E, T)``.
+        clipped_high: Share of saturated pixels, ``(K, E, T)``.
+        clipped_low: Share of black pixels, ``(K, E, T)``.
+        ms_per_decision: Time in `act` per camera and frame [ms], in batches.
+        captures_per_decision: Frames taken for one decision.
+        privileged: Whether it saw what no camera sees.
+        ms_alone: Time in `act` for one camera alone [ms]; None where it was not measured.
+    """
+
+    states: Ints
+    image_mean: Floats
+    clipped_high: Floats
+    clipped_low: Floats
+    ms_per_decision: float
+    captures_per_decision: float
+    privileged: bool
+    ms_alone: float | None = None
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Everything measured, per episode and frame; `E` episodes, `T` frames, `S` states.
+
+    Args:
+        grid: The exposure states.
+        scene_ids: Scene of each episode, ``(E,)``.
+        groups: Source group of each episode.
+        kinds: Kind of scene of each episode.
+        hard: Whether the episode's scene is in the hard part.
+        start_states: State of the reset frame.
+        scores: q of every state, ``(E, T, S)``.
+        allowed: Action masks, ``(E, S)``.
+        tracks: What each policy did.
+        seed: Seed of the first episode.
+        delay: Frames between a decision and the frame that it exposes.
+    """
+
+    grid: ExposureGrid
+    scene_ids: NDArray[Any]
+    groups: NDArray[Any]
+    kinds: NDArray[Any]
+    hard: NDArray[np.bool_]
+    start_states: Ints
+    scores: Floats
+    allowed: NDArray[np.bool_]
+    tracks: dict[str, Track]
+    seed: int
+    delay: int = 0
+
+    @cached_property
+    def oracle(self) -> Floats:
+        """Mean q of the oracle over the frames, ``(E,)``."""
+        return metrics.oracle_score(self.scores, self.allowed[:, None]).mean(axis=-1)
+
+    @cached_property
+    def delayed_oracle(self) -> Floats:
+        """Mean q of the oracle that decides `delay` frames earlier, ``(E,)``."""
+        per_frame = metrics.delayed_oracle_score(
+            self.scores, self.allowed, self.start_states, self.delay
+        )
+        return per_frame.mean(axis=-1)
+
+    @cached_property
+    def random(self) -> Floats:
+        """Exact mean q of a random policy over the frames, ``(E,)``."""
+        return metrics.random_score(self.scores, self.allowed[:, None]).mean(axis=-1)
+
+    @cached_property
+    def oracle_states(self) -> Ints:
+        """The oracle's state in the last frame, ties to the lower index, ``(E,)``."""
+        last = np.where(self.allowed, self.scores[:, -1], -np.inf)
+        return last.argmax(axis=-1).astype(np.int64)
+
+    def episode_metrics(self, policy: str) -> dict[str, NDArray[Any]]:
+        """Every metric of `policy` per training seed and episode, ``(K, E)``.
+
+        `ev_error` is per frame, ``(K, E, T)``: its median and percentiles are over frames.
+        """
+        if policy not in self._metrics:
+            self._metrics[policy] = self._measured(policy)
+        return self._metrics[policy]
+
+    @cached_property
+    def _metrics(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """Metrics that were asked for, by policy."""
+        return {}
+
+    @cached_property
+    def settling(self) -> Ints:
+        """Frame from which an episode's convergence counts, ``(E,)``; see `metrics.settling`."""
+        return metrics.settling(self.scores)
+
+    def _measured(self, policy: str) -> dict[str, NDArray[Any]]:
+        track = self.tracks[policy]
+        ev100, allowed = self.grid.ev100, self.allowed[:, None]
+        score = metrics.score_of(self.scores, track.states).mean(axis=-1)
+        errors = metrics.ev_error(self.scores, track.states, ev100, allowed)
+        frames, converged = metrics.frames_to_converge(errors, since=self.settling)
+        start = np.broadcast_to(self.start_states[:, None], (*track.states.shape[:-1], 1))
+        evs = ev100[np.concatenate([start, track.states], axis=-1)]
+        static = np.all(self.scores[:, 1:] == self.scores[:, :-1], axis=-1)  # (E, T - 1)
+        given = metrics.regret_given_ev(self.scores, track.states, ev100, allowed)
+        return {
+            "score": score,
+            "regret": self.oracle - score,
+            "regret_delayed": self.delayed_oracle - score,
+            "regret_given_ev": given.mean(axis=-1),
+            "ev_error": errors,
+            "frames_to_converge": frames,
+            "converged": converged,
+            "overshoot": metrics.overshoot(evs, since=self.settling),
+            "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
+            "reversals": metrics.reversals(evs),
+            "flicker": metrics.flicker(track.image_mean, static),
+            "clipped_high": track.clipped_high.mean(axis=-1),
+            "clipped_low": track.clipped_low.mean(axis=-1),
+        }
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """``("all", "hard", "rest")``, or ``("all",)`` where one of the two parts has no scenes."""
+        return CONDITIONS if self.hard.any() and not self.hard.all() else CONDITIONS[:1]
+
+    def condition(self, name: str) -> NDArray[np.bool_]:
+        """Which episodes belong to ``"all"``, ``"hard"`` or ``"rest"``, ``(E,)``."""
+        masks = {"all": np.ones_like(self.hard), "hard": self.hard, "rest": ~self.hard}
+        if name not in masks:
+            raise ValueError(f"`condition` (={name!r}) must be one of {', '.join(masks)}")
+        return masks[name]
+
+    def group_gains(self, policy: str, condition: str = "all") -> tuple[Floats, Floats]:
+        """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
+
+        These are what `agents.evaluation.statistics` takes.
+        """
+        members = self.condition(condition)
+        gains = (self.episode_metrics(policy)["score"] - self.random)[:, members]
+        span = (self.oracle - self.random)[members]
+        groups = self.groups[members]
+        return metrics.group_means(gains, groups)[0], metrics.group_means(span, groups)[0]

@@ -1,0 +1,119 @@
+"""What an evaluation has finished, kept in files so that a second run goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import zipfile
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.evaluation.plan import digest
+from simulator.files import sibling, write_atomically
+
+logger = logging.getLogger(__name__)
+
+#: Bumped when what a file holds changes.
+_VERSION = 1
+_ROOT = Path(__file__).resolve().parents[2]
+#: Modules that only show results: a change of theirs leaves what was measured as it is.
+_SHOWING = ("ae_bench", "plan_jobs", "ranking", "result_table", "statistics")
+_COMMANDS = ("cli", "console", "evaluation_commands", "rendering", "scorer_commands")
+
+
+class EvaluationStore:
+    """Finished parts of an evaluation, one ``.npz`` each, without pickles.
+
+    Args:
+        folder: Made where missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder)
+
+    def path(self, key: str) -> Path:
+        """File of a part."""
+        return self.folder / f"{key}.npz"
+
+    def has(self, key: str) -> bool:
+        """Whether the part is there, whole and readable."""
+        return self.load(key) is not None
+
+    def load(self, key: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+        """Arrays and JSON values of a part; None where there is none, or it is damaged."""
+        file = self.path(key)
+        try:
+            # All of it first: of a damaged file, NumPy leaves the handle open.
+            with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as content:
+                arrays = {name: content[name] for name in content.files}
+            return arrays, json.loads(str(arrays.pop("meta")))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            logger.warning("%s is damaged and is made anew: %s", file, error)
+            return None
+
+    def save(self, key: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Path:
+        """Writes a part: whole, or not at all."""
+        stream = io.BytesIO()
+        text = np.array(json.dumps(dict(meta), sort_keys=True))
+        content: dict[str, Any] = {"meta": text, **arrays}
+        np.savez_compressed(stream, **content)
+        return write_atomically(self.path(key), stream.getvalue())
+
+
+def part_key(kind: str, *parts: object) -> str:
+    """Name of a part: its kind and a hash of all that decides its content."""
+    return f"{kind}-{digest(_VERSION, *parts)[:32]}"
+
+
+def policy_content(name: str) -> str:
+    """Hash of what decides a policy beside its name: its weights, its file or its module.
+
+    Args:
+        name: As `agents.make_policy` takes it.
+    """
+    head, _, tail = name.rpartition(":") if ".py:" in name else name.partition(":")
+    if head.endswith(".py"):
+        return _files_digest([Path(head).expanduser()])
+    if head in ("ppo", "regression"):
+        from agents.policy import PRETRAINED
+
+        weights = Path(tail) if tail else PRETRAINED / head
+        return _files_digest([sibling(weights, end) for end in (".safetensors", ".json")])
+    if tail and "." in head:
+        try:
+            found = find_spec(head)
+        except (ImportError, ValueError):
+            found = None
+        if found is not None and found.origin is not None:
+            return _files_digest([Path(found.origin)])
+    return ""
+
+
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """Hash of the source that measurements come from: other code, other parts."""
+    files = [
+        file
+        for package in ("simulator", "ae_env", "agents")
+        for file in sorted((_ROOT / package).rglob("*.py"))
+        if not (package == "agents" and (file.stem in _SHOWING or file.parent.name == "report"))
+        and not (package == "ae_env" and file.stem in _COMMANDS)
+    ]
+    return _files_digest(files)
+
+
+def _files_digest(files: list[Path]) -> str:
+    found = hashlib.sha256()
+    for file in files:
+        content = file.read_bytes() if file.is_file() else b""
+        found.update(f"{file.name}\0{len(content)}\0".encode() + content)
+    return found.hexdigest()

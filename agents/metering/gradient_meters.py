@@ -1,0 +1,196 @@
+"""Meters that look for the exposure of the strongest gradients: Shim's and Zhang's.
+
+Both improve on the estimate that the controller holds, a step at each frame. The frame in hand is
+first exposed anew, in simulation, at that estimate: so the steps add up on a grid of whole stops,
+and with a delay no step is taken twice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.metering.histogram_meters import encoded
+from agents.metering.reading import (
+    BLACK_SIGNAL,
+    CODE_SIGNALS,
+    CODES,
+    GREEN,
+    TARGET_SIGNAL,
+    WHITE_SIGNAL,
+    Reading,
+    frame_ev100,
+    signal_codes,
+)
+from agents.policy import Observations
+from simulator.camera import CameraProfile
+
+Floats = NDArray[np.float64]
+
+#: Gammas that Shim's search tries; below 1 brightens.
+GAMMAS = (0.1, 0.5, 0.8, 1.0, 1.2, 1.5, 1.9)
+#: Speed K_p and shape d of Shim's update.
+SHIM_SPEED, SHIM_SHAPE = 2.0, 1.0
+#: Least factor of the exposure in one step of Shim's update.
+SHIM_LEAST = 0.125
+#: Zhang's step: EV per relative change of the metric and EV; its bound [EV]; half of the distance
+#: of the two exposures from which the derivative is taken [EV].
+ZHANG_RATE, ZHANG_LIMIT_EV, ZHANG_DELTA_EV = 3.0, 2.0, 0.25
+#: How often a step that lowers the metric is halved before it is given up.
+HALVINGS = 4
+#: The frame in hand is exposed anew by at most so many EV.
+SIMULATED_EV = 4.0
+#: Saturated share from which a frame hides something.
+SATURATED_SEEN = 0.01
+#: From a saturated share s of 0.1 on, a frame is too bright by 4 (s - 0.1) EV or more.
+SATURATED_LIMIT, SATURATED_SLOPE_EV = 0.1, 4.0
+#: Metric below which there is no gradient to follow.
+_NO_GRADIENT = 1e-9
+
+
+def shim_reading(
+    observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile
+) -> Reading:
+    """One update of Shim's controller: the gamma that shows most gradient tells where to go.
+
+    The picture (sRGB luma in [0, 1]) is raised to the powers gamma of `GAMMAS`; that with the most
+    gradient information (`ae_env.scorers.detail.shim_gradient`; between the powers, the top of a
+    parabola) is g. The exposure is multiplied by ``1 + a K_p (R - 1)`` with
+    ``R = 1 + d tan((1 - g) arctan(1 / d))``, a = 1/2 where g >= 1, else 1, K_p = 2, d = 1. A step
+    that lowers the metric itself is halved: otherwise scenes with two peaks never come to rest.
+
+    Source: I. Shim et al., IROS 2014 (metric and search); the nonlinear update is that of their
+    "Gradient-based camera exposure control for outdoor mobile platforms", IEEE TCSVT 29(6), 2019.
+    """
+    import torch
+
+    from ae_env.scorers.detail import shim_gradient
+
+    frame = _Frame(observations, estimate, camera)
+    base = _table(frame.shift)  # (N, CODES)
+    metric = np.stack(
+        [shim_gradient(torch.from_numpy(frame.luma(base**g))).numpy() for g in GAMMAS], axis=1
+    )
+    gamma = _best_gamma(metric)
+    ratio = SHIM_SHAPE * np.tan((1.0 - gamma) * math.atan(1.0 / SHIM_SHAPE))  # R - 1
+    factor = 1.0 + np.where(gamma >= 1.0, 0.5, 1.0) * SHIM_SPEED * ratio
+    here = metric[:, GAMMAS.index(1.0)]
+    step = np.log2(np.maximum(factor, SHIM_LEAST))
+    return frame.reading(frame.rising(step, here, frame.metric(shim_gradient)))
+
+
+def zhang_reading(
+    observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile
+) -> Reading:
+    """One gradient step of Zhang's controller on the soft percentile of the squared gradient.
+
+    With M = `ae_env.scorers.detail.zhang_gradient` of the picture (sRGB luma), the EV moves by
+    ``3 d ln M / d EV``, at most 2 EV; the derivative is the difference of the frame exposed a
+    quarter of an EV brighter and darker, through the known response (sRGB, clipped). A step that
+    lowers M is halved: M has a kink where pixels begin to clip.
+
+    Source: Z. Zhang, C. Forster, D. Scaramuzza, ICRA 2017 (p 0.7, k 5); relative to M, because its
+    size differs between scenes by orders of magnitude.
+    """
+    from ae_env.scorers.detail import zhang_gradient
+
+    frame = _Frame(observations, estimate, camera)
+    metric = frame.metric(zhang_gradient)
+    zero = np.zeros(len(frame.ev))
+    here = metric(zero)
+    brighter, darker = metric(zero + ZHANG_DELTA_EV), metric(zero - ZHANG_DELTA_EV)
+    both = frame.shows(zero - ZHANG_DELTA_EV)
+    rise = np.where(both, 0.5 * (brighter - darker), brighter - here)
+    slope = rise / (ZHANG_DELTA_EV * np.maximum(here, _NO_GRADIENT))
+    step = np.clip(ZHANG_RATE * slope, -ZHANG_LIMIT_EV, ZHANG_LIMIT_EV)
+    return frame.reading(frame.rising(step, here, metric))
+
+
+class _Frame:
+    """The frames in hand, to be exposed anew at the controller's estimate."""
+
+    def __init__(
+        self, observations: Observations, estimate: Floats | None, camera: CameraProfile
+    ) -> None:
+        self.ev = frame_ev100(observations)
+        held = self.ev if estimate is None else np.where(np.isnan(estimate), self.ev, estimate)
+        #: How much brighter than the frame its simulation is [EV].
+        self.shift = np.clip(self.ev - held, -SIMULATED_EV, SIMULATED_EV)
+        self.codes = signal_codes(observations["raw"], camera, GREEN)
+        signal = CODE_SIGNALS.astype(np.float32)[self.codes].reshape(len(self.codes), -1)
+        self._mean = signal.mean(axis=1, dtype=np.float64)
+        self._share = (signal >= WHITE_SIGNAL).mean(axis=1)
+
+    def luma(self, tables: Floats) -> NDArray[np.float32]:
+        """Luma of the frames ``(N, h, w)`` through a table of their own each, ``(N, CODES)``."""
+        table = tables.astype(np.float32)
+        count, _, height, width = self.codes.shape
+        out = np.empty((count, height, width), np.float32)
+        for i in range(count):
+            np.mean(table[i][self.codes[i]], axis=0, out=out[i])
+        return out
+
+    def metric(self, function: Callable[[Any], Any]) -> Callable[[Floats], Floats]:
+        """`function` of the luma, as one of how much brighter than the estimate it is [EV]."""
+        import torch
+
+        return lambda brighter: function(
+            torch.from_numpy(self.luma(_table(self.shift + brighter)))
+        ).numpy()
+
+    def shows(self, brighter: Floats) -> NDArray[np.bool_]:
+        """Whether the simulation is true at `brighter` than the estimate [EV], ``(N,)``.
+
+        What a saturated frame would show at less exposure than its own is not known.
+        """
+        shown: NDArray[np.bool_] = (self._share < SATURATED_SEEN) | (self.shift + brighter >= 0.0)
+        return shown
+
+    def rising(self, step: Floats, here: Floats, metric: Callable[[Floats], Floats]) -> Floats:
+        """The steps [EV], halved where the metric would be below that `here`, or 0.
+
+        Steps to where the frame shows nothing are as they are.
+        """
+        for _ in range(HALVINGS + 1):
+            falls = (metric(step) < here) & ((step > 0.0) | self.shows(step))
+            if not falls.any():
+                return step
+            step = np.where(falls, 0.5 * step, step)
+        return np.where(falls, 0.0, step)
+
+    def reading(self, brighter: Floats) -> Reading:
+        """The reading of a step that makes the picture `brighter` by so many EV, ``(N,)``."""
+        share, limit = self._share, SATURATED_LIMIT
+        bound = np.where(share >= limit, self.ev + SATURATED_SLOPE_EV * (share - limit), -np.inf)
+        ev = np.maximum(self.ev - self.shift - brighter, bound)
+        black = self._mean <= BLACK_SIGNAL
+        dark = self.ev + math.log2(BLACK_SIGNAL / TARGET_SIGNAL)
+        return Reading(np.where(black, dark, ev), share, black)
+
+
+def _table(shift: Floats) -> Floats:
+    """sRGB of each code of the observation at `shift` EV more exposure, ``(N, CODES)``."""
+    linear = np.clip(CODE_SIGNALS[None] * np.exp2(shift)[:, None], 0.0, 1.0)
+    assert linear.shape[1] == CODES
+    return encoded(linear)
+
+
+def _best_gamma(metric: Floats) -> Floats:
+    """The gamma of the highest metric, ``(N, len(GAMMAS))``; 1 where there is no gradient."""
+    gammas = np.array(GAMMAS)
+    best = metric.argmax(axis=1)
+    rows = np.arange(len(metric))
+    inner = np.clip(best, 1, len(gammas) - 2)
+    left, middle, right = (gammas[inner + i] for i in (-1, 0, 1))
+    low, top, high = (metric[rows, inner + i] for i in (-1, 0, 1))
+    # The top of the parabola through three unevenly spaced points.
+    rise, fall = (top - low) / (middle - left), (high - top) / (right - middle)
+    curved = (fall - rise) / (right - left)
+    fits = (best == inner) & (curved < -1e-12)
+    peak = 0.5 * (left + middle - rise / np.where(fits, curved, -1.0))
+    found = np.where(fits, np.clip(peak, left, right), gammas[best])
+    return np.where(metric.max(axis=1) > _NO_GRADIENT, found, 1.0)

@@ -1,0 +1,158 @@
+"""Reflected-light metering of raw frames: what exposure value does the frame in hand suggest?
+
+Every meter undoes the observation's companding, measures the linear green signal against the
+calibration of the exposure scale (an 18 % card is recorded at 0.12 of sensor white when the state's
+EV equals that of the incident light) and adds the EV100 at which the frame was taken. The meters
+here weigh pixels or zones; those of `histogram_meters` and `gradient_meters` look for an exposure.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ae_env.checks import did_you_mean
+from agents.metering.reading import (
+    BLACK_SIGNAL,
+    GREEN,
+    WHITE_SIGNAL,
+    Meter,
+    Reading,
+    frame_ev100,
+    linear_signal,
+    mean_reading,
+)
+from agents.policy import METERS, Observations
+from simulator.camera import CameraProfile
+
+#: Share of a centre-weighted meter's reading that comes from the central circle, and the circle's
+#: diameter in frame heights (12 mm of 24 mm).
+CENTRE_SHARE, CENTRE_DIAMETER = 0.75, 0.5
+#: Part of the frame's area that a spot meter reads.
+SPOT_AREA = 0.04
+#: Matrix metering: zones a side, standard deviation of their centre weighting [zones], and the
+#: levels between which the brightest 2 % of the pixels should lie, corrected by so many EV at most.
+#: Chosen among ten or so settings on the bundled training scenes.
+MATRIX_ZONES, MATRIX_SIGMA = 5, 1.0
+TOP_SHARE, TOP_AT_LEAST, TOP_AT_MOST, CONSTRAINT_LIMIT_EV = 0.02, 0.5, 0.8, 3.0
+#: What the zones' logarithms and the constraints together read too low on the ordinary (not hard)
+#: training scenes, against the incident light [EV].
+MATRIX_CALIBRATION_EV = 0.7
+
+
+def make_meter(name: str, camera: CameraProfile) -> Meter:
+    """The meter called `name`, one of `agents.policy.METERS`, for `camera`.
+
+    Raises:
+        ValueError: If there is none; the message proposes the nearest name.
+    """
+    if name not in METERS:
+        hint = did_you_mean(name, METERS)
+        raise ValueError(f"`meter` (={name!r}) must be one of {', '.join(METERS)}{hint}")
+    if name in ("average", "centre_weighted", "spot"):
+        return functools.partial(weighted_reading, camera=camera, name=name)
+    if name == "matrix":
+        return functools.partial(matrix_reading, camera=camera)
+    from agents.metering import gradient_meters, histogram_meters
+
+    module: Any = gradient_meters if name in ("shim", "zhang") else histogram_meters
+    return functools.partial(getattr(module, f"{name}_reading"), camera=camera)
+
+
+def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
+    """Metering weights of the pixels, ``(height, width)``, summing to 1.
+
+    Args:
+        name: ``"average"``; ``"centre_weighted"``: 75 % of the weight in the central circle of half
+            the frame's height (the classic 12 mm circle of 35 mm cameras), the rest around it;
+            ``"spot"``: a central circle of 4 % of the area.
+        height: Rows.
+        width: Columns.
+
+    >>> round(float(weight_map("centre_weighted", 64, 64)[16:48, 16:48].sum()), 2)
+    0.77
+    """
+    y = (np.arange(height) + 0.5) / height - 0.5
+    x = ((np.arange(width) + 0.5) - 0.5 * width) / height
+    radius = np.hypot(y[:, None], x[None, :])
+    if name == "average":
+        weights = np.ones((height, width))
+    elif name == "centre_weighted":
+        inside = radius <= CENTRE_DIAMETER / 2
+        weights = np.where(
+            inside, CENTRE_SHARE / inside.sum(), (1 - CENTRE_SHARE) / (~inside).sum()
+        )
+    else:
+        area = SPOT_AREA * height * width / height**2  # in frame heights squared
+        weights = (radius <= np.sqrt(area / np.pi)).astype(np.float64)
+    return (weights / weights.sum()).astype(np.float32)
+
+
+def weighted_reading(
+    observations: Observations,
+    estimate: NDArray[np.float64] | None = None,
+    *,
+    camera: CameraProfile,
+    name: str,
+) -> Reading:
+    """EV of the weighted mean signal, with the weights of `weight_map`."""
+    signal = linear_signal(observations["raw"], camera, GREEN)
+    weights = weight_map(name, *signal.shape[-2:]).ravel() / 2
+    flat = signal.reshape(len(signal), 2, -1)
+    mean = np.einsum("ncp,p->n", flat, weights, dtype=np.float64)
+    saturated = np.einsum("ncp,p->n", (flat >= WHITE_SIGNAL).astype(np.float32), weights)
+    return mean_reading(mean, saturated.astype(np.float64), frame_ev100(observations))
+
+
+def matrix_reading(
+    observations: Observations,
+    estimate: NDArray[np.float64] | None = None,
+    *,
+    camera: CameraProfile,
+) -> Reading:
+    """Multi-zone metering: contrast-aware zones, then highlight and shadow constraints.
+
+    The frame is cut into 5 x 5 zones, as in modern AGCs. The reading is the centre-weighted mean of
+    the zones' *log2* signals, so a lamp or the sun in one zone does not darken the rest. Then, as
+    in the ``normal`` and ``highlight`` constraint modes of the Raspberry Pi's AGC, the brightest
+    2 % of the pixels should be recorded between 0.5 and 0.8 of white at the
+    metered EV: snow is lifted, a lit figure in front of the dark is held.
+    """
+    signal = linear_signal(observations["raw"], camera, GREEN).mean(axis=1)  # (N, h, w)
+    ev = frame_ev100(observations)
+    level = np.log2(np.maximum(_zone_means(signal), BLACK_SIGNAL))
+    weights = _zone_weights()
+    saturated = _zone_means(signal >= WHITE_SIGNAL) @ weights
+    reading = mean_reading(np.exp2(level @ weights), saturated, ev)
+    # Signal of the top pixels if the frame were taken at the metered EV.
+    top = np.quantile(signal.reshape(len(ev), -1), 1.0 - TOP_SHARE, axis=1)
+    top_level = np.log2(np.maximum(top, BLACK_SIGNAL)) + (ev - reading.ev100)
+    # A saturated top is brighter than it says, so it cannot be known to be too dark.
+    too_bright = np.maximum(top_level - np.log2(TOP_AT_MOST), 0.0)
+    too_dark = np.where(top < WHITE_SIGNAL, np.minimum(top_level - np.log2(TOP_AT_LEAST), 0.0), 0.0)
+    correction = np.clip(too_bright + too_dark, -CONSTRAINT_LIMIT_EV, CONSTRAINT_LIMIT_EV)
+    correction += MATRIX_CALIBRATION_EV
+    return Reading(reading.ev100 + correction, reading.saturated, reading.black)
+
+
+def _zone_means(images: NDArray[Any]) -> NDArray[np.float64]:
+    """Means over the zones, ``(N, zones)``, row by row."""
+    for axis in (1, 2):
+        size = images.shape[axis]
+        starts = np.arange(MATRIX_ZONES) * size // MATRIX_ZONES
+        counts = np.diff(np.append(starts, size))
+        shape = (1, -1, 1) if axis == 1 else (1, 1, -1)
+        sums = np.add.reduceat(images, starts, axis=axis, dtype=np.float64)
+        images = sums / counts.reshape(shape)
+    return images.reshape(len(images), -1)
+
+
+def _zone_weights() -> NDArray[np.float64]:
+    """Centre weighting of the zones, summing to 1."""
+    offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
+    profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
+    weights: NDArray[np.float64] = np.outer(profile, profile).ravel()
+    return weights / weights.sum()

@@ -1,0 +1,229 @@
+"""From a metered EV to one state of the grid: the programs P, A, S and M, and the tuned ones."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ae_env.observation import SENSOR_RANGES, decode_sensors
+from agents.episodes import episode_batches, expected_scores, scenes_of
+from agents.metering.ev_tracker import EVTracker
+from agents.metering.meters import make_meter
+from agents.metering.reference_frames import ReferenceFrames
+from agents.metering.state_choice import ProgramOptions, StateChooser, check_program
+from agents.metering.tuned import ScoreRegression
+from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+#: Longest shutter of a hand-held camera that knows nothing of its motion [s]; the rule of thumb
+#: 1 / focal length for a normal lens.
+HANDHELD_LIMIT = 1 / 60
+#: With sensors: blur that programs accept, in frame heights (one pixel of a 64-pixel frame).
+BLUR_LIMIT = 1 / 64
+#: Aperture of programs A and M, aperture that P tends to, and shutter of programs S and M.
+PRIORITY_F_NUMBER, PROGRAM_F_NUMBER, PRIORITY_TIME = 8.0, 5.6, 1 / 125
+#: Meters whose reading is the most exposure that may be given: no state above it is chosen.
+CEILING_METERS = ("highlight_weighted",)
+#: Meters that try other exposures on a frame, and so need one that shows the scene well.
+SEARCH_METERS = ("skewness", "entropy", "shim", "zhang")
+#: Advantage of the last state in a tuned program [score].
+HYSTERESIS_SCORE = 0.002
+#: Episodes (in all, at least one per scene and pass) and frames per episode from which a tuned
+#: program learns; three times as many take 35 s and did not score higher on unseen scenes.
+FIT_EPISODES, FIT_FRAMES = 1600, 4
+#: Episodes of one scene in a pass, at most.
+FIT_PER_SCENE = 4
+#: Distance of the second pass's seeds from the first's: other episodes of the same scenes.
+SECOND_PASS = 1_000_000
+
+
+class MeteringPolicy(Policy):
+    """A light meter and a program that splits its EV between ISO, shutter and aperture.
+
+    Args:
+        context: The camera, the grid and the observation.
+        meter: One of `agents.policy.METERS`, such as ``"average"``.
+        program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
+            and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
+        compensation: Exposure compensation [EV], positive is brighter.
+        damping: Share of the distance to the metered EV that is kept per frame, in [0, 1).
+        shutter_cap: Longest exposure time that may be used [s].
+        f_number: Aperture that A and M keep.
+        exposure_time: Shutter that S and M keep [s].
+        iso: ISO speed that M keeps; None: it follows the meter.
+        weights: File of a tuned program, as `save` writes it.
+
+    Raises:
+        ValueError: If an argument is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        context: PolicyContext,
+        meter: str = "centre_weighted",
+        program: str = "P",
+        *,
+        compensation: float = 0.0,
+        damping: float = 0.0,
+        shutter_cap: float | None = None,
+        f_number: float = PRIORITY_F_NUMBER,
+        exposure_time: float = PRIORITY_TIME,
+        iso: float | None = None,
+        weights: str | os.PathLike[str] | None = None,
+    ) -> None:
+        super().__init__(context)
+        self.program = check_program(program, PROGRAMS)
+        self.options = ProgramOptions(
+            compensation, damping, shutter_cap, f_number, exposure_time, iso
+        )
+        self.meter = make_meter(meter, context.camera)
+        self._meter_name = meter
+        self.name = f"{meter}:{program}"
+        self.uses_sensors = context.has_sensors and program != "tuned_blind"
+        self.regression = None if weights is None else ScoreRegression.load(weights)
+        self._chooser = StateChooser(context.grid, program, self.options)
+        # The nearest state to half a step darker is never brighter than the reading.
+        self._ceiling = 0.5 * self._chooser.step if meter in CEILING_METERS else 0.0
+        self.reset(0)
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forget the past of `num_envs` cameras."""
+        super().reset(num_envs, seed)
+        ev100 = self.context.grid.ev100
+        ev_range = (float(ev100.min()), float(ev100.max()))
+        self._tracker = EVTracker(num_envs, ev_range, self.options.damping)
+        searches = self._meter_name in SEARCH_METERS
+        self._reference = ReferenceFrames(self.context.camera) if searches else None
+        self._sensor_sum = np.zeros((num_envs, 2))
+        self._frames = 0
+        self._previous: NDArray[np.int64] | None = None
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Meter the frames, then choose by the program."""
+        readings = self.observe(observations)
+        if self.program in ("tuned", "tuned_blind"):
+            utility = self._tuned_utility(readings)
+        else:
+            utility = self._program_utility(readings)
+        self._previous = masked_argmax(utility, action_masks)
+        return self._previous.copy()
+
+    def observe(self, observations: Observations) -> NDArray[np.float64]:
+        """Take in one frame; returns metered EV100, log2 speed, log2 defocus, ``(N, 1 or 3)``.
+
+        The sensors are averaged, in stops, over the frames of the episode.
+        """
+        self._frames += 1
+        metered = observations if self._reference is None else self._reference.update(observations)
+        held = np.clip(self._tracker.ev100, *self._tracker.ev_range)  # no farther than can be set
+        ev = self._tracker.update(self.meter(metered, held))
+        if not self.uses_sensors:
+            return ev[:, None]
+        speed, defocus = decode_sensors(observations["sensors"])
+        values = np.stack([np.maximum(speed, 2.0 ** SENSOR_RANGES[0, 0]), defocus], axis=1)
+        self._sensor_sum += np.log2(values)
+        return np.concatenate([ev[:, None], self._sensor_sum / self._frames], axis=1)
+
+    def _program_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Minus the cost of each state, by the program's priorities."""
+        chooser = self._chooser
+        target = readings[:, 0] - self.options.compensation + self._ceiling
+        slow = np.maximum(self._shutter_limit(readings) - chooser.time[None], 0.0)  # stops too slow
+        gain = (chooser.speed - chooser.speed.min())[None]
+        if self.program in ("S", "M"):
+            cost = 0.1 * gain
+        elif self.program == "A":
+            cost = 10.0 * slow + 0.1 * gain
+        else:
+            wide = np.maximum(self._aperture_limit(readings) - chooser.aperture[None], 0.0)
+            line = np.abs(chooser.aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))[None]
+            cost = slow**2 + 0.5 * wide**2 + 0.25 * gain**2 + 0.05 * line**2
+        return chooser.utility(chooser.kept(target, self._previous), cost)
+
+    def _shutter_limit(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Tv of the slowest shutter that keeps motion blur within the limit, ``(N, 1)``."""
+        if not self.uses_sensors:
+            return np.full((len(readings), 1), -np.log2(HANDHELD_LIMIT))
+        limit: NDArray[np.float64] = readings[:, 1:2] - np.log2(BLUR_LIMIT)
+        return limit
+
+    def _aperture_limit(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Av of the widest aperture that keeps defocus within the limit, ``(N, 1)``."""
+        if not self.uses_sensors:
+            return np.full((len(readings), 1), 2.0 * np.log2(PROGRAM_F_NUMBER))
+        # Blur diameter at f-number N is 4 D / N pixels of a 64-pixel frame.
+        limit: NDArray[np.float64] = 2.0 * (2.0 + readings[:, 2:3] - np.log2(64 * BLUR_LIMIT))
+        return limit
+
+    def _tuned_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self.regression is None:
+            raise ValueError(
+                f"policy {self.name!r} learns from scenes first: call fit(envs), or give `weights`"
+            )
+        if self.regression.features.shape[1] != readings.shape[1]:
+            raise ValueError(
+                f"policy {self.name!r} was fitted on {self.regression.features.shape[1]} readings "
+                f"but sees {readings.shape[1]}: the environments must agree on `sensors`"
+            )
+        compensated = readings - np.eye(1, readings.shape[1]) * self.options.compensation
+        scores = self.regression.predict(compensated) - 10.0 * self._chooser.over_cap
+        if self._previous is not None:
+            scores[np.arange(len(scores)), self._previous] += HYSTERESIS_SCORE
+        return scores
+
+    def fit(self, envs: gym.vector.VectorEnv, seed: int = 0) -> None:
+        """Tune on the scenes of `envs` (tuned programs only; the others have nothing to learn).
+
+        Episodes run twice: led by program P, then by what was learnt from those, so that the
+        readings are those of the frames that the tuned program itself brings about.
+
+        Args:
+            envs: Training environments; their episodes must not end within 4 frames.
+            seed: Decides the episodes.
+        """
+        if self.program not in ("tuned", "tuned_blind"):
+            return
+        tuned, self.program = self.program, "P"
+        per_scene = FIT_EPISODES // (2 * len(scenes_of(envs)))
+        per_scene = min(max(per_scene, 1), FIT_PER_SCENE)
+        first = self._gather(envs, seed, per_scene)
+        self.program = tuned
+        self.regression = ScoreRegression.fit(*first)
+        second = self._gather(envs, seed + SECOND_PASS, per_scene)
+        both: Any = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
+        self.regression = ScoreRegression.fit(*both)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a tuned program; ``weights=path`` restores it.
+
+        Raises:
+            ValueError: If there is none yet.
+        """
+        if self.regression is None:
+            raise ValueError(f"policy {self.name!r} has nothing to save before fit(envs)")
+        self.regression.save(path)
+
+    def _gather(
+        self, envs: gym.vector.VectorEnv, seed: int, episodes: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+        """Readings after the meter has settled, scores of all states, source groups."""
+        features, scores, groups = [], [], []
+        for batch in episode_batches(envs, episodes_per_scene=episodes, seed=seed):
+            self.reset(envs.num_envs)
+            observations, masks = batch.observations, batch.action_masks
+            for _ in range(FIT_FRAMES - 1):
+                actions = self.act(observations, masks)
+                observations = envs.step(actions)[0]
+            readings = self.observe(observations)
+            features.append(readings[batch.valid])
+            scores.append(expected_scores(envs)[batch.valid])
+            groups.append(batch.groups[batch.valid])
+        self.reset(0)
+        return np.concatenate(features), np.concatenate(scores), np.concatenate(groups)

@@ -1,0 +1,323 @@
+"""A camera's own AGC: a model of libcamera's for the Raspberry Pi.
+
+Written from its published behaviour ("Raspberry Pi Camera Algorithm and Tuning Guide", libcamera
+and its tuning of the imx477); `agents.metering.rpi_agc_tuning` has the numbers.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ae_env.checks import check_integer, check_number, check_word
+from agents.metering import rpi_agc_tuning as tuning
+from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
+from agents.metering.state_choice import ProgramOptions, StateChooser, check_program
+from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+
+Floats = NDArray[np.float64]
+
+#: Least signal by which a target is divided.
+_LEAST_SIGNAL = 1e-3
+#: How near to whole periods a flicker-free exposure time is, as a part of it.
+_PERIOD_TOLERANCE = 0.02
+#: Advantage of the last state; the square of a stop counts 1.
+_STAYS = 0.1
+#: Cost of a state whose shutter lets lamps flicker; the EV counts 1000 per stop.
+_FLICKERS = 1e5
+
+
+class RpiAgc(Policy):
+    """The Raspberry Pi's AGC on the states of a grid.
+
+    Each frame: the mean of 15 weighted zones gives a gain, which the constraints on the brightest
+    or darkest pixels may change; the gain and the exposure *of that frame* give the target; a
+    filter moves a continuous exposure towards it; the ladder of the exposure mode splits that into
+    shutter and gain; the nearest state of the grid is taken.
+
+    Args:
+        context: The camera, the grid and the observation.
+        program: ``"P"``: the ladder, at an aperture of `f_number`; ``"A"``: the same, and no other
+            aperture; ``"S"``: shutter by hand, the gain follows; ``"M"``: aperture and shutter by
+            hand.
+        metering: ``"centre_weighted"``, ``"spot"`` or ``"matrix"``: weights of the zones.
+        mode: ``"normal"``, ``"short"`` or ``"long"``: the ladder.
+        constraint: ``"normal"``, ``"highlight"`` or ``"shadows"``.
+        compensation: Exposure compensation [EV], positive is brighter.
+        damping: Share of the distance to the filtered EV that is kept per frame besides, in [0, 1).
+        shutter_cap: Longest exposure time that may be used [s].
+        f_number: Aperture of the lens.
+        exposure_time: Shutter that S and M keep [s].
+        iso: ISO speed that M keeps; None: it follows the meter.
+        max_gain: Gain at the end of the ladder, 1 at ISO 100.
+        flicker_period: Period of the lamps' light [s], such as 0.01: shutters of a period and more
+            are whole periods, and the gain makes up for it. None: lamps are steady.
+        speed: Share of the distance to the target that the filter goes per frame, in (0, 1].
+        startup_frames: Frames of an episode in which it goes all of the way.
+
+    Raises:
+        ValueError: If an argument is unknown or out of range.
+    """
+
+    def __init__(
+        self,
+        context: PolicyContext,
+        program: str = "P",
+        *,
+        metering: str = "centre_weighted",
+        mode: str = "normal",
+        constraint: str = "normal",
+        compensation: float = 0.0,
+        damping: float = 0.0,
+        shutter_cap: float | None = None,
+        f_number: float = 5.6,
+        exposure_time: float = 1 / 125,
+        iso: float | None = None,
+        max_gain: float = 16.0,
+        flicker_period: float | None = None,
+        speed: float = tuning.SPEED,
+        startup_frames: int = tuning.STARTUP_FRAMES,
+    ) -> None:
+        super().__init__(context)
+        self.program = check_program(program)
+        check_word("metering", metering, tuple(tuning.ZONE_WEIGHTS))
+        check_word("mode", mode, tuple(tuning.LADDERS))
+        check_word("constraint", constraint, tuple(tuning.CONSTRAINTS))
+        self.options = ProgramOptions(
+            compensation, damping, shutter_cap, f_number, exposure_time, iso
+        )
+        self.speed = check_number("speed", speed, 1e-3, 1.0)
+        self.startup_frames = check_integer("startup_frames", startup_frames, 0)
+        max_gain = check_number("max_gain", max_gain, 1.0, 1e5)
+        if flicker_period is not None:
+            flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
+        self.flicker_period = flicker_period
+        self.name = f"rpi_agc:{program}"
+        self._weights = np.array(tuning.ZONE_WEIGHTS[metering], np.float64)
+        self._constraints = tuning.CONSTRAINTS[constraint]
+        ladder = tuning.LADDERS[mode]
+        gains = (*ladder.gain[:-1], max(max_gain, 1.0))
+        self._ladder = tuning.Ladder(ladder.shutter, tuple(min(g, max_gain) for g in gains))
+        self._chooser = StateChooser(context.grid, program, self.options)
+        self.reset(0)
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Begin the start-up frames of `num_envs` cameras."""
+        super().reset(num_envs, seed)
+        self._filter = ExposureFilter(num_envs, self.speed, self.startup_frames)
+        self._damped = np.full(num_envs, np.nan)
+        self._previous: NDArray[np.int64] | None = None
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Meter the frames, filter the exposure, split it."""
+        gain, target_signal = self._gain(observations)
+        # Exposures are relative to that of EV100 0.
+        target = np.exp2(-frame_ev100(observations)) * gain
+        filtered = self._filter.update(np.minimum(target, self._most_exposure()))
+        reduce = (target_signal > tuning.FAST_REDUCE) & (gain < np.sqrt(target_signal))
+        ev = -np.log2(filtered * np.where(reduce, tuning.FAST_REDUCE, 1.0))
+        kept = self.options.damping * (self._damped - ev)
+        self._damped = ev + np.where(np.isnan(kept), 0.0, kept)
+        self._previous = masked_argmax(self._utility(self._damped), action_masks)
+        return self._previous.copy()
+
+    def _gain(self, observations: Observations) -> tuple[Floats, Floats]:
+        """Factor by which the exposure of the frames must change, and the signal it aims at."""
+        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
+        signal = np.maximum(signal, 0.0)
+        zones = _zone_matrix(*signal.shape[1:]) @ signal.reshape(len(signal), -1).T  # (15, N)
+        brightness = self._weights @ zones / self._weights.sum()
+        light = frame_ev100(observations) + np.log2(
+            np.maximum(brightness, _LEAST_SIGNAL) / TARGET_SIGNAL
+        )
+        lux = 2.5 * np.exp2(light)
+        wanted = self._compensated(np.interp(lux, tuning.TARGET_LUX, tuning.TARGET_SIGNALS))
+        gain = zone_gain(zones, self._weights, wanted)
+        pixels = signal.reshape(len(signal), -1)
+        for constraint in self._constraints:
+            bound = self._compensated(np.full(len(gain), constraint.target))
+            mean = quantile_mean(pixels, *constraint.quantiles)
+            other = bound / np.maximum(mean, _LEAST_SIGNAL)
+            adopted = other > gain if constraint.lower else other < gain
+            gain, wanted = np.where(adopted, other, gain), np.where(adopted, bound, wanted)
+        return gain, wanted
+
+    def _compensated(self, signal: Floats) -> Floats:
+        return np.minimum(signal * 2.0**self.options.compensation, tuning.TARGET_LIMIT)
+
+    def _most_exposure(self) -> float:
+        """The most that the ladder allows, relative to EV100 0."""
+        times, gains = self._ladder.shutter, self._ladder.gain
+        time = self.options.exposure_time if self.program in ("S", "M") else times[-1]
+        gain = gains[-1] if self.options.iso is None else self.options.iso / 100.0
+        return float(self._limited(time) * gain / self.options.f_number**2)
+
+    def _limited(self, time: float) -> float:
+        cap = self.options.shutter_cap
+        return time if cap is None else min(time, cap)
+
+    def split(self, exposure: Floats) -> tuple[Floats, Floats]:
+        """Shutter [s] and gain for exposures `time * gain` [s], ``(N,)`` each, by the ladder.
+
+        A rung at a time: the shutter goes up to its next value, then the gain. With a flicker
+        period, a shutter of a period or more is floored to whole periods.
+        """
+        by_hand = self.program in ("S", "M")
+        first = self.options.exposure_time if by_hand else self._ladder.shutter[0]
+        time = np.full_like(exposure, self._limited(first))
+        gain = np.full_like(exposure, self._ladder.gain[0])
+        for shutter_rung, gain_rung in zip(
+            self._ladder.shutter[1:], self._ladder.gain[1:], strict=True
+        ):
+            if not by_hand:
+                wanted = np.minimum(exposure / gain, self._limited(shutter_rung))
+                time = np.maximum(time, wanted)
+            gain = np.maximum(gain, np.minimum(exposure / time, gain_rung))
+        if self.flicker_period is not None and not by_hand:
+            periods = np.floor(time / self.flicker_period + 1e-9)
+            whole = np.where(periods > 0, periods * self.flicker_period, time)
+            time, gain = whole, gain * time / whole
+        return time, gain
+
+    def _utility(self, ev: Floats) -> Floats:
+        """How well each state fits the exposures and the ladder, ``(N, S)``."""
+        chooser = self._chooser
+        target = chooser.kept(ev, self._previous)
+        time, gain = self.split(self.options.f_number**2 * np.exp2(-target))
+        aperture = chooser.aperture - 2.0 * np.log2(self.options.f_number)
+        slower = np.log2(time)[:, None] + chooser.time[None]  # stops shorter than the ladder's
+        higher = chooser.speed[None] - 5.0 - np.log2(gain)[:, None]
+        cost = slower**2 + 0.25 * higher**2 + 4.0 * (aperture**2)[None]
+        if self._previous is not None:  # of nominally equal exposures the last one stays
+            cost[np.arange(len(cost)), self._previous] -= _STAYS
+        return chooser.utility(target, cost) - _FLICKERS * self._flickers(time)
+
+    def _flickers(self, time: Floats) -> Any:
+        """1.0 where a state's shutter is not of whole periods but the ladder's is, ``(N, S)``."""
+        if self.flicker_period is None or self.program in ("S", "M"):
+            return 0.0
+        periods = np.exp2(-self._chooser.time) / self.flicker_period
+        whole = (np.abs(periods - np.round(periods)) <= _PERIOD_TOLERANCE * periods) & (
+            periods > 0.5
+        )
+        return ((time >= self.flicker_period)[:, None] & ~whole[None]).astype(np.float64)
+
+
+class ExposureFilter:
+    """The AGC's filter: a continuous exposure that goes a part of the way at every frame.
+
+    Args:
+        num_envs: Cameras.
+        speed: Part of the (linear) distance that it goes; the square root of it within 20 % of the
+            target, nothing within 2 %.
+        startup_frames: Frames at first in which it goes all of the way.
+
+    >>> follow = ExposureFilter(1, startup_frames=0)
+    >>> [round(float(follow.update(np.array([x]))[0]), 3) for x in (1.0, 16.0, 16.0)]
+    [1.0, 4.0, 6.4]
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        speed: float = tuning.SPEED,
+        startup_frames: int = tuning.STARTUP_FRAMES,
+    ) -> None:
+        self.exposure = np.full(num_envs, np.nan)
+        self.speed, self.startup_frames = speed, startup_frames
+        self._frames = 0
+
+    def update(self, target: Floats) -> Floats:
+        """Take in the target of a frame, ``(N,)``; returns the exposures."""
+        self._frames += 1
+        old = self.exposure
+        if self._frames <= self.startup_frames:
+            new = target.copy()
+        else:
+            near = (old < (1.0 + tuning.NEAR) * target) & (old > (1.0 - tuning.NEAR) * target)
+            speed = np.where(near, np.sqrt(self.speed), self.speed)
+            new = speed * target + (1.0 - speed) * old
+            stable = (old * (1.0 - tuning.STABLE) < target) & (old * (1.0 + tuning.STABLE) > target)
+            new = np.where(np.isnan(old), target, np.where(stable, old, new))
+        self.exposure = new
+        return new.copy()
+
+
+def zone_gain(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
+    """Gain that brings the weighted mean of the zones to `wanted`, ``(N,)``.
+
+    A zone that saturates gives no more, so the gain is raised in several passes.
+
+    Args:
+        zones: Mean signal of each zone, ``(15, N)``.
+        weights: ``(15,)``.
+        wanted: ``(N,)``.
+    """
+    gain = np.ones(zones.shape[1])
+    done = np.zeros(zones.shape[1], bool)
+    for _ in range(tuning.GAIN_PASSES):
+        mean = weights @ np.minimum(zones * gain, 1.0) / weights.sum()
+        extra = np.minimum(tuning.GAIN_LIMIT, wanted / (mean + _LEAST_SIGNAL))
+        gain = np.where(done, gain, gain * extra)
+        done |= extra < tuning.GAIN_DONE
+        if done.all():
+            break
+    return gain
+
+
+def quantile_mean(values: NDArray[Any], low: float, high: float) -> Floats:
+    """Mean of the values between two quantiles, ``(N,)``.
+
+    Args:
+        values: ``(N, P)``.
+        low: Lower quantile.
+        high: Upper quantile; at least one value is averaged.
+    """
+    count = values.shape[1]
+    begin = min(int(np.ceil(low * count - 1e-9)), count - 1)
+    end = max(int(np.floor(high * count + 1e-9)), begin + 1)
+    ordered = np.partition(values, (begin, end - 1), axis=1)
+    return ordered[:, begin:end].mean(axis=1, dtype=np.float64)
+
+
+def zone_map(height: int, width: int) -> NDArray[np.int64]:
+    """Zone of each pixel, ``(height, width)``, 0 to 14.
+
+    The tuning names the zones by their order only, centre first; they are laid out so::
+
+        11 |     7     | 12
+        ---+-----------+---
+           |     3     |
+         9 | 5 1 0 2 6 | 10
+           |     4     |
+        ---+-----------+---
+        13 |     8     | 14
+
+    The outer zones are a sixth of the frame wide and high.
+    """
+    y, x = np.mgrid[:height, :width]
+    row, column = (y + 0.5) / height, (x + 0.5) / width
+    top, bottom, left, right = row < 1 / 6, row >= 5 / 6, column < 1 / 6, column >= 5 / 6
+    inner = np.minimum((column - 1 / 6) * 7.5, 4.0).astype(np.int64)  # 0 to 4 across
+    zones = np.array([5, 1, 0, 2, 6])[np.clip(inner, 0, 4)]
+    third = (row - 1 / 6) * 4.5
+    zones = np.where(third < 1, 3, np.where(third >= 2, 4, zones))
+    for zone, where in ((7, top), (8, bottom), (9, left), (10, right)):
+        zones = np.where(where, zone, zones)
+    corners = ((11, top & left), (12, top & right), (13, bottom & left), (14, bottom & right))
+    for zone, where in corners:
+        zones = np.where(where, zone, zones)
+    return zones.astype(np.int64)
+
+
+@functools.lru_cache(maxsize=8)
+def _zone_matrix(height: int, width: int) -> Floats:
+    """Weights of the pixels in the mean of each zone, ``(15, height * width)``."""
+    zones = zone_map(height, width).ravel()
+    matrix = (zones[None] == np.arange(15)[:, None]).astype(np.float64)
+    return matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1.0)

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from agents.evaluation import ae_bench
+from agents.evaluation.plan import EvaluationPlan
+from agents.evaluation.plan_episodes import plan_scenes
+from agents.evaluation.plan_jobs import run_plan
+from agents.report.tables import overall_ranking
+
+PLAN = EvaluationPlan(
+    name="Bench",
+    environment={"scenes": "bundled:small", "split": "test", "resolution": 36},
+    max_scenes=16,
+    frames=3,
+    starts=("middle",),
+    policies=("random", "matrix:P"),
+)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return plan_scenes(PLAN)
+
+
+@pytest.fixture(scope="module")
+def plan(scenes) -> EvaluationPlan:
+    return PLAN.changed(hash=ae_bench.bench_hash(PLAN, scenes))
+
+
+def test_hash_notices_the_plan_and_the_light(plan, scenes):
+    ae_bench.check_hash(plan, scenes)
+    ae_bench.check_hash(PLAN, scenes[:1])  # no benchmark, nothing to check
+    with pytest.raises(ValueError, match="has changed, so results would not"):
+        ae_bench.check_hash(plan.changed(frames=4), scenes)
+    brighter = [replace(scenes[0], light=scenes[0].light * 1.15), *scenes[1:]]  # 0.2 EV
+    with pytest.raises(ValueError, match="has changed"):
+        ae_bench.check_hash(plan, brighter)
+    light = scenes[0].light.clone()
+    light[:, :9, :9] *= 2.0
+    with pytest.raises(ValueError, match="has changed"):
+        ae_bench.check_hash(plan, [replace(scenes[0], light=light), *scenes[1:]])
+    ae_bench.check_hash(plan.changed(policies=("spot:P",)), scenes)  # who runs is no matter
+
+
+def test_hash_does_not_notice_the_last_bit(plan, scenes):
+    up = torch.tensor(float("inf"))
+    nudged = [replace(s, light=torch.nextafter(s.light, up)) for s in scenes]
+    ae_bench.check_hash(plan, nudged)
+
+
+def test_signature_of_known_light(scenes):
+    scene = scenes[0]
+    light = torch.full((4, 36, 36), 0.25)
+    light[:, :9, :9] = 1.0  # the first of 4 x 4 blocks
+    found = ae_bench.scene_signature(replace(scene, light=light))
+    codes = np.array(found[-1])
+    assert codes.shape == (4, 4, 4)
+    assert (codes[:, 0, 0] - codes[:, 3, 3] == 20).all()  # two stops in tenths
+
+
+def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path):
+    results = run_plan(plan, tmp_path / "parts")
+    ranking = overall_ranking(results, resamples=200)
+    table = tmp_path / "docs" / "ae-bench" / "v1.csv"
+    files = ae_bench.append_results(table, plan, results, ranking, author="first")
+    assert sorted(files) == ["ae-bench.md", "v1.csv"]
+    again = [one for one in ranking if one.policy == "random"]
+    ae_bench.append_results(table, plan, results, again, author="second")
+    with table.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(r["policy"], r["author"]) for r in rows] == [
+        ("matrix:P", "first"),
+        ("random", "second"),
+    ]
+    assert tuple(rows[0]) == ae_bench.COLUMNS
+    assert {row["hash"] for row in rows} == {plan.hash}
+    assert float(rows[0]["normalised_score"]) == pytest.approx(ranking[0].score.value, abs=5e-5)
+    page = (tmp_path / "docs" / "ae-bench.md").read_text()
+    assert "| `matrix:P` |" in page
+    assert page.index("matrix:P") < page.index("`random`")
+    assert str(tmp_path) not in page
+    with pytest.raises(ValueError, match="they do not compare"):
+        ae_bench.append_results(table, plan.changed(hash="0"), results, ranking, author="x")
+    table.write_text("policy,score\n")
+    with pytest.raises(ValueError, match="its columns must be"):
+        ae_bench.read_table(table)

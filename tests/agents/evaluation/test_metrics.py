@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from agents.evaluation import metrics
+from agents.evaluation.result_table import weighted_quantile
+
+EV = np.array([4.0, 4.05, 5.0, 6.0, 8.0])
+# One episode, two frames, five states.
+Q = np.array([[[0.2, 0.6, 0.895, 0.9, 0.1], [0.2, 0.6, 0.8, 0.9, 0.1]]])
+ALL = np.ones((1, 1, 5), bool)
+
+
+def test_scores_of_chosen_oracle_and_random():
+    states = np.array([[1, 3]])
+    np.testing.assert_allclose(metrics.score_of(Q, states), [[0.6, 0.9]])
+    np.testing.assert_allclose(metrics.oracle_score(Q, ALL), [[0.9, 0.9]])
+    np.testing.assert_allclose(metrics.random_score(Q, ALL), [[0.539, 0.52]])
+    some = np.array([True, True, False, False, True])
+    np.testing.assert_allclose(metrics.oracle_score(Q, some), [[0.6, 0.6]])
+    np.testing.assert_allclose(metrics.random_score(Q, some), [[0.3, 0.3]])
+
+
+def test_training_seeds_broadcast_against_the_same_scores():
+    states = np.array([[[1, 3]], [[0, 0]]])  # (K=2, E=1, T=2)
+    np.testing.assert_allclose(metrics.score_of(Q, states), [[[0.6, 0.9]], [[0.2, 0.2]]])
+
+
+def test_regret_given_ev_looks_at_the_same_exposure_only():
+    # State 0 shares its EV with state 1 (0.05 EV apart), the others stand alone.
+    states = np.array([[0, 2]])
+    np.testing.assert_allclose(metrics.regret_given_ev(Q, states, EV, ALL), [[0.4, 0.0]])
+    masked = np.array([True, False, True, True, True])
+    np.testing.assert_allclose(metrics.regret_given_ev(Q, states, EV, masked), [[0.0, 0.0]])
+
+
+def test_ev_error_is_to_the_nearest_state_that_is_good_enough():
+    # Good in frame 0: states 2 and 3 (within 0.01 of 0.9); in frame 1 only state 3.
+    errors = metrics.ev_error(Q, np.array([[4, 4]]), EV, ALL)
+    np.testing.assert_allclose(errors, [[2.0, 2.0]])
+    errors = metrics.ev_error(Q, np.array([[0, 0]]), EV, ALL)
+    np.testing.assert_allclose(errors, [[1.0, 2.0]])
+    assert metrics.ev_error(Q, np.array([[3, 3]]), EV, ALL).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("errors", "frames", "converged"),
+    [
+        ([0, 0, 0, 0], 1, True),
+        ([1, 0.3, 0, 1 / 3], 2, True),
+        ([0, 0, 1, 0], 4, True),
+        ([0, 0, 0, 1], 4, False),
+        ([1, 1, 1, 1], 4, False),
+    ],
+)
+def test_frames_to_converge(errors, frames, converged):
+    found = metrics.frames_to_converge(np.array(errors, float))
+    assert (int(found[0]), bool(found[1])) == (frames, converged)
+
+
+@pytest.mark.parametrize(
+    ("evs", "over", "turns"),
+    [
+        ([0, 4, 4, 4], 0.0, 0),
+        ([0, 6, 4, 4], 2.0, 1),
+        ([9, 2, 5, 4], 2.0, 2),
+        ([4, 5, 3, 4], 1.0, 2),  # ends where it began: largest excursion
+        ([0, 3, 3.1, 3], 0.1, 0),  # the same exposure split otherwise
+        ([4, 4, 4, 4], 0.0, 0),
+    ],
+)
+def test_overshoot_and_reversals(evs, over, turns):
+    evs = np.array([evs], float)
+    np.testing.assert_allclose(metrics.overshoot(evs), [over], atol=1e-12)
+    assert metrics.reversals(evs).tolist() == [turns]
+
+
+def test_convergence_after_a_step_counts_from_the_step():
+    # The light steps in frame 4 (index 3), which is the first that shows it: the answer to it is
+    # frame 5. It is right for good from frame 7 on: the third frame that knows.
+    light = np.array([[0, 0, 0, 1, 1, 1, 1, 1, 1, 1]], float)[..., None]
+    errors = np.array([[2, 0, 0, 4, 2, 1, 0, 0, 0, 0]], float)
+    since = metrics.settling(light)
+    assert since.tolist() == [4]
+    frames, converged = metrics.frames_to_converge(errors, since=since)
+    assert (frames.tolist(), converged.tolist()) == ([3], [True])
+    at_once = np.where(np.arange(10) == 3, 4.0, 0.0)[None]
+    assert metrics.frames_to_converge(at_once, since=since)[0].tolist() == [1]
+    # Never: as many frames as there are after the step, not T.
+    frames, converged = metrics.frames_to_converge(np.ones((1, 10)), since=since)
+    assert (frames.tolist(), converged.tolist()) == ([6], [False])
+
+
+@pytest.mark.parametrize(
+    ("light", "since"),
+    [
+        ([1, 1, 1, 1, 1, 1], 0),  # static: from the reset frame on
+        ([1, 2, 3, 3, 3, 3, 3], 3),  # a ramp that ends
+        ([1, 0, 0, 1, 1, 1, 1, 1], 4),  # a lens cap: from its removal
+        ([1, 2, 1, 2, 1, 2, 1, 2], 0),  # never at rest
+        ([1, 1, 1, 1, 1, 2, 2, 2], 0),  # too short to wait for
+    ],
+)
+def test_settling_is_the_frame_after_the_last_change(light, since):
+    scores = np.array(light, float)[None, :, None] * np.array([0.1, 0.2])
+    assert metrics.settling(scores).tolist() == [since]
+
+
+def test_overshoot_after_a_step_is_that_of_the_answer_to_it():
+    # 9 -> 5 before the step; then 5 -> 8 by way of 10: two beyond. Counted from the start, the
+    # way down from 9 would make it 2 in the other direction: 8 - 5 = 3.
+    evs = np.array([[9.0, 5.0, 5.0, 5.0, 10.0, 8.0]])
+    assert metrics.overshoot(evs, since=np.array([3])).tolist() == [2.0]
+    assert metrics.overshoot(evs).tolist() == [3.0]
+
+
+def test_ev_error_percentiles_and_share_of_a_known_trajectory():
+    # Only the state at 6 EV is good; the trajectory is 4, 2, 1, 1/3, 0 ... EV away from it.
+    ev100 = np.array([2.0, 4.0, 5.0, 6.0, 17.0 / 3.0])
+    scores = np.array([0.1, 0.2, 0.3, 0.9, 0.4])
+    states = np.array([[0, 1, 2, 4, 3, 3, 3, 3, 3, 3]])
+    allowed = np.ones(5, bool)
+    errors = metrics.ev_error(np.broadcast_to(scores, (1, 10, 5)), states, ev100, allowed)
+    np.testing.assert_allclose(errors, [[4, 2, 1, 1 / 3, 0, 0, 0, 0, 0, 0]], atol=1e-12)
+    weights = np.full(errors.shape, 0.1)
+    assert weighted_quantile(errors, weights, 0.95) == 4.0  # the tenth of ten values
+    assert weighted_quantile(errors, weights, 0.9) == 2.0
+    assert weighted_quantile(errors, weights, 0.5) == 0.0
+    assert (errors <= metrics.THIRD_EV).mean() == pytest.approx(0.7)
+
+
+def test_regret_delayed_subtracts_what_the_delay_alone_costs():
+    # Best states 0, 1, 1, 1 with q 1, others 0; start state 1; delay 1: the delayed oracle shows 1
+    # (the start), 0, 1, 1 and scores 0, 0, 1, 1; a policy stuck at 1 scores 0, 1, 1, 1.
+    scores = np.zeros((1, 4, 2))
+    for frame, best in enumerate((0, 1, 1, 1)):
+        scores[0, frame, best] = 1.0
+    oracle = metrics.delayed_oracle_score(scores, np.ones((1, 2), bool), np.array([1]), 1)
+    stuck = metrics.score_of(scores, np.ones((1, 4), np.int64))
+    assert oracle.tolist() == [[0.0, 0.0, 1.0, 1.0]]
+    assert float((oracle - stuck).mean()) == pytest.approx(-0.25)
+    assert float((metrics.oracle_score(scores, np.ones(2, bool)) - stuck).mean()) == 0.25
+
+
+def test_flicker_counts_frames_of_the_same_light_only():
+    means = np.array([[0.1, 0.2, 0.2, 0.5], [0.0, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(metrics.flicker(means, np.array([True])), [0.4 / 3, 0.0])
+    static = np.array([[True, True, False], [False, False, False]])
+    np.testing.assert_allclose(metrics.flicker(means, static), [0.05, 0.0])
+
+
+def test_delayed_oracle_acts_on_what_it_saw_earlier():
+    scores = np.zeros((1, 4, 3))
+    for frame, best in enumerate((0, 1, 2, 2)):
+        scores[0, frame, best] = 1.0
+    allowed = np.ones((1, 3), bool)
+    start = np.array([2])
+    for delay, expected in ((0, [1, 1, 1, 1]), (1, [0, 0, 0, 1]), (9, [0, 0, 1, 1])):
+        found = metrics.delayed_oracle_score(scores, allowed, start, delay)
+        np.testing.assert_array_equal(found, [expected])
+
+
+def test_normalised_score_at_its_ends_and_weighting():
+    random, oracle = np.array([0.2, 0.4]), np.array([0.6, 1.0])
+    assert metrics.normalised_score(random, random, oracle) == 0.0
+    assert metrics.normalised_score(oracle, random, oracle) == pytest.approx(1.0)
+    half = np.array([0.6, 0.4])  # all of the first group's 0.4, none of the second's 0.6
+    assert metrics.normalised_score(half, random, oracle) == pytest.approx(0.4)
+
+
+def test_group_means_weigh_episodes_within_a_group():
+    values = np.array([[1.0, 3.0, 10.0], [0.0, 0.0, 1.0]])
+    means, names = metrics.group_means(values, np.array(["b", "b", "a"]))
+    assert names.tolist() == ["a", "b"]
+    np.testing.assert_allclose(means, [[10.0, 2.0], [1.0, 0.0]])

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agents.metering.gradient_meters import GAMMAS, _best_gamma
+from agents.metering.meters import make_meter
+
+
+def _texture(seed=0):
+    rng = np.random.default_rng(seed)
+    return np.kron(rng.uniform(0.3, 1.7, (16, 16)), np.ones((4, 4)))
+
+
+@pytest.mark.parametrize("name", ["shim", "zhang"])
+def test_dark_frames_ask_for_more_light_and_bright_ones_for_less(context, photograph, name):
+    meter = make_meter(name, context.camera)
+    for state_ev, wanted in ((13.0, -1), (4.0, 1)):
+        state = context.grid.nearest(state_ev)
+        reading = meter(photograph(_texture(), 9.0, state))
+        step = reading.ev100[0] - context.grid.ev100[state]
+        assert np.sign(step) == wanted
+        assert 0.5 < abs(step) < 4.1
+
+
+@pytest.mark.parametrize("name", ["shim", "zhang"])
+def test_steps_go_on_from_the_estimate_and_not_from_the_state(context, photograph, name):
+    """The same frame, a controller that is further on: the step is taken from there."""
+    meter = make_meter(name, context.camera)
+    frame = photograph(_texture(), 9.0, context.grid.nearest(12.0))
+    path = [12.0]
+    for _ in range(40):
+        path.append(meter(frame, np.array([path[-1]])).ev100[0])
+    steps = np.abs(np.diff(path))
+    assert abs(path[-1] - path[-2]) < 0.02  # comes to rest though the frame stays
+    assert path[-1] < 10.5
+    assert steps[0] > 0.3
+
+
+def test_zhang_rests_where_the_metric_is_highest(context, photograph):
+    from ae_env.scorers.detail import zhang_gradient
+    from agents.metering.histogram_meters import encoded
+
+    torch = pytest.importorskip("torch")
+    light = _texture(3)
+    meter = make_meter("zhang", context.camera)
+    frame = photograph(light, 9.0, context.grid.nearest(10.0))
+    estimate = np.array([10.0])
+    for _ in range(60):
+        estimate = 0.5 * (estimate + meter(frame, estimate).ev100)
+    evs = np.arange(4.0, 12.0, 0.05)
+    pictures = [encoded(np.clip(0.12 * light * 2.0 ** (9.0 - ev), 0, 1)) for ev in evs]
+    metric = zhang_gradient(torch.tensor(np.array(pictures), dtype=torch.float32)).numpy()
+    reached = np.interp(estimate[0], evs, metric)
+    assert reached > 0.97 * metric.max()
+
+
+def test_frames_without_gradient_ask_for_nothing_or_for_their_bound(context, photograph):
+    for name in ("shim", "zhang"):
+        meter = make_meter(name, context.camera)
+        grey = context.grid.nearest(9.0)
+        card = meter(photograph(np.ones((64, 64)), 9.0, grey))
+        assert card.ev100[0] == pytest.approx(context.grid.ev100[grey])
+        bright = context.grid.nearest(0.0)
+        white = meter(photograph(np.ones((64, 64)), 12.0, bright))
+        assert white.ev100[0] == pytest.approx(context.grid.ev100[bright] + 4.0 * 0.9)
+        dark = context.grid.nearest(17.0)
+        black = meter(photograph(np.ones((64, 64)), -1.0, dark))
+        assert black.black[0]
+        expected = context.grid.ev100[dark] + math.log2(2e-4 / 0.12)
+        assert black.ev100[0] == pytest.approx(expected)
+
+
+def test_best_gamma_is_the_top_of_the_parabola():
+    gammas = np.array(GAMMAS)
+    metric = np.stack([1.0 - (gammas - 1.05) ** 2, gammas, 3.0 - gammas, np.zeros(7)])
+    np.testing.assert_allclose(_best_gamma(metric), [1.05, 1.9, 0.1, 1.0], atol=1e-9)

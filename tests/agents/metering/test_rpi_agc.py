@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from ae_env.grid import ExposureGrid
+from agents.metering.rpi_agc import ExposureFilter, quantile_mean, zone_gain, zone_map
+from agents.metering.rpi_agc_tuning import ZONE_WEIGHTS
+from agents.policy import make_policy
+
+GREY = np.ones((64, 64))
+
+
+@pytest.mark.parametrize(("stops", "frames"), [(-4.0, 11), (4.0, 24), (6.0, 30)])
+def test_filter_needs_the_published_frames(stops, frames):
+    """Light that changes by `stops`: frames until the exposure is within 2 % of its target."""
+    follow = ExposureFilter(1)
+    for _ in range(12):
+        follow.update(np.array([1.0]))
+    target = 2.0**-stops
+    errors = [abs(follow.update(np.array([target]))[0] / target - 1.0) for _ in range(60)]
+    assert next(i for i, error in enumerate(errors, 1) if error < 0.02) == frames
+
+
+def test_filter_goes_all_of_the_way_at_the_start_and_keeps_what_is_near():
+    follow = ExposureFilter(2, startup_frames=3)
+    for target in (1.0, 16.0, 0.25):
+        assert follow.update(np.array([target, target])).tolist() == [target, target]
+    assert follow.update(np.array([0.254, 0.246])).tolist() == [0.25, 0.25]  # within 2 %
+    near, far = follow.update(np.array([0.275, 1.25]))
+    assert near == pytest.approx(0.25 + math.sqrt(0.2) * 0.025)  # within 20 %
+    assert far == pytest.approx(0.25 + 0.2 * 1.0)
+
+
+def test_zones_cover_the_frame_with_the_first_in_the_middle():
+    zones = zone_map(60, 90)
+    assert np.unique(zones).tolist() == list(range(15))
+    assert zones[30, 45] == 0
+    assert (zones == zones[::-1, ::-1]).mean() < 1.0  # sides have names of their own
+    counts = np.bincount(zones.ravel())
+    assert counts[11:].tolist() == [10 * 15] * 4  # a sixth by a sixth
+    assert {int(zones[30, x]) for x in range(90)} == {9, 5, 1, 0, 2, 6, 10}
+    assert {len(w) for w in ZONE_WEIGHTS.values()} == {15}
+
+
+def test_gain_is_raised_for_zones_that_saturate():
+    weights = np.ones(15)
+    plain = zone_gain(np.full((15, 1), 0.04), weights, np.array([0.16]))
+    assert plain[0] == pytest.approx(0.16 / 0.04, rel=0.02)
+    zones = np.full((15, 1), 0.01)
+    zones[0] = 1.0  # a lamp: it stays at white whatever the gain
+    gain = zone_gain(zones, weights, np.array([0.16]))[0]
+    # (1 + 14 * 0.01 g) / 15 = 0.16 where g = 10; a share of white in the target is not reached.
+    assert gain == pytest.approx(10.0, rel=0.08)
+
+
+def test_quantile_mean_is_that_of_the_sorted_values():
+    values = np.random.default_rng(0).permutation(1000.0 * np.ones((2, 1)) + np.arange(100.0), 1)
+    np.testing.assert_allclose(quantile_mean(values, 0.98, 1.0), 1098.5)
+    np.testing.assert_allclose(quantile_mean(values, 0.0, 0.5), 1024.5)
+
+
+def _act(policy, frame, state=None):
+    policy.reset(1)
+    return policy.context.grid[int(policy.act(frame)[0])]
+
+
+def _ev(settings):
+    return -settings.log2_exposure
+
+
+def _exposure(policy, frame):
+    """EV100 that the policy would set if the grid held every exposure."""
+    policy.reset(1)
+    policy.act(frame)
+    return policy._damped[0]
+
+
+@pytest.mark.parametrize(("scene_ev", "target"), [(7.0, 0.1616), (12.0, 0.17), (9.0, None)])
+def test_mean_is_put_at_the_target_of_its_illuminance(context, photograph, scene_ev, target):
+    """0.16 at 0 lux, 0.165 at 1000, 0.17 from 10,000 on; 2.5 * 2^EV100 lux at mean light 1."""
+    light = np.where(np.arange(64)[:, None] % 16 == 0, 4.0, 0.8) * np.ones((64, 64))  # mean 1
+    if target is None:  # EV 9: 1280 lux
+        target = 0.165 + 0.005 * 280 / 9000
+    frame = photograph(light, scene_ev, context.grid.nearest(scene_ev))
+    found = _exposure(make_policy("rpi_agc?metering=matrix", context), frame)
+    assert found == pytest.approx(scene_ev - math.log2(target / 0.12), abs=0.04)
+
+
+def test_a_card_that_fills_the_frame_is_lifted_to_the_lower_bound(context, photograph):
+    """Its brightest 2 % are all of it: at 0.3 of white."""
+    for scene_ev in (7.0, 10.0, 13.0):
+        frame = photograph(GREY, scene_ev, context.grid.nearest(scene_ev))
+        found = _exposure(make_policy("rpi_agc", context), frame)
+        assert found == pytest.approx(scene_ev - math.log2(0.3 / 0.12), abs=0.06)
+
+
+def test_constraints(context, photograph):
+    """Wide range: half of the frame dark, 4 % of it highlights in the corners."""
+    light = np.full((64, 64), 1.0)
+    light[:, 32:] = 0.25
+    light[:2, :] = 10.0
+    light[-1:, :] = 10.0
+    frame = photograph(light, 9.0, context.grid.nearest(12.0))
+    evs = {
+        name: _exposure(make_policy(f"rpi_agc?constraint={name}&metering=spot", context), frame)
+        for name in ("normal", "highlight", "shadows")
+    }
+    # 0.12 * 10 * 2^(9 - EV) = 0.8 of white. Of the darker half, 61 x 32 pixels are at 0.25 and 96
+    # at 1: their mean at 0.17.
+    assert evs["highlight"] == pytest.approx(9.0 - math.log2(0.8 / 1.2), abs=0.03)
+    shade = 0.12 * (61 * 32 * 0.25 + 96 * 1.0) / 2048
+    assert evs["shadows"] == pytest.approx(9.0 - math.log2(0.17 / shade), abs=0.06)
+    assert evs["highlight"] > evs["normal"] > evs["shadows"]
+
+
+def test_compensation_moves_the_target(context, photograph):
+    frame = photograph(GREY, 9.0, context.grid.nearest(9.0))
+    plain, brighter, far = (
+        _exposure(make_policy(f"rpi_agc?compensation={c}", context), frame) for c in (0, 1, 8)
+    )
+    assert plain - brighter == pytest.approx(1.0, abs=0.01)
+    # No target above 0.9, which is then approached from below: nothing of it is measurable yet.
+    assert plain - far == pytest.approx(math.log2(0.9 / 0.3), abs=0.01)
+
+
+def test_ladder_splits_as_published(context):
+    policy = make_policy("rpi_agc", context)
+    exposures = np.array([0.004, 0.010, 0.015, 0.05, 0.12, 0.3, 1.0, 4.0])
+    time, gain = policy.split(exposures)
+    # 100 us..10 ms at 1; gain to 2; to 30 ms; gain to 4; to 60 ms; gain to 6; to 66.666 ms; to 16.
+    expected = [
+        (0.004, 1.0),
+        (0.010, 1.0),
+        (0.010, 1.5),
+        (0.025, 2.0),
+        (0.030, 4.0),
+        (0.060, 5.0),
+        (0.066666, 1.0 / 0.066666),
+        (0.066666, 16.0),
+    ]
+    np.testing.assert_allclose(np.stack([time, gain], axis=1), expected, rtol=1e-6)
+    short = make_policy("rpi_agc?mode=short", context).split(np.array([0.008]))
+    np.testing.assert_allclose(np.ravel(short), [0.005, 1.6])
+    long = make_policy("rpi_agc?mode=long&max_gain=64", context).split(np.array([9.0]))
+    np.testing.assert_allclose(np.ravel(long), [0.12, 64.0])  # 7.68 s at most
+
+
+def test_flicker_floors_the_shutter_to_whole_periods(context):
+    policy = make_policy("rpi_agc?flicker_period=0.01", context)
+    time, gain = policy.split(np.array([0.008, 0.05, 0.4]))
+    np.testing.assert_allclose(time, [0.008, 0.02, 0.06])
+    np.testing.assert_allclose(time * gain, [0.008, 0.05, 0.4])
+
+
+def test_lamps_do_not_flicker_on_a_grid_with_other_shutters(context):
+    """1/60 and 1/120 s would suit the exposure, but are no whole periods of 100 Hz."""
+    grid = ExposureGrid((100, 200, 400, 800, 1600), (1 / 120, 1 / 100, 1 / 60, 1 / 50), (5.6, 8))
+    other = dataclasses.replace(context, grid=grid)
+    evs = np.linspace(6.0, 11.0, 40)
+    used = {}
+    for name in ("rpi_agc", "rpi_agc?flicker_period=0.01"):
+        policy = make_policy(name, other)
+        states = policy._utility(evs).argmax(axis=1)
+        used[name] = {grid[int(s)].exposure_time for s in states}
+        assert np.abs(grid.ev100[states] - evs).max() < 1.1
+    assert used["rpi_agc"] & {1 / 120, 1 / 60}
+    assert used["rpi_agc?flicker_period=0.01"] <= {1 / 100, 1 / 50, 1 / 120}
+
+
+def test_shutter_cap_and_manual_shutter_in_the_ladder(context):
+    capped = make_policy("rpi_agc?shutter_cap=0.02", context).split(np.array([0.05]))
+    np.testing.assert_allclose(np.ravel(capped), [0.02, 2.5])
+    manual = make_policy("rpi_agc:S?exposure_time=0.008", context).split(np.array([0.05]))
+    np.testing.assert_allclose(np.ravel(manual), [0.008, 6.25])
+
+
+def test_exposure_ends_with_the_ladder(context, photograph):
+    frame = photograph(GREY, -1.0, context.grid.nearest(2.0))
+    # 66.666 ms at a gain of 16 and f/5.6 is EV100 log2(32 / (0.066666 * 16)) = 4.9 at the least.
+    assert _ev(_act(make_policy("rpi_agc", context), frame)) == pytest.approx(4.9, abs=0.6)
+    further = _ev(_act(make_policy("rpi_agc?max_gain=64", context), frame))
+    assert further == pytest.approx(2.9, abs=0.6)
+
+
+def test_programs_keep_what_is_set_by_hand(context, photograph):
+    for ev in (4.0, 8.0, 14.0):
+        frame = photograph(GREY, ev, context.grid.nearest(ev))
+        assert _act(make_policy("rpi_agc:A?f_number=4", context), frame).f_number == 4.0
+        assert _act(make_policy("rpi_agc:S", context), frame).exposure_time == 1 / 125
+        manual = _act(make_policy("rpi_agc:M?f_number=11&iso=1600", context), frame)
+        assert (manual.f_number, manual.exposure_time, manual.iso) == (11.0, 1 / 125, 1600.0)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("metering", "average"),
+        ("mode", "sport"),
+        ("constraint", None),
+        ("speed", 0.0),
+        ("speed", float("nan")),
+        ("startup_frames", -1),
+        ("max_gain", 0.5),
+        ("flicker_period", 0.0),
+        ("compensation", float("inf")),
+        ("program", "tuned"),
+    ],
+)
+def test_arguments_are_checked(context, option, value):
+    from agents.metering.rpi_agc import RpiAgc
+
+    with pytest.raises(ValueError, match=rf"`{option}` \(="):
+        RpiAgc(context, **{option: value})
