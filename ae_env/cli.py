@@ -40,8 +40,8 @@ app = typer.Typer(
     epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
 )
 BENCHMARKS = (
-    *("agents", "brackets", "colour_checker", "defects", "scorers", "simulator", "stability"),
-    *("throughput", "work-precision"),
+    *("agents", "brackets", "colour_checker", "convergence", "defects", "scorers", "simulator"),
+    *("stability", "throughput", "work-precision"),
 )
 #: Commands that go on where they were stopped.
 _RESUMING = ("quickstart", "train", "train-simulator", "evaluate", "bench")
