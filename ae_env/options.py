@@ -9,6 +9,7 @@ from typing import Any
 from ae_env.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, make_lighting
+from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.loading import is_sequence
 from ae_env.scenes.networks import (
@@ -32,6 +33,8 @@ NOISES = ("bank", "exact")
 MAX_DELAY = 16
 #: Highest image speed [frame heights/s] and blur diameter [pixel of a 64-pixel frame].
 MAX_BLUR = 1e3
+#: Nominal settings are rounded: 1/30 s stands for 1/32 s.
+_ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
 
@@ -108,8 +111,14 @@ class EnvOptions:
         return cls(**kwargs)
 
     def make_grid(self) -> ExposureGrid:
-        """The exposure grid."""
-        return ExposureGrid.from_spec(self.grid)
+        """The exposure grid.
+
+        Raises:
+            ValueError: If a value of it cannot be shown by an observation's ``settings``.
+        """
+        grid = ExposureGrid.from_spec(self.grid)
+        _check_shown(grid)
+        return grid
 
     def make_camera(self) -> CameraProfile:
         """The camera body."""
@@ -175,6 +184,23 @@ class EnvOptions:
         if networks is not None:
             scene = networks.denoised(scene)
         return scene if self.noise else without_noise(scene)
+
+
+def _check_shown(grid: ExposureGrid) -> None:
+    """Raises a `ValueError` where an observation's ``settings`` cannot show a value of `grid`."""
+    aperture, time, speed = SETTINGS_RANGES.tolist()
+    bounds = {
+        "isos": [3.125 * 2.0**value for value in speed],
+        "exposure_times": [2.0**-value for value in reversed(time)],
+        "f_numbers": [2.0 ** (value / 2.0) for value in aperture],
+    }
+    for name, (low, high) in bounds.items():
+        for value in getattr(grid, name):
+            if not low * (1.0 - _ROUNDED) <= value <= high * (1.0 + _ROUNDED):
+                raise ValueError(
+                    f"`grid[{name!r}]` (={value:g}) must be in [{low:g}, {high:g}]: the `settings` "
+                    "of an observation show no others"
+                )
 
 
 def _check_light(scenes: list[Scene]) -> None:

@@ -140,7 +140,8 @@ class StateHead(nn.Module):
         self.states: torch.Tensor
         self.log2_time: torch.Tensor
         self.log2_opening: torch.Tensor
-        normalised = (table - known.mean(dim=0)) / known.std(dim=0).clamp(min=1.0)
+        spread = known.std(dim=0) if len(known) > 1 else torch.ones(known.shape[1])
+        normalised = (table - known.mean(dim=0)) / spread.clamp(min=1.0)
         self.register_buffer("states", normalised, persistent=False)
         self.register_buffer("log2_time", -table[:, 2], persistent=False)
         self.register_buffer("log2_opening", 2.0 - 0.5 * table[:, 1], persistent=False)

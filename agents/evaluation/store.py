@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation.plan import digest
+from agents.policy import training_seeds
+from agents.policy_name import split_name
 from simulator.files import sibling, write_atomically
 
 logger = logging.getLogger(__name__)
@@ -75,27 +77,44 @@ def part_key(kind: str, *parts: object) -> str:
 
 
 def policy_content(name: str) -> str:
-    """Hash of what decides a policy beside its name: its weights, its file or its module.
+    """Hash of what decides a policy beside its name: its file or module, weights and folders.
 
     Args:
         name: As `agents.make_policy` takes it.
     """
-    head, _, tail = name.rpartition(":") if ".py:" in name else name.partition(":")
-    if head.endswith(".py"):
-        return _files_digest([Path(head).expanduser()])
-    if head in ("ppo", "regression"):
-        from agents.policy import PRETRAINED
+    base, options = split_name(name)
+    files = _own_files(base)
+    for value in options.values():
+        files += _named_files(str(value))
+    return _files_digest(files) if files else ""
 
-        weights = Path(tail) if tail else PRETRAINED / head
-        return _files_digest([sibling(weights, end) for end in (".safetensors", ".json")])
+
+def _own_files(base: str) -> list[Path]:
+    head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
+    if head.endswith(".py"):
+        return [Path(head).expanduser()]
+    if head in ("ppo", "regression"):
+        weights = tail or training_seeds(head)[0].partition(":")[2]
+        return _named_files(weights)
+    if head == "recorded":
+        return _named_files(tail)
     if tail and "." in head:
         try:
             found = find_spec(head)
         except (ImportError, ValueError):
             found = None
         if found is not None and found.origin is not None:
-            return _files_digest([Path(found.origin)])
-    return ""
+            return [Path(found.origin)]
+    return []
+
+
+def _named_files(text: str) -> list[Path]:
+    """The file of this name, the two of an agent's, or all in a folder; none where there is none."""
+    path = Path(text).expanduser()
+    if path.is_dir():
+        return sorted(file for file in path.rglob("*") if file.is_file())
+    pair = [sibling(path, end) for end in (".safetensors", ".json")] if path.name else []
+    return [file for file in (path, *pair) if file.is_file()]
 
 
 @lru_cache(maxsize=1)
@@ -111,9 +130,14 @@ def code_digest() -> str:
     return _files_digest(files)
 
 
+def _place(file: Path) -> str:
+    """Name of a file that is the same wherever the packages are installed."""
+    return str(file.relative_to(_ROOT)) if file.is_relative_to(_ROOT) else file.name
+
+
 def _files_digest(files: list[Path]) -> str:
     found = hashlib.sha256()
     for file in files:
         content = file.read_bytes() if file.is_file() else b""
-        found.update(f"{file.name}\0{len(content)}\0".encode() + content)
+        found.update(f"{_place(file)}\0{len(content)}\0".encode() + content)
     return found.hexdigest()

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ae_env.captures import describe_captures
 from ae_env.scenes import Scene
-from ae_env.score_table import describe_captures, scene_latent
+from ae_env.score_table import scene_latent
 from ae_env.scorers import CompositeScorer
 from benchmarks.markdown import table
 from simulator import CameraProfile
@@ -20,6 +21,8 @@ OFFSETS = np.arange(-6.0, 4.01, 0.5)
 #: Stops that the gain rises by, at fixed brightness.
 STOPS = 6
 F_NUMBER = 5.6
+#: Scores nearer than this are equal.
+_EQUAL = 1e-9
 
 
 def best_ev_rows(
@@ -29,21 +32,31 @@ def best_ev_rows(
     seed: int,
 ) -> list[dict[str, Any]]:
     """A row per scorer: in how many stops above incident light each scene scores best."""
-    best: dict[str, dict[str, float]] = {name: {} for name in scorers}
+    best: dict[str, dict[str, float | None]] = {name: {} for name in scorers}
     for i, scene in enumerate(scenes):
         states = [_state(scene, 100.0, offset) for offset in OFFSETS]
         for name, scores in _scores(scorers, scene, states, camera, seed + i).items():
-            best[name][scene.scene_id] = float(OFFSETS[np.argmax(scores)])
-    return [
-        {
-            "scorer": name,
-            "median": float(np.median(list(own.values()))),
-            "lowest": min(own.values()),
-            "highest": max(own.values()),
-            "by_scene": own,
-        }
-        for name, own in best.items()
-    ]
+            best[name][scene.scene_id] = _best(scores)
+    return [_best_row(name, own) for name, own in best.items()]
+
+
+def _best(scores: np.ndarray) -> float | None:
+    """The best exposure, of equal ones that nearest to the incident light's; None of all equal."""
+    if np.ptp(scores) < _EQUAL:
+        return None
+    best = OFFSETS[scores >= scores.max() - _EQUAL]
+    return float(best[np.argmin(np.abs(best))])
+
+
+def _best_row(name: str, by_scene: dict[str, float | None]) -> dict[str, Any]:
+    known = [value for value in by_scene.values() if value is not None]
+    return {
+        "scorer": name,
+        "median": float(np.median(known)) if known else None,
+        "lowest": min(known, default=None),
+        "highest": max(known, default=None),
+        "by_scene": by_scene,
+    }
 
 
 def gain_rows(
@@ -128,20 +141,23 @@ def gain_section(rows: Sequence[Mapping[str, Any]]) -> str:
 def best_ev_section(rows: Sequence[Mapping[str, Any]]) -> str:
     """The part of the page that shows what `best_ev_rows` gives."""
     scenes = list(rows[0]["by_scene"])
+    known = [row for row in rows if row["median"] is not None]
     body = [
         [
             f"`{row['scorer']}`",
             f"{row['median']:+.1f}",
             f"{row['lowest']:+.1f} to {row['highest']:+.1f}",
-            " ".join(f"{row['by_scene'][scene]:+g}" for scene in scenes),
+            " ".join("=" if v is None else f"{v:+g}" for v in row["by_scene"].values()),
         ]
-        for row in sorted(rows, key=lambda row: row["median"])
+        for row in sorted(known, key=lambda row: row["median"])
     ]
+    same = ", ".join(f"`{row['scorer']}`" for row in rows if row["median"] is None)
     head = ["scorer", "median [EV]", "range", "scene by scene"]
     text = (
         f"The exposure, of a sweep from {OFFSETS[0]:+g} to {OFFSETS[-1]:+g} EV around the incident "
         f"light in half stops at ISO 100 and f/{F_NUMBER:g}, at which each scene scores best; "
         "noisy captures without blur. A scorer whose best exposure is at an end of the sweep "
-        "cannot stand alone. Scenes, in this order: " + ", ".join(f"`{s}`" for s in scenes) + "."
+        f"cannot stand alone. To {same} all exposures are equal without blur and flicker. Scenes, "
+        "in this order: " + ", ".join(f"`{s}`" for s in scenes) + "."
     )
     return f"{text}\n\n{table(head, body)}"

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from ae_env.captures import describe_captures
 from ae_env.options import EnvOptions
-from ae_env.score_table import describe_captures, scene_latent
+from ae_env.score_table import scene_latent
 from ae_env.scorers import Captures, CompositeScorer
 from benchmarks.markdown import table
 from simulator import develop

@@ -120,6 +120,9 @@ GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
             for value in (None, "100", [], [100, "x"], [True, 200], [NAN, 1], [2, 1], [1, 1], 100)
         ),
         ({"grid": {**GRID, "isos": [100, INF]}}, r"`grid`: `iso` \(=inf\)"),
+        ({"grid": {**GRID, "f_numbers": [8, 45]}}, r"`grid\['f_numbers'\]` \(=45\) .*\[1, 32\]"),
+        ({"grid": {**GRID, "exposure_times": [60]}}, r"`grid\['exposure_times'\]` \(=60\)"),
+        ({"grid": {**GRID, "isos": [25]}}, r"`grid\['isos'\]` \(=25\) must be in \[50, 409600\]"),
         ({"grid": {**GRID, "f_numbers": [0.1]}}, r"`grid`: `f_number` \(=0.1\)"),
         ({"grid": {"iso": [100]}}, "`grid`.*did you mean 'isos'"),
         ({"grid": "third_stops"}, "did you mean 'third_stop'"),

@@ -247,6 +247,24 @@ def test_another_file_of_a_policy_is_another_policy(tmp_path):
     assert policy_content("ppo") != policy_content("regression")
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["matrix:tuned?weights={0}/a", "ppo:{0}/a?device=cpu", "ppo:{0}/a", "recorded:{0}", "{0}/a:C"],
+)
+def test_what_a_name_points_to_counts(name, tmp_path):
+    name = name.format(tmp_path)
+    if name.endswith(":C"):
+        name = name.replace("/a:C", "/a.py:C?width=3")
+    files = [tmp_path / "a", tmp_path / "a.safetensors", tmp_path / "a.json", tmp_path / "a.py"]
+    for file in files:
+        file.write_text("before")
+    before = policy_content(name)
+    assert policy_content(name) == before
+    for file in files:
+        file.write_text("after!")
+    assert policy_content(name) != before
+
+
 def test_parts_hold_no_pickles(tmp_path):
     store = EvaluationStore(tmp_path)
     store.save("a", {"x": np.arange(3)}, {"y": [1, None]})
