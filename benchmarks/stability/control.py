@@ -21,8 +21,8 @@ POLICIES = (*(f"{m}:{p}" for m in CLASSIC_METERS for p in ("P", "A", "S")), *LEA
 DELAYS = (0, 1, 2, 4)
 #: Frame of the step, and how many of the last frames tell whether it has come to rest.
 _STEP, _LAST = 12, 12
-#: Frames of an episode: an agent that averages over all of it takes long to forget.
-_FRAMES, _FRAMES_LEARNT = 72, 200
+#: Frames of an episode.
+_FRAMES = 72
 #: Scenes that an agent is shown.
 _SCENES_LEARNT = 8
 #: Largest swing at the end [EV]: none without noise, one state of the grid with it; an agent, two.
@@ -81,11 +81,10 @@ def _loop(name: str, delay: int, stops: float, noise: bool, seed: int) -> _Loop:
     envs.close()
     if name in LEARNT:
         count = min(count, _SCENES_LEARNT)
-    frames = _FRAMES_LEARNT if name in LEARNT else _FRAMES
-    envs = make_envs(options, num_envs=count, frames=frames)
+    envs = make_envs(options, num_envs=count, frames=_FRAMES)
     try:
         policy = make_policy(name, PolicyContext.from_envs(envs))
-        evs = _evs(policy, envs, frames, seed)
+        evs = _evs(policy, envs, seed)
     finally:
         envs.close()
     last = evs[:, -_LAST:]
@@ -95,14 +94,14 @@ def _loop(name: str, delay: int, stops: float, noise: bool, seed: int) -> _Loop:
     return _Loop(max(0, *settled), amplitude)
 
 
-def _evs(policy: Policy, envs: Any, frames: int, seed: int) -> np.ndarray:
+def _evs(policy: Policy, envs: Any, seed: int) -> np.ndarray:
     """(E, T) EV100 of every frame, each scene in its own environment."""
     policy.reset(envs.num_envs, seed)
     scenes = list(range(envs.num_envs))
     observations, info = envs.reset(seed=seed, options={"scene": scenes})
     evs = [info["ev100"]]
     masks = envs.unwrapped.action_masks()
-    for _ in range(frames):
+    for _ in range(_FRAMES):
         actions = policy.act(observations, masks)
         observations, _, _, _, info = envs.step(actions)
         evs.append(info["ev100"])
