@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -58,6 +58,13 @@ class Member:
     index: int = 0
 
 
+def _names(spec: Any) -> list[str]:
+    """What `spec` may name: a scorer, a mapping of scorers, or the file of a lighting."""
+    if isinstance(spec, Mapping):
+        return [*map(str, spec), *(value for value in spec.values() if isinstance(value, str))]
+    return [spec] if isinstance(spec, str) else []
+
+
 class PlanRun:
     """A plan with its scenes and episodes, and where its parts are kept.
 
@@ -110,7 +117,9 @@ class PlanRun:
 
     def _shared(self, condition: Condition) -> tuple[Any, ...]:
         base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-        return self.code, base, condition.lighting, self._content
+        named = [*_names(base.get("scorer")), *_names(condition.lighting)]
+        files = [policy_content(name) for name in named]
+        return self.code, base, condition.lighting, files, self._content
 
     def policy_key(self, member: Member, condition: Condition) -> str:
         """Name of the part with what `member` did in `condition`."""
@@ -131,8 +140,9 @@ class PlanRun:
         states = {
             n: hashlib.sha256(t.states.tobytes()).hexdigest() for n, t in result.tracks.items()
         }
-        plan = self.plan
-        shown = (plan.seeds, plan.starts, list(plan.other_scorers), plan.other_scorer_scenes)
+        plan, scorers = self.plan, list(self.plan.other_scorers)
+        files = [policy_content(name) for name in scorers]
+        shown = (plan.seeds, plan.starts, scorers, files, plan.other_scorer_scenes)
         return part_key("scorers", *self._shared(condition), *shown, states)
 
     # -- score tables -------------------------------------------------------------------------

@@ -80,10 +80,10 @@ def policy_content(name: str) -> str:
     """Hash of what decides a policy beside its name: its file or module, weights and folders.
 
     Args:
-        name: As `agents.make_policy` takes it.
+        name: As `agents.make_policy` takes it; a scorer's name or a file's will do as well.
     """
     base, options = split_name(name)
-    files = _own_files(base)
+    files = _own_files(base) or _named_files(base)
     for value in options.values():
         files += _named_files(str(value))
     return _files_digest(files) if files else ""

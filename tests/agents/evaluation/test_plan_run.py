@@ -11,6 +11,7 @@ from agents.evaluation import store as evaluation_store
 from agents.evaluation.plan import Condition, EvaluationPlan, digest, load_plan
 from agents.evaluation.plan_episodes import PlanEpisodes, groups_in_turn, plan_scenes, start_state
 from agents.evaluation.plan_jobs import run_plan
+from agents.evaluation.plan_run import PlanRun
 from agents.evaluation.store import EvaluationStore, policy_content
 
 ENVIRONMENT = {"scenes": "bundled:small", "split": "test", "resolution": 36}
@@ -35,10 +36,8 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def results(folder, tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:  # the fixture that does it serves single tests
-        patch.setenv("AE_ENV_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
-        return run_plan(PLAN, folder)
+def results(folder):
+    return run_plan(PLAN, folder)
 
 
 # -- the plan -------------------------------------------------------------------------------------
@@ -263,6 +262,27 @@ def test_what_a_name_points_to_counts(name, tmp_path):
     for file in files:
         file.write_text("after!")
     assert policy_content(name) != before
+
+
+def test_files_of_scorers_and_lightings_count(tmp_path):
+    scorer, light = tmp_path / "mine.py", tmp_path / "light.csv"
+    scorer.write_text(
+        "class Half:\n    domain = 'raw'\n    def __call__(self, images, captures):\n"
+        "        return images.new_full((len(images),), 0.5)\n"
+    )
+    light.write_text("0\n-1\n")
+
+    def key(run):
+        return run.light_key(Condition(lighting={"kind": "schedule", "file": str(light)}))
+
+    plan = PLAN.changed(environment={**PLAN.environment, "scorer": {f"{scorer}:Half": 1.0}})
+    run = PlanRun(plan, tmp_path / "parts", code="the same")
+    first = key(run)
+    assert key(run) == first
+    light.write_text("0\n-2\n")
+    second = key(run)
+    scorer.write_text(scorer.read_text().replace("0.5", "0.6"))
+    assert len({first, second, key(run)}) == 3
 
 
 def test_parts_hold_no_pickles(tmp_path):
