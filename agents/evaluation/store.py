@@ -109,7 +109,7 @@ def _own_files(base: str) -> list[Path]:
 
 
 def _named_files(text: str) -> list[Path]:
-    """The file of this name, the two of an agent's, or all in a folder; none where there is none."""
+    """The file of this name, the two of an agent, or all in a folder; none where there is none."""
     path = Path(text).expanduser()
     if path.is_dir():
         return sorted(file for file in path.rglob("*") if file.is_file())
