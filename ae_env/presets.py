@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def list_presets(kind: str = "env") -> list[str]:
     return sorted({file.stem for folder in _FOLDERS for file in (folder / kind).glob("*.yaml")})
 
 
-def find_preset(name: str, kind: str = "env") -> Path:
+def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
     """The YAML file of a preset.
 
     Args:
@@ -32,19 +33,20 @@ def find_preset(name: str, kind: str = "env") -> Path:
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.
     """
-    for folder in _FOLDERS:
-        file = folder / kind / f"{name}.yaml"
-        if file.is_file():
-            return file
-    own = Path(name).expanduser()
-    if own.suffix in (".yaml", ".yml") and own.is_file():
-        return own
+    if isinstance(name, str | PathLike):
+        for folder in _FOLDERS:
+            file = folder / kind / f"{name}.yaml"
+            if file.is_file():
+                return file
+        own = Path(name).expanduser()
+        if own.suffix in (".yaml", ".yml") and own.is_file():
+            return own
     known = list_presets(kind)
     hint = did_you_mean(name, known)
     raise ValueError(f"`preset` (={name!r}) must be one of {known} or a .yaml file{hint}")
 
 
-def load_preset(name: str) -> dict[str, Any]:
+def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
     """Arguments of the environment from a preset of ``configs/env``.
 
     Args:

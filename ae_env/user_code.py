@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import importlib.util
 import inspect
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from ae_env.checks import did_you_mean
+
+#: Modules that the files run so far have imported from their own folders.
+_helpers: set[str] = set()
 
 
 def split_file_name(name: str) -> tuple[str, str] | None:
@@ -28,7 +34,8 @@ def split_file_name(name: str) -> tuple[str, str] | None:
 def load_from_file(path: str, name: str, argument: str, example: str = "MyClass") -> Any:
     """What a Python file calls `name`.
 
-    The file is run once, and again only after it has changed.
+    The file is run once, and again only after it has changed. At its top it may import modules
+    beside it, as a script may; files in different folders may have helpers of the same name.
 
     Args:
         path: The file; a relative one is looked for in the current folder, ``~`` is the home.
@@ -87,7 +94,8 @@ def _module(path: str, file: Path, argument: str) -> ModuleType:
     sys.modules[key] = module  # dataclasses look their module up while it loads
     try:
         # Not through the loader, whose bytecode of a second ago may be that of other content.
-        exec(compile(content, str(file), "exec", dont_inherit=True), module.__dict__)
+        with _importing_from(file.parent):
+            exec(compile(content, str(file), "exec", dont_inherit=True), module.__dict__)
     except (Exception, SystemExit) as error:  # a script, for example, ends the program
         sys.modules.pop(key, None)
         raise ValueError(
@@ -95,3 +103,35 @@ def _module(path: str, file: Path, argument: str) -> ModuleType:
         ) from error
     module.__dict__["_ae_env_content"] = digest
     return module
+
+
+@contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    """Modules in `folder` can be imported; those of earlier files, from theirs, are forgotten."""
+    for name in [n for n in sys.modules if n.partition(".")[0] in _helpers]:
+        del sys.modules[name]
+    _helpers.clear()
+    before = {name.partition(".")[0] for name in sys.modules}
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        if str(folder) in sys.path:  # what was run may have changed it
+            sys.path.remove(str(folder))
+        new = {name.partition(".")[0] for name in sys.modules} - before
+        _helpers.update(name for name in new if _is_only_in(folder, name))
+
+
+def _is_only_in(folder: Path, name: str) -> bool:
+    """Whether the module `name` came from `folder`, and would not be found without it."""
+    module = sys.modules.get(name)
+    place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", [])), None)
+    if module is None or place is None or not Path(place).is_relative_to(folder):
+        return False
+    del sys.modules[name]
+    try:
+        spec = importlib.util.find_spec(name)
+    finally:
+        sys.modules[name] = module
+    return spec is None or spec.origin != getattr(module, "__file__", None)

@@ -88,14 +88,19 @@ def render(scene: Scene, defect: str, generator: torch.Generator) -> torch.Tenso
     return pictures
 
 
+def generator_of(seed: int, scene: int, defect: str) -> torch.Generator:
+    """Random numbers of one rendering, independent of those of all others and of other seeds."""
+    entropy = np.random.SeedSequence([seed, scene, DEFECTS.index(defect)])
+    return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
+
+
 def signs_of(
     scenes: list[Scene], defect: str, names: list[str], seed: int
 ) -> dict[str, np.ndarray]:
     """Signs (scenes, L) by name, of renderings with `defect`."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for i, scene in enumerate(scenes):
-        generator = torch.Generator().manual_seed(1000 * seed + 6 * i + DEFECTS.index(defect))
-        pictures = render(scene, defect, generator)
+        pictures = render(scene, defect, generator_of(seed, i, defect))
         for name in names:
             found[name].append(SIGNS[name](pictures).numpy())
     return {name: np.stack(values) for name, values in found.items()}

@@ -27,9 +27,10 @@ def _check_frame(name: str, value: Any, low: int, high: int) -> int:
 _FRAME = (-(2**31), 2**31, _check_frame)
 _RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
     "stops": (-MAX_STOPS, MAX_STOPS, check_number),
-    "stops_per_frame": (-MAX_STOPS, MAX_STOPS, check_number),
+    "stops_per_frame": (0, MAX_STOPS, check_number),
     "period": (1e-3, 2**31, check_number),
-    **dict.fromkeys(("at", "enter", "leave", "edge", "on", "off"), _FRAME),
+    "edge": (0, 2**31, _check_frame),
+    **dict.fromkeys(("at", "enter", "leave", "on", "off"), _FRAME),
 }
 
 

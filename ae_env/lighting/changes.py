@@ -24,7 +24,7 @@ class StepLighting(Lighting):
 
 @dataclass(frozen=True)
 class RampLighting(Lighting):
-    """The light changes by `stops_per_frame` each frame, up to `stops` in all."""
+    """The light changes by `stops_per_frame` (>= 0) each frame, up to `stops` (of either sign)."""
 
     name: ClassVar[str] = "ramp"
     stops: float = -4.0
@@ -32,7 +32,7 @@ class RampLighting(Lighting):
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
-        change = min(abs(self.stops), abs(self.stops_per_frame) * frame)
+        change = min(abs(self.stops), self.stops_per_frame * frame)
         return 2.0 ** math.copysign(change, self.stops)
 
 
@@ -51,7 +51,11 @@ class SineLighting(Lighting):
 
 @dataclass(frozen=True)
 class TunnelLighting(Lighting):
-    """Into a tunnel `stops` darker at frame `enter`, over `edge` frames, and out at `leave`."""
+    """Into a tunnel `stops` darker from frame `enter` on, over `edge` frames, and out at `leave`.
+
+    Frame ``enter`` is the last one of the light outside: ``enter + k`` has k / `edge` of the
+    change. With `edge` 0 all of it is in frame ``enter``. Likewise with `leave`.
+    """
 
     name: ClassVar[str] = "tunnel"
     stops: float = -6.0
@@ -65,10 +69,14 @@ class TunnelLighting(Lighting):
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
-        edge = max(self.edge, 1)
-        inside = min(max((frame - self.enter) / edge, 0.0), 1.0)
-        outside = min(max((frame - self.leave) / edge, 0.0), 1.0)
+        inside, outside = self._share(frame - self.enter), self._share(frame - self.leave)
         return 2.0 ** (self.stops * (inside - outside))
+
+    def _share(self, frames: int) -> float:
+        """Share of a change that is there `frames` after it began."""
+        if self.edge == 0:
+            return 1.0 if frames >= 0 else 0.0
+        return min(max(frames / self.edge, 0.0), 1.0)
 
 
 @dataclass(frozen=True)

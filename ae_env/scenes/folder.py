@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 OnError = Literal["stop", "skip"]
 #: Seconds between two log lines about how far the reading is, and names in one about what is bad.
 _PROGRESS_SECONDS, _NAMES = 10.0, 5
+_HOW_TO_SKIP = "; in Python or YAML, {'path': ..., 'on_error': 'skip'} leaves it out"
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,8 @@ class FolderOptions:
         ev100: EV100 of the radiance maps, in place of the assumed one.
         on_error: What a file does that cannot be read, or is black without `illuminance`:
             ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
-            ``"skip"`` leaves it out, and a warning in the log says how many were and why.
+            ``"skip"`` leaves it out, and a warning in the log says how many were and why; not
+            for sequences.
     """
 
     illuminance: float | Mapping[str, float] | None = None
@@ -207,9 +209,12 @@ class Reader:
 
 
 def read_all(
-    spec: str | Path, files: list[Path], reader: Reader
+    spec: str | Path, files: list[Path], reader: Reader, hint: str = _HOW_TO_SKIP
 ) -> tuple[list[Scene], dict[str, Shot]]:
-    """The scenes of all `files`, and what tells the groups of those that none is named for."""
+    """The scenes of all `files`, and what tells the groups of those that none is named for.
+
+    `hint` ends the error of a file that cannot be read, where there are others.
+    """
     scenes: list[Scene] = []
     shots: dict[str, Shot] = {}
     skipped: dict[Path, Exception] = {}
@@ -218,10 +223,8 @@ def read_all(
             own, shot = reader(path)
         except (ValueError, OSError) as error:  # it may also have vanished since it was listed
             if reader.options.on_error == "stop":
-                hint = ""
-                if len(files) > 1:
-                    hint = "; in Python or YAML, {'path': ..., 'on_error': 'skip'} leaves it out"
-                raise ValueError(f"scene file {str(path)!r}: {error}{hint}") from error
+                more = hint if len(files) > 1 else ""
+                raise ValueError(f"scene file {str(path)!r}: {error}{more}") from error
             skipped[path] = error
             continue
         scenes += own

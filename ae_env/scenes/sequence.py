@@ -36,7 +36,8 @@ def sequence_scenes(
 
     The raws of one folder, in the natural order of their names, are one sequence and one source
     group; its name is the folder's below `spec`. Each raw's light is known through its own
-    settings: it may change from frame to frame.
+    settings: it may change from frame to frame. Raws in `spec` itself are named after it, or ``.``
+    where a folder below has that name.
 
     Args:
         spec: A folder, searched with its sub-folders, or a glob.
@@ -44,12 +45,19 @@ def sequence_scenes(
         camera: Not used by raws, which bring their own; as of `folder_scenes`.
         resolution: Packed pixels a side; None keeps each raw's own size.
         crop: See `Scene.resized`.
-        options: What the caller knows about the files.
+        options: What the caller knows about the files; `on_error` must be ``"stop"``.
         resize: Brings each scene to `resolution`, before the next file is read.
 
     Raises:
-        ValueError: If there are no raws, one cannot be read, or there are no sequences of `split`.
+        ValueError: If there are no raws, one cannot be read, there are no sequences of `split`, or
+            unreadable raws were to be skipped: all later frames would come too early.
     """
+    options = FolderOptions() if options is None else options
+    if options.on_error == "skip":
+        raise ValueError(
+            "`on_error` (='skip') must be 'stop' for a sequence: without a raw all later ones "
+            "would come a frame too early; cut the recording there, into two folders"
+        )
     base, found = find_files(spec)
     by_folder: dict[Path, list[Path]] = {}
     for path in found:
@@ -64,17 +72,21 @@ def sequence_scenes(
         raise too_few_groups(spec, str(len(by_folder)))  # before any time is spent on reading
     files = [path for paths in by_folder.values() for path in paths]
     names = scene_names(base, files)
-    groups = {names[path]: _sequence_name(base, path.parent) for path in files}
-    options = FolderOptions() if options is None else options
+    sequences = _sequence_names(base, list(by_folder))
+    groups = {names[path]: sequences[path.parent] for path in files}
     reader = Reader(base, names, {}, options, camera, resolution, crop, resize)
-    scenes, _ = read_all(spec, files, reader)
+    scenes, _ = read_all(spec, files, reader, hint="")
     scenes = [replace(scene, group=groups[scene.scene_id]) for scene in scenes]
     log_groups(str(spec), {scene.scene_id: scene.group for scene in scenes})
     return of_split(spec, scenes, split)
 
 
-def _sequence_name(base: Path, folder: Path) -> str:
-    return folder.resolve().name if folder == base else folder.relative_to(base).as_posix()
+def _sequence_names(base: Path, folders: list[Path]) -> dict[Path, str]:
+    names = {folder: folder.relative_to(base).as_posix() for folder in folders}
+    own = base.resolve().name
+    if base in names and own and own not in names.values():
+        names[base] = own  # else "."
+    return names
 
 
 def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,8 @@ class ScorerRow:
 
     Args:
         name: What `ae_env.scorers.make_scorer` takes.
-        domain: ``"raw"`` or ``"srgb"``; empty where it is not known.
+        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``; empty where it is
+            not known.
         depends_on: ``"image"``, ``"light"`` or ``"blur"``; empty where it is not known.
         needs: What does not come with this package; empty where that is nothing.
         summary: First line of its docstring.
@@ -66,12 +67,18 @@ def _row(name: str, found: Any, package: str) -> ScorerRow:
     text = found if inspect.isclass(found) or inspect.isfunction(found) else type(found)
     return ScorerRow(
         name,
-        domain=found.domain,
+        domain=", ".join(sorted(_domains(found))),
         depends_on=getattr(found, "depends_on", "image"),
         needs=str(getattr(found, "needs", "")),
         summary=(inspect.getdoc(text) or "").partition("\n")[0].replace("``", ""),
         package=package,
     )
+
+
+def _domains(found: Any) -> set[str]:
+    """What a scorer sees; of one that is made of others, what they do."""
+    parts = getattr(found, "parts", {}).values()
+    return set().union(*map(_domains, parts)) if parts else {found.domain}
 
 
 def _package(point: Any) -> str:

@@ -42,6 +42,17 @@ def test_tunnel_goes_in_and_out() -> None:
     assert stops == pytest.approx([0, 0, 0, -3, -6, -6, -6, -3, 0, 0])
 
 
+@pytest.mark.parametrize(
+    ("edge", "stops"),
+    [(0, [0, 0, -6, -6, -6, 0, 0, 0]), (1, [0, 0, 0, -6, -6, -6, 0, 0])],
+)
+def test_a_tunnel_begins_after_the_named_frame_or_without_an_edge_at_it(
+    edge: int, stops: list[float]
+) -> None:
+    gains = _gains({"kind": "tunnel", "enter": 2, "leave": 5, "edge": edge}, 8)
+    assert gains == [2.0**s for s in stops]
+
+
 def test_lens_cap_goes_on_and_off() -> None:
     gains = _gains({"kind": "lens_cap", "on": 1, "off": 3}, 4)
     assert gains == [1.0, 2.0**-20, 2.0**-20, 1.0]
@@ -93,6 +104,8 @@ def test_own_lightings_are_checked_too() -> None:
         ({"kind": "sine", "period": 0}, r"`lighting\['period'\]` \(=0\)"),
         ({"kind": "sine", "period": -4}, r"`lighting\['period'\]` \(=-4\)"),
         ({"kind": "ramp", "stops_per_frame": math.inf}, r"`lighting\['stops_per_frame'\]`"),
+        ({"kind": "ramp", "stops_per_frame": -1}, r"'stops_per_frame'\]` \(=-1\) .*\[0, 64\]"),
+        ({"kind": "tunnel", "edge": -1}, r"`lighting\['edge'\]` \(=-1\) must be an integer in \[0"),
         ({"kind": "tunnel", "enter": 5, "leave": 4}, r"'leave'.*\(=4\).*'enter'.*\(=5\)"),
         ({"kind": "lens_cap", "on": 6}, r"'off'.*\(=5\).*'on'.*\(=6\)"),
         ({"kind": ["step"]}, "must be one of"),

@@ -21,8 +21,8 @@ from ae_env.scorers import make_scorer
 
 ID = "ae_env/AutoExposure-v0"
 PRESETS = ae_env.list_presets()
-#: Scores that rise with noise.
-READ_NOISE = {"entropy", "shim", "zhang"}
+#: Scores that rise with noise, as docs/scorers.md warns.
+READ_NOISE = {"entropy", "shim", "zhang", "keypoints", "analytic_blur", "analytic_haze"}
 
 
 def _load(name: str) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def test_all_are_there() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_run_as_they_are(name: str) -> None:
+def test_presets_run_on_small_scenes(name: str) -> None:
     arguments = _load(name)
     steps = arguments["max_episode_steps"]
     env = gym.make(ID, **arguments)
@@ -51,10 +51,42 @@ def test_presets_run_as_they_are(name: str) -> None:
     assert envs.step(np.array([1, 2]))[0]["raw"].shape == (2, 4, 36, 36)
 
 
+@pytest.mark.parametrize("name", ["snow", "office_led"])
+def test_presets_run_as_they_are(name: str) -> None:
+    env = gym.make(ID, split="test", **ae_env.load_preset(name))
+    observation, info = env.reset(seed=0)
+    assert observation["raw"].shape == (4, 64, 64)
+    ended, steps = False, 0
+    while not ended:
+        _, reward, _, ended, info = env.step(env.action_space.sample())
+        assert 0.0 <= reward <= 1.0
+        steps += 1
+    assert steps == ae_env.load_preset(name)["max_episode_steps"]
+    assert info["scene_id"]
+
+
+def _reads_noise_unpaired(scorer: str | dict[str, float]) -> bool:
+    """Whether a score that rises with noise stands without `noise`."""
+    names = {scorer} if isinstance(scorer, str) else set(scorer)
+    parts = set(names)
+    for name in names - READ_NOISE:  # some of those need an extra
+        parts |= set(make_scorer(name).parts)
+    return bool(READ_NOISE & parts) and "noise" not in parts
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_scores_that_read_noise_as_detail_are_paired_with_noise(name: str) -> None:
-    parts = make_scorer(ae_env.load_preset(name)["scorer"]).parts
-    assert not READ_NOISE & set(parts) or "noise" in parts
+    assert not _reads_noise_unpaired(ae_env.load_preset(name)["scorer"])
+
+
+def test_the_rule_of_pairing_tells_the_two_apart() -> None:
+    for name in READ_NOISE:
+        assert _reads_noise_unpaired(name)
+        assert _reads_noise_unpaired({name: 0.5, "brightness": 0.5})
+        assert not _reads_noise_unpaired({name: 0.5, "noise": 0.5})
+        assert not _reads_noise_unpaired({name: 0.5, "balanced": 0.5})
+    assert _reads_noise_unpaired("defects")  # it has parts that do
+    assert not _reads_noise_unpaired("balanced")
 
 
 def test_the_office_has_shutters_of_whole_periods() -> None:
@@ -93,8 +125,12 @@ def test_unknown_kinds_are_refused_with_the_nearest() -> None:
 def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"`preset` .*did you mean 'tunnel'"):
         ae_env.load_preset("tunel")
+    for name in (None, 3, ["snow"], b"snow", ""):
+        with pytest.raises(ValueError, match=r"`preset` \(=.*\) must be one of .*'snow'"):
+            ae_env.load_preset(name)  # type: ignore[arg-type]
     own = tmp_path / "own.yaml"
     own.write_text("lighting: sine\nmax_episode_steps: 4\n")
+    assert ae_env.load_preset(own) == ae_env.load_preset(str(own))
     assert ae_env.load_preset(str(own)) == {"lighting": "sine", "max_episode_steps": 4}
     own.write_text("- 1\n")
     with pytest.raises(ValueError, match="must map arguments"):

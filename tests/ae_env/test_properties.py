@@ -212,7 +212,8 @@ def test_sensors_are_decoded_as_they_read(
 def lightings(draw: st.DrawFn) -> dict[str, Any]:
     """Any lighting in its range."""
     stops, frames = st.floats(-MAX_STOPS, MAX_STOPS), st.integers(-(2**31), 2**31)
-    values = {"period": log_uniform(1e-3, 2**31), "stops": stops, "stops_per_frame": stops}
+    values = {"period": log_uniform(1e-3, 2**31), "stops": stops}
+    values |= {"stops_per_frame": st.floats(0, MAX_STOPS), "edge": st.integers(0, 2**31)}
     values |= {"frequency": log_uniform(1e-3, 1e6), "frame_rate": log_uniform(1e-3, 1e6)}
     values |= {"depth": st.floats(0, 1), "duty": st.none() | st.floats(1e-6, 1)}
     values |= {"ev": st.lists(stops, min_size=1, max_size=3), "file": st.none()}

@@ -96,6 +96,39 @@ def test_folders_are_sequences_and_source_groups(folder: Path) -> None:
     assert drawn == {"street/IMG_2", "yard/day/IMG_2"}
 
 
+@pytest.mark.parametrize(
+    ("folders", "groups"),
+    [
+        (("", "rec"), {".", "rec"}),
+        (("", "other"), {"rec", "other"}),
+        (("rec", "other"), {"rec", "other"}),
+        (("rec", "other/rec"), {"rec", "other/rec"}),
+    ],
+)
+def test_recordings_of_one_name_are_apart(
+    tmp_path: Path, folders: tuple[str, str], groups: set[str]
+) -> None:
+    base = tmp_path / "rec"
+    for folder in folders:
+        _write(base / folder)
+    env = _env(base)
+    assert {s.group for s in env.scenes} == groups
+    for group in groups:
+        env.reset(seed=0, options={"scene": group})
+        shown = [env.step(0)[4]["scene_id"] for _ in range(3)]
+        place = "" if group == "." or group not in folders else f"{group}/"
+        assert shown == [f"{place}{name}" for name in (*NAMES[1:], NAMES[-1])]
+
+
+def test_a_broken_frame_is_an_error(tmp_path: Path) -> None:
+    """Without it all later ones would come too early, so nothing proposes to skip it."""
+    _write(tmp_path)
+    (tmp_path / "IMG_3.dng").write_bytes(b"II*\0")
+    with pytest.raises(ValueError, match=r"scene file '.*IMG_3\.dng'") as caught:
+        load_scenes({"sequence": tmp_path}, "test", camera=CAMERA, resolution=36)
+    assert "skip" not in str(caught.value)
+
+
 def test_a_glob_names_the_frames(folder: Path) -> None:
     env = _env(folder / "street" / "IMG_?.dng")
     env.reset(seed=0)
@@ -152,6 +185,7 @@ def test_many_at_once_are_as_single_ones(folder: Path, extra: dict[str, Any]) ->
         ({"sequence": "{}/none"}, "test", "must name an existing file, folder or glob"),
         ({"sequence": 3}, "test", "must have a 'path' or a 'sequence'"),
         ({"sequence": "{}", "path": "{}"}, "test", "field 'path' must be one of"),
+        ({"sequence": "{}", "on_error": "skip"}, "test", r"`on_error` \(='skip'\) must be 'stop'"),
         ({"sequence": "{}", "hrad": True}, "test", "did you mean 'hard'"),
         ({"sequence": "bundled:snow"}, "test", "give the name 'bundled:snow' itself"),
     ],

@@ -183,6 +183,14 @@ def _linear(pictures: torch.Tensor) -> torch.Tensor:
     return shown / (slope - (slope - 1.0) * shown)
 
 
+def test_every_rendering_has_random_numbers_of_its_own() -> None:
+    places = [(seed, i, d) for seed in (0, 1, 2) for i in (0, 1, 166, 167, 333) for d in DEFECTS]
+    drawn = {tuple(torch.randn(2, generator=benchmark.generator_of(*p)).tolist()) for p in places}
+    assert len(drawn) == len(places)
+    again = torch.randn(2, generator=benchmark.generator_of(*places[0]))
+    assert tuple(again.tolist()) in drawn
+
+
 def test_severity_1_is_what_the_benchmark_says() -> None:
     """On a grey card with a bright stripe, seen by a camera whose colours are sRGB's."""
     camera = replace(CAMERA, colour_matrix=None)

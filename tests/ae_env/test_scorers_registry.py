@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 import types
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import torch
 
 import ae_env  # noqa: F401, registers the environment
 from ae_env.scorers import list_scorers, make_scorer, registry
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.listing import ScorerRow, describe_scorers
 
+ID = "ae_env/AutoExposure-v0"
+SMALL = {"scenes": "bundled:small", "split": "test", "resolution": 36}
 MINE = '''
 import torch
 
@@ -75,6 +80,7 @@ def test_the_list_tells_of_each_scorer() -> None:
     assert rows["gone"].error == "ModuleNotFoundError: No module named 'not_there'"
     assert rows["ends"].error == "SystemExit: 3"
     assert rows["balanced"].depends_on == "blur"
+    assert (rows["balanced"].domain, rows["defects"].domain) == ("raw", "srgb")
     assert rows["noise"].depends_on == "light"
     assert rows["nima_technical"].needs == "weights: AE_ENV_NIMA_TECHNICAL"
     assert rows["keypoints"].needs == "extra cv"
@@ -84,6 +90,29 @@ def test_the_list_tells_of_each_scorer() -> None:
             assert row.domain in ("raw", "srgb")
             assert row.summary.endswith(".")
     sys.modules.pop("their_scores", None)
+
+
+def test_one_of_several_parts_sees_what_they_see(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Mixed(CompositeScorer):
+        """All of it."""
+
+        def __init__(self) -> None:
+            super().__init__({name: make_scorer(name) for name in ("entropy", "clipping", "snr")})
+
+    monkeypatch.setitem(registry._REGISTRY, "mixed", Mixed)
+    assert {row.name: row.domain for row in describe_scorers()}["mixed"] == "raw, srgb"
+
+
+def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> None:
+    """As docs/scorers.md says of a scorer from a file, whose class no other process knows."""
+    (tmp_path / "my_scorer.py").write_text(MINE)
+    env = gym.make(ID, scorer=f"{tmp_path}/my_scorer.py:Level", **SMALL)
+    content = pickle.dumps(env.spec)
+    for name in [name for name in sys.modules if name.startswith("ae_env_user_")]:
+        del sys.modules[name]
+    other = gym.make(pickle.loads(content))
+    rewards = [(e.reset(seed=0), e.step(5))[1][1] for e in (env, other)]
+    assert rewards[0] == rewards[1] > 0.0
 
 
 def test_only_the_self_contained(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,6 +73,41 @@ def test_a_file_means_what_it_means_alone(tmp_path: Path) -> None:
     assert not hasattr(sys.modules[mine.__module__], "Path")
 
 
+def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> None:
+    """From any folder, a package too; two folders may have helpers of the same names."""
+    before, path = set(sys.modules), list(sys.path)
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        (folder / "own_package").mkdir(parents=True)
+        _write(folder / "own_helper.py", f"number = {number}")
+        _write(folder / "own_package" / "__init__.py", "")
+        _write(folder / "own_package" / "part.py", f"from own_helper import number as n{number}")
+        text = f"from own_package.part import n{number} as n\nclass Mine:\n    number = n\n"
+        _write(folder / "mine.py", text)
+    files = [str(tmp_path / str(number) / "mine.py") for number in (1, 2)]
+    assert [load_from_file(f, "Mine", ARGUMENT).number for f in (*files, files[0])] == [1, 2, 1]
+    _write(tmp_path / "1" / "own_helper.py", "number = 333")
+    with open(files[0], "a") as file:
+        file.write("# changed")
+    assert load_from_file(files[0], "Mine", ARGUMENT).number == 333
+    assert sys.path == path
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def test_what_is_importable_anyway_is_not_imported_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Packages of an environment within the folder, or of the folder itself, on the path."""
+    monkeypatch.syspath_prepend(tmp_path)
+    _write(tmp_path / "on_the_path.py", "class Base: ...")
+    for name in ("one", "two"):
+        _write(tmp_path / f"{name}.py", "from on_the_path import Base as Mine")
+    one, two = (load_from_file(str(tmp_path / f"{n}.py"), "Mine", ARGUMENT) for n in ("one", "two"))
+    assert one is two
+    monkeypatch.delitem(sys.modules, "on_the_path")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
