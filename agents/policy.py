@@ -99,6 +99,15 @@ class Policy:
         """Forget the past: the next observations begin new episodes of `num_envs` cameras."""
         self.num_envs = num_envs
 
+    def check_reset(self, observations: Observations) -> None:
+        """Raises a `ValueError` unless `reset` was called for as many cameras as are observed."""
+        count = len(observations["raw"])
+        if count != self.num_envs:
+            raise ValueError(
+                f"policy {self.name!r} keeps {self.num_envs} cameras in mind, `observations` are "
+                f"of {count}: call reset(num_envs) first"
+            )
+
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
@@ -170,17 +179,19 @@ def make_policy(
     for key in options:
         if key in named:
             raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
-    policy = _make(base, context, device, {**options, **named})
+    policy = _make(base, name, context, device, {**options, **named})
     if named:
         policy.name = name
     return policy
 
 
-def _make(name: str, context: PolicyContext, device: str, options: dict[str, Any]) -> Policy:
-    """The policy of a name without options."""
-    head, _, tail = name.rpartition(":") if ".py:" in name else name.partition(":")
+def _make(
+    base: str, name: str, context: PolicyContext, device: str, options: dict[str, Any]
+) -> Policy:
+    """The policy called `base`; `name`, with the options, is for the messages."""
+    head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
     if not tail:
-        head = head or name
+        head = head or base
     if head.endswith(".py"):
         return _construct(_class_in_file(head, tail, name), name, context, options)
     if head in _SIMPLE and not tail:
@@ -195,13 +206,18 @@ def _make(name: str, context: PolicyContext, device: str, options: dict[str, Any
         cls = _class_in("agents.recorded", "Recorded")
         return _construct(cls, name, context, options, path=tail)
     if head in _TRAINED:
+        if "*" in tail:
+            raise ValueError(
+                f"`policy` (={name!r}) is a pattern, so several agents: it is for evaluations; "
+                "`training_seeds` lists the names of the single ones"
+            )
         if "network" not in options:
             weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
             options = {"weights": weights, "device": device, **options}
         return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)
     if tail and head not in (*METERS, *_SIMPLE, RPI_AGC):
         return _construct(_class_in_module(head, tail, name), name, context, options)
-    raise ValueError(_unknown(name))
+    raise ValueError(_unknown(base))
 
 
 def training_seeds(name: str) -> list[str]:

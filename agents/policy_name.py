@@ -7,7 +7,9 @@ from typing import Any
 
 import yaml
 
-_FRACTION = re.compile(r"\s*(\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
+#: Where options begin: a question mark before a slash of a path is a part of the path.
+_OPTIONS = re.compile(r"\?(?![^=]*/)")
+_FRACTION = re.compile(r"\s*([+-]?\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
 
 
 def split_name(name: str) -> tuple[str, dict[str, Any]]:
@@ -31,14 +33,15 @@ def split_name(name: str) -> tuple[str, dict[str, Any]]:
             f"`policy` (={name!r}) must be a name, such as 'matrix:P', not a {type(name).__name__}"
         )
     # A folder may have a question mark in its name, a class may not.
-    start = name.find("?", max(name.find(".py:"), 0))
-    if start < 0:
+    mark = _OPTIONS.search(name, max(name.find(".py:"), 0))
+    if mark is None:
         return name, {}
+    start = mark.start()
     options: dict[str, Any] = {}
     for part in name[start + 1 :].split("&"):
-        key, mark, text = part.partition("=")
+        key, equals, text = part.partition("=")
         key = key.strip()
-        if not mark or not key.isidentifier():
+        if not equals or not key.isidentifier():
             raise ValueError(
                 f"`policy` (={name!r}): options are written name?key=value&key=value, not {part!r}"
             )

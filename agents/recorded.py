@@ -51,6 +51,7 @@ class Recorded(Policy):
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """The state nearest to the next raw's settings, or the nearest allowed one."""
+        self.check_reset(observations)
         cost = self._cost[min(self._frame, len(self._cost) - 1)].round(9)
         self._frame += 1
         return masked_argmax(

@@ -119,6 +119,7 @@ class RegressionPolicy(NetworkPolicy):
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """Best state (N,) after this frame and those before it in the same light."""
+        self.check_reset(observations)
         self._forget_other_light(observations)
         device = next(self.network.parameters()).device
         with torch.inference_mode():

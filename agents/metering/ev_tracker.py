@@ -35,19 +35,29 @@ class EVTracker:
 
     With damping the EV that is handed out follows that estimate, keeping `damping` of its distance
     to it at every frame. It is a number of its own and never read back from the settings: a grid of
-    whole stops does not hold it up.
+    whole stops does not hold it up. What is kept of it is never beyond the range: light that comes
+    back after a long night is followed at once.
 
     Args:
         num_envs: Cameras.
         ev_range: Lowest and highest EV100 of the camera's exposure states.
         damping: Share of the distance to the estimate, in EV, that is kept per frame, in [0, 1).
+        compensation: Exposure compensation [EV] that is taken off what is handed out: the range of
+            that is so much higher.
     """
 
-    def __init__(self, num_envs: int, ev_range: tuple[float, float], damping: float = 0.0) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        ev_range: tuple[float, float],
+        damping: float = 0.0,
+        compensation: float = 0.0,
+    ) -> None:
         self.ev100 = np.full(num_envs, np.nan)
         self.damped = np.full(num_envs, np.nan)
         self.ev_range = ev_range
         self.damping = check_damping(damping)
+        self.compensation = compensation
 
     def update(self, reading: Reading) -> NDArray[np.float64]:
         """Take in one frame's reading; returns the estimates, ``(N,)``, damped."""
@@ -60,6 +70,7 @@ class EVTracker:
         new = np.where(white, np.maximum(new, 0.5 * (bound + high)), new)
         blended = np.where(np.abs(new - old) > 1.0, new, 0.5 * (new + old))
         self.ev100 = np.where(np.isnan(old), new, np.where(agrees, old, blended))
-        distance = self.damping * (self.damped - self.ev100)
+        before = np.clip(self.damped, low + self.compensation, high + self.compensation)
+        distance = self.damping * (before - self.ev100)
         self.damped = self.ev100 + np.where(np.isnan(distance), 0.0, distance)
         return self.damped.copy()

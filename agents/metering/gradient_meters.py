@@ -48,6 +48,9 @@ SIMULATED_EV = 4.0
 SATURATED_SEEN = 0.01
 #: From a saturated share s of 0.1 on, a frame is too bright by 4 (s - 0.1) EV or more.
 SATURATED_LIMIT, SATURATED_SLOPE_EV = 0.1, 4.0
+#: A frame without a gradient that is so far below the target is exposed for it, in steps of at
+#: most so much [EV].
+DARK_FROM_EV, DARK_STEP_EV = 1.0, 2.0
 #: Metric below which there is no gradient to follow.
 _NO_GRADIENT = 1e-9
 
@@ -62,6 +65,8 @@ def shim_reading(
     parabola) is g. The exposure is multiplied by ``1 + a K_p (R - 1)`` with
     ``R = 1 + d tan((1 - g) arctan(1 / d))``, a = 1/2 where g >= 1, else 1, K_p = 2, d = 1. A step
     that lowers the metric itself is halved: otherwise scenes with two peaks never come to rest.
+    Where no gamma shows a gradient, a picture that is 1 EV or more below the average meter's target
+    goes to it, at most 2 EV a frame.
 
     Source: I. Shim et al., IROS 2014 (metric and search); the nonlinear update is that of their
     "Gradient-based camera exposure control for outdoor mobile platforms", IEEE TCSVT 29(6), 2019.
@@ -80,7 +85,8 @@ def shim_reading(
     factor = 1.0 + np.where(gamma >= 1.0, 0.5, 1.0) * SHIM_SPEED * ratio
     here = metric[:, GAMMAS.index(1.0)]
     step = np.log2(np.maximum(factor, SHIM_LEAST))
-    return frame.reading(frame.rising(step, here, frame.metric(shim_gradient)))
+    rising = frame.rising(step, here, frame.metric(shim_gradient))
+    return frame.reading(frame.lifted(rising, metric.max(axis=1)))
 
 
 def zhang_reading(
@@ -91,7 +97,8 @@ def zhang_reading(
     With M = `ae_env.scorers.detail.zhang_gradient` of the picture (sRGB luma), the EV moves by
     ``3 d ln M / d EV``, at most 2 EV; the derivative is the difference of the frame exposed a
     quarter of an EV brighter and darker, through the known response (sRGB, clipped). A step that
-    lowers M is halved: M has a kink where pixels begin to clip.
+    lowers M is halved: M has a kink where pixels begin to clip. Where M is 0, a picture that
+    is 1 EV or more below the average meter's target goes to it.
 
     Source: Z. Zhang, C. Forster, D. Scaramuzza, ICRA 2017 (p 0.7, k 5); relative to M, because its
     size differs between scenes by orders of magnitude.
@@ -107,7 +114,8 @@ def zhang_reading(
     rise = np.where(both, 0.5 * (brighter - darker), brighter - here)
     slope = rise / (ZHANG_DELTA_EV * np.maximum(here, _NO_GRADIENT))
     step = np.clip(ZHANG_RATE * slope, -ZHANG_LIMIT_EV, ZHANG_LIMIT_EV)
-    return frame.reading(frame.rising(step, here, metric))
+    rising = frame.rising(step, here, metric)
+    return frame.reading(frame.lifted(rising, np.maximum(here, brighter)))
 
 
 class _Frame:
@@ -161,6 +169,12 @@ class _Frame:
                 return step
             step = np.where(falls, 0.5 * step, step)
         return np.where(falls, 0.0, step)
+
+    def lifted(self, step: Floats, gradient: Floats) -> Floats:
+        """The steps [EV], upwards in the dark where there is no `gradient`, all ``(N,)``."""
+        missing = np.log2(TARGET_SIGNAL / np.maximum(self._mean, BLACK_SIGNAL)) - self.shift
+        dark = (missing >= DARK_FROM_EV) & (gradient <= _NO_GRADIENT)
+        return np.where(dark, np.minimum(missing, DARK_STEP_EV), step)
 
     def reading(self, brighter: Floats) -> Reading:
         """The reading of a step that makes the picture `brighter` by so many EV, ``(N,)``."""

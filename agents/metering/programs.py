@@ -13,7 +13,7 @@ from agents.episodes import episode_batches, expected_scores, scenes_of
 from agents.metering.ev_tracker import EVTracker
 from agents.metering.meters import make_meter
 from agents.metering.reference_frames import ReferenceFrames
-from agents.metering.state_choice import ProgramOptions, StateChooser, check_program
+from agents.metering.state_choice import ProgramOptions, StateChooser, check_program, check_used
 from agents.metering.tuned import ScoreRegression
 from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
 
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
 HANDHELD_LIMIT = 1 / 60
 #: With sensors: blur that programs accept, in frame heights (one pixel of a 64-pixel frame).
 BLUR_LIMIT = 1 / 64
-#: Aperture of programs A and M, aperture that P tends to, and shutter of programs S and M.
-PRIORITY_F_NUMBER, PROGRAM_F_NUMBER, PRIORITY_TIME = 8.0, 5.6, 1 / 125
+#: Aperture that P tends to.
+PROGRAM_F_NUMBER = 5.6
 #: Meters whose reading is the most exposure that may be given: no state above it is chosen.
 CEILING_METERS = ("highlight_weighted",)
 #: Meters that try other exposures on a frame, and so need one that shows the scene well.
 SEARCH_METERS = ("skewness", "entropy", "shim", "zhang")
-#: Advantage of the last state in a tuned program [score].
-HYSTERESIS_SCORE = 0.002
+#: Advantage of the last state in a tuned program [score], and in program P; there the square of a
+#: stop counts 1/4 to 1.
+HYSTERESIS_SCORE, HYSTERESIS_COST = 0.002, 0.1
 #: Episodes (in all, at least one per scene and pass) and frames per episode from which a tuned
 #: program learns; three times as many take 35 s and did not score higher on unseen scenes.
 FIT_EPISODES, FIT_FRAMES = 1600, 4
@@ -53,13 +54,13 @@ class MeteringPolicy(Policy):
         compensation: Exposure compensation [EV], positive is brighter.
         damping: Share of the distance to the metered EV that is kept per frame, in [0, 1).
         shutter_cap: Longest exposure time that may be used [s].
-        f_number: Aperture that A and M keep.
-        exposure_time: Shutter that S and M keep [s].
+        f_number: Aperture that A and M keep; None: f/8.
+        exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
         weights: File of a tuned program, as `save` writes it.
 
     Raises:
-        ValueError: If an argument is unknown or out of range.
+        ValueError: If an argument is unknown, out of range or of another program.
     """
 
     def __init__(
@@ -71,24 +72,23 @@ class MeteringPolicy(Policy):
         compensation: float = 0.0,
         damping: float = 0.0,
         shutter_cap: float | None = None,
-        f_number: float = PRIORITY_F_NUMBER,
-        exposure_time: float = PRIORITY_TIME,
+        f_number: float | None = None,
+        exposure_time: float | None = None,
         iso: float | None = None,
         weights: str | os.PathLike[str] | None = None,
     ) -> None:
         super().__init__(context)
         self.program = check_program(program, PROGRAMS)
-        self.options = ProgramOptions(
-            compensation, damping, shutter_cap, f_number, exposure_time, iso
-        )
+        by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
+        check_used(program, **by_hand, weights=weights)
+        given = {name: value for name, value in by_hand.items() if value is not None}
+        self.options = ProgramOptions(compensation, damping, shutter_cap, **given)
         self.meter = make_meter(meter, context.camera)
         self._meter_name = meter
         self.name = f"{meter}:{program}"
         self.uses_sensors = context.has_sensors and program != "tuned_blind"
-        self.regression = None if weights is None else ScoreRegression.load(weights)
-        self._chooser = StateChooser(context.grid, program, self.options)
-        # The nearest state to half a step darker is never brighter than the reading.
-        self._ceiling = 0.5 * self._chooser.step if meter in CEILING_METERS else 0.0
+        self.regression = None if weights is None else ScoreRegression.load(weights, "weights")
+        self._chooser = StateChooser(context.grid, program, self.options, meter in CEILING_METERS)
         self.reset(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
@@ -96,7 +96,8 @@ class MeteringPolicy(Policy):
         super().reset(num_envs, seed)
         ev100 = self.context.grid.ev100
         ev_range = (float(ev100.min()), float(ev100.max()))
-        self._tracker = EVTracker(num_envs, ev_range, self.options.damping)
+        options = self.options
+        self._tracker = EVTracker(num_envs, ev_range, options.damping, options.compensation)
         searches = self._meter_name in SEARCH_METERS
         self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))
@@ -120,6 +121,7 @@ class MeteringPolicy(Policy):
 
         The sensors are averaged, in stops, over the frames of the episode.
         """
+        self.check_reset(observations)
         self._frames += 1
         metered = observations if self._reference is None else self._reference.update(observations)
         held = np.clip(self._tracker.ev100, *self._tracker.ev_range)  # no farther than can be set
@@ -134,7 +136,7 @@ class MeteringPolicy(Policy):
     def _program_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
         """Minus the cost of each state, by the program's priorities."""
         chooser = self._chooser
-        target = readings[:, 0] - self.options.compensation + self._ceiling
+        target = readings[:, 0] - self.options.compensation
         slow = np.maximum(self._shutter_limit(readings) - chooser.time[None], 0.0)  # stops too slow
         gain = (chooser.speed - chooser.speed.min())[None]
         if self.program in ("S", "M"):
@@ -145,6 +147,8 @@ class MeteringPolicy(Policy):
             wide = np.maximum(self._aperture_limit(readings) - chooser.aperture[None], 0.0)
             line = np.abs(chooser.aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))[None]
             cost = slow**2 + 0.5 * wide**2 + 0.25 * gain**2 + 0.05 * line**2
+            if self._previous is not None:
+                cost[np.arange(len(cost)), self._previous] -= HYSTERESIS_COST
         return chooser.utility(chooser.kept(target, self._previous), cost)
 
     def _shutter_limit(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from ae_env.checks import check_integer, check_number, check_word
 from agents.metering import rpi_agc_tuning as tuning
 from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
-from agents.metering.state_choice import ProgramOptions, StateChooser, check_program
+from agents.metering.state_choice import (
+    PRIORITY_TIME,
+    ProgramOptions,
+    StateChooser,
+    check_program,
+    check_used,
+)
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 
 Floats = NDArray[np.float64]
@@ -26,8 +32,9 @@ _LEAST_SIGNAL = 1e-3
 _PERIOD_TOLERANCE = 0.02
 #: Advantage of the last state; the square of a stop counts 1.
 _STAYS = 0.1
-#: Cost of a state whose shutter lets lamps flicker; the EV counts 1000 per stop.
-_FLICKERS = 1e5
+#: Cost of a state whose shutter lets lamps flicker where one nearby does not; the EV counts 1000
+#: per stop. A state is nearby within this of the EV [EV], or where none is nearer.
+_FLICKERS, _NEARBY_EV = 1e5, 0.5
 
 
 class RpiAgc(Policy):
@@ -41,8 +48,8 @@ class RpiAgc(Policy):
     Args:
         context: The camera, the grid and the observation.
         program: ``"P"``: the ladder, at an aperture of `f_number`; ``"A"``: the same, and no other
-            aperture; ``"S"``: shutter by hand, the gain follows; ``"M"``: aperture and shutter by
-            hand.
+            aperture; ``"S"``: shutter by hand, the gain follows, and the aperture where the gain
+            alone comes less near to the EV; ``"M"``: aperture and shutter by hand.
         metering: ``"centre_weighted"``, ``"spot"`` or ``"matrix"``: weights of the zones.
         mode: ``"normal"``, ``"short"`` or ``"long"``: the ladder.
         constraint: ``"normal"``, ``"highlight"`` or ``"shadows"``.
@@ -50,16 +57,16 @@ class RpiAgc(Policy):
         damping: Share of the distance to the filtered EV that is kept per frame besides, in [0, 1).
         shutter_cap: Longest exposure time that may be used [s].
         f_number: Aperture of the lens.
-        exposure_time: Shutter that S and M keep [s].
+        exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
         max_gain: Gain at the end of the ladder, 1 at ISO 100.
         flicker_period: Period of the lamps' light [s], such as 0.01: shutters of a period and more
-            are whole periods, and the gain makes up for it. None: lamps are steady.
+            are whole periods, and the gain makes up for it (P and A). None: lamps are steady.
         speed: Share of the distance to the target that the filter goes per frame, in (0, 1].
         startup_frames: Frames of an episode in which it goes all of the way.
 
     Raises:
-        ValueError: If an argument is unknown or out of range.
+        ValueError: If an argument is unknown, out of range or of another program.
     """
 
     def __init__(
@@ -74,7 +81,7 @@ class RpiAgc(Policy):
         damping: float = 0.0,
         shutter_cap: float | None = None,
         f_number: float = 5.6,
-        exposure_time: float = 1 / 125,
+        exposure_time: float | None = None,
         iso: float | None = None,
         max_gain: float = 16.0,
         flicker_period: float | None = None,
@@ -83,12 +90,12 @@ class RpiAgc(Policy):
     ) -> None:
         super().__init__(context)
         self.program = check_program(program)
+        check_used(program, exposure_time=exposure_time, iso=iso, flicker_period=flicker_period)
         check_word("metering", metering, tuple(tuning.ZONE_WEIGHTS))
         check_word("mode", mode, tuple(tuning.LADDERS))
         check_word("constraint", constraint, tuple(tuning.CONSTRAINTS))
-        self.options = ProgramOptions(
-            compensation, damping, shutter_cap, f_number, exposure_time, iso
-        )
+        time = PRIORITY_TIME if exposure_time is None else exposure_time
+        self.options = ProgramOptions(compensation, damping, shutter_cap, f_number, time, iso)
         self.speed = check_number("speed", speed, 1e-3, 1.0)
         self.startup_frames = check_integer("startup_frames", startup_frames, 0)
         max_gain = check_number("max_gain", max_gain, 1.0, 1e5)
@@ -115,13 +122,16 @@ class RpiAgc(Policy):
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """Meter the frames, filter the exposure, split it."""
+        self.check_reset(observations)
         gain, target_signal = self._gain(observations)
         # Exposures are relative to that of EV100 0.
         target = np.exp2(-frame_ev100(observations)) * gain
         filtered = self._filter.update(np.minimum(target, self._most_exposure()))
         reduce = (target_signal > tuning.FAST_REDUCE) & (gain < np.sqrt(target_signal))
         ev = -np.log2(filtered * np.where(reduce, tuning.FAST_REDUCE, 1.0))
-        kept = self.options.damping * (self._damped - ev)
+        states = self.context.grid.ev100
+        before = np.clip(self._damped, states.min(), states.max())
+        kept = self.options.damping * (before - ev)
         self._damped = ev + np.where(np.isnan(kept), 0.0, kept)
         self._previous = masked_argmax(self._utility(self._damped), action_masks)
         return self._previous.copy()
@@ -195,17 +205,23 @@ class RpiAgc(Policy):
         cost = slower**2 + 0.25 * higher**2 + 4.0 * (aperture**2)[None]
         if self._previous is not None:  # of nominally equal exposures the last one stays
             cost[np.arange(len(cost)), self._previous] -= _STAYS
-        return chooser.utility(target, cost) - _FLICKERS * self._flickers(time)
+        return chooser.utility(target, cost) - _FLICKERS * self._flickers(time, target)
 
-    def _flickers(self, time: Floats) -> Any:
-        """1.0 where a state's shutter is not of whole periods but the ladder's is, ``(N, S)``."""
-        if self.flicker_period is None or self.program in ("S", "M"):
+    def _flickers(self, time: Floats, target: Floats) -> Any:
+        """1.0 where lamps flicker in a state but not in one near the EV, ``(N, S)``.
+
+        Shutters of whole periods are looked for where that of the ladder is one, up to its longest.
+        """
+        if self.flicker_period is None:
             return 0.0
-        periods = np.exp2(-self._chooser.time) / self.flicker_period
-        whole = (np.abs(periods - np.round(periods)) <= _PERIOD_TOLERANCE * periods) & (
-            periods > 0.5
-        )
-        return ((time >= self.flicker_period)[:, None] & ~whole[None]).astype(np.float64)
+        times = np.exp2(-self._chooser.time)
+        periods = times / self.flicker_period
+        tolerance = _PERIOD_TOLERANCE * periods
+        whole = (np.abs(periods - np.round(periods)) <= tolerance) & (periods > 0.5)
+        whole &= times <= self._ladder.shutter[-1] * (1.0 + _PERIOD_TOLERANCE)
+        steady = self._chooser.nearby(target, _NEARBY_EV) & whole
+        found = (time >= self.flicker_period) & steady.any(axis=1)
+        return (found[:, None] & ~steady).astype(np.float64)
 
 
 class ExposureFilter:

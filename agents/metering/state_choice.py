@@ -18,10 +18,22 @@ Floats = NDArray[np.float64]
 #: A program keeps its EV until another is nearer to the metered one by this, in steps of the grid:
 #: on even steps, while it is within 0.6 steps.
 HYSTERESIS_STEPS = 0.2
+#: Aperture of A and M, and shutter of S and M [s], where no other is given.
+PRIORITY_F_NUMBER, PRIORITY_TIME = 8.0, 1 / 125
+#: Options that not every program uses, and the programs that do.
+USED_BY = {
+    "f_number": ("A", "M"),
+    "exposure_time": ("S", "M"),
+    "iso": ("M",),
+    "flicker_period": ("P", "A"),
+    "weights": ("tuned", "tuned_blind"),
+}
 #: Largest exposure compensation [EV].
 MAX_COMPENSATION = 32.0
 #: Weights of what comes first, second and third in the choice of a state.
 _CAPPED, _BY_HAND, _DISTANCE = 1e9, 1e6, 1e3
+#: A state above the ceiling is so much farther than it is [EV]: any below it is nearer.
+_ABOVE_CEILING_EV = 100.0
 
 
 @dataclass(frozen=True)
@@ -44,8 +56,8 @@ class ProgramOptions:
     compensation: float = 0.0
     damping: float = 0.0
     shutter_cap: float | None = None
-    f_number: float = 8.0
-    exposure_time: float = 1 / 125
+    f_number: float = PRIORITY_F_NUMBER
+    exposure_time: float = PRIORITY_TIME
     iso: float | None = None
 
     def __post_init__(self) -> None:
@@ -71,17 +83,16 @@ class StateChooser:
         grid: The exposure states.
         program: ``"P"``, ``"A"``, ``"S"`` or ``"M"``; nothing is set by hand in any other.
         options: What is set by hand, and the shutter cap.
-
-    Raises:
-        ValueError: If an ISO speed is given to another program than M.
+        ceiling: Whether the EV wanted is the most exposure that may be given.
     """
 
-    def __init__(self, grid: ExposureGrid, program: str, options: ProgramOptions) -> None:
-        if options.iso is not None and program != "M":
-            raise ValueError(f"`iso` (={options.iso!r}) is set by hand in program M only")
+    def __init__(
+        self, grid: ExposureGrid, program: str, options: ProgramOptions, ceiling: bool = False
+    ) -> None:
         apex = np.array([(s.aperture_stop / 3.0, s.time_value, s.speed_value) for s in grid.states])
         self.aperture, self.time, self.speed = apex.T
         self.ev100 = grid.ev100
+        self.ceiling = ceiling
         self.step = ev_step(grid)
         self.hysteresis = HYSTERESIS_STEPS * self.step
         self._fixed = self._off(program, options)
@@ -109,17 +120,27 @@ class StateChooser:
         if previous is None:
             return target
         old = self.ev100[previous]
+        if self.ceiling:  # a brighter state must be below the ceiling by the hysteresis
+            return np.where(old < target, target, np.minimum(target + self.hysteresis, old))
         farther = np.abs(target - old) - self._least_distance(self._distance(target))[:, 0]
         return np.where(farther < self.hysteresis, old, target)
 
     def _distance(self, target: Floats) -> Floats:
-        distance: Floats = np.abs(self.ev100[None] - target[:, None])
-        return distance  # (N, S)
+        darker: Floats = self.ev100[None] - target[:, None]  # (N, S)
+        distance: Floats = np.abs(darker)
+        return distance + _ABOVE_CEILING_EV * (darker < -1e-9) if self.ceiling else distance
 
     def _least_distance(self, distance: Floats) -> Floats:
         """Of the states that the cap and what is set by hand leave, ``(N, 1)``."""
         least: Floats = distance[:, self._allowed].min(axis=1, keepdims=True)
         return least
+
+    def nearby(self, target: Floats, limit: float) -> NDArray[np.bool_]:
+        """States that may be used within `limit` [EV] of `target` or as near as any, ``(N, S)``."""
+        distance = self._distance(target)
+        near = np.maximum(self._least_distance(distance) + SAME_EV, limit)
+        found: NDArray[np.bool_] = (distance <= near) & self._allowed
+        return found
 
     def utility(self, target: Floats, preference: Floats) -> Floats:
         """How well each state fits, ``(N, S)``; the highest is to be taken.
@@ -146,6 +167,17 @@ def check_program(program: str, programs: tuple[str, ...] = MANUAL_PROGRAMS) -> 
     """
     check_word("program", program, programs)
     return program
+
+
+def check_used(program: str, **options: object) -> None:
+    """Raises a `ValueError` if one of the `options` of `USED_BY` is given to another program."""
+    for name, value in options.items():
+        users = USED_BY[name]
+        if value is not None and program not in users:
+            programs = f"program{'s' if len(users) > 1 else ''} {' and '.join(users)}"
+            raise ValueError(
+                f"`{name}` (={value!r}) is an option of {programs} only, not of {program}"
+            )
 
 
 def ev_step(grid: ExposureGrid) -> float:

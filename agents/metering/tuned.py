@@ -129,8 +129,12 @@ class ScoreRegression:
         return write_atomically(path, save({k: np.ascontiguousarray(v) for k, v in arrays.items()}))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> ScoreRegression:
+    def load(cls, path: str | os.PathLike[str], name: str = "path") -> ScoreRegression:
         """Read what `save` wrote.
+
+        Args:
+            path: The file.
+            name: What errors call it.
 
         Raises:
             ValueError: If the file is missing or is not one of these.
@@ -141,9 +145,9 @@ class ScoreRegression:
         try:
             arrays = load_file(path)
         except (OSError, SafetensorError) as error:
-            raise ValueError(f"`path` (={str(path)!r}) cannot be read: {error}") from None
+            raise ValueError(f"`{name}` (={str(path)!r}) cannot be read: {error}") from None
         if set(arrays) != {"features", "scores", "bandwidths"}:
-            raise ValueError(f"`path` (={str(path)!r}) holds no tuned program: {sorted(arrays)}")
+            raise ValueError(f"`{name}` (={str(path)!r}) holds no tuned program: {sorted(arrays)}")
         return cls(**arrays)
 
 

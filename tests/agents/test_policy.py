@@ -65,6 +65,8 @@ def test_options_in_a_name(context):
     assert (policy.options.compensation, policy.options.damping) == (-1.0, 0.5)
     assert policy.options.shutter_cap == pytest.approx(1 / 60)
     assert make_policy("spot?compensation=1", context).program == "P"
+    assert make_policy("spot?compensation=-1/3", context).options.compensation == -1 / 3
+    assert make_policy("spot?compensation=+2/3", context).options.compensation == 2 / 3
     assert make_policy("rpi_agc:M?iso=400&mode=long", context).options.iso == 400.0
     assert make_policy("average:A", context, f_number=4).options.f_number == 4.0
 
@@ -72,7 +74,10 @@ def test_options_in_a_name(context):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("spot?compensatio=1", r"does not take the option 'compensatio'.*did you mean 'compensat"),
+        (
+            "spot?compensatio=1",
+            r"'spot\?compensatio=1'\): .* does not take the option 'compensatio'.*mean 'comp",
+        ),
         ("spot?meter=matrix", r"does not take the option 'meter'"),
         ("rpi_agc?program=A", r"does not take the option 'program'"),
         ("oracle?state=3", r"does not take the option 'state'; it takes none"),
@@ -81,7 +86,10 @@ def test_options_in_a_name(context):
         ("spot?compensation=true", r"`compensation` \(=True\) must be a number"),
         ("spot?damping=1", r"`damping` \(=1\) must be below 1"),
         ("spot?shutter_cap=0", r"`shutter_cap` \(=0\) must be a number in"),
-        ("spot:A?iso=100", r"`iso` \(=100(\.0)?\) is set by hand in program M only"),
+        ("spot:A?iso=100", r"`iso` \(=100(\.0)?\) is an option of program M only, not of A"),
+        ("average:tuned?weights=/no/file", r"`weights` \(='/no/file'\) cannot be read"),
+        ("ppo:runs/ppo-*", r"is a pattern, so several agents: .*`training_seeds`"),
+        ("recorded:/no/what?/x", r"`path` \(='/no/what\?/x'\) must be a folder"),
         ("spot?", r"options are written name\?key=value&key=value, not ''"),
         ("spot?damping", r"not 'damping'"),
         ("spot?damping=[1]", r"option 'damping' \(='\[1\]'\) must be a YAML scalar"),

@@ -19,7 +19,9 @@ EVERY = 3
 
 
 @functools.cache
-def _loop(name: str, frames: int, **options: Any) -> tuple[Any, np.ndarray, np.ndarray]:
+def _loop(
+    name: str, frames: int, start: int | None = None, **options: Any
+) -> tuple[Any, np.ndarray, np.ndarray]:
     """The grid, the states (E, T) and the EV of the light at the start (E,)."""
     options = {
         **SMALL,
@@ -35,7 +37,9 @@ def _loop(name: str, frames: int, **options: Any) -> tuple[Any, np.ndarray, np.n
         base: Any = envs.unwrapped
         policy = make_policy(name, PolicyContext.from_envs(envs))
         policy.reset(len(scenes), seed=0)
-        observations, _ = envs.reset(seed=0, options={"scene": scenes})
+        observations, _ = envs.reset(
+            seed=0, options={"scene": scenes, **({} if start is None else {"state": start})}
+        )
         states = []
         for _ in range(frames):
             states.append(policy.act(observations, base.action_masks()))
@@ -46,10 +50,13 @@ def _loop(name: str, frames: int, **options: Any) -> tuple[Any, np.ndarray, np.n
         envs.close()
 
 
-@pytest.mark.parametrize("program", MANUAL_PROGRAMS)
+@pytest.mark.parametrize(
+    ("program", "start"), [*((p, None) for p in MANUAL_PROGRAMS), ("P", 3), ("P", 60)]
+)
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_comes_to_rest_in_steady_light(name, program):
-    grid, states, light = _loop(f"{name}:{program}", 24)
+def test_comes_to_rest_in_steady_light(name, program, start):
+    """From a start of the environment's, from the darkest state (3) and from the brightest (60)."""
+    grid, states, light = _loop(f"{name}:{program}", 24, start)
     ev = grid.ev100[states]
     # Shim's and Zhang's meters may still be on their way in the dark, but they do not turn back.
     moves = np.sign(np.diff(ev[:, -10:], axis=1).round(1))
@@ -76,9 +83,8 @@ def test_comes_to_rest_after_a_step_with_delay(name, stops):
 @pytest.mark.parametrize("name", ["centre_weighted", "rpi_agc"])
 def test_damped_controllers_converge_on_whole_stops(name):
     """A controller that took its EV back from the settings would stay: its first step is short."""
-    grid, plain, _ = _loop(f"{name}:P", 40)
     lighting = (("kind", "step"), ("stops", -3.0), ("at", 6))
-    _, damped, _ = _loop(f"{name}:P?damping=0.9", 90, lighting=lighting)
+    grid, damped, _ = _loop(f"{name}:P?damping=0.9", 90, lighting=lighting)
     _, free, _ = _loop(f"{name}:P", 90, lighting=lighting)
     ev_damped, ev_free = grid.ev100[damped], grid.ev100[free]
     assert np.abs(ev_damped[:, -1] - ev_free[:, -1]).max() < 1.1
@@ -86,7 +92,6 @@ def test_damped_controllers_converge_on_whole_stops(name):
     # 3 EV * 0.9^n falls below half a stop after 17 frames.
     late = np.abs(ev_damped[:, 12] - ev_damped[:, 5]) <= 2.1
     assert late.mean() > 0.9
-    assert plain.shape[1] == 40
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
@@ -102,7 +107,8 @@ def test_compensation_shifts_the_exposure_by_its_ev(name):
 @pytest.mark.parametrize("program", MANUAL_PROGRAMS)
 @pytest.mark.parametrize("name", ["average", "rpi_agc"])
 def test_shutter_cap_holds_whatever_the_program(name, program):
-    grid, states, _ = _loop(f"{name}:{program}?shutter_cap=1/500&exposure_time=0.5", 8)
+    slow = "&exposure_time=0.5" if program in ("S", "M") else ""
+    grid, states, _ = _loop(f"{name}:{program}?shutter_cap=1/500{slow}", 8)
     assert {grid[int(s)].exposure_time for s in states.ravel()} == {1 / 1000}
     none_shorter, states, _ = _loop(f"{name}:{program}?shutter_cap=1/8000", 4)
     assert {none_shorter[int(s)].exposure_time for s in states.ravel()} == {1 / 1000}

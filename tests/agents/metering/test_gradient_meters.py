@@ -7,6 +7,7 @@ import pytest
 
 from agents.metering.gradient_meters import GAMMAS, _best_gamma
 from agents.metering.meters import make_meter
+from agents.policy import make_policy
 
 
 def _texture(seed=0):
@@ -71,6 +72,21 @@ def test_frames_without_gradient_ask_for_nothing_or_for_their_bound(context, pho
         assert black.black[0]
         expected = context.grid.ev100[dark] + math.log2(2e-4 / 0.12)
         assert black.ev100[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("name", ["shim", "zhang", "entropy"])
+def test_the_dark_is_left(context, photograph, name):
+    """8 EV under at the start, and again after a flash of EV 35: within 2 EV of the light."""
+    rng = np.random.default_rng(0)
+    light = 1.0 + 0.1 * np.kron(rng.uniform(-1, 1, (16, 16)), np.ones((4, 4)))
+    policy = make_policy(f"{name}:P", context)
+    policy.reset(1)
+    state = np.array([context.grid.nearest(17.0)])
+    for frame in range(26):
+        if frame == 12:
+            assert context.grid.ev100[state[0]] < 9.0 + 1.6
+        state = policy.act(photograph(light, 35.0 if frame in (13, 14) else 9.0, state))
+    assert context.grid.ev100[state[0]] < 9.0 + 1.6
 
 
 def test_best_gamma_is_the_top_of_the_parabola():

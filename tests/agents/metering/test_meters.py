@@ -14,6 +14,22 @@ from agents.policy import METERS
 GREY = np.ones((64, 64))
 
 
+@pytest.mark.parametrize("compensation", [0.0, 3.0])
+def test_damping_does_not_wind_up_in_the_dark(compensation):
+    """A range of 0 to 10: of 40 frames that read -9, at most the last one counts beyond it."""
+    tracker = EVTracker(1, (0.0, 10.0), 0.5, compensation)
+
+    def read(ev):
+        return Reading(np.array([ev]), np.zeros(1), np.zeros(1, bool))
+
+    for _ in range(40):
+        tracker.update(read(-9.0))
+    low = compensation
+    # 0.5 * -9 + 0.5 * low in the dark; that is clipped to low, and half of the way to 8 is left.
+    assert tracker.damped[0] == pytest.approx(0.5 * (low - 9.0))
+    assert tracker.update(read(8.0))[0] == pytest.approx(0.5 * (low + 8.0))
+
+
 @pytest.mark.parametrize("name", ["average", "centre_weighted", "spot"])
 def test_a_grey_card_reads_the_incident_ev(context, photograph, name):
     states = [int(np.argmin(np.abs(context.grid.ev100 - ev))) for ev in (7.0, 8.0, 9.0, 10.0)]

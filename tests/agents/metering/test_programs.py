@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
+import itertools
+
 import numpy as np
 import pytest
 
@@ -137,7 +140,80 @@ def test_arguments_are_checked(context):
         MeteringPolicy(context, "average", "X")
     with pytest.raises(ValueError, match="`f_number`"):
         MeteringPolicy(context, f_number=0.0)
-    assert {p.partition(":")[2] for p in (f"a:{q}" for q in PROGRAMS)} == set(PROGRAMS)
+    with pytest.raises(ValueError, match=r"`weights` \(='/no/file'\) cannot be read"):
+        MeteringPolicy(context, "average", "tuned", weights="/no/file")
+    for program in PROGRAMS:
+        assert MeteringPolicy(context, "average", program).program == program
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        *[(f"spot:{p}", "f_number") for p in ("P", "S", "tuned", "tuned_blind")],
+        *[(f"spot:{p}", "exposure_time") for p in ("P", "A", "tuned")],
+        *[(f"spot:{p}", "iso") for p in ("P", "A", "S", "tuned")],
+        *[(f"spot:{p}", "weights") for p in ("P", "A", "S", "M")],
+        *[("rpi_agc:P", "exposure_time"), ("rpi_agc:A", "iso"), ("rpi_agc:M", "flicker_period")],
+    ],
+)
+def test_options_of_other_programs_are_refused(context, name, option):
+    with pytest.raises(ValueError, match=rf"`{option}` \(=4\) is an option of programs? .* only"):
+        make_policy(f"{name}?{option}=4", context)
+
+
+def test_a_policy_that_was_not_reset_says_so(context, photograph):
+    frame = photograph(GREY, 9.0, [1, 2])
+    for name in ("matrix:P", "shim:A", "rpi_agc"):
+        policy = make_policy(name, context)
+        with pytest.raises(ValueError, match=r"are of 2: call reset\(num_envs\) first"):
+            policy.act(frame)
+
+
+UNEVEN = ExposureGrid((100, 800), (1 / 4000, 1 / 500, 1 / 400, 1 / 30), (2.8, 16))
+
+
+@pytest.mark.parametrize("program", ["P", "A", "S", "M"])
+@pytest.mark.parametrize("grid", [ExposureGrid.default(), UNEVEN])
+@pytest.mark.parametrize("masked", [False, True])
+def test_highlights_have_a_ceiling_on_uneven_grids(context, photograph, program, grid, masked):
+    """A frame-filling card at 0.12 * 2^d: never above 0.9 of white where a darker state is left."""
+    policy = make_policy(f"highlight_weighted:{program}", dataclasses.replace(context, grid=grid))
+    masks = np.random.default_rng(0).random((1, len(grid))) < (0.5 if masked else 2.0)
+    allowed = policy._chooser._allowed & masks[0]  # by the program and the masks
+    for scene_ev in np.arange(2.0, 16.0, 0.7):
+        reading = scene_ev - np.log2(0.9 / 0.12)
+        policy.reset(1)
+        start = context.grid.nearest(scene_ev)
+        for drift in (0.0, 0.1, -0.1):  # hysteresis must not lead above it
+            frame = photograph(GREY, scene_ev + drift, start)
+            chosen = grid.ev100[policy.act(frame, masks)[0]]
+            darker = grid.ev100[allowed & (grid.ev100 > reading + 0.2)]
+            if len(darker):
+                assert chosen > reading + min(drift, 0.0) - 0.06  # half a code
+                assert chosen <= darker.min() + 0.4 * policy._chooser.step
+    assert allowed.any()
+
+
+def test_p_keeps_a_state_while_the_sensors_waver(context):
+    """Of two states of one exposure the better one may change with every look at the motion."""
+    policy = make_policy("average:P", context)
+
+    def choose(speed):
+        readings = np.array([[7.0, speed, -1.0]])
+        return int(policy._program_utility(readings).argmax())
+
+    policy.reset(1)
+    speeds = np.arange(-8.0, 3.0, 0.01)
+    chosen = [choose(speed) for speed in speeds]
+    borders = [s for s, (a, b) in zip(speeds, itertools.pairwise(chosen), strict=False) if a != b]
+    assert len(borders) >= 2
+    for border in borders:
+        policy.reset(1)
+        path = []
+        for k in range(6):
+            path.append(choose(border + (0.02 if k % 2 else -0.02)))
+            policy._previous = np.array(path[-1:])
+        assert len(set(path)) == 1
 
 
 def test_compensation_moves_the_reading_of_a_tuned_program(context, photograph, tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
+from ae_env.presets import load_preset
 from agents.metering.rpi_agc import ExposureFilter, quantile_mean, zone_gain, zone_map
 from agents.metering.rpi_agc_tuning import ZONE_WEIGHTS
 from agents.policy import make_policy
@@ -169,6 +170,24 @@ def test_lamps_do_not_flicker_on_a_grid_with_other_shutters(context):
         assert np.abs(grid.ev100[states] - evs).max() < 1.1
     assert used["rpi_agc"] & {1 / 120, 1 / 60}
     assert used["rpi_agc?flicker_period=0.01"] <= {1 / 100, 1 / 50, 1 / 120}
+
+
+@pytest.mark.parametrize("preset", ["static", "office_led"])
+def test_flicker_does_not_cost_exposure(context, preset):
+    """The default grid has one shutter of whole periods, 1/2 s; that of `office_led` has three."""
+    grid = ExposureGrid.from_spec(load_preset(preset).get("grid", "default"))
+    policy = make_policy("rpi_agc?flicker_period=0.01", dataclasses.replace(context, grid=grid))
+    evs = np.linspace(grid.ev100.min(), grid.ev100.max(), 120)
+    states = policy._utility(evs).argmax(axis=1)
+    least = np.abs(grid.ev100[None] - evs[:, None]).min(axis=1)
+    assert (np.abs(grid.ev100[states] - evs) <= np.maximum(least + 0.17, 0.5)).all()
+    times = np.array([grid[int(s)].exposure_time for s in states])
+    dim = evs < 8.0  # the ladder is at 10 ms and more: f/5.6 at 1/100 s is EV100 11.6
+    if preset == "static":
+        assert (times[dim] < 0.2).mean() > 0.5  # half a second is no shutter of the ladder
+    else:
+        reached = least[dim] < 0.4
+        assert set(times[dim][reached]) <= {0.01, 0.02, 0.04}
 
 
 def test_shutter_cap_and_manual_shutter_in_the_ladder(context):
