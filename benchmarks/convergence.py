@@ -22,12 +22,13 @@ from agents.episodes import make_envs
 from agents.evaluation.metrics import THIRD_EV
 from agents.evaluation.result import EvaluationResult
 from agents.metering.rpi_agc import ExposureFilter
+from agents.policy import METERS
 from benchmarks.markdown import table
 from simulator.files import write_atomically
 from simulator.results import result_meta, write_results
 
 #: Policies that are watched.
-POLICIES = ("rpi_agc", "centre_weighted:P", "matrix:P", "highlight_weighted:P", "regression", "ppo")
+POLICIES = ("rpi_agc", *(f"{meter}:P" for meter in METERS), "regression", "ppo")
 #: Frames until the published filter of the Raspberry Pi's AGC is within 2 % of its target.
 PUBLISHED_FRAMES = {-4.0: 11, 4.0: 24, 6.0: 30}
 STOPS = (-6.0, -4.0, -2.0, 2.0, 4.0, 6.0)
@@ -128,17 +129,22 @@ def _plot(curves: dict[float, dict[str, np.ndarray]]) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(3.6 * len(curves), 3.2), layout="constrained")
+    columns = min(3, len(curves))
+    lines = -(-len(curves) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.0 * lines), layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(curves), sharey=True, squeeze=False)[0]
+    panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, (stops, by_policy) in zip(panels, curves.items(), strict=True):
         for name, departure in by_policy.items():
             frames = np.arange(1, FRAMES + 1) - STEP
-            axes.plot(frames, np.median(departure, axis=0), lw=1.4, label=name)
+            style = "-" if name in ("rpi_agc", "regression", "ppo") else "--"
+            axes.plot(frames, np.median(departure, axis=0), style, lw=1.3, label=name)
         axes.axhspan(-THIRD_EV, THIRD_EV, color="0.92")
         axes.set(title=f"light {stops:+g} EV", xlabel="frames since the step", xlim=(-5, 40))
-    panels[0].set_ylabel("EV100 less the final one (median)")
-    panels[-1].legend(fontsize=7)
+    for axes in panels[::columns]:
+        axes.set_ylabel("EV100 less the final one (median)", fontsize=8)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=7)
     buffer = io.BytesIO()
     canvas.print_png(buffer)
     return buffer.getvalue()
