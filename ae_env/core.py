@@ -267,7 +267,8 @@ class EpisodeCore:
 
     def _totals(self, parts: dict[str, np.ndarray], places: np.ndarray) -> np.ndarray:
         """(B,) float64 scores before costs."""
-        if self.options.reward == "expected" and not self._part_scores.are_expected:
+        # A closed form is its own expectation, and needs no table of all states.
+        if self.options.reward == "expected" and not self.scorer.closed_form:
             pairs = zip(places.tolist(), self.episodes.state[places].tolist(), strict=True)
             return np.array([self.expected_scores(place).mean[state] for place, state in pairs])
         return self._part_scores.totals(parts, places)

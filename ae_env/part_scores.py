@@ -27,7 +27,6 @@ class PartScores:
     Attributes:
         reads_images: Whether a part looks at the images.
         reads_pixels: Whether a part looks at all pixels of a frame, in torch.
-        are_expected: Whether the totals are expectations over noise whatever the frames.
     """
 
     def __init__(
@@ -47,7 +46,7 @@ class PartScores:
         self._scores = np.zeros((slots, len(self.grid), len(self._closed) + 1))
         self._scored = np.zeros(slots, bool)
         self.reads_images = not self.scorer.closed_form
-        self.are_expected = static and self.scorer.closed_form
+        self._keeps_totals = static and self.scorer.closed_form
         others = None if static else tables.others
         self.reads_pixels = self.reads_images or (
             others is not None and any(map(reads_pixels, others.parts.values()))
@@ -86,7 +85,8 @@ class PartScores:
         parts: CompositeScorer | None = self.scorer
         kinds: tuple[DependsOn, ...] = ("image",)
         if not self._static:
-            found = self.tables.light_scores.scores(scenes, captures)
+            fused = self.tables.fused
+            found = fused.scores(captures, fused.means(scenes, captures))
             scores = {f"score:{name}": values for name, values in found.items()}
             parts, kinds = self.tables.others, ("image", "light", "blur")
         images = None if frames is None else torch.from_numpy(frames).clamp(0.0, 1.0)
@@ -97,7 +97,7 @@ class PartScores:
 
     def totals(self, parts: dict[str, np.ndarray], places: np.ndarray) -> np.ndarray:
         """(B,) float64 of the whole scorer, from the scores of its parts."""
-        if self.are_expected:
+        if self._keeps_totals:
             return self._scores[self.episodes.slot[places], self.episodes.state[places], -1]
         return self.scorer.totals(parts)
 

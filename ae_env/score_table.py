@@ -19,10 +19,10 @@ from ae_env.bands import expected_in_bands, expose_in_bands
 from ae_env.captures import SceneCaptures
 from ae_env.checks import check_integer
 from ae_env.grid import ExposureGrid
-from ae_env.light_scores import LightScores
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.call import is_own
 from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.fused import FusedScores
 from ae_env.scorers.protocol import DependsOn, reads_pixels
 from ae_env.scorers.registry import scorer_fingerprint
 from simulator.cache import DiskCache, LruCache, cache_key
@@ -32,7 +32,7 @@ from simulator.latent import Latent
 from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
 
 #: Bumped when the way that scores are computed changes.
-TABLE_VERSION = 3
+TABLE_VERSION = 4
 #: What the scores that are kept in memory take at most: some 10,000 scenes at 64 states [byte].
 MEMORY_BYTES = 2**25
 #: States evaluated at once: more only spends time in memory paging. Where only the blur matters,
@@ -133,9 +133,9 @@ class ScoreTables:
         self._captures = SceneCaptures(camera, MEMORY_BYTES, copies=is_own(scorer))
         self._disk = DiskCache()
         self._light_parts: LruCache[_LightParts] = LruCache(MEMORY_BYTES)
-        self.light_scores = LightScores(scorer)
-        #: All other parts, for light that changes; None if there are none.
-        self.others = scorer.subset(set(scorer.parts) - set(self.light_scores.parts))
+        self.fused = FusedScores(scorer)
+        #: All other parts; None if there are none.
+        self.others = scorer.subset(set(scorer.parts) - set(self.fused.parts))
 
     def table(
         self,
@@ -184,53 +184,60 @@ class ScoreTables:
         row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
         """Scores (S,) of those parts of the scorer that have a closed form; see `table`."""
-        if not isinstance(gain, np.ndarray) and gain == 1.0:
-            blur_parts = self._parts(self.scorer, scene, ("blur",), speed, defocus)
-            return {**self._scene_parts(scene, gain), **blur_parts}
-        states = self.grid.states
         light: Any = {"gain": gain, "row_gain": row_gain}
-        captures = self._captures.describe(scene, states, speed=speed, defocus=defocus, **light)
-        parts = self.light_scores.scores([scene] * len(states), captures)
-        if self.others is None:
-            return parts
-        if isinstance(gain, np.ndarray):  # of one moment that hardly comes again
-            parts |= self._parts(self.others, scene, ("light",), **light)
+        if isinstance(gain, np.ndarray) or row_gain is not None:  # hardly comes again
+            found = self._of_light(scene, **light)
         else:
-            parts |= self._scene_parts(scene, gain)
-        return parts | self._parts(self.others, scene, ("blur",), speed, defocus, **light)
+            found = self._of_steady_light(scene, gain)
+        parts = dict(found.parts)
+        if self.fused.parts:
+            states = self.grid.states
+            captures = self._captures.describe(scene, states, speed=speed, defocus=defocus, **light)
+            parts |= self.fused.scores(captures, found.means)
+        return parts | self._parts(scene, ("blur",), speed, defocus, **light)
 
-    def _scene_parts(self, scene: Scene, gain: float) -> dict[str, np.ndarray]:
-        """Scores that the scene and its light decide; of changed light, those of `others`."""
+    def _of_steady_light(self, scene: Scene, gain: float) -> _LightParts:
+        """What is the same for any blur, kept in memory; of the scene's own light, on disk too."""
         known = self._light_parts.get((id(scene), gain))
         if known is not None and known.scene() is scene:  # an id may be given out again
-            return known.parts
-        if gain == 1.0:
-            parts = self._own_parts(scene)
-        else:
-            assert self.others is not None
-            parts = self._parts(self.others, scene, ("light",), gain=gain)
-        size = sum(values.nbytes for values in parts.values())
-        self._light_parts.put(
-            (id(scene), gain), _LightParts(weakref.ref(scene), parts), size + _ENTRY_BYTES
-        )
-        return parts
+            return known
+        found = self._of_own_light(scene) if gain == 1.0 else self._of_light(scene, gain=gain)
+        size = found.means.nbytes + sum(values.nbytes for values in found.parts.values())
+        self._light_parts.put((id(scene), gain), found, size + _ENTRY_BYTES)
+        return found
 
-    def _own_parts(self, scene: Scene) -> dict[str, np.ndarray]:
-        """Scores of the scene's own light, from the disk where they have been made before."""
-        names = self.scorer.names("light")
-        key = self._key(scene) if names else None
+    def _of_own_light(self, scene: Scene) -> _LightParts:
+        """That of the scene's own light, from the disk where it has been made before."""
+        names = [] if self.others is None else self.others.names("light")
+        key = self._key(scene) if names or self.fused.reads_pixels else None
         stored = None if key is None else self._disk.get("score_tables", key)
-        if stored is not None and set(stored) == set(names):
-            return {name: stored[name].numpy() for name in names}
-        parts = self._parts(self.scorer, scene, ("light",))
+        if stored is not None and set(stored) == {"means", *(f"score:{name}" for name in names)}:
+            parts = {name: stored[f"score:{name}"].numpy() for name in names}
+            return _LightParts(weakref.ref(scene), stored["means"].numpy(), parts)
+        found = self._of_light(scene, keep=False)  # its means are kept, its pixels not needed again
         if key is not None:
-            kept = {name: torch.from_numpy(values) for name, values in parts.items()}
-            self._disk.put("score_tables", key, kept)
-        return parts
+            kept = {f"score:{name}": torch.from_numpy(v) for name, v in found.parts.items()}
+            self._disk.put("score_tables", key, {"means": torch.from_numpy(found.means), **kept})
+        return found
+
+    def _of_light(
+        self,
+        scene: Scene,
+        *,
+        gain: float | np.ndarray = 1.0,
+        row_gain: np.ndarray | None = None,
+        keep: bool = True,
+    ) -> _LightParts:
+        """What the scene and its light decide; `keep` is that of `FusedScores.means`."""
+        states, means = self.grid.states, np.empty((0, 3))
+        light: Any = {"gain": gain, "row_gain": row_gain}
+        if self.fused.reads_pixels:
+            captures = self._captures.describe(scene, states, **light)
+            means = self.fused.means([scene] * len(states), captures, keep=keep)
+        return _LightParts(weakref.ref(scene), means, self._parts(scene, ("light",), **light))
 
     def _parts(
         self,
-        scorer: CompositeScorer,
         scene: Scene,
         kinds: tuple[DependsOn, ...],
         speed: float = 0.0,
@@ -239,13 +246,14 @@ class ScoreTables:
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        names = scorer.names(*kinds)
-        if not names:
+        """Scores (S,) of those of `others` that depend on one of `kinds`."""
+        names = [] if self.others is None else self.others.names(*kinds)
+        if self.others is None or not names:
             return {}
         size, chunks = _CHUNK, []
         if kinds == ("blur",):
             size = max(size, _BLUR_SAMPLES // scene.light.numel())
-        elif not any(reads_pixels(scorer.parts[name]) for name in names):
+        elif not any(reads_pixels(self.others.parts[name]) for name in names):
             size = len(self.grid)
         for part in _slices(len(self.grid), size):
             captures = self._captures.describe(
@@ -256,7 +264,7 @@ class ScoreTables:
                 gain=gain[part] if isinstance(gain, np.ndarray) else gain,
                 row_gain=None if row_gain is None else row_gain[part],
             )
-            scores = scorer.score_parts(None, captures, kinds)
+            scores = self.others.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
 
@@ -269,7 +277,7 @@ class ScoreTables:
         row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
-        changes = isinstance(gain, np.ndarray)
+        changes = isinstance(gain, np.ndarray) or row_gain is not None
         latent = replace(
             scene_latent(scene, self.camera, speed=speed, defocus=defocus),
             tolerance=self.tolerance,
@@ -324,9 +332,16 @@ class ScoreTables:
 
 @dataclass(frozen=True)
 class _LightParts:
-    """Scores (S,) of a scene by part; the scene itself is not kept for them."""
+    """What a scene's light decides; the scene itself is not kept for it.
+
+    Args:
+        scene: The scene.
+        means: Of `FusedScores.means`.
+        parts: Scores (S,) of the other parts by name.
+    """
 
     scene: weakref.ref[Scene]
+    means: np.ndarray
     parts: dict[str, np.ndarray]
 
 

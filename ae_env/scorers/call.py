@@ -71,10 +71,15 @@ def describe_range(values: Any) -> str:
     return f"scores from {float(values.min())} to {float(values.max())}"
 
 
-def _versions(captures: Captures) -> tuple[int, ...]:
-    """Numbers that torch counts up as tensors are written to, views of them included."""
-    tensors = (captures.scene_light, captures.ratio, captures.proper_ev, captures.blur_px)
-    return tuple(0 if t.is_inference() else t._version for t in tensors)
+def _versions(captures: Captures) -> dict[str, int]:
+    """Numbers that torch counts up as tensors are written to, views of them included.
+
+    By name of the field or property; those that are 0 are left out, as are properties that nobody
+    has asked for yet.
+    """
+    tensors = {name: value for name, value in vars(captures).items() if torch.is_tensor(value)}
+    counted = {name: t._version for name, t in tensors.items() if not t.is_inference()}
+    return {name: version for name, version in counted.items() if version}
 
 
 def _watched(

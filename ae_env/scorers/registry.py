@@ -6,7 +6,7 @@ import hashlib
 import importlib
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
@@ -227,7 +227,7 @@ def scorer_fingerprint(scorer: CompositeScorer) -> str | None:
     kept on disk only if it has a ``version`` (a string or number that its author changes with it).
     """
     digest = hashlib.sha256()
-    for name, part in [("", scorer), *scorer.parts.items()]:
+    for path, part in _nested(scorer):
         kind = part if inspect.isfunction(part) else type(part)
         version = getattr(part, "version", None)
         if not kind.__module__.startswith("ae_env.") and not isinstance(version, str | int | float):
@@ -236,11 +236,20 @@ def scorer_fingerprint(scorer: CompositeScorer) -> str | None:
             source = inspect.getsource(kind)
         except (OSError, TypeError):
             return None
-        digest.update(f"{name}\0{version}\0{source}\0".encode())
+        digest.update(f"{path}\0{version}\0{source}\0".encode())
         for key, value in sorted(getattr(part, "__dict__", {}).items()):
-            if key in ("parts", "closed_form"):
+            if key == "closed_form" or (key == "parts" and isinstance(value, Mapping)):
                 continue
             if not isinstance(value, int | float | str | bool | dict | tuple):
                 return None
             digest.update(f"{key}={value!r}\0".encode())
     return digest.hexdigest()
+
+
+def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """`scorer` and all parts inside of it, however deep, each with the names that lead to it."""
+    yield path, scorer
+    parts = getattr(scorer, "parts", None)
+    if isinstance(parts, Mapping):
+        for name, part in parts.items():
+            yield from _nested(part, (*path, name))

@@ -1,6 +1,9 @@
 """The built-in scorers that have a closed form on the noise-free light.
 
 The constants of the five that `balanced` is made of were frozen before any agent was trained.
+
+These are the definitions. The environment evaluates `Highlights`, `Shadows` and `Noise` by a fused
+kernel that reads their constants from here (`ae_env.scorers.fused`) and agrees within 1e-6.
 """
 
 from __future__ import annotations
@@ -57,29 +60,42 @@ class Highlights:
 
     f is the mean over the pixels of the largest ``sigmoid(log2(x) / 0.12)`` of its planes: the
     share of the frame at or above sensor white.
+
+    Attributes:
+        scale: Share at which the score is 1/e, 0.15.
+        width: Of the sigmoid, 0.12 stop.
     """
 
     domain: Domain = "raw"
     depends_on: DependsOn = "light"
     scale = 0.15
+    width = 0.12
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
         brightest = captures.log2_light.amax(dim=1)  # (B, H, W); the sigmoid is monotone
-        fraction = torch.sigmoid(brightest / 0.12).mean(dim=(1, 2), dtype=torch.float64)
+        fraction = torch.sigmoid(brightest / self.width).mean(dim=(1, 2), dtype=torch.float64)
         return torch.exp(-fraction / self.scale)
 
 
 class Shadows:
-    """Blocked shadows: ``exp(-f / 0.20)``, f the mean of ``sigmoid(-(log2(x) + 9) / 0.5)``."""
+    """Blocked shadows: ``exp(-f / 0.20)``, f the mean of ``sigmoid(-(log2(x) + 9) / 0.5)``.
+
+    Attributes:
+        scale: Share at which the score is 1/e, 0.20.
+        depth: How far below white a pixel is half blocked, 9 stops.
+        width: Of the sigmoid, 0.5 stop.
+    """
 
     domain: Domain = "raw"
     depends_on: DependsOn = "light"
     scale = 0.20
+    depth = 9.0
+    width = 0.5
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        dark = torch.sigmoid((captures.log2_light + 9.0).mul_(-2.0))
+        dark = torch.sigmoid((captures.log2_light + self.depth).mul_(-1.0 / self.width))
         return torch.exp(-dark.mean(dim=(1, 2, 3), dtype=torch.float64) / self.scale)
 
 
@@ -88,10 +104,14 @@ class Noise:
 
     SNR is ``min(x, 1) / sqrt(shot x + read)``. The NLF is that of the sensor's own pixels, not of
     the box-averaged frame: otherwise ISO would be nearly free.
+
+    Attributes:
+        half_snr: SNR at which the score is a half, 18.
     """
 
     domain: Domain = "raw"
     depends_on: DependsOn = "light"
+    half_snr = 18.0
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
@@ -100,7 +120,7 @@ class Noise:
         light = captures.light.clamp(min=0.0)
         variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
         power = (light.clamp_(max=1.0).square_() / variance).pow_(0.75)  # SNR**1.5
-        return (power / (power + 18.0**1.5)).mean(dim=(1, 2, 3), dtype=torch.float64)
+        return (power / (power + self.half_snr**1.5)).mean(dim=(1, 2, 3), dtype=torch.float64)
 
 
 class Sharpness:

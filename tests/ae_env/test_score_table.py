@@ -19,6 +19,7 @@ from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, reference_settings
 from ae_env.score_table import ScoreTables, scene_latent
 from ae_env.scorers import CompositeScorer, make_scorer
+from ae_env.scorers.fused import FusedScores
 from ae_env.scorers.protocol import Captures
 from ae_env.scorers.terms import Highlights
 from simulator import get_camera
@@ -147,7 +148,7 @@ def test_second_time_comes_from_the_cache(cache: Path, monkeypatch: pytest.Monke
     scene = _scene()
     first = _tables().table(scene, speed=0.2, defocus=1.5)
     assert len(_files(cache)) == 1
-    monkeypatch.setattr(Highlights, "__call__", None)  # would fail if it were called again
+    monkeypatch.setattr(FusedScores, "means", None)  # would fail if it were called again
     second = _tables().table(scene, speed=0.2, defocus=1.5)
     np.testing.assert_array_equal(first.mean, second.mean)
 
@@ -317,6 +318,28 @@ def test_a_scorer_of_ones_own_is_not_kept_on_disk_unless_it_has_a_version() -> N
     for value in (0.2, 0.9):
         table = ScoreTables(grid, camera, make_scorer(constant(value))).table(scene)
         assert table.mean == pytest.approx(value)
+
+
+def test_bands_count_whatever_form_the_gain_has() -> None:
+    scene = replace(_scene(), light=torch.full((4, 40, 40), 0.05), saturated=None)
+    rows = np.full((8, 40), 1.9)
+    rows[:, 20:] = 0.1
+    # Half of the rows each: the standard deviation is half the distance, 2.124 stops.
+    banding = 1.0 / (1.0 + (np.log2(1.9 / 0.1) / 2.0 / 0.1) ** 2)
+    for gain in (1.0, 0.5, np.ones(8)):
+        table = _tables("banding").table(scene, gain=gain, row_gain=rows)
+        np.testing.assert_allclose(table.mean, banding, rtol=1e-6)
+
+    def top(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        return images[:, :, :20].mean(dim=(1, 2, 3))
+
+    top.domain = "raw"  # type: ignore[attr-defined]
+    grid = ExposureGrid((100,), (1 / 500, 1 / 250), (4,))
+    for noise in (False, True):
+        tables = _tables(top, grid=grid, noise=noise, use_cache=False)
+        found = tables.table(scene, row_gain=rows[:2]).mean
+        stops = [s.log2_exposure - scene.reference.log2_exposure for s in grid]
+        np.testing.assert_allclose(found, 0.05 * 1.9 * 2.0 ** np.array(stops), atol=1e-3)
 
 
 def test_without_noise_the_expected_score_is_that_of_the_noise_free_capture() -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import sys
 import threading
 import time
+from functools import cached_property
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -114,7 +116,10 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
     np.testing.assert_array_equal(envs.step(np.array([3, 20, 40]))[0]["raw"], plain["raw"])
 
 
-@pytest.mark.parametrize("name", ["scene_light", "ratio", "proper_ev", "blur_px"])
+FIELDS = ["scene_light", "ratio", "proper_ev", "blur_px", "white_balance", "row_gain"]
+
+
+@pytest.mark.parametrize("name", [*FIELDS, "light", "log2_light", "ev100"])
 @pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
 def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
     """The scene, which other environments show too, stays as it is."""
@@ -123,11 +128,20 @@ def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
         getattr(captures, name)[0] *= 0.5
         return torch.zeros(len(captures))
 
-    env = AutoExposureEnv(scorer=Own(write, depends_on=depends_on), **SMALL)
+    lighting = "flicker" if name == "row_gain" else "static"
+    env = AutoExposureEnv(scorer=Own(write, depends_on=depends_on), lighting=lighting, **SMALL)
     before = [scene.clean_light.clone() for scene in env.scenes]
     with pytest.raises(UserCodeError, match="scorer 'Own' changed its `captures` in place"):
         env.reset(seed=0)
     assert all(torch.equal(s.clean_light, b) for s, b in zip(env.scenes, before, strict=True))
+
+
+def test_every_tensor_of_the_captures_is_watched() -> None:
+    """A field or property that is added must be in the test above, too."""
+    fields = {f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type)}
+    cached = {name for name, value in vars(Captures).items() if isinstance(value, cached_property)}
+    assert fields == set(FIELDS)
+    assert cached == {"light", "log2_light", "ev100"}
 
 
 def test_a_slow_scorer_is_told_of_once_and_while_it_runs(

@@ -10,12 +10,12 @@ import torch
 
 from ae_env.captures import describe_captures
 from ae_env.grid import ExposureGrid
-from ae_env.light_scores import LightScores
 from ae_env.scenes import Scene, reference_settings
 from ae_env.score_table import ScoreTables
 from ae_env.scorers import CompositeScorer, make_scorer
+from ae_env.scorers.fused import FusedScores
 from ae_env.scorers.protocol import Captures
-from ae_env.scorers.terms import Noise
+from ae_env.scorers.terms import Highlights, Noise, Shadows
 from simulator import get_camera
 
 CAMERA = get_camera("nikon_z6")
@@ -58,12 +58,12 @@ def test_scores_are_those_of_the_terms(scorer: Any, bands: bool, size: int) -> N
     one, other = _scene(0, size), _scene(1, size)
     scenes = [one] * 5 + [other] * 3 + [one]
     rows = np.exp(rng.normal(0.0, 1.0, (9, size))) if bands else None
-    scores = LightScores(made)
+    scores = FusedScores(made)
     assert set(scores.parts) == set(made.parts)
     for gain in (2.0**-64, 2.0**-20, 0.7, 1.0, 30.0, 2.0**64):
         captures = _captures(scenes, rows, gain)
         wanted = made.score_parts(None, captures)
-        for name, found in scores.scores(scenes, captures).items():
+        for name, found in scores.scores(captures, scores.means(scenes, captures)).items():
             np.testing.assert_allclose(found, wanted[name], atol=1e-6, err_msg=f"{name} {gain}")
 
 
@@ -73,18 +73,63 @@ def test_scorers_of_ones_own_are_called() -> None:
             return super().__call__(images, captures) ** 2
 
     tables = ScoreTables(GRID, CAMERA, CompositeScorer({"strict": Strict(), "noise": Noise()}))
-    assert set(tables.light_scores.parts) == {"noise"}
+    assert set(tables.fused.parts) == {"noise"}
     parts = tables.table(_scene(), gain=3.0).parts
     np.testing.assert_allclose(parts["strict"], parts["noise"] ** 2, atol=1e-6)
 
 
+@pytest.mark.parametrize("on_the_class", [True, False])
+def test_constants_are_those_of_the_terms(
+    on_the_class: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts: dict[str, Any] = {"highlights": Highlights(), "shadows": Shadows(), "noise": Noise()}
+    tables = ScoreTables(GRID, CAMERA, CompositeScorer(parts), use_cache=False)
+    before = tables.table(_scene()).parts
+    for name, constant, value in (
+        ("highlights", "scale", 0.3),
+        ("highlights", "width", 0.5),
+        ("shadows", "scale", 0.1),
+        ("shadows", "depth", 6.0),
+        ("shadows", "width", 1.5),
+        ("noise", "half_snr", 40.0),
+    ):
+        part = parts[name]
+        monkeypatch.setattr(type(part) if on_the_class else part, constant, value)
+    made = CompositeScorer(parts)
+    found = ScoreTables(GRID, CAMERA, made, use_cache=False).table(_scene()).parts
+    states = list(GRID)
+    nothing = np.zeros(64)
+    captures = describe_captures(
+        [_scene()] * 64, states, CAMERA, speed=nothing, defocus=nothing, gain=nothing + 1.0
+    )
+    for name, wanted in made.score_parts(None, captures).items():
+        np.testing.assert_allclose(found[name], wanted, atol=1e-6, err_msg=name)
+        assert np.abs(found[name] - before[name]).max() > 0.02
+
+
+def test_static_and_changing_light_are_scored_by_the_same_kernel(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However deep in a mean the terms are: in torch, all states take some 20 times as long."""
+    scorer = make_scorer({"balanced": 0.8, "noise": 0.2})
+    alone = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
+    tables = ScoreTables(GRID, CAMERA, scorer, use_cache=False)
+    for term in (Highlights, Shadows, Noise):
+        monkeypatch.setattr(term, "__call__", None)  # would fail if it were called
+    found = tables.table(_scene(), speed=0.1)
+    for gain in (1.0, np.ones(64)):
+        other = alone.table(_scene(), speed=0.1, gain=gain)
+        np.testing.assert_array_equal(found.parts["balanced"], other.mean)
+        np.testing.assert_allclose(found.mean, 0.8 * other.mean + 0.2 * other.parts["noise"])
+
+
 def test_another_scene_of_the_same_id_is_not_taken_for_it() -> None:
-    scores = LightScores(make_scorer("noise"))
+    scores = FusedScores(make_scorer("noise"))
     for seed in range(5):  # each may get the memory, and so the id(), of the one before
         scene = _scene(seed)
         captures = _captures([scene], None, 2.0)
         wanted = make_scorer("noise").score_parts(None, captures)["noise"]
-        found = scores.scores([scene], captures)["noise"]
+        found = scores.scores(captures, scores.means([scene], captures))["noise"]
         np.testing.assert_allclose(found, wanted, atol=1e-6)
         del scene, captures
 

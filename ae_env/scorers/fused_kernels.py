@@ -1,9 +1,10 @@
-"""Means over the pixels that `highlights`, `shadows` and `noise` are made of, for many exposures.
+"""The kernel of `ae_env.scorers.fused`: means over the pixels, for many exposures.
 
 Light that is exposed longer is multiplied, and so are the exponentials under their sigmoids: those
 of the scene are worked out once, and no exposure needs a transcendental function of a pixel.
 
-This module imports numba.
+The constants are those of `ae_env.scorers.terms`, and arguments here: numba's cache on disk would
+not notice that they changed elsewhere. This module imports numba.
 """
 
 from __future__ import annotations
@@ -15,8 +16,6 @@ from simulator.jit import kernel
 #: Pixels that are added up in float32 before their sum is in float64.
 _BLOCK = 256
 _ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-30)
-#: SNR**1.5 at which `noise` is a half.
-_HALF = np.float32(18.0**1.5)
 
 _jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
 
@@ -40,8 +39,8 @@ def _bright(values, factor):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _clean(light, ratio, shot, read):  # type: ignore[no-untyped-def]
-    """Sum of ``s / (s + 18^1.5)``, s = SNR^1.5."""
+def _clean(light, ratio, shot, read, half):  # type: ignore[no-untyped-def]
+    """Sum of ``s / (s + half)``, s = SNR^1.5."""
     total = _ZERO
     for i in range(len(light)):
         x = light[i] * ratio
@@ -51,13 +50,13 @@ def _clean(light, ratio, shot, read):  # type: ignore[no-untyped-def]
         x = x if x < _ONE else _ONE
         root = np.sqrt(x * x / variance)
         power = root * np.sqrt(root)
-        total += power / (power + _HALF)
+        total += power / (power + half)
     return total
 
 
 @_jit
-def light_means(  # type: ignore[no-untyped-def]
-    first, last, light, dark, bright, ratio, dark_root, bright_factor, shot, read, means
+def fused_means(  # type: ignore[no-untyped-def]
+    first, last, light, dark, bright, ratio, dark_root, bright_factor, shot, read, half, means
 ):
     """Exposures `first` to `last` of S, of light in R parts of C pixels that each have their gain.
 
@@ -65,13 +64,14 @@ def light_means(  # type: ignore[no-untyped-def]
         first: First exposure.
         last: Behind the last.
         light: (4, R, C) float32.
-        dark: (4, R, C) float32, ``exp(2 (log2 x + 9))`` of the light x.
-        bright: (R, C) float64, ``exp(log2 x / 0.12)`` of the brightest plane.
+        dark: (4, R, C) float32, ``exp((log2 x + depth) / width)`` of the light x.
+        bright: (R, C) float64, ``exp(log2 x / width)`` of the brightest plane.
         ratio: (S, R) float32, what the light is multiplied by.
         dark_root: (S, R) float32, root of what `dark` is multiplied by.
         bright_factor: (S, R) float64, what `bright` is multiplied by.
         shot: (S, 4) float32 of the camera.
         read: (S, 4) float32.
+        half: float32, SNR^1.5 at which `noise` is a half.
         means: (S, 3) float64 to write to: shares of blown and of blocked pixels, and `noise`.
     """
     planes, rows, columns = light.shape
@@ -85,7 +85,8 @@ def light_means(  # type: ignore[no-untyped-def]
                     part = dark[plane, row, start:end]
                     blocked += _dark(part, dark_root[state, row])
                     noise = shot[state, plane], read[state, plane]
-                    clean += _clean(light[plane, row, start:end], ratio[state, row], *noise)
+                    signal = light[plane, row, start:end]
+                    clean += _clean(signal, ratio[state, row], *noise, half)
         count = rows * columns
         means[state, 0] = blown / count
         means[state, 1] = blocked / (4 * count)

@@ -1,8 +1,10 @@
-"""Scores with a closed form, of captures in light that changes.
+"""Fused scoring: the built-in terms with a closed form, of many captures in one pass.
 
 `Highlights`, `Shadows` and `Noise` see the light and nothing else of a scene: what they need of its
-pixels is worked out once, and each capture is a pass of a fused kernel over them. Their torch
-versions are the reference; both agree within 1e-6.
+pixels is worked out once, and each capture is a pass of a fused kernel over them
+(`ae_env.scorers.fused_kernels`). The environment and its score tables score by it, in static and in
+changing light. The torch versions (`ae_env.scorers.terms`) are the reference, and have the
+constants; both agree within 1e-6.
 """
 
 from __future__ import annotations
@@ -27,14 +29,14 @@ from simulator.threads import in_shares
 _BYTES = 2**27
 #: Pixels times exposures from which another thread is worth waking.
 _WORTH_A_THREAD = 2**17
-#: Columns of `light_means`, and parts that need none.
+#: Columns of `fused_means`, and parts that need none.
 _COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
 _WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
 
 
 @dataclass(frozen=True, eq=False)
 class _Pixels:
-    """What `light_means` takes of a scene, (4, H, W) and (H, W)."""
+    """What `fused_means` takes of a scene, (4, H, W) and (H, W)."""
 
     scene: weakref.ref[Scene]
     light: np.ndarray
@@ -42,7 +44,7 @@ class _Pixels:
     bright: np.ndarray
 
 
-class LightScores:
+class FusedScores:
     """The parts of a scorer that are made of the built-in closed forms.
 
     That is those which read the pixels of the light, those which read none, and composites of them.
@@ -52,27 +54,35 @@ class LightScores:
 
     Attributes:
         parts: Those parts by name.
+        reads_pixels: Whether one of them is made of the pixels of the light.
     """
 
     def __init__(self, scorer: CompositeScorer) -> None:
         self.parts = {name: part for name, part in scorer.parts.items() if _is_known(part)}
-        self._reads_pixels = any(_has_pixels(part) for part in self.parts.values())
+        self.reads_pixels = any(_has_pixels(part) for part in self.parts.values())
         self._pixels: LruCache[_Pixels] = LruCache(_BYTES)
 
-    def scores(self, scenes: Sequence[Scene], captures: Captures) -> dict[str, np.ndarray]:
+    def scores(self, captures: Captures, means: np.ndarray) -> dict[str, np.ndarray]:
         """Scores (B,) float64 by part.
+
+        Args:
+            captures: The captures; `Captures.scene_light` is not looked at.
+            means: What `means` returns for them, whatever their blur.
+        """
+        return {name: _score(part, means, captures) for name, part in self.parts.items()}
+
+    def means(
+        self, scenes: Sequence[Scene], captures: Captures, *, keep: bool = True
+    ) -> np.ndarray:
+        """(B, 3) float64, all that the parts take of the pixels; (0, 3) unless `reads_pixels`.
 
         Args:
             scenes: Scene of each of the B captures; captures of one follow each other.
             captures: The captures; `Captures.scene_light` is not looked at.
+            keep: Whether to keep what is known of the scenes' pixels, for other light.
         """
-        if not self.parts:
-            return {}
-        means = self._all_means(scenes, captures) if self._reads_pixels else np.empty((0, 3))
-        return {name: _score(part, means, captures) for name, part in self.parts.items()}
-
-    def _all_means(self, scenes: Sequence[Scene], captures: Captures) -> np.ndarray:
-        """(B, 3) of `light_means`."""
+        if not self.reads_pixels:
+            return np.empty((0, 3))
         ratios = captures.ratio.numpy()
         rows = None if captures.row_gain is None else captures.row_gain.numpy()
         # Frames without bands are rounded alike whether or not others of the batch have some.
@@ -83,51 +93,53 @@ class LightScores:
         for first, last in pairwise([*begins, len(scenes)]):
             part = slice(first, last)
             gains = rows[part] if rows is not None and banded[first] else None
-            means[part] = self._means(scenes[first], ratios[part], captures.nlf[part], gains)
+            pixels = self._known(scenes[first], keep)
+            means[part] = _pixel_means(pixels, ratios[part], captures.nlf[part], gains)
         return means
 
-    def _means(
-        self,
-        scene: Scene,
-        ratios: np.ndarray,
-        noises: Sequence[NoiseLevelFunction],
-        row_gain: np.ndarray | None,
-    ) -> np.ndarray:
-        from ae_env.scorers.light_kernels import light_means  # numba: only where light changes
-
-        pixels = self._known(scene)
-        rows = 1 if row_gain is None else pixels.light.shape[1]
-        gains = ratios[:, None] if row_gain is None else ratios[:, None] * row_gain  # (S, R)
-        with np.errstate(over="ignore", under="ignore"):
-            stops = np.log2(gains)
-            fixed = (
-                pixels.light.reshape(4, rows, -1),
-                pixels.dark.reshape(4, rows, -1),
-                pixels.bright.reshape(rows, -1),
-                gains.astype(np.float32),
-                np.exp(stops).astype(np.float32),
-                np.exp(stops / 0.12),
-                np.array([n.shot for n in noises], np.float32),
-                np.array([n.read for n in noises], np.float32),
-            )
-        means = np.empty((len(ratios), 3))
-        least = max(1, _WORTH_A_THREAD // pixels.light.size)
-        in_shares(lambda a, b: light_means(a, b, *fixed, means), len(ratios), least=least)
-        return means
-
-    def _known(self, scene: Scene) -> _Pixels:
+    def _known(self, scene: Scene, keep: bool) -> _Pixels:
         known = self._pixels.get(id(scene))
         if known is not None and known.scene() is scene:  # an id may be given out again
             return known
         light = np.ascontiguousarray(scene.clean_light.numpy())
         stops = np.log2(np.maximum(light, 2.0**-40).astype(np.float64))
         with np.errstate(over="ignore"):
-            dark = np.exp(2.0 * (stops + 9.0)).astype(np.float32)
-        bright = np.exp(stops.max(axis=0) / 0.12)
+            dark = np.exp((stops + Shadows.depth) / Shadows.width).astype(np.float32)
+        bright = np.exp(stops.max(axis=0) / Highlights.width)
         known = _Pixels(weakref.ref(scene), light, dark, bright)
-        size = dark.nbytes + bright.nbytes
-        self._pixels.put(id(scene), known, size)
+        if keep:
+            self._pixels.put(id(scene), known, light.nbytes + dark.nbytes + bright.nbytes)
         return known
+
+
+def _pixel_means(
+    pixels: _Pixels,
+    ratios: np.ndarray,
+    noises: Sequence[NoiseLevelFunction],
+    row_gain: np.ndarray | None,
+) -> np.ndarray:
+    """(S, 3) of `fused_means`, of one scene."""
+    from ae_env.scorers.fused_kernels import fused_means  # numba: only where something is scored
+
+    rows = 1 if row_gain is None else pixels.light.shape[1]
+    gains = ratios[:, None] if row_gain is None else ratios[:, None] * row_gain  # (S, R)
+    with np.errstate(over="ignore", under="ignore"):
+        stops = np.log2(gains)
+        fixed = (
+            pixels.light.reshape(4, rows, -1),
+            pixels.dark.reshape(4, rows, -1),
+            pixels.bright.reshape(rows, -1),
+            gains.astype(np.float32),
+            np.exp(stops / (2.0 * Shadows.width)).astype(np.float32),
+            np.exp(stops / Highlights.width),
+            np.array([n.shot for n in noises], np.float32),
+            np.array([n.read for n in noises], np.float32),
+            np.float32(Noise.half_snr**1.5),
+        )
+    means = np.empty((len(ratios), 3))
+    least = max(1, _WORTH_A_THREAD // pixels.light.size)
+    in_shares(lambda a, b: fused_means(a, b, *fixed, means), len(ratios), least=least)
+    return means
 
 
 def _is_known(part: Any) -> bool:
@@ -135,7 +147,8 @@ def _is_known(part: Any) -> bool:
     if isinstance(part, CompositeScorer):
         known = type(part).__module__.startswith("ae_env.")
         return known and all(map(_is_known, part.parts.values()))
-    return type(part) in (*_COLUMNS, *_WITHOUT_PIXELS)
+    # One with constants of its own is left to itself.
+    return type(part) in (*_COLUMNS, *_WITHOUT_PIXELS) and not vars(part)
 
 
 def _has_pixels(part: Any) -> bool:
