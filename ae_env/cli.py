@@ -27,9 +27,9 @@ from ae_env.console import (
     progress_bars,
     torch_device,
 )
-from ae_env.evaluation_commands import evaluate, print_scores
 from ae_env.scorer_commands import convert_nima, scorers
 from ae_env.simulator_commands import simulate, sweep, train_simulator
+from agents.evaluation.commands import evaluate, print_scores
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,3 +52,23 @@ def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def the_same_random_numbers() -> None:
     """A test that draws from torch's own generator draws the same on every run, in any order."""
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def ae_env(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path):
+    """Runs the command line as the console script does, in a folder of its own."""
+    from ae_env import cli
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)  # pytest has its own handlers
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        argv = ["ae-env", *map(str, arguments)]
+        monkeypatch.setattr("sys.argv", argv)
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        output = capsys.readouterr()
+        return int(caught.value.code or 0), output.out, output.err
+
+    return run

@@ -56,7 +56,7 @@ def published_as(content: bytes) -> str | None:
 
 
 def read_weights(file: str | os.PathLike[str], digest: str | None = None) -> dict[str, Tensor]:
-    """State of a `ae_env.scorers.nima.NimaMobileNet`.
+    """State of a `ae_env.scorers.nima_network.NimaMobileNet`.
 
     Args:
         file: ``.safetensors`` that `convert_nima` wrote, or Keras' ``.h5`` or ``.hdf5``.
@@ -192,7 +192,7 @@ def _places() -> dict[tuple[str, str], tuple[str, tuple[int, ...], tuple[int, ..
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:
-    from ae_env.scorers.nima import NimaMobileNet
+    from ae_env.scorers.nima_network import NimaMobileNet
 
     with torch.device("meta"):
         state = NimaMobileNet().state_dict()

@@ -26,8 +26,8 @@ logger = logging.getLogger(__name__)
 _VERSION = 1
 _ROOT = Path(__file__).resolve().parents[2]
 #: Modules that only show results: a change of theirs leaves what was measured as it is.
-_SHOWING = ("ae_bench", "plan_jobs", "ranking", "result_table", "statistics")
-_COMMANDS = ("cli", "console", "evaluation_commands", "rendering", "scorer_commands")
+_SHOWING = ("ae_bench", "commands", "plan_jobs", "ranking", "result_table", "statistics")
+_COMMANDS = ("cli", "console", "rendering", "scorer_commands")
 
 
 class EvaluationStore:

@@ -2,32 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ae_env import cli
 from simulator import CameraSettings, RawImage, get_camera, write_dng
-
-
-@pytest.fixture
-def ae_env(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path):
-    """Runs the command line as the console script does, in a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)  # pytest has its own handlers
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        argv = ["ae-env", *map(str, arguments)]
-        monkeypatch.setattr("sys.argv", argv)
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        output = capsys.readouterr()
-        return int(caught.value.code or 0), output.out, output.err
-
-    return run
 
 
 @pytest.fixture(scope="module")

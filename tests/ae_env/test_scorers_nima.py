@@ -17,7 +17,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.nima import NimaMobileNet, mean_rating, nima_network
+from ae_env.scorers.nima import mean_rating
+from ae_env.scorers.nima_network import NimaMobileNet, nima_network
 from ae_env.scorers.nima_weights import (
     NUMBER_OF_VALUES,
     PUBLISHED,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ae_env.evaluation_commands import _plan
+from agents.evaluation.commands import _plan
 
 BASE = """\
 name: mine
