@@ -1,4 +1,4 @@
-"""The command line in a folder of its own, and a raw to give it."""
+"""A raw to give to the command line."""
 
 from __future__ import annotations
 
