@@ -305,11 +305,13 @@ def _construct(
             f"`policy` (={name!r}): {cls.__name__} does not take (context"
             f"{''.join(f', {key}=' for key in options)}): {error}"
         ) from None
-    if cls.__module__.startswith("agents."):  # its own errors say what is wrong
-        return cls(context, **options)
     try:
         return cls(context, **options)
     except Exception as error:
+        if cls.__module__.startswith("agents."):  # its own errors say what is wrong
+            if isinstance(error, ValueError) and "?" in name:
+                raise ValueError(f"`policy` (={name!r}): {error}") from error
+            raise
         raise ValueError(_broken(name, f"{cls.__name__} cannot be made", error)) from error
 
 

@@ -50,6 +50,8 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
             "them, or a Lighting"
         )
     options = {"kind": spec} if isinstance(spec, str) else dict(spec)
+    if "kind" not in options:
+        raise ValueError(f"`lighting` (={spec!r}) needs a 'kind', one of {sorted(KINDS)}")
     name = options.pop("kind", None)
     if not isinstance(name, str) or name not in KINDS:
         hint = did_you_mean(name, KINDS)

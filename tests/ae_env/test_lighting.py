@@ -90,7 +90,7 @@ def test_own_lightings_are_checked_too() -> None:
     ("spec", "message"),
     [
         ("stepp", "did you mean 'step'"),
-        ({"stops": 3}, "must be one of"),
+        ({"stops": 3}, r"`lighting` \(={'stops': 3}\) needs a 'kind', one of"),
         ({"kind": "step", "stop": 3}, "not 'stop'; did you mean 'stops'"),
         ({"kind": "step", "stops": math.nan}, r"`lighting\['stops'\]` \(=nan\) must be a number"),
         ({"kind": "step", "stops": -2000}, r"`lighting\['stops'\]` \(=-2000\) .*\[-64, 64\]"),

@@ -207,3 +207,8 @@ def test_public_names():
         assert getattr(agents, name).__module__.startswith("agents.")
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         getattr(importlib.import_module("agents"), "nothing")  # noqa: B009
+
+
+def test_an_option_out_of_range_is_told_with_its_policy(context):
+    with pytest.raises(ValueError, match=r"`policy` \(='spot:P\?damping=2'\): `damping` \(=2"):
+        make_policy("spot:P?damping=2", context)
