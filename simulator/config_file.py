@@ -15,6 +15,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 #: A configuration is no larger than this [byte], nor has it more entries, or deeper ones.
 MAX_BYTES, MAX_ENTRIES, MAX_DEPTH = 2**20, 10_000, 50
 
+#: What is said in place of the names of Python's types.
+_PLAIN = {
+    **dict.fromkeys(("tuple_type", "list_type"), "must be a list"),
+    **dict.fromkeys(("dict_type", "mapping_type", "model_type"), "must be a mapping"),
+}
+
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 200
 
@@ -76,7 +82,7 @@ def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str
     parts = []
     for item in error.errors():
         entry = ".".join(str(key) for key in item["loc"])
-        message = item["msg"].removeprefix("Value error, ")
+        message = _PLAIN.get(item["type"]) or item["msg"].removeprefix("Value error, ")
         if item["type"] == "extra_forbidden" and model is not None:
             message = _unknown(model, item["loc"])
         given = f" (={_short.repr(item['input'])})" if entry and item["type"] != "missing" else ""
@@ -87,8 +93,12 @@ def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str
 def _unknown(model: Any, place: tuple[int | str, ...]) -> str:
     """What to say of an unknown entry at `place` of a configuration."""
     for key in place[:-1]:
-        annotation = model.model_fields[key].annotation
-        model = next(t for t in (annotation, *get_args(annotation)) if hasattr(t, "model_fields"))
+        if hasattr(model, "model_fields"):
+            model = model.model_fields[key].annotation
+            if type(None) in get_args(model):  # an entry that may be left out
+                model = next(t for t in get_args(model) if t is not type(None))
+        else:  # `key` is one of a mapping's, or a place in a list
+            model = next(t for t in reversed(get_args(model)) if t is not Ellipsis)
     known = list(model.model_fields)
     near = difflib.get_close_matches(str(place[-1]), known, n=1)
     hint = f"; did you mean `{near[0]}`?" if near else ""

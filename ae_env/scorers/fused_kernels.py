@@ -17,10 +17,14 @@ from simulator.jit import kernel
 _BLOCK = 256
 _ZERO, _ONE, _TINY = np.float32(0), np.float32(1), np.float32(1e-30)
 
-_jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
+_FAST = {"nsz", "contract", "reassoc"}
+_jit = kernel(fastmath=_FAST, boundscheck=False)
+#: Written into its caller. Sums of a function that is called would be added up in another order in
+#: the process that compiles it than in those that load what was compiled.
+_inline = kernel(fastmath=_FAST, boundscheck=False, inline="always")
 
 
-@_jit
+@_inline
 def _dark(values, root):  # type: ignore[no-untyped-def]
     """Sum of ``1 / (1 + value root^2)``; the square alone could leave float32's range."""
     total = _ZERO
@@ -29,7 +33,7 @@ def _dark(values, root):  # type: ignore[no-untyped-def]
     return total
 
 
-@_jit
+@_inline
 def _bright(values, factor):  # type: ignore[no-untyped-def]
     """Sum of ``1 - 1 / (1 + value factor)``."""
     total = 0.0
@@ -38,7 +42,7 @@ def _bright(values, factor):  # type: ignore[no-untyped-def]
     return total
 
 
-@_jit
+@_inline
 def _clean(light, ratio, shot, read, half):  # type: ignore[no-untyped-def]
     """Sum of ``s / (s + half)``, s = SNR^1.5."""
     total = _ZERO
@@ -84,9 +88,9 @@ def fused_means(  # type: ignore[no-untyped-def]
                 for plane in range(planes):
                     part = dark[plane, row, start:end]
                     blocked += _dark(part, dark_root[state, row])
-                    noise = shot[state, plane], read[state, plane]
+                    by_light, by_itself = shot[state, plane], read[state, plane]
                     signal = light[plane, row, start:end]
-                    clean += _clean(signal, ratio[state, row], *noise, half)
+                    clean += _clean(signal, ratio[state, row], by_light, by_itself, half)
         count = rows * columns
         means[state, 0] = blown / count
         means[state, 1] = blocked / (4 * count)

@@ -16,6 +16,7 @@ from agents.evaluation import metrics
 from agents.evaluation.plan import EvaluationPlan, digest
 from agents.evaluation.ranking import Rank
 from agents.evaluation.result import EvaluationResult
+from agents.policy_name import split_name
 from agents.report.of_evaluation import markdown_table
 from agents.report.tables import static_condition
 from simulator.files import write_atomically
@@ -29,6 +30,8 @@ logger = logging.getLogger(__name__)
 #: The scenes' light is hashed as means of so many blocks a side, to so many EV: a scene that was
 #: made otherwise is noticed, the last bit of another processor's arithmetic is not.
 BLOCKS, STEP_EV = 4, 0.1
+#: Kinds of policies whose names have a file's or folder's path behind the colon.
+_WITH_FILES = ("ppo", "regression", "recorded")
 COLUMNS = (
     *("policy", "author", "date", "normalised_score", "ci95_low", "ci95_high", "static"),
     *("hard", "regret", "ev_within_third", "frames_to_converge", "converged", "clipped_high"),
@@ -88,6 +91,62 @@ def refuse_changes(plan: EvaluationPlan, options: Sequence[str]) -> None:
         )
 
 
+def row_name(policy: str) -> str:
+    """A policy's name as the table has it: without the folder of a file of one's own.
+
+    >>> row_name("u/my.py:Mine?gain=2"), row_name("ppo:runs/mine"), row_name("matrix:P")
+    ('my.py:Mine?gain=2', 'ppo:mine', 'matrix:P')
+    """
+    base, _ = split_name(policy)
+    options = policy[len(base) :]
+    if ".py:" in base:
+        file, _, cls = base.rpartition(":")
+        return f"{Path(file).name}:{cls}{options}"
+    head, _, tail = base.partition(":")
+    if head in _WITH_FILES and tail:
+        return f"{head}:{Path(tail).name}{options}"
+    return policy
+
+
+def check_append(
+    table: Path, plan: EvaluationPlan, policies: Sequence[str], *, author: str
+) -> None:
+    """Checks that rows of `policies` can be added to a table, before they are measured.
+
+    Args:
+        table: CSV with `COLUMNS`, or a file to be made.
+        plan: The benchmark.
+        policies: Those that get a row.
+        author: Who made them.
+
+    Raises:
+        ValueError: If `table` is no benchmark's table or has rows of another hash, no policy gets
+            a row, two would get the same one, or a row without an author would be replaced.
+    """
+    rows = _rows_of_hash(table, plan)
+    if page_of(table) == table:
+        raise ValueError(f"`append` (={str(table)!r}) must be a CSV file, such as mine.csv")
+    if not policies:
+        raise ValueError(
+            f"`append` (={str(table)!r}): none of the policies gets a row, since privileged "
+            "policies, such as 'oracle', are not ranked"
+        )
+    seen: dict[str, str] = {}
+    for policy in policies:
+        name = row_name(policy)
+        if name in seen:
+            raise ValueError(
+                f"`policy` (={policy!r}) and {seen[name]!r} would have the same row {name!r} of "
+                f"{table}: rename a file"
+            )
+        seen[name] = policy
+        if not author.strip() and (name, "") in rows:
+            raise ValueError(
+                f"`author` (={author!r}) must be given: {table} has a row of {name!r} without an "
+                "author, which may be another's"
+            )
+
+
 def append_results(
     table: Path,
     plan: EvaluationPlan,
@@ -98,7 +157,7 @@ def append_results(
 ) -> dict[str, Path]:
     """Adds a row per policy to a benchmark's table, and writes its page anew.
 
-    A policy of the same name is replaced.
+    A row of the same policy and author is replaced, which is logged; rows of other authors stay.
 
     Args:
         table: CSV with `COLUMNS`; made where missing.
@@ -113,15 +172,13 @@ def append_results(
     Raises:
         ValueError: If the table has other columns, or rows of another hash.
     """
-    rows = {row["policy"]: row for row in read_table(table)}
-    for name, row in rows.items():
-        if row["hash"] != plan.hash:
-            raise ValueError(
-                f"{table}: policy {name!r} was measured under the hash {row['hash']}, this run "
-                f"under {plan.hash}: they do not compare"
-            )
+    rows, author = _rows_of_hash(table, plan), author.strip()
     for one in ranking:
-        rows[one.policy] = _row(plan, results, one, author)
+        row = _row(plan, results, one, author)
+        key = row["policy"], author
+        if key in rows:
+            logger.warning("%s: replaced the row of %r by %r", table, *key)
+        rows[key] = row
     ordered = sorted(rows.values(), key=lambda row: -float(row["normalised_score"]))
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
@@ -134,19 +191,34 @@ def append_results(
     }
 
 
+def _rows_of_hash(table: Path, plan: EvaluationPlan) -> dict[tuple[str, str], dict[str, str]]:
+    """Rows of a table by policy and author; an error where one has another hash."""
+    rows = {(row["policy"], row["author"]): row for row in read_table(table)}
+    for (name, _), row in rows.items():
+        if row["hash"] != plan.hash:
+            raise ValueError(
+                f"{table}: policy {name!r} was measured under the hash {row['hash']}, this run "
+                f"under {plan.hash}: they do not compare"
+            )
+    return rows
+
+
 def read_table(table: Path) -> list[dict[str, str]]:
     """Rows of a benchmark's table; none where there is no file.
 
     Raises:
-        ValueError: If its columns are not `COLUMNS`.
+        ValueError: If it cannot be read, or its columns are not `COLUMNS`.
     """
     if not table.is_file():
         return []
-    with table.open(encoding="utf-8", newline="") as stream:
-        reader = csv.DictReader(stream)
-        if tuple(reader.fieldnames or ()) != COLUMNS:
-            raise ValueError(f"{table}: its columns must be {', '.join(COLUMNS)}")
-        return list(reader)
+    try:
+        text = table.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{table} cannot be read as a table: {error}") from error
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    if tuple(reader.fieldnames or ()) != COLUMNS:
+        raise ValueError(f"{table}: its columns must be {', '.join(COLUMNS)}")
+    return list(reader)
 
 
 def page_of(table: Path) -> Path:
@@ -189,7 +261,7 @@ def _row(
         "ms_alone": track.ms_alone,
     }
     return {
-        "policy": name,
+        "policy": row_name(name),
         "author": author,
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         **{key: "" if value is None else f"{value:.4f}" for key, value in numbers.items()},
@@ -238,9 +310,13 @@ def table_page(plan: EvaluationPlan, rows: Sequence[Mapping[str, str]], table: P
         "best state of the last frame's light in every frame. What the columns mean: "
         "[evaluation.md](evaluation.md). Times are those of each row's own machine (`cpu` in the "
         "CSV file).",
-        "Add your own policy with one command, and send the two files that it changes:",
+        "Add your own policy with one command:",
         f"    ae-env evaluate --preset ae_bench_v1 --policy my.py:Mine \\\n"
         f'        --append {_shown(table)} --author "Your name"',
+        "Its row replaces the one of the same policy and author, where there is one, and no other. "
+        "Send it as a pull request with the two files that the command changes, "
+        f"`{_shown(table)}` and `{_shown(page_of(table))}`, and, if it may be public, the "
+        "policy's file.",
         f"The plan and the light of its scenes have the hash `{plan.hash}`, which every row "
         "carries; a run under another one is refused.",
         markdown_table(head, body),

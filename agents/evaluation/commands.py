@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,8 +22,11 @@ from ae_env.console import (
 
 if TYPE_CHECKING:
     from agents.evaluation.plan import EvaluationPlan
+    from agents.evaluation.plan_run import PlanRun
     from agents.evaluation.ranking import Rank
     from agents.evaluation.result import EvaluationResult
+
+logger = logging.getLogger(__name__)
 
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
@@ -114,20 +118,37 @@ def evaluate(
             f"`append` (={str(append)!r}) takes the results of a benchmark only: give "
             "--preset ae_bench_v1"
         )
+    if append is None and author:
+        raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
+    if append is not None:
+        make_folder(append.parent, name="append", file=append)
     loaded = plan_scenes(plan)
     check_hash(plan, loaded)
     make_folder(out)
+    run = PlanRun(plan, out / "parts", loaded, device)
+    if append is not None and plan.policies:
+        _check_append(append, run, author)
     with progress_bars() as progress, progress("evaluation") as task:
         results = run_plan(
             plan, out / "parts", scenes=loaded, workers=workers, device=device, progress=task
         )
-    run = PlanRun(plan, out / "parts", loaded, device)
     files = write_plan_report(run, results, out, command=command_line())
     ranking = overall_ranking(results)
     if append is not None:
         files |= append_results(append, plan, results, ranking, author=author)
     _print_ranking(ranking, results, static_condition(plan))
     print_files(files)
+
+
+def _check_append(table: Path, run: PlanRun, author: str) -> None:
+    """Checks a benchmark's table before the run, and says which policies get no row."""
+    from agents.evaluation.ae_bench import check_append
+    from agents.evaluation.plan_jobs import ranked_policies
+
+    ranked = ranked_policies(run)
+    check_append(table, run.plan, ranked, author=author)
+    for name in (p for p in run.plan.policies if p not in ranked):
+        logger.warning("%s gets no row in %s: it is told the best states", name, table)
 
 
 def _plan(
@@ -215,7 +236,7 @@ def print_scores(result: EvaluationResult) -> None:
     rows = result_rows(result, source="", split="", resamples=2000)
     conditions = result.conditions
     table = Table(title="normalised score: 0 is random, 1 the best state of every frame")
-    table.add_column("policy")
+    table.add_column("policy", overflow="fold")
     for condition in conditions:
         table.add_column(condition, justify="right")
     table.add_column("95 % interval (all)", justify="right")
@@ -241,7 +262,8 @@ def _print_ranking(
         return
     table = Table(title=f"normalised score over {len(results)} conditions, and in {static!r}")
     for name in ("tier", "policy", "all conditions", "95 % interval", static):
-        table.add_column(name, justify="left" if name == "policy" else "right")
+        justify: Any = "left" if name == "policy" else "right"
+        table.add_column(name, justify=justify, overflow="fold")
     for one in ranking:
         gains, span = results[static].group_gains(one.policy)
         pair = one.score.pair
@@ -271,7 +293,8 @@ def _print_groups(result: EvaluationResult, groups: int) -> None:
         for i, column in enumerate(zip(head, *own_groups, strict=True)):
             if i == 0:
                 for name in column:
-                    values.add_column(name, justify="left" if name == head[0] else "right")
+                    justify: Any = "left" if name == head[0] else "right"
+                    values.add_column(name, justify=justify, overflow="fold")
             else:
                 values.add_row(*column)
         console.print(values)

@@ -91,11 +91,9 @@ def run_plan(
         raise ValueError("`policies` (=[]) must hold at least one policy")
     run = PlanRun(plan, folder, scenes, device)
     members, conditions = plan_members(plan.policies), plan.all_conditions
-    privileged: dict[str, bool] = {}
-    for member in members:  # what is wrong with one is known before any work is done
-        for condition in {c.delay: c for c in conditions.values()}.values():
-            made = run.make(member, condition)
-            privileged[member.name] = bool(getattr(made, "privileged", False))
+    for scorer in plan.other_scorers:  # what is wrong is known before any work is done
+        _check_scorer(scorer)
+    privileged = _privileged(run, members)
     judging, following = _jobs(run, members, folder)
     total = max(sum(ms for _, ms in (*judging, *following)), 1.0)
     done: dict[str, float] = {}
@@ -118,6 +116,36 @@ def run_plan(
     if progress is not None:
         progress(int(total), int(total), "")
     return {name: run.result(condition, members) for name, condition in conditions.items()}
+
+
+def ranked_policies(run: PlanRun) -> list[str]:
+    """Policies of a plan that a ranking has: all but privileged ones.
+
+    Raises:
+        ValueError: If a policy is unknown, or does not fit the environment.
+    """
+    members = plan_members(run.plan.policies)
+    privileged = _privileged(run, members)
+    return list(dict.fromkeys(m.policy for m in members if not privileged[m.name]))
+
+
+def _privileged(run: PlanRun, members: Sequence[Member]) -> dict[str, bool]:
+    """Whether each member is told the best states; makes every one once per delay."""
+    found: dict[str, bool] = {}
+    for member in members:
+        for condition in {c.delay: c for c in run.plan.all_conditions.values()}.values():
+            made = run.make(member, condition)
+            found[member.name] = bool(getattr(made, "privileged", False))
+    return found
+
+
+def _check_scorer(name: str) -> None:
+    from ae_env.scorers import make_scorer
+
+    try:
+        make_scorer(name)
+    except ValueError as error:
+        raise ValueError(f"`other_scorers` (={name!r}): {error}") from error
 
 
 def _jobs(

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import logging
+import os
 import zipfile
 from collections.abc import Mapping
 from functools import lru_cache
@@ -24,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 #: Bumped when what a file holds changes.
 _VERSION = 1
+#: Python files beside one's own that count as parts of it.
+_MAX_NEIGHBOURS = 200
 _ROOT = Path(__file__).resolve().parents[2]
 #: Modules that only show results: a change of theirs leaves what was measured as it is.
 _SHOWING = ("ae_bench", "commands", "plan_jobs", "ranking", "result_table", "statistics")
@@ -79,6 +82,9 @@ def part_key(kind: str, *parts: object) -> str:
 def policy_content(name: str) -> str:
     """Hash of what decides a policy beside its name: its file or module, weights and folders.
 
+    With a Python file, all of its folder count, since it may import them; data that it reads is
+    not known.
+
     Args:
         name: As `agents.make_policy` takes it; a scorer's name or a file's will do as well.
     """
@@ -92,7 +98,7 @@ def policy_content(name: str) -> str:
 def _own_files(base: str) -> list[Path]:
     head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
     if head.endswith(".py"):
-        return [Path(head).expanduser()]
+        return _with_neighbours(Path(head).expanduser())
     if head in ("ppo", "regression"):
         weights = tail or training_seeds(head)[0].partition(":")[2]
         return _named_files(weights)
@@ -104,8 +110,14 @@ def _own_files(base: str) -> list[Path]:
         except (ImportError, ValueError):
             found = None
         if found is not None and found.origin is not None:
-            return [Path(found.origin)]
+            return _with_neighbours(Path(found.origin))
     return []
+
+
+def _with_neighbours(file: Path) -> list[Path]:
+    """A Python file, and the first `_MAX_NEIGHBOURS` others of its folder by name."""
+    others = sorted(other for other in file.parent.glob("*.py") if other.name != file.name)
+    return [file, *(o for o in others[:_MAX_NEIGHBOURS] if os.access(o, os.R_OK))]
 
 
 def _named_files(text: str) -> list[Path]:

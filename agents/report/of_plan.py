@@ -169,6 +169,7 @@ def plan_markdown(
         f"groups{seeds_note(result)}. How everything is defined: `docs/evaluation.md`.",
         *_ranking_part(ranking, len(results)),
         "![Scores with intervals](scores.png)",
+        "*Frames to converge*: an episode that never converges counts with all its frames.",
     ]
     for part in result.conditions:
         own = [r for r in rows if r["condition"] == part]
@@ -251,11 +252,9 @@ def _conditions_part(
         [c, *(f"{r.episode_metrics(p)['converged'].mean():.0%}" for p in names)]
         for c, r in results.items()
     ]
-    text = "Episodes that never settle count with all frames that there are."
     return [
         *parts,
         "### Share of episodes that converge",
-        text,
         markdown_table(["condition", *names], share),
     ]
 

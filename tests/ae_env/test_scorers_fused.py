@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -146,3 +150,25 @@ def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: floa
     wanted = tables.table(lit, speed=0.2, defocus=1.0)
     np.testing.assert_allclose(changed.mean, wanted.mean, atol=1e-6)
     assert changed.oracle == wanted.oracle
+
+
+def test_what_is_compiled_and_what_is_loaded_agree_to_the_last_bit(tmp_path: Path) -> None:
+    """The first process of a fresh installation compiles; all others load what it kept."""
+    code = (
+        "import sys, numpy as np; from ae_env.scorers.fused_kernels import fused_means as f\n"
+        "rng = np.random.default_rng(0); n = np.float32\n"
+        "light, dark = rng.random((2, 4, 1, 900)).astype(n)\n"
+        "means, ratio = np.empty((3, 3)), rng.random((3, 1))\n"
+        "f(0, 3, light, dark, rng.random((1, 900)), ratio.astype(n), ratio.astype(n), ratio,\n"
+        "  np.full((3, 4), 1e-3, n), np.full((3, 4), 1e-6, n), n(76.0), means)\n"
+        "sys.stdout.buffer.write(means.tobytes())\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, check=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert len(outputs[0]) == 72
+    assert outputs[0] == outputs[1]

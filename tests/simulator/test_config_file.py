@@ -122,3 +122,26 @@ def test_true_is_no_number(tmp_path: Path, entry: str) -> None:
     (tmp_path / "a.yaml").write_text(f"{entry}: yes\n")
     with pytest.raises(ValueError, match=rf"{entry} \(=True\): .*not be true or false"):
         load_yaml(tmp_path / "a.yaml", Numbers)
+
+
+class Many(Configuration):
+    parts: dict[str, Part] = Field(default_factory=dict)
+    rows: tuple[Part, ...] = ()
+    one: Part | None = None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("parts: {a: {stesp: 3}}", r"parts\.a\.stesp \(=3\): unknown, the .*mean `steps`"),
+        ("rows: [{steps: 2}, {foo: 3}]", r"rows\.1\.foo \(=3\): unknown, .*'steps'"),
+        ("one: {foo: 3}", r"one\.foo \(=3\): unknown, .*'steps'"),
+        ("rows: 3", r"rows \(=3\): must be a list"),
+        ("parts: 3", r"parts \(=3\): must be a mapping"),
+        ("parts: {a: 3}", r"parts\.a \(=3\): must be a mapping"),
+    ],
+)
+def test_entries_of_mappings_and_lists(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_yaml(tmp_path / "a.yaml", Many)

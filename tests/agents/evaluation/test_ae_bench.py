@@ -64,18 +64,23 @@ def test_signature_of_known_light(scenes):
     assert (codes[:, 0, 0] - codes[:, 3, 3] == 20).all()  # two stops in tenths
 
 
-def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path):
+def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog):
     results = run_plan(plan, tmp_path / "parts")
     ranking = overall_ranking(results, resamples=200)
     table = tmp_path / "docs" / "ae-bench" / "v1.csv"
     files = ae_bench.append_results(table, plan, results, ranking, author="first")
     assert sorted(files) == ["ae-bench.md", "v1.csv"]
     again = [one for one in ranking if one.policy == "random"]
+    assert "replaced" not in caplog.text
     ae_bench.append_results(table, plan, results, again, author="second")
+    assert "replaced" not in caplog.text
+    ae_bench.append_results(table, plan, results, again, author="first")
+    assert "replaced the row of 'random' by 'first'" in caplog.text
     with table.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [(r["policy"], r["author"]) for r in rows] == [
+    assert sorted((r["policy"], r["author"]) for r in rows) == [
         ("matrix:P", "first"),
+        ("random", "first"),
         ("random", "second"),
     ]
     assert tuple(rows[0]) == ae_bench.COLUMNS
@@ -90,3 +95,41 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path):
     table.write_text("policy,score\n")
     with pytest.raises(ValueError, match="its columns must be"):
         ae_bench.read_table(table)
+
+
+def _table(file, plan, **entries):
+    row = dict.fromkeys(ae_bench.COLUMNS, "") | {"hash": plan.hash} | entries
+    file.write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
+    return file
+
+
+def test_names_of_rows_have_no_folder():
+    names = {
+        "/home/u/my.py:Mine": "my.py:Mine",
+        "u/my.py:Mine?path=a/b": "my.py:Mine?path=a/b",
+        "regression:runs/mine": "regression:mine",
+        "package.module:Class": "package.module:Class",
+        "centre_weighted:P?shutter_cap=1/50": "centre_weighted:P?shutter_cap=1/50",
+    }
+    assert {name: ae_bench.row_name(name) for name in names} == names
+
+
+def test_a_table_is_checked_before_the_run(plan, tmp_path):
+    check = ae_bench.check_append
+    check(tmp_path / "new.csv", plan, ["random"], author="")
+    table = _table(tmp_path / "a.csv", plan, policy="my.py:Mine")
+    check(table, plan, ["u/my.py:Mine"], author="me")
+    check(table, plan, ["random"], author="")
+    with pytest.raises(ValueError, match=r"`author` .*row of 'my\.py:Mine' without an author"):
+        check(table, plan, ["u/my.py:Mine"], author=" ")
+    with pytest.raises(ValueError, match=r"the same row 'my\.py:Mine'"):
+        check(table, plan, ["u/my.py:Mine", "v/my.py:Mine"], author="me")
+    with pytest.raises(ValueError, match="none of the policies gets a row"):
+        check(table, plan, [], author="me")
+    with pytest.raises(ValueError, match="must be a CSV file"):
+        check(tmp_path / "a.md", plan, ["random"], author="me")
+    with pytest.raises(ValueError, match="they do not compare"):
+        check(_table(table, plan, hash="0"), plan, ["random"], author="me")
+    table.write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match="cannot be read as a table"):
+        check(table, plan, ["random"], author="me")

@@ -70,6 +70,8 @@ def test_an_environment_is_the_base(tmp_path):
         (("--preset", "mine.yaml", "--append", "x.csv"), "takes the results of a benchmark only"),
         (("--policy", "random", "--scorer", "nois"), "did you mean 'noise'"),
         (("--preset", "broken.yaml"), "starts"),
+        (("--policy", "random", "--author", "me"), "give --append too"),
+        (("--preset", "ae_bench_v1", "--append", "."), "must be a file, but it is a folder"),
     ],
 )
 def test_mistakes_are_one_line(ae_env, tmp_path, arguments, message):

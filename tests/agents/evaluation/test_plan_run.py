@@ -10,7 +10,7 @@ from agents.evaluation import plan_run
 from agents.evaluation import store as evaluation_store
 from agents.evaluation.plan import Condition, EvaluationPlan, digest, load_plan
 from agents.evaluation.plan_episodes import PlanEpisodes, groups_in_turn, plan_scenes, start_state
-from agents.evaluation.plan_jobs import run_plan
+from agents.evaluation.plan_jobs import ranked_policies, run_plan
 from agents.evaluation.plan_run import PlanRun
 from agents.evaluation.store import EvaluationStore, policy_content
 
@@ -235,6 +235,27 @@ def test_unknown_policies_are_refused_before_any_work(tmp_path):
     assert not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match="at least one policy"):
         run_plan(PLAN.changed(policies=()), tmp_path)
+    with pytest.raises(ValueError, match=r"`other_scorers` .*did you mean 'mid_grey'"):
+        run_plan(PLAN.changed(other_scorers=("mid_gray",)), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_privileged_policies_are_not_ranked(tmp_path):
+    run = PlanRun(PLAN.changed(policies=("oracle", "random")), tmp_path)
+    assert ranked_policies(run) == ["random"]
+
+
+def test_modules_beside_a_file_count(tmp_path):
+    file, helper, inner = tmp_path / "mine.py", tmp_path / "helper.py", tmp_path / "sub"
+    inner.mkdir()
+    for path in (file, helper, inner / "other.py", tmp_path / "data.csv"):
+        path.write_text("x = 1\n")
+    before = policy_content(f"{file}:Mine")
+    for path in (inner / "other.py", tmp_path / "data.csv"):
+        path.write_text("x = 2\n")
+    assert policy_content(f"{file}:Mine") == before
+    helper.write_text("x = 2\n")
+    assert policy_content(f"{file}:Mine") != before
 
 
 def test_another_file_of_a_policy_is_another_policy(tmp_path):
