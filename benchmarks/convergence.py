@@ -120,7 +120,6 @@ def _rows(result: EvaluationResult, stops: float) -> Iterator[dict[str, Any]]:
             "right_at_last": float(known.mean()),
             "frames_to_be_right_median": float(np.median(right[known])) if known.any() else None,
             "final_ev_error": float(error[:, -_LAST:].mean()),
-            "ms_per_decision": result.tracks[policy].ms_per_decision,
             "num_scenes": len(settled),
         }
 
@@ -162,7 +161,6 @@ def _markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
             f"{row['right_at_last']:.0%}",
             _cell(row["frames_to_be_right_median"]),
             f"{row['final_ev_error']:.2f}",
-            f"{row['ms_per_decision']:.2f}",
         ]
         for row in rows
     ]
@@ -171,13 +169,8 @@ def _markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
         for own in meta["filter"]
     ]
     head = ["light [EV]", "policy", "frames to settle (median)", "P90", "follows the whole step"]
-    head += [
-        "frames to settle where it does",
-        "right at last",
-        "frames to be right (median)",
-        "final EV error",
-        "ms per decision",
-    ]
+    head += ["frames to settle where it does", "right at last", "frames to be right (median)"]
+    head += ["final EV error"]
     return "\n".join(
         [
             "# Convergence after a jump of the light",
@@ -190,7 +183,8 @@ def _markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
             "its frames are those of the scenes in which the policy is right at last. *Follows the "
             f"whole step*: where it ends is within {_FOLLOWS_EV:g} EV of where the light went; in "
             "the other scenes it meets the end of the grid or of its ladder, or bright and dark "
-            "parts of the scene count otherwise.",
+            "parts of the scene count otherwise. Times per decision are in the [evaluation]"
+            "(evaluation/report.md).",
             "",
             "![EV100 over time](convergence.png)",
             "",
