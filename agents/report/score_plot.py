@@ -65,7 +65,8 @@ def plot_scores(
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=4, frameon=False)
+    columns = 2 if len(conditions) > 3 else 3
+    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
     if title:
         figure.suptitle(title, fontsize=11)
     picture = io.BytesIO()
