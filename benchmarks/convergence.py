@@ -35,6 +35,7 @@ STOPS = (-6.0, -4.0, -2.0, 2.0, 4.0, 6.0)
 FRAMES, STEP = 90, 30
 #: Frames at the end whose mean is where a policy ends.
 _LAST = 12
+_COLOURS = {"rpi_agc": "black", "regression": "tab:red", "ppo": "tab:blue"}
 #: A policy follows a step whose exposure ends this near to where the light went [EV].
 _FOLLOWS_EV = 0.5
 
@@ -136,8 +137,9 @@ def _plot(curves: dict[float, dict[str, np.ndarray]]) -> bytes:
     for axes, (stops, by_policy) in zip(panels, curves.items(), strict=True):
         for name, departure in by_policy.items():
             frames = np.arange(1, FRAMES + 1) - STEP
-            style = "-" if name in ("rpi_agc", "regression", "ppo") else "--"
-            axes.plot(frames, np.median(departure, axis=0), style, lw=1.3, label=name)
+            colour = _COLOURS.get(name)  # the others': matplotlib's own, dashed
+            style = "--" if colour is None else "-"
+            axes.plot(frames, np.median(departure, axis=0), style, color=colour, label=name)
         axes.axhspan(-THIRD_EV, THIRD_EV, color="0.92")
         axes.set(title=f"light {stops:+g} EV", xlabel="frames since the step", xlim=(-5, 40))
     for axes in panels[::columns]:
