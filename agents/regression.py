@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.history import History
-from agents.metering.meters import make_meter
+from agents.metering.meters import Meter, make_meter
 from agents.network_policy import NetworkPolicy
 from agents.networks import ExposureFeatures, StateHead
 from agents.policy import Observations, PolicyContext, masked_argmax
@@ -91,15 +92,10 @@ class RegressionPolicy(NetworkPolicy):
 
     kind = "regression"
 
-    def __init__(
-        self,
-        context: PolicyContext,
-        weights: str | Path | None = None,
-        network: nn.Module | None = None,
-        device: str = "cpu",
-    ) -> None:
-        self._meter = make_meter("average", context.camera)
-        super().__init__(context, weights, network, device)
+    @cached_property
+    def _meter(self) -> Meter:
+        """Tells light that changed."""
+        return make_meter("average", self.context.camera)
 
     @staticmethod
     def make_network(
