@@ -7,13 +7,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ae_env.checks import check_actions, check_seed, check_word
-from ae_env.core import EpisodeCore, Frames
-from ae_env.draws import check_options
+from ae_env.episodes.core import EpisodeCore, Frames
+from ae_env.episodes.draws import check_options
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
+from ae_env.utils.checks import check_actions, check_seed, check_word
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]
@@ -89,7 +89,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | `delay` | 0 | frames between an action and the first capture that has it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
-    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise_bank`), `"exact"` draws it, which takes longer |
+    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise.generator`), `"exact"` draws it, which takes longer |
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |

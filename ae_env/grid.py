@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ae_env.checks import did_you_mean
+from ae_env.utils.checks import did_you_mean
 from simulator.settings import CameraSettings
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simulator.jit import kernel
+from simulator.utils.jit import kernel
 
 if TYPE_CHECKING:
     import torch

@@ -6,23 +6,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-from ae_env.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.loading import is_sequence
-from ae_env.scenes.networks import (
+from ae_env.scenes.loading import (
     DEFAULT_SIMULATOR,
     SceneNetworks,
     check_weights,
+    is_sequence,
     without_noise,
 )
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, make_scorer
-from simulator.cache import LruCache
+from ae_env.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from simulator.camera import CameraProfile, get_camera
-from simulator.tolerance import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+from simulator.utils.cache import LruCache
 
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36
@@ -140,7 +140,7 @@ class EnvOptions:
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; kept for the next environment like this.
 
-        Of sequences, all frames (`ae_env.scenes.sequence`).
+        Of sequences, all frames (`ae_env.scenes.folder`).
         """
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"

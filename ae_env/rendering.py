@@ -15,15 +15,15 @@ from PIL import Image, ImageDraw, ImageFont
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
 from ae_env.scenes.scene import Scene
-from ae_env.score_table import ScoreTable, ScoreTables, scene_latent
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.registry import make_scorer
+from ae_env.scorers.score_table import ScoreTable, ScoreTables, scene_latent
 from simulator.camera import CameraProfile
-from simulator.isp import develop
+from simulator.raw.develop import develop
 from simulator.settings import format_exposure_time
 
 if TYPE_CHECKING:
-    from ae_env.core import EpisodeCore, Frames
+    from ae_env.episodes.core import EpisodeCore, Frames
 
 #: Least side of a rendered frame [pixel].
 FRAME_PIXELS = 256

@@ -12,13 +12,13 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from ae_env.checks import check_actions, check_integer, check_seed, check_word
-from ae_env.core import EpisodeCore, Frames
-from ae_env.draws import check_options
+from ae_env.episodes.core import EpisodeCore, Frames
+from ae_env.episodes.draws import check_options
 from ae_env.grid import ExposureGrid, plain, plain_list
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
+from ae_env.utils.checks import check_actions, check_integer, check_seed, check_word
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]

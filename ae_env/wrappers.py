@@ -18,8 +18,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector.utils import batch_space
 
-from ae_env.checks import check_actions
 from ae_env.grid import ExposureGrid
+from ae_env.utils.checks import check_actions
 
 #: Distances in stops are compared to this many decimals, so that ties do not hang on rounding.
 _DISTANCE_DECIMALS = 9

@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 _EXPORTS = {
-    "EvaluationPlan": "evaluation.plan",
+    "EvaluationPlan": "evaluation.evaluation_plan",
     "EvaluationResult": "evaluation.result",
     "MeteringPolicy": "metering.programs",
     "Policy": "policy",
@@ -14,7 +14,7 @@ _EXPORTS = {
     "evaluate": "evaluation.protocol",
     "fit_policies": "evaluation.protocol",
     "list_policies": "policy",
-    "load_plan": "evaluation.plan",
+    "load_plan": "evaluation.evaluation_plan",
     "make_policy": "policy",
     "result_rows": "evaluation.result_table",
     "run_plan": "evaluation.plan_jobs",
@@ -23,8 +23,8 @@ _EXPORTS = {
 __all__ = sorted(_EXPORTS)
 
 if TYPE_CHECKING:
-    from agents.evaluation.plan import EvaluationPlan as EvaluationPlan
-    from agents.evaluation.plan import load_plan as load_plan
+    from agents.evaluation.evaluation_plan import EvaluationPlan as EvaluationPlan
+    from agents.evaluation.evaluation_plan import load_plan as load_plan
     from agents.evaluation.plan_jobs import run_plan as run_plan
     from agents.evaluation.protocol import evaluate as evaluate
     from agents.evaluation.protocol import fit_policies as fit_policies

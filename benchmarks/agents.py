@@ -13,13 +13,13 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
+from agents.cli.quickstart import prepare_tables
 from agents.episodes import make_envs
 from agents.evaluation.protocol import evaluate, fit_policies
-from agents.parallel import TrainingJob, train_in_parallel
+from agents.learning.parallel import TrainingJob, train_in_parallel
+from agents.learning.training import load_config
 from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
-from agents.quickstart import prepare_tables
 from agents.report.of_evaluation import write_report
-from agents.training import load_config
 
 CONFIGS = {"regression": Path("configs/regression.yaml"), "ppo": Path("configs/ppo.yaml")}
 SEEDS = (0, 1, 2)

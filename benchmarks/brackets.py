@@ -31,9 +31,9 @@ from simulator import (
     estimate_nlf,
     exposure_ratio,
 )
-from simulator.files import write_atomically
-from simulator.raw_image import PLANES
-from simulator.results import result_meta, write_results
+from simulator.raw.image import PLANES
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 SCENES = {"left_c0": "static", "left_c5": "moving"}
 #: Timed runs of each simulation.

@@ -19,8 +19,8 @@ from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
 from benchmarks.data import data_folder
 from simulator import RawImage, develop, read_raw
-from simulator.isp import TONES, XYZ_FROM_SRGB, srgb_from_camera
-from simulator.results import result_meta, write_results
+from simulator.raw.develop import TONES, XYZ_FROM_SRGB, srgb_from_camera
+from simulator.utils.results import result_meta, write_results
 
 #: X-Rite, "New color specifications for ColorChecker SG and Classic charts" (2016): CIE L*a*b*,
 #: D50, 2 degree, charts made after November 2014.

@@ -24,8 +24,8 @@ from agents.evaluation.result import EvaluationResult
 from agents.metering.rpi_agc import ExposureFilter
 from agents.policy import METERS
 from benchmarks.markdown import table
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 #: Policies that are watched.
 POLICIES = ("rpi_agc", *(f"{meter}:P" for meter in METERS), "regression", "ppo")

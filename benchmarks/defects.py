@@ -17,17 +17,17 @@ import torch
 from scipy.optimize import nnls
 from scipy.stats import spearmanr
 
-from ae_env.console import console
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.luma import luma_of
+from agents.cli.console import console
 from benchmarks.markdown import table
 from simulator import develop, get_camera
-from simulator.blur import disc_blur
-from simulator.files import write_atomically
-from simulator.isp import GREY_CARD_SIGNAL
-from simulator.results import result_meta, write_results
+from simulator.optics.blur import disc_blur
+from simulator.raw.develop import GREY_CARD_SIGNAL
 from simulator.settings import exposure_ratio
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 CAMERA = "nikon_z6"
 #: Packed pixels a side of the renderings that the maps are fitted on, and of those tested on.

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from simulator.cache import CACHE_VARIABLE
+from simulator.utils.cache import CACHE_VARIABLE
 
 ROOT = Path(__file__).absolute().parents[1]
 MIB = 2.0**20

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 T = TypeVar("T")
 #: Folder of the repository.

@@ -10,20 +10,20 @@ _EXPORTS = {
     "CameraProfile": "camera",
     "CameraSettings": "settings",
     "CameraSimulator": "camera_simulator",
-    "Latent": "latent",
+    "Latent": "capture.prepared_scene",
     "NoiseLevelFunction": "camera",
-    "RawImage": "raw_image",
-    "SimulationPlan": "plan",
-    "develop": "isp",
-    "estimate_nlf": "noise_estimation",
+    "RawImage": "raw.image",
+    "SimulationPlan": "capture.plan",
+    "develop": "raw.develop",
+    "estimate_nlf": "raw.noise_estimation",
     "exposure_ratio": "settings",
     "get_camera": "camera",
     "incident_ev100": "settings",
     "list_cameras": "camera",
-    "read_raw": "raw_file",
-    "render_srgb": "isp",
+    "read_raw": "raw.read",
+    "render_srgb": "raw.develop",
     "sensor_signal": "settings",
-    "write_dng": "dng",
+    "write_dng": "raw.dng",
 }
 __all__ = sorted(_EXPORTS)
 
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from simulator.camera import get_camera as get_camera
     from simulator.camera import list_cameras as list_cameras
     from simulator.camera_simulator import CameraSimulator as CameraSimulator
-    from simulator.dng import write_dng as write_dng
-    from simulator.isp import develop as develop
-    from simulator.isp import render_srgb as render_srgb
-    from simulator.latent import Latent as Latent
-    from simulator.noise_estimation import estimate_nlf as estimate_nlf
-    from simulator.plan import SimulationPlan as SimulationPlan
-    from simulator.raw_file import read_raw as read_raw
-    from simulator.raw_image import RawImage as RawImage
+    from simulator.capture.plan import SimulationPlan as SimulationPlan
+    from simulator.capture.prepared_scene import Latent as Latent
+    from simulator.raw.develop import develop as develop
+    from simulator.raw.develop import render_srgb as render_srgb
+    from simulator.raw.dng import write_dng as write_dng
+    from simulator.raw.image import RawImage as RawImage
+    from simulator.raw.noise_estimation import estimate_nlf as estimate_nlf
+    from simulator.raw.read import read_raw as read_raw
     from simulator.settings import CameraSettings as CameraSettings
     from simulator.settings import exposure_ratio as exposure_ratio
     from simulator.settings import incident_ev100 as incident_ev100

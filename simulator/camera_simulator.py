@@ -16,23 +16,67 @@ from typing import Any, Literal, cast, get_args
 import torch
 from torch import nn
 
-from simulator.denoised import Denoised
-from simulator.full_run import FullRun, Stages
-from simulator.latent import HasLatent, Latent, Noise, check_noise
-from simulator.modules.aperture import ApertureModule, usable_defocus
-from simulator.modules.exposure import ExposureModule
-from simulator.modules.noise import NoiseModule, Preset, smoothed, variance_map
-from simulator.network_cache import NetworkCache, Where
-from simulator.opening import MapOpening, NetworkOpening, Opening
-from simulator.plan import SimulationPlan
-from simulator.raw_image import RawImage
+from simulator.capture.aperture_blur import MapOpening, NetworkOpening, Opening
+from simulator.capture.denoised import Denoised
+from simulator.capture.plan import SimulationPlan
+from simulator.capture.prepared_scene import HasLatent, Latent, Noise, check_noise
+from simulator.networks.aperture_module import ApertureModule, usable_defocus
+from simulator.networks.exposure_module import ExposureModule
+from simulator.networks.full_run import FullRun, Stages
+from simulator.networks.network_cache import NetworkCache, Where
+from simulator.networks.noise_module import NoiseModule, Preset, smoothed, variance_map
+from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
-from simulator.sources import Depth, check_depth, latent_of
-from simulator.tiles import in_tiles, varying
+from simulator.utils.tiles import in_tiles, varying
+
+# What the simulator photographs: raws, latents and scenes, as light on a device.
+#: What is known of a scene's depth: it is far or in focus throughout, or not known.
+Depth = Literal["far", "unknown"]
+
+
+def check_depth(depth: str) -> None:
+    """Raises a `ValueError` unless `depth` says what is known of the scene's."""
+    if depth not in get_args(Depth):
+        raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
+
+
+def latent_of(source: RawImage | Latent | HasLatent, device: torch.device) -> Latent:
+    """The light of `source` as it was recorded, or a latent as it is, on `device`.
+
+    Raises:
+        ValueError: If `source` is neither a raw nor a latent nor a scene.
+    """
+    if isinstance(source, RawImage):
+        return _recorded(source, device)
+    if isinstance(source, Latent):
+        if source.light.device == device:
+            return source
+        given = {name: getattr(source, name) for name in ("light", "denoised", "saturated")}
+        moved = {name: part.to(device) for name, part in given.items() if part is not None}
+        return replace(source, **moved)
+    if hasattr(source, "latent"):
+        return latent_of(source.latent, device)
+    raise ValueError(f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene")
+
+
+def _recorded(raw: RawImage, device: torch.device) -> Latent:
+    saturated, camera = raw.saturated, raw.camera
+    if raw.nlf is not None and not camera.nlf_by_iso:
+        camera = camera.with_nlf(raw.settings.iso, raw.nlf)
+    return Latent(
+        light=raw.data.to(device),
+        reference=raw.settings,
+        camera=camera,
+        nlf=raw.noise,
+        saturated=saturated.to(device) if saturated.count_nonzero() else None,
+        white_balance=raw.white_balance,
+        box_factor=raw.box_factor,
+    )
+
 
 #: What the compact networks see around a pixel [pixel]; tiles overlap by it.
 _NOISE_HALO, _MAP_HALO = 36, 56
-#: How far the largest disc of `simulator.modules.disc_bank` reaches [pixel].
+#: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
 _DISC_REACH = 16
 
 
@@ -105,7 +149,7 @@ class CameraSimulator:
         Raises:
             ValueError: If there are no such weights, or they are damaged or those of a baseline.
         """
-        from simulator.weights import load_modules
+        from simulator.networks.weights import load_modules
 
         modules, card = load_modules(name)
         if card["preset"] not in get_args(Preset):

@@ -57,7 +57,7 @@ def the_same_random_numbers() -> None:
 @pytest.fixture
 def ae_env(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path):
     """Runs the command line as the console script does, in a folder of its own."""
-    from ae_env import cli
+    from agents.cli import main as cli
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")

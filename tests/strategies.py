@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ae_env.grid import ExposureGrid
 from simulator import CameraSettings, NoiseLevelFunction
 from simulator.camera import BayerPattern, CameraProfile
-from simulator.latent import Latent
+from simulator.capture.prepared_scene import Latent
 
 Mosaic = tuple[CameraProfile, np.ndarray]
 

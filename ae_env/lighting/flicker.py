@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ae_env.checks import check_number
 from ae_env.lighting.base import MAX_STOPS, Lighting, RollingShutter
-from simulator.lamps import Lamp, MainsLamp, PulsedLamp
+from ae_env.utils.checks import check_number
+from simulator.optics.lamps import Lamp, MainsLamp, PulsedLamp
 
 #: Depth of a lamp on the mains, where none is given.
 MAINS_DEPTH = 0.8
@@ -34,7 +34,7 @@ _RANGES = {
 class FlickerLighting(Lighting):
     """Light that flickers much faster than frames follow each other, around the scene's own.
 
-    It is integrated in closed form over the exposure time of each row (`simulator.lamps`). Rows
+    It is integrated in closed form over the exposure time of each row (`simulator.optics.lamps`). Rows
     begin one after the other: unless the exposure lasts whole periods, the frame has bands.
 
     Args:

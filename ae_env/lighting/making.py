@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from ae_env.checks import did_you_mean
 from ae_env.lighting.base import Lighting
 from ae_env.lighting.changes import (
     LensCapLighting,
@@ -17,6 +16,7 @@ from ae_env.lighting.changes import (
 )
 from ae_env.lighting.flicker import FlickerLighting
 from ae_env.lighting.schedule import ScheduleLighting
+from ae_env.utils.checks import did_you_mean
 
 KINDS: dict[str, type[Lighting]] = {
     kind.name: kind

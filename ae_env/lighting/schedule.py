@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ae_env.checks import check_number
 from ae_env.lighting.base import MAX_STOPS, Lighting
+from ae_env.utils.checks import check_number
 
 #: Most frames of a schedule.
 MAX_FRAMES = 2**20

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ae_env.scenes.light_scale import MEAN_SIGNAL, WHITE_SIGNAL, reference_settings
 from ae_env.scenes.loading import load_scenes
-from ae_env.scenes.scene import Scene
+from ae_env.scenes.scene import MEAN_SIGNAL, WHITE_SIGNAL, Scene, reference_settings
 
 __all__ = ["MEAN_SIGNAL", "WHITE_SIGNAL", "Scene", "load_scenes", "reference_settings"]

@@ -16,17 +16,12 @@ import safetensors.torch
 import torch
 
 from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
-from ae_env.scenes.procedural import (
-    GENERATOR_VERSION,
-    HARD_KINDS,
-    MOTION_SPEED,
-    draw,
-)
+from ae_env.scenes.procedural import GENERATOR_VERSION, HARD_KINDS, MOTION_SPEED, draw
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
-from simulator.cache import cache_dir, cache_key
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.files import write_atomically
 from simulator.settings import CameraSettings
+from simulator.utils.cache import cache_dir, cache_key
+from simulator.utils.files import write_atomically
 
 logger = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from simulator.raw_image import RawImage
+from simulator.raw.image import RawImage
 
 logger = logging.getLogger(__name__)
 

@@ -19,11 +19,10 @@ import numpy as np
 import torch
 
 from ae_env.scenes.colour import camera_from_srgb
-from ae_env.scenes.light_scale import mean_anchor
 from ae_env.scenes.procedural import NATIVE_SIZE
-from ae_env.scenes.scene import Crop, Resize, Scene
+from ae_env.scenes.scene import Crop, Resize, Scene, mean_anchor
 from simulator.camera import CameraProfile
-from simulator.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
+from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +54,7 @@ def read_radiance(path: str | Path) -> np.ndarray:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
         ValueError: If the file cannot be read, is empty of light or is neither kind, or claims more
-            pixels than `simulator.files.MAX_PIXELS`, or `MAX_RADIANCE_PIXELS_PER_BYTE` of them for
+            pixels than `simulator.utils.files.MAX_PIXELS`, or `MAX_RADIANCE_PIXELS_PER_BYTE` of them for
             each byte of the file.
     """
     path = as_path(path)

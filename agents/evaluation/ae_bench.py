@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.evaluation import metrics
-from agents.evaluation.plan import EvaluationPlan, digest
+from agents.evaluation.evaluation_plan import EvaluationPlan, digest
 from agents.evaluation.ranking import Rank
 from agents.evaluation.result import EvaluationResult
-from agents.policy_name import split_name
+from agents.policy import split_name
 from agents.report.of_evaluation import markdown_table
 from agents.report.tables import static_condition
-from simulator.files import write_atomically
-from simulator.results import machine, versions
+from simulator.utils.files import write_atomically
+from simulator.utils.results import machine, versions
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene

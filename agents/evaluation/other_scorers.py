@@ -43,8 +43,8 @@ def state_scores(
         speed: Image speed [frame heights per second].
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
     """
-    from ae_env.captures import describe_captures
-    from ae_env.score_table import scene_latent
+    from ae_env.scorers.captures import describe_captures
+    from ae_env.scorers.score_table import scene_latent
 
     options = run.plan.options()
     camera = options.make_camera()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.episodes import EpisodeBatch, make_envs
-from agents.evaluation.plan import Condition, EvaluationPlan
+from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -34,7 +34,7 @@ def plan_scenes(plan: EvaluationPlan) -> list[Scene]:
     Raises:
         ValueError: If one of `scene_ids` is not there.
     """
-    from ae_env.checks import did_you_mean
+    from ae_env.utils.checks import did_you_mean
 
     scenes = plan.options().load_scenes()
     if plan.scene_ids:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.score_table import TIE
-from agents.evaluation.plan import Condition, EvaluationPlan
+from ae_env.scorers.score_table import TIE
+from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
 from agents.evaluation.plan_episodes import (
     PlanEpisodes,
     batch_size,
@@ -211,7 +211,7 @@ class PlanRun:
             self.store.save(key, arrays, meta)
 
     def _fitted(self, member: Member, condition: Condition) -> Policy:
-        from agents.quickstart import training_scenes
+        from agents.cli.quickstart import training_scenes
 
         policy = self.make(member, condition)
         base = {k: v for k, v in self.plan.environment.items() if k != "costs"}

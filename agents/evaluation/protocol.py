@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.checks import check_integer
+from ae_env.utils.checks import check_integer
 from agents.episodes import EpisodeBatch, episode_batches, expected_scores, make_envs
 from agents.evaluation.result import EvaluationResult, Track
 from agents.evaluation.running import (

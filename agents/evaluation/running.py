@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.checks import UserCodeError, check_number
+from ae_env.utils.checks import UserCodeError, check_number
 from agents.episodes import EpisodeBatch
 from agents.evaluation.result import Track
 from agents.metering.meters import linear_signal

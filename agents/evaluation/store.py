@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.plan import digest
-from agents.policy import training_seeds
-from agents.policy_name import split_name
-from simulator.files import sibling, write_atomically
+from agents.evaluation.evaluation_plan import digest
+from agents.policy import split_name, training_seeds
+from simulator.utils.files import sibling, write_atomically
 
 logger = logging.getLogger(__name__)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.checks import check_number
+from ae_env.utils.checks import check_number
 from agents.metering.reading import SATURATED_STEP_EV, Reading
 
 #: Metered weight from which a frame is all white.

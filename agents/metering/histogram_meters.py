@@ -180,9 +180,9 @@ def _search_reading(shares: Floats, ev: Floats, found: Floats) -> Reading:
 
 
 def encoded(linear: NDArray[Any]) -> Floats:
-    """Linear light in [0, 1] as sRGB, see `simulator.isp.srgb_encode`."""
+    """Linear light in [0, 1] as sRGB, see `simulator.raw.develop.srgb_encode`."""
     import torch
 
-    from simulator.isp import srgb_encode
+    from simulator.raw.develop import srgb_encode
 
     return np.asarray(srgb_encode(torch.from_numpy(np.asarray(linear, np.float64))))

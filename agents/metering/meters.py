@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.checks import did_you_mean
+from ae_env.utils.checks import did_you_mean
 from agents.metering.reading import (
     BLACK_SIGNAL,
     GREEN,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.checks import check_integer, check_number, check_word
+from ae_env.utils.checks import check_integer, check_number, check_word
 from agents.metering import rpi_agc_tuning as tuning
 from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
 from agents.metering.state_choice import (

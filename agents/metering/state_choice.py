@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.checks import check_number, check_word
 from ae_env.grid import ExposureGrid
+from ae_env.utils.checks import check_number, check_word
 from agents.evaluation.metrics import SAME_EV
 from agents.metering.ev_tracker import check_damping
 from agents.policy import MANUAL_PROGRAMS

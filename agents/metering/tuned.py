@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
 EV_BANDWIDTHS = (0.35, 0.6, 1.0)

@@ -12,7 +12,7 @@ import numpy as np
 
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 #: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from agents.report.convergence_plot import line_style
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 
 def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> list[str]:

@@ -20,9 +20,9 @@ from agents.evaluation.result_table import (
 )
 from agents.evaluation.statistics import MIN_GROUPS
 from agents.report.score_plot import plot_scores
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
 from simulator.settings import format_exposure_time
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 _TABLE = (
     ("policy", "policy", ""),

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from agents.evaluation.evaluation_plan import EvaluationPlan, digest
 from agents.evaluation.other_scorers import other_scores
-from agents.evaluation.plan import EvaluationPlan, digest
 from agents.evaluation.plan_run import PlanRun
 from agents.evaluation.ranking import Rank
 from agents.evaluation.result import EvaluationResult
@@ -36,8 +36,8 @@ from agents.report.tables import (
     ranking_rows,
     static_condition,
 )
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 Rows = list[dict[str, Any]]
 

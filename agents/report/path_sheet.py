@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from agents.evaluation.result import EvaluationResult
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
     from agents.evaluation.plan_run import PlanRun

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 #: Okabe and Ito's colour-blind-safe palette, and a shape for print without colour.
 _STYLE = {

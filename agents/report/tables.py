@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from agents.evaluation import metrics
-from agents.evaluation.plan import EvaluationPlan
+from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.evaluation.ranking import Rank, rank
 from agents.evaluation.result import EvaluationResult
 from agents.evaluation.result_table import result_rows

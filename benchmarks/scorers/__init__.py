@@ -8,13 +8,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ae_env.core import EpisodeCore
+from ae_env.episodes.core import EpisodeCore
 from ae_env.options import EnvOptions
 from ae_env.scorers import CompositeScorer, list_scorers, make_scorer
 from benchmarks.markdown import table
 from benchmarks.scorers import correlations, sweeps, timing
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 #: Packed pixels a side of the captures that every scorer is shown.
 SIZE = 128

@@ -15,13 +15,13 @@ import torch
 from scipy.stats import pearsonr, spearmanr
 from skimage.metrics import structural_similarity
 
-from ae_env.core import EpisodeCore
+from ae_env.episodes.core import EpisodeCore
 from ae_env.scenes import Scene, reference_settings
-from ae_env.score_table import scene_latent
 from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import scene_latent
 from benchmarks.markdown import table
 from simulator import CameraProfile, develop
-from simulator.capture import clip_and_quantise
+from simulator.capture.record import clip_and_quantise
 
 SCORERS = ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced")
 #: What each scorer alone is about, measured on captures with no other fault than that one.

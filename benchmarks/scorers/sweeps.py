@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ae_env.captures import describe_captures
 from ae_env.scenes import Scene
-from ae_env.score_table import scene_latent
 from ae_env.scorers import CompositeScorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.score_table import scene_latent
 from benchmarks.markdown import table
 from simulator import CameraProfile
 from simulator.settings import CameraSettings

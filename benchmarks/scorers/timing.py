@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ae_env.captures import describe_captures
 from ae_env.options import EnvOptions
-from ae_env.score_table import scene_latent
 from ae_env.scorers import Captures, CompositeScorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.score_table import scene_latent
 from benchmarks.markdown import table
 from simulator import develop
 

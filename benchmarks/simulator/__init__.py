@@ -12,7 +12,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ae_env.console import console, print_files
+from agents.cli.console import console, print_files
 from benchmarks.simulator import (
     brackets,
     defocus,
@@ -25,8 +25,8 @@ from benchmarks.simulator import (
 from benchmarks.simulator.models import Models
 from benchmarks.simulator.parts import measure_parts
 from benchmarks.simulator.scenes import data_root
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 #: In the order of the report: module and heading.
 PARTS = {
@@ -71,7 +71,7 @@ def _markdown(models: Models, rows: list[dict[str, Any]], meta: dict[str, Any]) 
         "# The camera simulator, measured",
         "",
         f"`{meta['command']}`, {meta['date'][:10]}, seed {meta['seed']}, {machine['cpu']}, one "
-        "thread, float32. Ground truth is the reference camera (`simulator/reference.py`); every "
+        "thread, float32. Ground truth is the reference camera (`simulator/reference/reference_camera.py`); every "
         "scene is from the test split, whose source groups no training saw. Error and time stand "
         "side by side: a millisecond is that of one 4 x 128 x 128 raw unless stated otherwise.",
         "",

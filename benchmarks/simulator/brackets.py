@@ -32,7 +32,7 @@ from benchmarks.brackets import (
 )
 from benchmarks.simulator.scenes import Progress, data_root
 from simulator import CameraSimulator, Latent, RawImage, exposure_ratio
-from simulator.modules.exposure import ExposureModule, LinearFit
+from simulator.networks.exposure_module import ExposureModule, LinearFit
 
 if TYPE_CHECKING:
     from benchmarks.simulator.models import Models

@@ -9,10 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from simulator import CameraSettings, RawImage, exposure_ratio
-from simulator.noise import noise_variance
-from simulator.reference import ReferenceCamera, ReferenceCapture, ReferenceScene
-from simulator.sequences import Pair, select_pairs
-from simulator.sequences import Sequence as CaptureSequence
+from simulator.noise.noise_level_function import noise_variance
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceCapture, ReferenceScene
+from simulator.reference.sequences import Pair, select_pairs
+from simulator.reference.sequences import Sequence as CaptureSequence
 
 #: Defocus that can be seen [packed pixel], and the share of white pixels from which a source counts
 #: as saturated.

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ae_env.scenes.reference import depth_photographs, reference_scenes
+from ae_env.scenes.reference_scenes import depth_photographs, reference_scenes
 from benchmarks.simulator.depth_views import (
     BORDER,
     CLASSES,
@@ -33,9 +33,9 @@ from benchmarks.simulator.depth_views import (
 )
 from benchmarks.simulator.scenes import Progress, clipped, data_root
 from simulator import RawImage, get_camera
-from simulator.modules.aperture import ApertureModule, added_blur
-from simulator.modules.disc_bank import DiscBank
-from simulator.modules.noise import NoiseModule, smoothed, variance_map
+from simulator.networks.aperture_module import ApertureModule, added_blur
+from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
+from simulator.optics.disc_bank import DiscBank
 
 if TYPE_CHECKING:
     from benchmarks.simulator.models import Models

@@ -30,8 +30,8 @@ from simulator import (
     RawImage,
     get_camera,
 )
-from simulator.noise import nlf_tensors
-from simulator.reference import ReferenceCamera, ReferenceCapture
+from simulator.noise.noise_level_function import nlf_tensors
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceCapture
 
 CAMERAS = ("nikon_z6", "canon_70d")
 SOURCE_ISO, TARGET_ISO = 6400, 100

@@ -10,10 +10,10 @@ import torch
 from scipy.ndimage import maximum_filter, minimum_filter
 from torch import Tensor
 
-from ae_env.scenes.reference import packed_pitch
+from ae_env.scenes.reference_scenes import packed_pitch
 from simulator import CameraProfile, CameraSettings, RawImage
-from simulator.modules.exposure import OVER_EXPOSED
-from simulator.reference import ReferenceCamera, ReferenceScene
+from simulator.networks.exposure_module import OVER_EXPOSED
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 F_SOURCE, F_TARGET = 11.0, 4.0
 ISOS = (100, 1600)

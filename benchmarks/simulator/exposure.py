@@ -6,11 +6,11 @@ from typing import Any
 
 import torch
 
-from ae_env.scenes.reference import reference_scenes
+from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.simulator.models import Models
 from simulator.camera import get_camera
-from simulator.modules.exposure import OVER_EXPOSED, ExposureModule, LinearFit
-from simulator.reference import BodyError, ReferenceCamera
+from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
+from simulator.reference.reference_camera import BodyError, ReferenceCamera
 from simulator.training.data import Batch, ReferencePairs, draw_sequences
 
 #: The body that the shipped weights were trained on.

@@ -9,11 +9,11 @@ from typing import Any
 
 from torch import nn
 
-from ae_env.simulator_commands import training_scenes
+from agents.cli.simulator_commands import training_scenes
 from simulator import CameraSimulator
+from simulator.networks.weights import list_pretrained, load_modules
 from simulator.training.config import load_config
 from simulator.training.train import train_and_save
-from simulator.weights import list_pretrained, load_modules
 
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]

@@ -29,8 +29,8 @@ from simulator import (
     RawImage,
     get_camera,
 )
-from simulator.noise import noise_variance
-from simulator.reference import ReferenceCamera, ReferenceScene
+from simulator.noise.noise_level_function import noise_variance
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 CAMERAS = ("nikon_z6", "canon_70d")
 #: ISO of the targets; the last is beyond both calibrations.

@@ -24,7 +24,7 @@ from benchmarks.simulator.models import Models
 from benchmarks.simulator.pairs_report import section as section
 from benchmarks.simulator.scenes import FULL, QUICK, Progress, clipped, held_out_scenes, psnr
 from simulator import CameraSimulator, get_camera
-from simulator.reference import BodyError, ReferenceCamera
+from simulator.reference.reference_camera import BodyError, ReferenceCamera
 from simulator.training.data import draw_sequences, settings_parameters
 
 #: Camera and the seed of its body: the one trained on, and one that no training saw.

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ae_env.console import progress_bars
+from agents.cli.console import progress_bars
 from benchmarks.keeping import Kept
 from benchmarks.simulator.models import FOLDER, Models, load_models
 

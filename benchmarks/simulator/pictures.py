@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ae_env.scenes.reference import depth_photographs, reference_scenes
+from ae_env.scenes.reference_scenes import depth_photographs, reference_scenes
 from benchmarks.simulator.depth_views import equal_exposure
 from benchmarks.simulator.scenes import Progress, clipped, data_root, psnr
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
-from simulator.files import write_atomically
-from simulator.reference import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
     from benchmarks.simulator.models import Models

@@ -12,9 +12,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ae_env.scenes.reference import reference_scenes
+from ae_env.scenes.reference_scenes import reference_scenes
 from simulator import CameraProfile, get_camera
-from simulator.reference import ReferenceScene
+from simulator.reference.reference_camera import ReferenceScene
 
 #: Called with what is being measured and the share of the part that is done.
 Progress = Callable[[str, float], None]

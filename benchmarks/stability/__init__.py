@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from ae_env.console import print_files, progress_bars
+from agents.cli.console import print_files, progress_bars
 from benchmarks.keeping import Kept
 from benchmarks.stability import (
     control,
@@ -29,8 +29,8 @@ from benchmarks.stability import (
 from benchmarks.stability.case import Row
 from benchmarks.stability.plots import draw
 from benchmarks.stability.report import markdown
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 #: Groups of a run that was stopped.
 FOLDER = Path("runs/stability")

@@ -12,8 +12,8 @@ from scipy import stats
 
 from benchmarks.stability.case import Row, time_ratio
 from simulator import CameraProfile, CameraSettings, Latent, NoiseLevelFunction, get_camera
-from simulator.frame_noise import Noise
-from simulator.reference import ReferenceCamera
+from simulator.noise.generator import Noise
+from simulator.reference.reference_camera import ReferenceCamera
 
 GROUP = "noise draws"
 _STATE = CameraSettings(iso=100.0, exposure_time=1.0, f_number=4.0)

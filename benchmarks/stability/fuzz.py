@@ -187,7 +187,7 @@ def _configs(folder: Path) -> list[Path]:
 
 
 def _cached(folder: Path) -> list[Path]:
-    from simulator.cache import DiskCache
+    from simulator.utils.cache import DiskCache
 
     cache = DiskCache(folder)
     cache.put("denoised", _KEY, _tensors())
@@ -211,9 +211,9 @@ def _read_radiance(path: Path) -> bool:
 
 
 def _read_config(path: Path) -> bool:
-    from agents.training import AgentConfig
-    from simulator.config_file import load_yaml
+    from agents.learning.training import AgentConfig
     from simulator.training.config import SimulatorConfig
+    from simulator.utils.config_file import load_yaml
 
     try:
         load_yaml(path, AgentConfig)
@@ -224,7 +224,7 @@ def _read_config(path: Path) -> bool:
 
 def _read_cached(path: Path) -> bool:
     """Whether a cache finds what was written; where it finds nothing, that counts as refused."""
-    from simulator.cache import DiskCache
+    from simulator.utils.cache import DiskCache
 
     cache = DiskCache(path.parent / "damaged")  # the original stays
     target = cache.path("denoised", _KEY)

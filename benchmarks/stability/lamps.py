@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import quad
 
 from benchmarks.stability.case import Row, time_ratio
-from simulator.lamps import Flash, Lamp, MainsLamp, PulsedLamp
+from simulator.optics.lamps import Flash, Lamp, MainsLamp, PulsedLamp
 
 GROUP = "stiff light"
 #: Relative error that is right.

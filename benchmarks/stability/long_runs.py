@@ -224,10 +224,10 @@ def train(agent: str, out: str) -> dict[str, Any]:
     Returns:
         Hash of its weights, and the step that it was resumed at, 0 where it was not.
     """
-    import agents.ppo
-    import agents.regression
-    from agents.training import AgentConfig, train_agent
-    from simulator.checkpoint import Checkpoint
+    import agents.learning.ppo
+    import agents.learning.regression_training
+    from agents.learning.training import AgentConfig, train_agent
+    from simulator.utils.checkpoint import Checkpoint
 
     # What runs in the background of a shell ignores interrupts.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -242,7 +242,7 @@ def train(agent: str, out: str) -> dict[str, Any]:
             steps.append(super().restore())
             return steps[-1]
 
-    agents.ppo.Checkpoint = agents.regression.Checkpoint = Often  # type: ignore[misc]
+    agents.learning.ppo.Checkpoint = agents.learning.regression_training.Checkpoint = Often  # type: ignore[misc]
     training: dict[str, dict[str, Any]] = {
         "regression": {"frames": _FRAMES, "width": 16},
         "ppo": {"total_timesteps": _FRAMES, "n_steps": 8, "batch_size": 64, "width": 16},

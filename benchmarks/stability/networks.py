@@ -9,13 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.stability.case import Row, time_ratio
-from simulator.modules.baselines import NUM_PARAMETERS
-from simulator.modules.build import PRESETS, build_modules
-from simulator.modules.instance_norm import instance_norm
-from simulator.modules.noise import NoiseModule, smoothed, variance_map
+from simulator.networks.baselines import NUM_PARAMETERS
+from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
+from simulator.networks.unet import instance_norm
+from simulator.networks.weights import PRESETS, build_modules, load_modules
 from simulator.training.data import Batch
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
-from simulator.weights import load_modules
 
 GROUP = "networks"
 EPS32 = 2.0**-24

@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 #: Errors below this are drawn at it: a logarithmic axis has no zero.
 _LEAST = 1e-17

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import torch
 
-from ae_env.checks import UserCodeError
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
-from ae_env.score_table import ScoreTable, ScoreTables
 from ae_env.scorers import list_scorers, make_scorer
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from ae_env.utils.checks import UserCodeError
 from benchmarks.stability.case import Row, time_ratio
 from benchmarks.stability.signals import extreme_signals
 from simulator import CameraProfile, CameraSettings, get_camera

@@ -11,11 +11,11 @@ import torch
 
 from benchmarks.stability.case import Row, time_ratio
 from simulator import CameraProfile, CameraSettings, Latent, NoiseLevelFunction, get_camera
-from simulator.blur import disc_blur, motion_blur
-from simulator.blur_shapes import disc_kernel, motion_kernel
-from simulator.capture import add_noise
-from simulator.exposure import Exposure
-from simulator.frame_noise import FrameNoise
+from simulator.capture.exposure import Exposure
+from simulator.capture.record import add_noise
+from simulator.noise.generator import FrameNoise
+from simulator.optics.blur import disc_blur, motion_blur
+from simulator.optics.shapes import disc_kernel, motion_kernel
 
 GROUP = "signals"
 EPS32 = 2.0**-24

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ae_env.console import print_files, progress_bars
+from agents.cli.console import print_files, progress_bars
 from benchmarks.isolated import CORES, isolated
 from benchmarks.keeping import Kept
 from benchmarks.simulator.scenes import data_root
@@ -28,8 +28,8 @@ from benchmarks.throughput.report import markdown
 from benchmarks.throughput.step_profile import measure_profile
 from benchmarks.throughput.steps import SCENES, measure_steps
 from benchmarks.throughput.targets import check_targets
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 #: Parts of a run that was stopped.
 FOLDER = Path("runs/throughput")

@@ -9,7 +9,7 @@ import torch
 
 from ae_env.scenes.dead_leaves import dead_leaves
 from simulator import CameraSettings, RawImage, get_camera
-from simulator.blur import disc_blur
+from simulator.optics.blur import disc_blur
 
 CAMERA = "nikon_z6"
 #: Side of the picture that is repeated, mirrored, over a larger frame [packed pixel].

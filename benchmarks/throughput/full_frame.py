@@ -21,7 +21,7 @@ from benchmarks.isolated import forget_peak, isolated, peak_memory, timed
 from benchmarks.keeping import Kept
 from benchmarks.throughput.frames import noisy_raw
 from simulator import CameraSettings, CameraSimulator, read_raw, write_dng
-from simulator.dng_tags import SOFTWARE_NAME
+from simulator.raw.dng import SOFTWARE_NAME
 
 #: Packed height and width of 24 megapixels, and of the quick run's 1.5.
 FULL, QUICK = (2000, 3000), (500, 750)

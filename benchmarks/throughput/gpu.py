@@ -11,8 +11,8 @@ from typing import Any, get_args
 import torch
 
 from benchmarks.throughput.growth import clean_latent, many_states
-from simulator.frame_noise import Noise
-from simulator.latent import Latent
+from simulator.capture.prepared_scene import Latent
+from simulator.noise.generator import Noise
 
 SIZES = ((128, 128), (512, 768), (2000, 3000))
 #: Bytes that a state must move: the light is read and the frame written, float32.

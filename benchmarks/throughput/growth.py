@@ -22,8 +22,8 @@ from benchmarks.keeping import Kept
 from benchmarks.throughput.frames import noisy_raw
 from benchmarks.throughput.kernel_limit import KernelLimit
 from simulator import CameraSettings, CameraSimulator, get_camera
-from simulator.frame_noise import Noise
-from simulator.latent import Latent
+from simulator.capture.prepared_scene import Latent
+from simulator.noise.generator import Noise
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.
 PIXELS = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2000, 3000))

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 import torch
 
-from simulator.normal_kernels import draw_block
+from simulator.noise.generator import draw_block
 
 _F = np.float32
 _ZERO, _ONE, _HALF = _F(0), _F(1), _F(0.5)

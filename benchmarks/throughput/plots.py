@@ -10,7 +10,7 @@ from benchmarks.isolated import CORES
 from benchmarks.throughput.growth import MEMORY_FLOOR
 from benchmarks.throughput.steps import DIGITAL_KERNEL, KERNEL, LOOKUP
 from benchmarks.throughput.targets import SIZE, STEPS_PER_SECOND
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 _TITLES = {
     "pixels": "sensor pixels",

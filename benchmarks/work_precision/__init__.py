@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ae_env.console import console, print_files
+from agents.cli.console import console, print_files
 from benchmarks.simulator.parts import measure_parts
 from benchmarks.simulator.scenes import data_root
 from benchmarks.work_precision import bound, compiled, left_out, plots, precision, report, sweep
-from simulator.files import write_atomically
-from simulator.results import result_meta, write_results
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
 
 #: In the order in which they run.
 PARTS = {

@@ -26,9 +26,9 @@ from benchmarks.simulator.scenes import Progress
 from benchmarks.work_precision.methods import TOLERANCES
 from benchmarks.work_precision.trials import GRID, Trial, test_trials
 from simulator import CameraSettings, CameraSimulator, RawImage
-from simulator.capture import exposed_light
-from simulator.latent import Latent
-from simulator.noise import noise_variance, top_up_variance
+from simulator.capture.prepared_scene import Latent
+from simulator.capture.record import exposed_light
+from simulator.noise.noise_level_function import noise_variance, top_up_variance
 
 #: Photographs of each scene.
 DRAWS = 8

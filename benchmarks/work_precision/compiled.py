@@ -14,7 +14,7 @@ from benchmarks.work_precision.measures import quartiles, timed
 from benchmarks.work_precision.methods import Dtype, simulator
 from benchmarks.work_precision.trials import trials
 from simulator import CameraSettings, CameraSimulator
-from simulator.modules.defocus_map import DefocusMap
+from simulator.networks.aperture_module import DefocusMap
 
 #: Height and width, and rounds.
 SIZE, ROUNDS = 128, 15

@@ -15,8 +15,8 @@ from benchmarks.work_precision.measures import quartiles, timed
 from benchmarks.work_precision.methods import DEFAULT, simulator
 from benchmarks.work_precision.trials import GRID, Trial, source_settings, test_trials
 from simulator import CameraSimulator, NoiseLevelFunction, RawImage, read_raw
-from simulator.latent import Latent
-from simulator.reference import DRAPED
+from simulator.capture.prepared_scene import Latent
+from simulator.reference.reference_camera import DRAPED
 
 #: Height and width of every scene, how many there are of a kind, and runs of each sweep.
 SIZE, SCENES, REPEATS = 128, 3, 5

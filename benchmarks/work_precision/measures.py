@@ -13,7 +13,7 @@ from torch import Tensor
 
 from benchmarks.simulator.scenes import clipped, psnr
 from simulator import CameraProfile, NoiseLevelFunction
-from simulator.noise import noise_variance
+from simulator.noise.noise_level_function import noise_variance
 
 Result = TypeVar("Result")
 

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 from benchmarks.simulator.denoising import behind_anscombe, non_local_means
 from benchmarks.simulator.models import FOLDER, Models
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, exposure_ratio
-from simulator.capture import add_noise, clip_and_quantise
-from simulator.exposure import Exposure
-from simulator.frame_noise import FrameNoise, sweep_keys
-from simulator.latent import Latent
+from simulator.capture.exposure import Exposure
+from simulator.capture.prepared_scene import Latent
+from simulator.capture.record import add_noise, clip_and_quantise
+from simulator.noise.generator import FrameNoise, sweep_keys
 from simulator.training.data import settings_parameters
 
 Dtype = Literal["float32", "bfloat16"]

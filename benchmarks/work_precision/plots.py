@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from simulator.files import write_atomically
+from simulator.utils.files import write_atomically
 
 Row = dict[str, Any]
 

@@ -34,7 +34,7 @@ def markdown(rows: Sequence[Row], meta: dict[str, Any]) -> str:
         "",
         f"`{meta['command']}`, {meta['date'][:10]}, seed {meta['seed']}, {machine['cpu']}, "
         f"{meta['threads']} threads.{quick} The truth is the reference camera "
-        "(`simulator/reference.py`), here without hidden errors of its body. Scenes are of the "
+        "(`simulator/reference/reference_camera.py`), here without hidden errors of its body. Scenes are of the "
         "test split: procedural ones with and without depth, photographs, views into radiance "
         "maps, and such views draped over depth; the simulator is not told their depth. Each is "
         "photographed at f/8 with ISO 100 to 6400 and up to 2 EV less than incident light asks "

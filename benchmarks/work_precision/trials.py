@@ -17,11 +17,11 @@ from torch import Tensor
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes.depth import FOCAL_LENGTH, draw_depth, lens_and_depth
-from ae_env.scenes.reference import reference_scenes
+from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.simulator.scenes import cropped, data_root
 from simulator import CameraSettings, RawImage, get_camera
-from simulator.reference import DRAPED, Lens, ReferenceCamera, ReferenceScene
-from simulator.sequences import exposure_error
+from simulator.reference.reference_camera import DRAPED, Lens, ReferenceCamera, ReferenceScene
+from simulator.reference.sequences import exposure_error
 from simulator.settings import incident_ev100
 
 #: Height and width [packed pixel].

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from simulator.camera import get_camera
-from simulator.config_file import Configuration, load_yaml
+from simulator.utils.config_file import Configuration, load_yaml
 
 
 class StageConfig(Configuration):
@@ -42,7 +42,7 @@ class SceneConfig(Configuration):
     Args:
         procedural: Procedural scenes in the training split; three quarters of them have depth.
         size: Height and width of a scene [packed pixel].
-        radiance: Folder of radiance maps (those named in `ae_env.scenes.reference`), searched with
+        radiance: Folder of radiance maps (those named in `ae_env.scenes.reference_scenes`), searched with
             its subfolders; null leaves them out.
     """
 
@@ -107,5 +107,5 @@ class SimulatorConfig(Configuration):
 
 
 def load_config(path: str | Path) -> SimulatorConfig:
-    """The configuration in a YAML file; see `simulator.config_file.load_yaml`."""
+    """The configuration in a YAML file; see `simulator.utils.config_file.load_yaml`."""
     return load_yaml(path, SimulatorConfig)

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from simulator.camera import CameraProfile
-from simulator.noise import noise_generator
-from simulator.reference import ReferenceCamera, ReferenceScene
-from simulator.sequences import Pair, Stage, draw_settings, select_pairs
-from simulator.sequences import Sequence as CaptureSequence
+from simulator.noise.noise_level_function import noise_generator
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.sequences import Pair, Stage, draw_settings, select_pairs
+from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.settings import CameraSettings, exposure_ratio
 
 #: Called with what is done and what there is to do.
@@ -78,7 +78,7 @@ class ReferencePairs:
     Args:
         sequences: Scenes and settings.
         camera: The body.
-        stage: Whose pairs, see `simulator.sequences.select_pairs`.
+        stage: Whose pairs, see `simulator.reference.sequences.select_pairs`.
         seed: Seed of pairs, crops and noise.
         optics: Rendered light to share between stages; filled as needed.
         progress: Called while the light is rendered.

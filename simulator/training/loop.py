@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from simulator.checkpoint import Checkpoint, HasState
 from simulator.training.config import StageConfig
 from simulator.training.data import ReferencePairs
+from simulator.utils.checkpoint import Checkpoint, HasState
 
 if TYPE_CHECKING:
     from accelerate import Accelerator

@@ -6,11 +6,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.modules.aperture import ApertureModule, added_blur, dead_zone
-from simulator.modules.defocus_map import LOG_OFFSET, DefocusMap, to_diameter
-from simulator.modules.disc_bank import DiscBank
-from simulator.modules.exposure import OVER_EXPOSED, ExposureModule
-from simulator.modules.noise import NoiseModule, smoothed, variance_map
+from simulator.networks.aperture_module import (
+    LOG_OFFSET,
+    ApertureModule,
+    DefocusMap,
+    added_blur,
+    dead_zone,
+    to_diameter,
+)
+from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
+from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
+from simulator.optics.disc_bank import DiscBank
 from simulator.training.data import Batch
 
 #: Weight of the loss on the logarithm of the circle of confusion beside that on the picture.

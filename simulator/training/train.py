@@ -14,21 +14,20 @@ import torch
 from torch import nn
 
 from simulator.camera import get_camera
-from simulator.files import sibling
-from simulator.modules.build import build_modules
-from simulator.reference import DRAPED, BodyError, ReferenceCamera, ReferenceScene
-from simulator.results import result_meta
-from simulator.sequences import Stage
+from simulator.networks.weights import build_modules, save_modules
+from simulator.reference.reference_camera import DRAPED, BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.sequences import Stage
 from simulator.training.config import SimulatorConfig
 from simulator.training.data import ReferencePairs, draw_sequences
 from simulator.training.loop import train_stage
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
-from simulator.weights import save_modules
+from simulator.utils.files import sibling
+from simulator.utils.results import result_meta
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-#: Makes the scenes of a split, ``"train"`` or ``"validation"``; `ae_env.scenes.reference` has them.
+#: Makes the scenes of a split, ``"train"`` or ``"validation"``; `ae_env.scenes.reference_scenes` has them.
 SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]

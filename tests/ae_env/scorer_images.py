@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ae_env.captures import describe_captures
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
+from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.protocol import Captures
 from simulator import CameraSettings, get_camera
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from ae_env import cli
+from agents.cli import main as cli
 
 UNMADE = """\
 from agents import Policy

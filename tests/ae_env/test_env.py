@@ -369,13 +369,13 @@ def test_every_lighting_works_on_every_scene(lighting: str) -> None:
 def test_kept_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blurred light is kept where memory allows; frames must not depend on it."""
     kept = _rollout(5, depth=3.0, motion=0.5)
-    monkeypatch.setattr("ae_env.core.OPTICS_BYTES", 0)
+    monkeypatch.setattr("ae_env.episodes.core.OPTICS_BYTES", 0)
     _assert_equal(_rollout(5, depth=3.0, motion=0.5), kept)
 
 
 def test_frames_are_the_simulators_own() -> None:
     """The batched path and `CameraSimulator` give the same digital numbers for the same light."""
-    from ae_env.score_table import scene_latent
+    from ae_env.scorers.score_table import scene_latent
 
     env = _make(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
     for state in (0, 21, 42, 63):

@@ -17,17 +17,16 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 
 import ae_env  # noqa: F401  (registers the environment)
-from ae_env.captures import describe_captures
 from ae_env.observation import decode_sensors
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.networks import SceneNetworks
-from ae_env.score_table import ScoreTables
+from ae_env.scenes.loading import SceneNetworks
 from ae_env.scorers import make_scorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, CameraSimulator, Latent, get_camera
-from simulator.modules.aperture import DEAD_ZONE
-from simulator.modules.build import build_modules
-from simulator.weights import save_modules
+from simulator.networks.aperture_module import DEAD_ZONE
+from simulator.networks.weights import build_modules, save_modules
 
 ID = "ae_env/AutoExposure-v0"
 CAMERA = get_camera("nikon_z6")
@@ -284,7 +283,7 @@ def test_memory_spared_changes_nothing(
     narrow, wide = 15, 12  # slow: the narrow one is blurred by motion alone
     actions = [narrow, wide, narrow, wide - 4, wide, narrow - 4, narrow, narrow]
     kept = _rollout(lambda: _make(**arguments), actions=actions)
-    monkeypatch.setattr("ae_env.core.OPTICS_BYTES", 0)
+    monkeypatch.setattr("ae_env.episodes.core.OPTICS_BYTES", 0)
     _assert_equal(_rollout(lambda: _make(**arguments), actions=actions), kept)
 
 

@@ -13,8 +13,8 @@ import torch
 import yaml
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.listing import describe_scorers
-from agents.training import AgentConfig
+from ae_env.scorers.registry import describe_scorers
+from agents.learning.training import AgentConfig
 
 PAGE = (Path(__file__).parents[2] / "docs" / "own-scorer.md").read_text(encoding="utf-8")
 SMALL = {"scenes": "bundled:snow", "resolution": 36}

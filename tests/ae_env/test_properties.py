@@ -29,8 +29,8 @@ from ae_env.observation import (
     encode_settings,
 )
 from ae_env.scenes import Scene
-from ae_env.score_table import TIE, ScoreTables
 from ae_env.scorers import list_scorers, make_scorer
+from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.wrappers import ContinuousActions, ControlActions, RelativeActions
 from simulator import CameraSettings, NoiseLevelFunction, get_camera
 from tests.strategies import LIGHT, SEEDS, USUAL_SETTINGS, grids, lights, log_uniform

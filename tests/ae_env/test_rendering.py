@@ -17,8 +17,8 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
 from ae_env.rendering import _averaged, _Sheet, _visits
 from ae_env.scenes import Scene, reference_settings
-from ae_env.score_table import ScoreTable, ScoreTables
 from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator import NoiseLevelFunction, develop, get_camera
 
 CAMERA = get_camera("nikon_z6")

@@ -12,12 +12,12 @@ import pytest
 import scipy.optimize
 import torch
 
-from ae_env.captures import describe_captures
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
-from ae_env.score_table import ScoreTables
 from ae_env.scorers import CompositeScorer, list_scorers, make_scorer, register_scorer, registry
+from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.protocol import Captures, Scorer
+from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, NoiseLevelFunction, get_camera, incident_ev100
 
 CAMERA = get_camera("nikon_z6")

@@ -18,8 +18,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from simulator.checkpoint import Checkpoint
-from simulator.files import sibling
+from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.files import sibling
 from tests.agents.conftest import TINY
 
 #: Signals in turn; each interrupts a process in another way.
@@ -29,8 +29,8 @@ REPORTS = {"regression": 30, "ppo": 48, "simulator": 30}
 
 
 def train_agent(kind: str, out: Path, report: Callable[[], None]) -> None:
-    from agents.training import AgentConfig
-    from agents.training import train_agent as train
+    from agents.learning.training import AgentConfig
+    from agents.learning.training import train_agent as train
 
     hyperparameters: dict[str, dict[str, Any]] = {
         # The memory forgets the first frames, so that a resumed one must forget the same.
@@ -134,7 +134,13 @@ def context() -> Any:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         pytest.skip("needs POSIX signals")
     found = multiprocessing.get_context("forkserver")
-    used = ("ae_env.cli", "agents.ppo", "agents.training", "ae_env.vector_env", "torch._dynamo")
+    used = (
+        "agents.cli.main",
+        "agents.learning.ppo",
+        "agents.learning.training",
+        "ae_env.vector_env",
+        "torch._dynamo",
+    )
     tests = ("tests.simulator.training.test_train", "tests.agents.test_killed")
     found.set_forkserver_preload([*used, *tests])
     return found
@@ -165,7 +171,7 @@ def test_killed_at_random_moments(kind: str, context: Any, tmp_path: Path) -> No
 
 def command(folder: Path, started: Any) -> None:
     """What runs as `ae-env train` in the process that is stopped, between its steps 3 and 4."""
-    from ae_env.cli import main
+    from agents.cli.main import main
 
     heed_interrupts()
     save = Checkpoint.save

@@ -38,7 +38,7 @@ def test_every_listed_name_makes_a_policy(context):
         ("oracle:P", r"must be one of"),
         ("", r"must be one of"),
         ("no_such_pkg.mod:Class", r"no module 'no_such_pkg'"),
-        ("agents.simple:Rundom", r"no class 'Rundom' there; found Random, BestFixed, Oracle"),
+        ("agents.baselines:Rundom", r"no class 'Rundom' there; found Random, BestFixed, Oracle"),
         ("agents.evaluation.metrics:flicker", r"must name a class, not a function"),
         (
             "agents.evaluation.statistics:Interval",
@@ -191,7 +191,7 @@ def test_an_error_inside_the_users_file_is_not_hidden(context, tmp_path):
 
 
 def test_own_module(context):
-    assert type(make_policy("agents.simple:Random", context)).__name__ == "Random"
+    assert type(make_policy("agents.baselines:Random", context)).__name__ == "Random"
 
 
 def test_masked_argmax():

@@ -19,12 +19,11 @@ from skimage.io import imsave
 
 from benchmarks.stability import fuzz
 from simulator import RawImage, get_camera, read_raw, write_dng
-from simulator import dng as dng_module
-from simulator import raw_file as raw_file_module
-from simulator.exif import camera_identity
-from simulator.files import write_atomically
-from simulator.raw_file import RawFileError
-from simulator.tiff import read_directories
+from simulator.raw import dng as dng_module
+from simulator.raw import read as raw_file_module
+from simulator.raw.metadata import camera_identity, read_directories
+from simulator.raw.read import RawFileError
+from simulator.utils.files import write_atomically
 from tests.simulator.test_raw_file import NLF, SETTINGS, write_sample_dng
 
 MOSAIC = np.random.default_rng(0).integers(100, 4000, (64, 96), dtype=np.uint16)

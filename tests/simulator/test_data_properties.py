@@ -12,19 +12,12 @@ import torch
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from simulator import (
-    CameraSettings,
-    RawImage,
-    get_camera,
-    list_cameras,
-    read_raw,
-    write_dng,
-)
+from simulator import CameraSettings, RawImage, get_camera, list_cameras, read_raw, write_dng
 from simulator.camera import CameraProfile
-from simulator.demosaic import demosaic_malvar
-from simulator.isp import develop, render_srgb
-from simulator.lamps import Flash, Lamp, MainsLamp, PulsedLamp
-from simulator.raw_image import pack_mosaic, unpack_mosaic
+from simulator.optics.lamps import Flash, Lamp, MainsLamp, PulsedLamp
+from simulator.raw.demosaic import demosaic_malvar
+from simulator.raw.develop import develop, render_srgb
+from simulator.raw.image import pack_mosaic, unpack_mosaic
 from tests.strategies import (
     SEEDS,
     SHAPES,

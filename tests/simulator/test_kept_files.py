@@ -18,15 +18,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import nn
 
-from agents.weights import load_agent, save_agent
+from agents.learning.agent_weights import load_agent, save_agent
 from benchmarks.keeping import Kept
-from simulator import files
-from simulator.cache import CACHE_KINDS, DiskCache, cache_dir, cache_key
-from simulator.checkpoint import Checkpoint
-from simulator.modules.build import build_modules
-from simulator.network_cache import NetworkCache
-from simulator.results import write_results
-from simulator.weights import load_modules, save_modules
+from simulator.networks.network_cache import NetworkCache
+from simulator.networks.weights import build_modules, load_modules, save_modules
+from simulator.utils import files
+from simulator.utils.cache import CACHE_KINDS, DiskCache, cache_dir, cache_key
+from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.results import write_results
 
 KEY = cache_key({"a": 1})
 #: Seconds that processes work against each other.
@@ -117,7 +116,7 @@ def test_new_weights_beside_the_card_of_an_earlier_version(tmp_path: Path, monke
         written.append(path)
         return real(path, content)
 
-    monkeypatch.setattr("simulator.weights.write_atomically", killed)
+    monkeypatch.setattr("simulator.networks.weights.write_atomically", killed)
     with pytest.raises(KeyboardInterrupt):
         save_agent(tmp_path / "net", "ppo", nn.Linear(2, 2), description)
     with pytest.raises(ValueError, match=r"the hash of net.safetensors .* of another training"):
@@ -207,7 +206,7 @@ def test_a_folder_that_may_not_be_read_costs_one_warning(
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "read_bytes", denied)
-    monkeypatch.setattr("simulator.cache.os.listdir", denied)
+    monkeypatch.setattr("simulator.utils.cache.os.listdir", denied)
     with caplog.at_level(logging.WARNING):
         assert [DiskCache(tmp_path).get("denoised", KEY) for _ in range(3)] == [None] * 3
         DiskCache(tmp_path).put("opened", KEY, {"x": torch.zeros(1)})  # counts the files
@@ -250,7 +249,7 @@ def test_a_full_disk_stops_no_training(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("simulator.files.os.replace", full)
+        patch.setattr("simulator.utils.files.os.replace", full)
         store.save(2, force=True)
     assert "could not be written" in caplog.text
     assert [p.name for p in tmp_path.iterdir()] == ["run.checkpoint"]
@@ -274,7 +273,7 @@ def test_results_are_those_of_before_or_after(
         def writelines(self, pieces: Any) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("simulator.files.os.fdopen", lambda *_: Full())
+    monkeypatch.setattr("simulator.utils.files.os.fdopen", lambda *_: Full())
     with pytest.raises(OSError, match="No space left"):
         write_results(path, [{"x": 2}], {"seed": 0})
     assert hashlib.sha256(path.read_bytes()).hexdigest() == before

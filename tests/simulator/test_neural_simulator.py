@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from simulator import CameraSettings, CameraSimulator, RawImage, camera_simulator, get_camera
-from simulator.modules.exposure import ExposureModule
-from simulator.opening import MapOpening, NetworkOpening
-from simulator.tiles import in_tiles
-from simulator.weights import save_modules
+from simulator.capture.aperture_blur import MapOpening, NetworkOpening
+from simulator.networks.exposure_module import ExposureModule
+from simulator.networks.weights import save_modules
+from simulator.utils.tiles import in_tiles
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(6400, 1 / 64, 8)

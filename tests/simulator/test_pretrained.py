@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from ae_env.scenes.reference import reference_scenes
+from ae_env.scenes.reference_scenes import reference_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.modules.aperture import added_blur
-from simulator.reference import ReferenceCamera, ReferenceScene
+from simulator.networks.aperture_module import added_blur
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 FOLDER = Path(str(resources.files("simulator").joinpath("pretrained")))
 

@@ -22,12 +22,10 @@ from simulator import (
     get_camera,
 )
 from simulator.camera import CameraProfile
-from simulator.capture import add_noise, clip_and_quantise, sensor_light
-from simulator.exposure import Exposure
-from simulator.frame_noise import FrameNoise, sweep_keys
-from simulator.noise_bank import bank_normals
-from simulator.noise_keys import noise_keys
-from simulator.raw_image import unpack_mosaic
+from simulator.capture.exposure import Exposure
+from simulator.capture.record import add_noise, clip_and_quantise, sensor_light
+from simulator.noise.generator import FrameNoise, bank_normals, noise_keys, sweep_keys
+from simulator.raw.image import unpack_mosaic
 from tests.strategies import (
     LIGHT,
     SEEDS,

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from simulator import kernels
 from simulator.camera import NoiseLevelFunction, get_camera
-from simulator.capture import (
+from simulator.capture import kernels
+from simulator.capture.exposure import Exposure
+from simulator.capture.record import (
     add_noise,
     clip_and_quantise,
     exposed_light,
@@ -18,8 +19,7 @@ from simulator.capture import (
     record,
     top_up,
 )
-from simulator.exposure import Exposure
-from simulator.frame_noise import FrameNoise
+from simulator.noise.generator import FrameNoise
 
 Z6 = get_camera("nikon_z6")
 SPAN = 14512

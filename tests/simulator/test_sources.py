@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage, get_camera
-from simulator.sources import latent_of
+from simulator.camera_simulator import latent_of
 
 CPU = torch.device("cpu")
 SETTINGS = CameraSettings(400, 1 / 64, 4)

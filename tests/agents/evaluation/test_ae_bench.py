@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from agents.evaluation import ae_bench
-from agents.evaluation.plan import EvaluationPlan
+from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.evaluation.plan_episodes import plan_scenes
 from agents.evaluation.plan_jobs import run_plan
 from agents.report.tables import overall_ranking

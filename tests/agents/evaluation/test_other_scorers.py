@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ae_env.score_table import ScoreTables
 from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTables
+from agents.evaluation.evaluation_plan import EvaluationPlan
 from agents.evaluation.other_scorers import other_scores, state_scores
-from agents.evaluation.plan import EvaluationPlan
 from agents.evaluation.plan_jobs import run_plan
 from agents.evaluation.plan_run import PlanRun
 

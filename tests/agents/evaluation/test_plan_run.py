@@ -8,7 +8,7 @@ import pytest
 
 from agents.evaluation import plan_run
 from agents.evaluation import store as evaluation_store
-from agents.evaluation.plan import Condition, EvaluationPlan, digest, load_plan
+from agents.evaluation.evaluation_plan import Condition, EvaluationPlan, digest, load_plan
 from agents.evaluation.plan_episodes import PlanEpisodes, groups_in_turn, plan_scenes, start_state
 from agents.evaluation.plan_jobs import ranked_policies, run_plan
 from agents.evaluation.plan_run import PlanRun

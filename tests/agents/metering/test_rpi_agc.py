@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from ae_env.presets import load_preset
+from ae_env.utils.presets import load_preset
 from agents.metering.rpi_agc import ExposureFilter, quantile_mean, zone_gain, zone_map
 from agents.metering.rpi_agc_tuning import ZONE_WEIGHTS
 from agents.policy import make_policy

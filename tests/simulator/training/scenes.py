@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from simulator import CameraSettings
-from simulator.reference import ReferenceScene
-from simulator.thin_lens import Lens
+from simulator.optics.thin_lens import Lens
+from simulator.reference.reference_camera import ReferenceScene
 
 #: 640 lux is EV100 8: a white card gives 0.663 of sensor white here.
 LUX = 640.0

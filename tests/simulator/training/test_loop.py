@@ -13,11 +13,11 @@ import pytest
 import torch
 from torch import nn
 
-from simulator.checkpoint import Checkpoint
 from simulator.training import loop
 from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.loop import Clock, learning_rate, train_stage
 from simulator.training.train import make_accelerator
+from simulator.utils.checkpoint import Checkpoint
 
 Hook = Callable[[int], None]
 STEPS = 12

@@ -11,10 +11,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from simulator.modules.aperture import DEAD_ZONE, ApertureModule
-from simulator.modules.disc_bank import DiscBank
-from simulator.modules.exposure import ExposureModule
-from simulator.modules.noise import NoiseModule
+from simulator.networks.aperture_module import DEAD_ZONE, ApertureModule
+from simulator.networks.exposure_module import ExposureModule
+from simulator.networks.noise_module import NoiseModule
+from simulator.optics.disc_bank import DiscBank
 from simulator.training.data import Batch
 from simulator.training.losses import (
     ApertureLoss,

@@ -13,16 +13,11 @@ import torch
 from torch import nn
 
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.reference import ReferenceCamera, ReferenceScene
+from simulator.networks.weights import load_modules
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training.config import SimulatorConfig
 from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.train import (
-    make_accelerator,
-    train_and_save,
-    train_simulator,
-    validate,
-)
-from simulator.weights import load_modules
+from simulator.training.train import make_accelerator, train_and_save, train_simulator, validate
 from tests.simulator.training.scenes import scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}

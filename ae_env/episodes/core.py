@@ -1,0 +1,332 @@
+"""The episodes behind both environments: n of them side by side, in one process.
+
+`AutoExposureEnv` runs one, `AutoExposureVectorEnv` many; everything that happens in an episode
+happens here, so that the two cannot differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from ae_env.episodes.draws import Draws
+from ae_env.episodes.light import FrameLight
+from ae_env.episodes.recorder import Recorder
+from ae_env.episodes.scores import PartScores
+from ae_env.episodes.state import Episode, Episodes
+from ae_env.lighting import Lighting
+from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
+from ae_env.options import COSTS, EnvOptions
+from ae_env.scenes.folder import sequence_bounds
+from ae_env.scenes.scene import Scene
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from simulator.noise.generator import single_normals
+from simulator.optics.disc_bank import DIAMETERS
+
+#: Samples that are scored together: a chunk this small stays in the processor's cache.
+CHUNK_SAMPLES = 2**18
+#: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
+OPTICS_BYTES = 256 * 2**20
+_RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
+_STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
+_OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
+
+
+@dataclass
+class Frames:
+    """What n episodes show after a reset or a step.
+
+    Args:
+        observation: Arrays by name, n long; new ones every time.
+        info: Columns by name, n long; ``rewards`` is a dictionary of columns.
+        reward: (n,) float64.
+    """
+
+    observation: dict[str, np.ndarray]
+    info: dict[str, Any]
+    reward: np.ndarray
+
+
+class EpisodeCore:
+    """Scenes, grid, camera and scorer, and the episodes that run on them.
+
+    Args:
+        options: The environment's arguments.
+        num_envs: Number of episodes side by side.
+    """
+
+    def __init__(self, options: EnvOptions, num_envs: int) -> None:
+        self.options = options
+        self.grid = options.make_grid()
+        self.camera = options.make_camera()
+        self.scorer = options.make_scorer()
+        self.lighting = options.make_lighting()
+        self.scenes = options.load_scenes()
+        self.tables = ScoreTables(
+            self.grid,
+            self.camera,
+            self.scorer,
+            noise=bool(options.noise),
+            tolerance=options.tolerance,
+        )
+        self.episodes = Episodes(num_envs, int(options.delay))
+        # First and last frame of the sequence that each scene is a frame of.
+        self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
+        self._draws = Draws(options, self.first_scenes, len(self.grid))
+        self._scene_ids = np.array([scene.scene_id for scene in self.scenes], object)
+        states = self.grid.states
+        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
+        self._settings = encode_settings(apex)
+        # (4, S), see `_STATE_INFO`
+        self._bounds = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
+        self._static = type(self.lighting) is Lighting
+        has_map = np.array([scene.defocus_map is not None for scene in self.scenes])
+        self._shareable = self._static & ~has_map
+        self._light = FrameLight(
+            self.lighting, self.episodes, self.scenes, self.camera, options.resolution
+        )
+        self._part_scores = PartScores(self.tables, self.scenes, self.episodes, static=self._static)
+        self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
+        frame_bytes = 16 * options.resolution**2
+        keep = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
+        self.recorder = Recorder(
+            options, self.grid, self.camera, self.scenes, self.episodes, keep=keep
+        )
+
+    def _kept_frames(self) -> int:
+        """Blurred frames that an episode keeps at most."""
+        apertures = len(self.grid.f_numbers)
+        if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results
+            apertures += len(DIAMETERS) + apertures
+        as_recorded_and_denoised = 1 + any(s.denoised is not None for s in self.scenes)
+        return as_recorded_and_denoised * apertures + 1
+
+    # -- spaces -------------------------------------------------------------------------------
+
+    def observation_space(self) -> gym.spaces.Dict:
+        """Space of one episode's observation."""
+        shape = (4, self.options.resolution, self.options.resolution)
+        low, high, dtype = {
+            "uint8": (0.0, 255.0, np.uint8),
+            "linear": (-PEDESTAL, 1.0, np.float32),
+            "dn": (0.0, self.camera.white_level, np.uint16),
+        }[self.options.observation]
+        spaces: dict[str, gym.Space] = {
+            "raw": gym.spaces.Box(low, high, shape, dtype),
+            "settings": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
+        }
+        if self.options.sensors:
+            spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        return gym.spaces.Dict(spaces)
+
+    def action_masks(self) -> np.ndarray:
+        """(S,) bool: states that may be chosen. Every aperture is exact here, so all of them."""
+        return np.ones(len(self.grid), dtype=bool)
+
+    @property
+    def first_scenes(self) -> list[Scene]:
+        """Scenes that episodes draw from: of a sequence, its first frame."""
+        if self._sequence is None:
+            return self.scenes
+        return [self.scenes[i] for i in np.unique(self._sequence[0])]
+
+    # -- life of an episode -------------------------------------------------------------------
+
+    def start(self, place: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        """Begins an episode at `place`; see `Draws.draw`."""
+        self.begin(np.array([place]), [rng], [options])
+
+    def begin(
+        self,
+        places: np.ndarray,
+        rngs: Sequence[np.random.Generator],
+        options: Sequence[Mapping[str, Any]] | None = None,
+    ) -> None:
+        """Draws episodes for `places` (K,), where others may end; see `Draws.draw`."""
+        drawn = self._draws.draw(rngs, options)
+        if self._sequence is not None:
+            first = np.unique(self._sequence[0])[drawn["scene"]]
+            drawn["scene"] = self._shown_at(first, drawn["frame"])
+        self._forget(places)
+        slots = self._slots(places, drawn["scene"], drawn["speed"], drawn["defocus"])
+        self.episodes.begin(places, drawn, slots)
+
+    def _forget(self, places: np.ndarray) -> None:
+        """Lets go of what was worked out for the scenes that are shown at `places`."""
+        self.recorder.end(places)
+        self._part_scores.forget(len(self.scenes) + places)
+        for place in places.tolist():
+            self._tables[place] = None
+
+    def _slots(
+        self, places: np.ndarray, scenes: np.ndarray, speed: np.ndarray, defocus: np.ndarray
+    ) -> np.ndarray:
+        """(K,) slots, see `Episodes`."""
+        # At rest, its light and its scores are those of every episode that shows its scene.
+        moves = (speed > 0.0) | (defocus > 0.0)
+        return np.where(~moves & self._shareable[scenes], scenes, len(self.scenes) + places)
+
+    def _shown_at(self, scenes: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Scenes that the sequences of `scenes` show in `frames`; the last one stays."""
+        assert self._sequence is not None
+        first, last = self._sequence
+        return np.minimum(first[scenes] + frames, last[scenes])
+
+    def _show_next(self, places: np.ndarray) -> None:
+        """Shows the scene of the current frame at each of `places`."""
+        episodes = self.episodes
+        now = self._shown_at(episodes.scene[places], episodes.frame[places])
+        changes = now != episodes.scene[places]
+        places, now = places[changes], now[changes]
+        self._forget(places)
+        episodes.scene[places] = now
+        speed, defocus = episodes.speed[places], episodes.defocus[places]
+        episodes.slot[places] = self._slots(places, now, speed, defocus)
+
+    def episode(self, place: int) -> Episode:
+        """The episode at `place` as it is now."""
+        self._check_begun(place)
+        return self.episodes[place]
+
+    def _check_begun(self, places: np.ndarray | int) -> None:
+        if not self.episodes.begun[places].all():
+            raise gym.error.ResetNeeded("call reset() before step(), render() or scores")
+
+    def act(self, places: np.ndarray, actions: np.ndarray) -> None:
+        """Lets the episodes at `places` (K,) go on by one frame.
+
+        Args:
+            places: Whose turn it is.
+            actions: (K,) their actions, integers; applied after the delay.
+
+        Raises:
+            ValueError: If an action is not a state of the grid; no episode goes on then.
+        """
+        self._check_begun(places)
+        wrong = (actions < 0) | (actions >= len(self.grid))
+        if wrong.any():
+            raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {len(self.grid)})")
+        self.episodes.act(places, actions)
+        if self._sequence is not None:
+            self._show_next(places)
+
+    def expected_scores(self, place: int) -> ScoreTable:
+        """Scores of all states in the current frame of the episode at `place`."""
+        episode = self.episode(place)
+        gain: float | np.ndarray = 1.0
+        rows = None
+        if self.lighting.within_frame:
+            key: float = episode.frame
+        else:
+            key = gain = self._light.of(place, 0.0)[0]
+        known = self._tables[place]
+        if known is None or known[0] != key:
+            if self.lighting.within_frame:
+                gain, rows = self._light.of_states(place, self._bounds[1])
+            table = self.tables.table(
+                self.scenes[episode.scene],
+                speed=episode.speed,
+                defocus=episode.defocus,
+                gain=gain,
+                row_gain=rows,
+            )
+            known = self._tables[place] = (key, table)
+        return known[1]
+
+    # -- what the camera records --------------------------------------------------------------
+
+    def observe(self, places: np.ndarray) -> Frames:
+        """Photographs the episodes at `places` (B,), each in its current state."""
+        raw, columns = self._capture_all(places)
+        episodes = self.episodes
+        scenes, states = episodes.scene[places], episodes.state[places]
+        observation = {"raw": raw, "settings": self._settings[states]}
+        if self.options.sensors:
+            observation["sensors"] = encode_sensors(
+                episodes.speed[places], episodes.focus_drive[places], columns.pop("sensor_noise")
+            )
+        rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
+        rewards["score"] = self._totals(rewards, places)
+        reward = rewards["score"].copy()
+        for name, cost in self._costs(places, columns.pop("image_mean", None)).items():
+            rewards[name] = cost
+            reward -= self.options.costs[name] * cost
+        info = {"scene_id": self._scene_ids[scenes], "state": states}
+        info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
+        info |= columns | {"rewards": rewards}
+        if self.options.with_oracle:
+            tables = [self.expected_scores(place) for place in places.tolist()]
+            best = np.array([t.mean[t.oracle] for t in tables])
+            info["oracle_state"] = np.array([t.oracle for t in tables])
+            info["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
+        return Frames(observation, info, reward)
+
+    def _totals(self, parts: dict[str, np.ndarray], places: np.ndarray) -> np.ndarray:
+        """(B,) float64 scores before costs."""
+        # A closed form is its own expectation, and needs no table of all states.
+        if self.options.reward == "expected" and not self.scorer.closed_form:
+            pairs = zip(places.tolist(), self.episodes.state[places].tolist(), strict=True)
+            return np.array([self.expected_scores(place).mean[state] for place, state in pairs])
+        return self._part_scores.totals(parts, places)
+
+    def _capture_all(self, places: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Observations of `raw` and the info columns, worked out chunk by chunk."""
+        size = self.options.resolution
+        raw = np.empty((len(places), 4, size, size), _RAW_DTYPES[self.options.observation])
+        gains, rows = np.ones(len(places)), None
+        if not self._static:
+            gains, rows = self._light.of_each(places, self._bounds[1, self.episodes.state[places]])
+        self.recorder.prepare(places, gains)
+        # Only where no part of the score needs it is no float of every sample made.
+        few = self._part_scores.reads_pixels or rows is not None
+        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(places)
+        if step >= len(places):
+            return raw, self._capture(places, gains, rows, raw)
+        chunks = []
+        for start in range(0, len(places), step):
+            part = slice(start, start + step)
+            some = None if rows is None else rows[part]
+            chunks.append(self._capture(places[part], gains[part], some, raw[part]))
+        return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
+
+    def _capture(
+        self, places: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Info columns of the episodes at `places`; their observations are written to `raw`."""
+        outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
+        if self._part_scores.reads_images:
+            outputs.setdefault("signals", np.empty(raw.shape, np.float32))
+        if "flicker" in self.options.costs:
+            outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
+        columns = self.recorder.record(places, row_gain=rows, **outputs)
+        key = columns.pop("noise_key")
+        if self.options.sensors:
+            columns["sensor_noise"] = single_normals(key, 2)
+        columns |= self._part_scores.of(places, outputs.get("signals"), gains, rows)
+        if self.options.observation == "linear":
+            np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
+        if "flicker" in self.options.costs:
+            codes = outputs["codes"].reshape(len(raw), -1)
+            columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
+        return columns
+
+    def _costs(self, places: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
+        """(B,) each; 0 in the first frame of an episode."""
+        if not self.options.costs:
+            return {}
+        episodes = self.episodes
+        first = episodes.previous[places] < 0
+        costs = {name: np.zeros(len(places)) for name in COSTS if name in self.options.costs}
+        if means is not None:
+            change = np.abs(means - episodes.image_mean[places])
+            costs["flicker"] = np.where(first, 0.0, change)
+            episodes.image_mean[places] = means
+        if "switch" in costs:
+            now = self.grid.controls(episodes.state[places])
+            before = self.grid.controls(np.where(first, 0, episodes.previous[places]))
+            costs["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
+        return costs

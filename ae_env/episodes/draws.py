@@ -1,0 +1,138 @@
+"""What an episode begins with: scene, start state, motion, defocus, seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from ae_env.options import EnvOptions
+from ae_env.scenes.scene import Scene
+from ae_env.utils.checks import check_integer, did_you_mean
+
+#: Share of the episodes in which nothing moves.
+STATIC_SHARE = 1.0 / 3.0
+#: Standard deviation of the natural logarithm of the image speed.
+SPEED_SIGMA = 1.3
+#: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
+DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
+#: What a reset may choose, and what its errors call it; frames are counted up to `MAX_FRAME`.
+OPTIONS = ("scene", "state", "frame")
+_OPTION = tuple(f"options[{name!r}]" for name in OPTIONS)
+MAX_FRAME = 2**31 - 1
+#: Uniform numbers that an episode is made of.
+_NUMBERS = 7
+#: Those have so many different values.
+_VALUES = 2.0**53
+
+
+class Draws:
+    """Draws episodes.
+
+    Args:
+        options: The environment's arguments.
+        scenes: What episodes choose from; of sequences, the first frames.
+        num_states: Number of exposure states.
+    """
+
+    def __init__(self, options: EnvOptions, scenes: Sequence[Scene], num_states: int) -> None:
+        self._options, self._num_states = options, num_states
+        self._index = {scene.scene_id: i for i, scene in enumerate(scenes)}
+        if options.in_sequences:  # which have a name of their own
+            self._index |= {scene.group: i for i, scene in enumerate(scenes)}
+        self._ids = [scene.scene_id for scene in scenes]
+        self._speeds = np.array([scene.median_speed for scene in scenes])
+        self._own_blur = np.array([s.own_blur(4.0) * 64.0 / options.resolution for s in scenes])
+
+    def draw(
+        self,
+        rngs: Sequence[np.random.Generator],
+        chosen: Sequence[Mapping[str, Any]] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """K episodes as columns, each of its own generator.
+
+        What is drawn does not depend on what is chosen, which only replaces it.
+
+        Args:
+            rngs: K generators; each gives the same count of numbers for every episode.
+            chosen: For each the ``scene``, ``state`` and ``frame`` that it shall have.
+
+        Returns:
+            (K,) arrays by the names of `ae_env.episodes.state.Episode`.
+
+        Raises:
+            ValueError: If there is no such scene, state or frame.
+        """
+        given = [self._chosen(options) for options in chosen or ()]  # refused before any draw
+        uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
+        place, start, moving, speed, defocus, phase, seed = uniforms
+        scene = (place * len(self._ids)).astype(np.int64)
+        state = (start * self._num_states).astype(np.int64)
+        frame = np.zeros(len(rngs), np.int64)
+        for i, wanted in enumerate(given):
+            for column, value in zip((scene, state, frame), wanted, strict=True):
+                if value is not None:
+                    column[i] = value
+        speeds = (moving >= STATIC_SHARE) * np.exp(SPEED_SIGMA * ndtri(speed)) * self._speeds[scene]
+        discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
+        discs = _fixed_or_drawn(
+            self._options.depth, np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
+        )
+        return {
+            "scene": scene,
+            "state": state,
+            "speed": _fixed_or_drawn(self._options.motion, speeds),
+            "defocus": discs,
+            "focus_drive": np.hypot(discs, self._own_blur[scene]),
+            "phase": phase,
+            "noise_seed": (seed * _VALUES).astype(np.int64),
+            "frame": frame,
+        }
+
+    def _chosen(self, options: Mapping[str, Any]) -> tuple[int | None, int | None, int | None]:
+        """Scene, state and frame that the options of a reset ask for; None where they do not."""
+        scene, state, frame = (options.get(name) for name in OPTIONS)
+        return (
+            None if scene is None else self._scene(scene),
+            None if state is None else check_integer(_OPTION[1], state, 0, self._num_states - 1),
+            None if frame is None else check_integer(_OPTION[2], frame, 0, MAX_FRAME),
+        )
+
+    def _scene(self, wanted: Any) -> int:
+        if isinstance(wanted, str) and wanted in self._index:
+            return self._index[wanted]
+        hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
+        rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
+        return check_integer(_OPTION[0], wanted, 0, len(self._ids) - 1, more=rule)
+
+
+def check_options(options: Any, *more: str) -> dict[str, Any]:
+    """The options of a reset as a dictionary of its own.
+
+    Args:
+        options: What `reset` was given: None or a mapping.
+        more: Names that are allowed beside those of `OPTIONS`.
+
+    Raises:
+        ValueError: If there is another name, or it is no mapping.
+    """
+    known = [*OPTIONS, *more]
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"`options` (={options!r}) must be None or a dictionary with {known}")
+    for name in options:
+        if name not in known:
+            raise ValueError(
+                f"`options` has {name!r}; it may have {known}{did_you_mean(name, known)}"
+            )
+    return dict(options)
+
+
+def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
+    """`drawn` for ``"random"``, 0 for every other word, or the number itself."""
+    if option == "random":
+        return drawn
+    return np.full(len(drawn), 0.0 if isinstance(option, str) else float(option))

@@ -1,0 +1,154 @@
+"""`Captures`, what scorers are told: of any captures, and of every state of a scene."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ae_env.scenes.scene import Scene
+from ae_env.scorers.protocol import Captures
+from simulator.camera import CameraProfile
+from simulator.settings import CameraSettings, exposure_ratio
+from simulator.utils.cache import LruCache
+
+#: What the captures of a state take in memory, about [byte].
+_STATE_BYTES = 1000
+
+
+def describe_captures(
+    scenes: Sequence[Scene],
+    settings: Sequence[CameraSettings],
+    camera: CameraProfile,
+    *,
+    speed: np.ndarray,
+    defocus: np.ndarray,
+    gain: np.ndarray,
+    row_gain: np.ndarray | None = None,
+    light: torch.Tensor | None = None,
+) -> Captures:
+    """`Captures` of one state each of `scenes`, all (B,) long.
+
+    Args:
+        scenes: Scene of each capture.
+        settings: Settings of each capture.
+        camera: The body.
+        speed: (B,) image speed [frame heights per second].
+        defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
+        gain: (B,) light relative to the scenes' own.
+        row_gain: (B, H) light of each row relative to that; None where all rows have the same.
+        light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
+    """
+    height = scenes[0].light.shape[-2]
+    times = np.array([s.exposure_time for s in settings])
+    openings = np.array([4.0 / s.effective_f_number for s in settings])
+    blur = np.hypot(speed * times * height, defocus * openings * height / 64.0)
+    own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
+    blur = np.hypot(blur, own)  # exactly `blur` where they are 0
+    ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
+    return Captures(
+        settings=settings,
+        scene_ids=[c.scene_id for c in scenes],
+        scene_light=torch.stack([c.clean_light for c in scenes]) if light is None else light,
+        ratio=torch.from_numpy(np.array(ratios) * gain),
+        nlf=[camera.nlf(s.iso) for s in settings],
+        proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
+        blur_px=torch.from_numpy(blur),
+        white_balance=torch.tensor([c.white_balance for c in scenes]),
+        colour_matrices=[c.camera.colour_matrix for c in scenes],
+        row_gain=None if row_gain is None else torch.from_numpy(row_gain),
+    )
+
+
+@dataclass(frozen=True)
+class _AtRest:
+    """Captures of a scene at rest in its own light, and what blur is worked out from."""
+
+    scene: weakref.ref[Scene]
+    captures: Captures
+    times: np.ndarray
+    openings: np.ndarray
+
+
+class SceneCaptures:
+    """Describes captures of a scene, and keeps what depends neither on blur nor on its light.
+
+    Args:
+        camera: The body.
+        max_bytes: What it may keep.
+        copies: Whether scorers get a copy of the light.
+    """
+
+    def __init__(self, camera: CameraProfile, max_bytes: int, *, copies: bool) -> None:
+        self.camera, self.copies = camera, copies
+        self._at_rest: LruCache[_AtRest] = LruCache(max_bytes)
+
+    def describe(
+        self,
+        scene: Scene,
+        states: Sequence[CameraSettings],
+        *,
+        speed: float = 0.0,
+        defocus: float = 0.0,
+        gain: float | np.ndarray = 1.0,
+        row_gain: np.ndarray | None = None,
+    ) -> Captures:
+        """Captures of `states`, which a grid's order begins and ends (S long).
+
+        Args:
+            scene: The scene.
+            states: Some that follow each other in a grid.
+            speed: Image speed [frame heights per second].
+            defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+            gain: Light relative to the scene's own, one or (S,).
+            row_gain: (S, H), see `describe_captures`.
+        """
+        known = self._known(scene, states)
+        height = scene.light.shape[-2]
+        blur = np.hypot(speed * known.times * height, defocus * known.openings * height / 64.0)
+        captures = replace(
+            known.captures,
+            scene_light=self._light(scene, len(states)),
+            blur_px=torch.from_numpy(np.hypot(blur, known.captures.blur_px.numpy())),
+        )
+        if not isinstance(gain, np.ndarray) and gain == 1.0 and row_gain is None:
+            return captures
+        return replace(
+            captures,
+            ratio=torch.from_numpy(captures.ratio.numpy() * gain),
+            proper_ev=torch.from_numpy(captures.proper_ev.numpy() + np.log2(gain)),
+            row_gain=None if row_gain is None else torch.from_numpy(row_gain),
+        )
+
+    def _known(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:
+        key = (id(scene), states[0], len(states))
+        known = self._at_rest.get(key)
+        if known is None or known.scene() is not scene:  # an id may be given out again
+            known = self._described(scene, states)
+            self._at_rest.put(key, known, _STATE_BYTES * len(states))
+        return known
+
+    def _described(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:
+        nothing = np.zeros(len(states))
+        captures = describe_captures(
+            [scene] * len(states),
+            states,
+            self.camera,
+            speed=nothing,
+            defocus=nothing,
+            gain=np.ones(len(states)),
+            light=torch.empty(0),  # keeps no scene alive
+        )
+        return _AtRest(
+            weakref.ref(scene),
+            captures,
+            np.array([s.exposure_time for s in states]),
+            np.array([4.0 / s.effective_f_number for s in states]),
+        )
+
+    def _light(self, scene: Scene, count: int) -> torch.Tensor:
+        light = scene.clean_light.clone() if self.copies else scene.clean_light
+        return light.expand(count, -1, -1, -1)

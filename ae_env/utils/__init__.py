@@ -1,0 +1,1 @@
+"""Checks, presets and code of the user."""

@@ -1,0 +1,69 @@
+"""The YAML files of ``configs/`` by their names: environments and evaluations."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ae_env.utils.checks import did_you_mean
+
+#: In a clone the folder beside the packages, in an installed package a part of this one.
+_FOLDERS = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "configs")
+
+
+def list_presets(kind: str = "env") -> list[str]:
+    """Names of the presets of one kind.
+
+    Args:
+        kind: Folder of ``configs/``, such as ``"env"``.
+    """
+    return sorted({file.stem for folder in _FOLDERS for file in (folder / kind).glob("*.yaml")})
+
+
+def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
+    """The YAML file of a preset.
+
+    Args:
+        name: That of a preset, or the path of a ``.yaml`` file of one's own.
+        kind: Folder of ``configs/``, such as ``"env"``.
+
+    Raises:
+        ValueError: If there is neither; the message proposes the nearest name.
+    """
+    if isinstance(name, str | PathLike):
+        for folder in _FOLDERS:
+            file = folder / kind / f"{name}.yaml"
+            if file.is_file():
+                return file
+        own = Path(name).expanduser()
+        if own.suffix in (".yaml", ".yml") and own.is_file():
+            return own
+    known = list_presets(kind)
+    hint = did_you_mean(name, known)
+    raise ValueError(f"`preset` (={name!r}) must be one of {known} or a .yaml file{hint}")
+
+
+def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
+    """Arguments of the environment from a preset of ``configs/env``.
+
+    Args:
+        name: Such as ``"tunnel"``, or the path of a ``.yaml`` file of one's own.
+
+    Returns:
+        Keyword arguments of ``gymnasium.make("ae_env/AutoExposure-v0", ...)``,
+        ``max_episode_steps`` among them.
+
+    Raises:
+        ValueError: If there is no such preset, or it is not a mapping.
+    """
+    file = find_preset(name)
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{file}: not YAML: {error}") from None
+    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
+        raise ValueError(f"{file}: must map arguments of the environment to values")
+    return content

@@ -1,0 +1,122 @@
+"""What the commands share: the console, progress bars, and checks of what the user typed."""
+
+from __future__ import annotations
+
+import io
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from simulator.utils.files import write_atomically
+
+console = Console()
+
+MAX_SEED = 2**63 - 1
+Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
+OwnSeed = Annotated[int | None, typer.Option(help="Not the YAML's.", min=0, max=MAX_SEED)]
+Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
+
+
+@contextmanager
+def progress_bars() -> Iterator[Any]:
+    """Progress bars with time left; yields a function that opens one."""
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("[dim]{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console) as display:
+
+        @contextmanager
+        def bar(title: str) -> Iterator[Any]:
+            task = display.add_task(title, total=None, note="")
+
+            def move(done: int, total: int, note: str = "") -> None:
+                display.update(task, completed=done, total=total, note=note)
+
+            yield move
+
+        yield bar
+
+
+def print_files(files: Mapping[str, Path]) -> None:
+    """Says what was written where."""
+    for name, path in files.items():
+        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True, markup=False)
+
+
+def save_picture(path: Path, picture: Any) -> Path:
+    """Writes a PIL image as PNG."""
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG")
+    return write_atomically(path, buffer.getvalue())
+
+
+def parse_seconds(text: str) -> float:
+    """Seconds from ``"1/60"`` or ``"0.5"``."""
+    numerator, _, denominator = text.removesuffix("s").partition("/")
+    try:
+        return float(numerator) / float(denominator or 1)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
+
+
+def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> None:
+    """Makes a folder for results before any time is spent on them.
+
+    Args:
+        path: The folder.
+        name: The option that named it.
+        file: What the option named, where that is a file in the folder.
+
+    Raises:
+        ValueError: If nothing can be written there.
+    """
+    given = f"`{name}` (={str(file or path)!r})"
+    try:
+        existing = next(p for p in (path, *path.parents) if p.exists())
+        if not existing.is_dir():
+            wanted = "be" if file is None else "lie in"
+            raise ValueError(f"{given} must {wanted} a folder, but {existing} is a file")
+        if file is not None and file.is_dir():
+            raise ValueError(f"{given} must be a file, but it is a folder")
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise ValueError(f"{given} cannot be written: {error.strerror}") from error
+
+
+def torch_device(name: str) -> str:
+    """The torch device called `name`, checked before any work is done."""
+    import torch
+
+    cuda = torch.cuda.is_available()
+    if name == "auto":
+        return "cuda" if cuda else "cpu"
+    if name != "cpu" and not (cuda and name.partition(":")[0] == "cuda"):
+        raise ValueError(f"`device` (={name!r}) must be auto, cpu{', cuda' if cuda else ''} here")
+    return name
+
+
+def command_line() -> str:
+    """What the user typed, for result files."""
+    return shlex.join(["ae-env", *sys.argv[1:]])

@@ -1,0 +1,1 @@
+"""The learnt agents: networks, training, weights, and the adapter to Stable-Baselines3."""

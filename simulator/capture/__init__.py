@@ -1,0 +1,1 @@
+"""The transition engine: prepared scenes, exposures, plans and batches of captures."""

@@ -1,0 +1,175 @@
+"""What a wider aperture does to a photograph whose depth is not known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from simulator.capture.denoised import Denoised
+from simulator.capture.exposure import LATENT_LIMIT
+from simulator.networks.aperture_module import added_blur
+from simulator.optics.disc_bank import HALO, DiscBank, remaining_variance
+from simulator.utils.cache import LruCache
+from simulator.utils.tiles import TILE, Tile, make_tiles
+
+#: Memory that the opened light of one scene may take [byte].
+KEPT_BYTES = 256 * 2**20
+
+
+class Opening(Protocol):
+    """Opens the aperture of one scene's light; results are kept, as f-numbers are few."""
+
+    f_number: float
+    """Effective f-number at which the light was recorded."""
+
+    needs_denoised: bool
+    """Whether it works on the noise-reduced light only."""
+
+    everywhere: bool
+    """Whether it opens also where a positive tolerance needs no network."""
+
+    def extent(self, f_number: float) -> float:
+        """Largest diameter of the blur that opening to `f_number` adds [pixel]."""
+
+    def opened(self, f_number: float, *, denoised: bool) -> Tensor:
+        """Light (4, H, W) at the wider aperture, at unchanged exposure.
+
+        Args:
+            f_number: Effective f-number wanted, smaller than the source's.
+            denoised: Whether the noise-reduced light is opened, or the light as it was recorded.
+        """
+
+    def remaining(self, f_number: float) -> Tensor | None:
+        """(H, W) share of the recorded noise's variance that the blur leaves."""
+
+
+class MapOpening:
+    """Blurs by the estimated circle of confusion of each pixel (preset ``"compact"``).
+
+    Only the parts of the frame that are out of focus are blurred, tile by tile; the rest is copied.
+
+    Args:
+        light: (4, H, W) as recorded.
+        denoised: The same with little noise.
+        diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or what estimates it,
+            called when an aperture first opens.
+        f_number: Effective f-number of the light.
+        everywhere: See `Opening`.
+    """
+
+    needs_denoised = False
+
+    def __init__(
+        self,
+        light: Tensor,
+        denoised: Denoised,
+        diameter: Tensor | Callable[[], Tensor],
+        f_number: float,
+        *,
+        everywhere: bool = True,
+    ) -> None:
+        self.f_number, self._diameter, self.everywhere = f_number, diameter, everywhere
+        self._recorded, self._denoised = light, denoised
+        self._banks: dict[tuple[Tile, bool], DiscBank] = {}
+        self._kept: LruCache[Tensor] = LruCache(KEPT_BYTES)
+
+    @cached_property
+    def diameter(self) -> Tensor:
+        """(H, W) circle of confusion at the light's own f-number [pixel]."""
+        return self._diameter if isinstance(self._diameter, Tensor) else self._diameter()
+
+    def extent(self, f_number: float) -> float:
+        """See `Opening`."""
+        if f_number >= self.f_number:
+            return 0.0
+        return float(added_blur(self._largest, self.f_number, f_number))
+
+    def opened(self, f_number: float, *, denoised: bool) -> Tensor:
+        """See `Opening`."""
+        key = (f_number, denoised)
+        result = self._kept.get(key)
+        if result is None:
+            light = self._denoised.light if denoised else self._recorded
+            result = self._blurred(light, denoised, f_number)
+            self._kept.put(key, result, result.nbytes)
+        return result
+
+    def remaining(self, f_number: float) -> Tensor:
+        """See `Opening`."""
+        return remaining_variance(added_blur(self.diameter, self.f_number, f_number))
+
+    @cached_property
+    def _largest(self) -> Tensor:
+        return self.diameter.max()
+
+    @cached_property
+    def _tiles(self) -> list[Tile]:
+        """What is out of focus."""
+        return make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
+
+    def _blurred(self, light: Tensor, denoised: bool, f_number: float) -> Tensor:
+        def blurred(tile: Tile) -> Tensor:
+            added = added_blur(self.diameter[tile.outer], self.f_number, f_number)
+            return self._bank(light, denoised, tile).blurred(added)[tile.core]
+
+        tiles = self._tiles
+        if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
+            return blurred(tiles[0])
+        result = light.clamp(-LATENT_LIMIT, LATENT_LIMIT)
+        for tile in tiles:
+            result[tile.inner] = blurred(tile)
+        return result
+
+    def _bank(self, light: Tensor, denoised: bool, tile: Tile) -> DiscBank:
+        """The discs of a tile, kept on small frames: neighbouring f-numbers share most of them."""
+        bank = self._banks.get((tile, denoised))
+        if bank is None:
+            # Beyond the limit sums would no longer resolve the shadows.
+            bank = DiscBank(light[tile.outer].clamp(-LATENT_LIMIT, LATENT_LIMIT))
+            if self.diameter.numel() <= TILE**2:
+                self._banks[tile, denoised] = bank
+        return bank
+
+
+class NetworkOpening:
+    """Runs the paper's attention U-Net for every f-number (preset ``"paper"``).
+
+    Args:
+        denoised: Light (4, H, W) with little noise.
+        module: The trained network, called as `ApertureModule` is.
+        f_number: Effective f-number of the light.
+    """
+
+    needs_denoised = True
+    everywhere = True
+
+    def __init__(
+        self,
+        denoised: Denoised,
+        module: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor],
+        f_number: float,
+    ) -> None:
+        self.f_number, self._denoised, self._module = f_number, denoised, module
+        self._kept: LruCache[Tensor] = LruCache(KEPT_BYTES)
+
+    def extent(self, f_number: float) -> float:
+        """Unknown before the network ran: taken as large wherever the aperture opens."""
+        return float("inf") if f_number < self.f_number else 0.0
+
+    @torch.no_grad()
+    def opened(self, f_number: float, *, denoised: bool = True) -> Tensor:
+        """See `Opening`."""
+        result = self._kept.get(f_number)
+        if result is None:
+            image = self._denoised.light[None]
+            f_numbers = (torch.tensor([n], device=image.device) for n in (self.f_number, f_number))
+            result = self._module(image, torch.zeros_like(image), *f_numbers)[0]
+            self._kept.put(f_number, result, result.nbytes)
+        return result
+
+    def remaining(self, f_number: float) -> None:
+        """The recorded noise is gone: there is nothing to account for."""

@@ -1,0 +1,266 @@
+"""Aperture module: the blur that a wider aperture adds."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from simulator.networks.noise_module import Preset, check_preset
+from simulator.networks.unet import AttentionUNet
+from simulator.optics.blur import box_mean, disc_blur
+from simulator.optics.disc_bank import DiscBank
+
+# Estimates how defocused each pixel of a photograph is, from its texture.
+#: Discs whose differences are the bands [pixel of diameter]; 0 is the image itself.
+BAND_DIAMETERS = (0.0, 1.5, 3.0, 5.5, 10.0)
+#: Windows over which a band's energy is averaged, and the contrast that it is compared to.
+_ENERGY_WINDOW, _CONTRAST_WINDOW = 7, 25
+#: The network estimates log(diameter + this): its resolution is even where blur is visible.
+LOG_OFFSET = 0.3
+#: Largest diameter that is estimated [pixel].
+LARGEST = 12.0
+
+
+class DefocusMap(nn.Module):
+    """A small network from local band energies to the circle of confusion.
+
+    Defocus removes fine detail first: the energies of neighbouring difference-of-disc bands,
+    relative to the contrast of the neighbourhood, tell by how much. They do not depend on the
+    exposure. The network looks at half the resolution (pixel unshuffle).
+
+    Args:
+        width: Channels of the network.
+        dilations: One residual block each.
+    """
+
+    def __init__(self, width: int = 48, dilations: tuple[int, ...] = (1, 2, 4, 1)) -> None:
+        super().__init__()
+        bands = len(BAND_DIAMETERS) - 1
+        self.head = nn.Conv2d(4 * (2 * bands + 1), width, 3, padding=1)
+        self.blocks = nn.ModuleList(_Block(width, dilation) for dilation in dilations)
+        self.tail = nn.Conv2d(width, 1, 3, padding=1)
+        nn.init.zeros_(self.tail.bias)  # type: ignore[arg-type]
+        with torch.no_grad():
+            self.tail.weight.mul_(0.1)
+
+    def forward(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """Logarithm of the blur, ``log(diameter + 0.3)``.
+
+        Args:
+            image: (B, 4, H, W) raw with little noise, any exposure; H, W >= 1.
+            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
+
+        Returns:
+            (B, H, W); the diameter is in pixels of `image`.
+        """
+        height, width = image.shape[-2:]
+        features = F.pad(
+            band_features(image, deviation), (0, width % 2, 0, height % 2), "replicate"
+        )
+        x = F.relu_(self.head(F.pixel_unshuffle(features, 2)))
+        for block in self.blocks:
+            x = block(x)
+        coarse = self.tail(x).float()
+        size = features.shape[-2:]
+        fine = F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+        return fine[:, 0, :height, :width]
+
+    def diameter(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """Diameter of the circle of confusion of each pixel (B, H, W), in pixels of `image`."""
+        return to_diameter(self(image, deviation))
+
+
+def to_diameter(log_blur: Tensor) -> Tensor:
+    """What ``log(diameter + 0.3)`` stands for, in [0, `LARGEST`]."""
+    return (log_blur.clamp(max=3.0).exp() - LOG_OFFSET).clamp(0.0, LARGEST)
+
+
+class _Block(nn.Module):
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        with torch.no_grad():
+            self.second.weight.mul_(0.3)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        return self.second(F.relu_(self.first(x))).add_(x)
+
+
+def band_features(image: Tensor, deviation: Tensor) -> Tensor:
+    """What the network sees, (B, 9, H, W): independent of the exposure.
+
+    Four signed bands relative to the local contrast, the logarithms of their local energies
+    relative to it, and the logarithm of the noise relative to it.
+    """
+    grey = image.float().mean(dim=1)
+    # Noise of the mean of four planes.
+    floor = deviation.float().square().mean(dim=1) / 4.0 + 1e-6 * grey.square() + 1e-24
+    discs = [disc_blur(grey, diameter) for diameter in BAND_DIAMETERS]
+    bands = torch.stack([a - b for a, b in itertools.pairwise(discs)], dim=1)
+    energy = box_mean(bands.square(), _ENERGY_WINDOW)
+    contrast = box_mean(bands.square().sum(dim=1, keepdim=True), _CONTRAST_WINDOW) + floor[:, None]
+    signed = (bands / contrast.sqrt()).clamp(-8.0, 8.0)
+    relative = torch.log(energy / contrast + 1e-5)
+    noise = torch.log(floor[:, None] / contrast + 1e-5)
+    return torch.cat([signed, 0.3 * relative + 1.0, 0.3 * noise + 1.0], dim=1)
+
+
+#: Blur below this diameter [pixel] is not told from sharpness, and left as it is.
+DEAD_ZONE = 1.0
+#: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
+#: on as defocused.
+IN_FOCUS = (1.7, 2.2)
+#: Variance over squared mean from which a neighbourhood counts fully as detail.
+_FULL_CONTRAST = 0.05
+#: Side of the window that contrast is measured in [pixel].
+_USABLE_WINDOW = 9
+#: Share of a picture's detail that may be no more than soft where it counts as in focus.
+_IN_FOCUS_SHARE = 0.95
+#: Equal parts of `IN_FOCUS` that the weight is summed in before any value is sorted.
+_STEPS = 512
+
+
+class ApertureModule(nn.Module):
+    """Opens the aperture of a photograph with little noise; it never closes it.
+
+    Args:
+        preset: ``"compact"``: estimates a map of the circle of confusion once per scene and blurs
+            with a bank of discs; ``"paper"``: the residual attention U-Net of the paper's section
+            3.3, run for every pair of f-numbers.
+    """
+
+    def __init__(self, preset: Preset = "compact") -> None:
+        super().__init__()
+        check_preset(preset)
+        self.preset = preset
+        self.network: nn.Module = DefocusMap() if preset == "compact" else AttentionUNet()
+
+    def forward(
+        self, image: Tensor, deviation: Tensor, f_source: Tensor, f_target: Tensor
+    ) -> Tensor:
+        """The image with the aperture's defocus at `f_target`, at unchanged exposure.
+
+        Args:
+            image: (B, 4, H, W) raw with little noise.
+            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
+            f_source: (B,) effective f-number of `image`.
+            f_target: (B,) effective f-number wanted; where it is not smaller, the image stays.
+        """
+        if self.preset == "paper":
+            return self._residual(image, f_source, f_target)
+        diameter = self.defocus(image, deviation)
+        added = added_blur(diameter, f_source[:, None, None], f_target[:, None, None])
+        return DiscBank(image).blurred(added[:, None])
+
+    def defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """Circle of confusion of each pixel of the source (B, H, W) [pixel], as far as trusted.
+
+        Raises:
+            ValueError: If the preset has no such map.
+        """
+        return usable_defocus(self.estimate_defocus(image, deviation), image)
+
+    def estimate_defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """The network's map (B, H, W) [pixel]; each pixel depends on its neighbourhood alone.
+
+        Raises:
+            ValueError: If the preset has no such map.
+        """
+        if not isinstance(self.network, DefocusMap):
+            raise ValueError(f"`preset` (={self.preset!r}) must be 'compact' to have a defocus map")
+        return self.network.diameter(image, deviation)
+
+    def _residual(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
+        # One scalar per image makes the network see every exposure alike: it then commutes with
+        # exposure, like the compact one.
+        scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
+        f_numbers = torch.stack([f_source, f_target], dim=1).float()
+        # Eighteen normalisations in a row: bfloat16 would change half of the residual.
+        with torch.autocast(image.device.type, enabled=False):
+            residual = self.network((image / scale).float(), f_numbers)
+            # A picture without detail has a constant residual; without it, it stays as it is.
+            flat = self.network(image.new_zeros(len(image), 4, 1, 1).float(), f_numbers)
+        residual = (residual - flat) * scale
+        opens = (f_target < f_source)[:, None, None, None]
+        return torch.where(opens, image + residual, image)
+
+
+def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:
+    """The part of an estimated map that is to be trusted: none of it where nothing is defocused.
+
+    Args:
+        diameter: (B, H, W) as `ApertureModule.estimate_defocus` gives it [pixel].
+        image: (B, 4, H, W) that it was estimated from.
+    """
+    return dead_zone(diameter) * is_defocused(diameter, image)[:, None, None]
+
+
+def is_defocused(diameter: Tensor, image: Tensor) -> Tensor:
+    """Whether a picture shows defocus at all, (B,) from 0 to 1.
+
+    Blur up to 1.5 pixels is hard to tell from softness, and a false map costs a sharp picture more
+    than a missed one costs a blurred picture. So a picture counts as in focus throughout unless a
+    twentieth of its detail (weighed by local contrast) is blurred by more than `IN_FOCUS`.
+
+    Args:
+        diameter: (B, H, W) estimated circle of confusion [pixel].
+        image: (B, 4, H, W).
+    """
+    grey = image.mean(dim=1, keepdim=True)
+    mean = box_mean(grey, _USABLE_WINDOW)
+    contrast = box_mean((grey - mean).square(), _USABLE_WINDOW) / mean.square().clamp(min=1e-24)
+    weights = contrast.clamp(max=_FULL_CONTRAST).flatten(1)
+    low, high = IN_FOCUS
+    levels = [
+        _quantile(values, weight, low, high)
+        for values, weight in zip(diameter.flatten(1), weights, strict=True)
+    ]
+    return ((torch.stack(levels) - low) / (high - low)).clamp(0.0, 1.0)
+
+
+def _quantile(values: Tensor, weight: Tensor, low: float, high: float) -> Tensor:
+    """The value that `_IN_FOCUS_SHARE` of the weight does not exceed, told apart in [low, high].
+
+    Only values between matter, as whole frames are sharp or blurred far outside, and of these only
+    the ones near the answer are sorted.
+    """
+    wanted = _IN_FOCUS_SHARE * weight.sum(dtype=torch.float64)
+    below = torch.where(values < low, weight, 0.0).sum(dtype=torch.float64)
+    if bool(below >= wanted):
+        return values.new_tensor(low)
+    between = ((values >= low) & (values <= high)).nonzero()[:, 0]
+    chosen, share = values[between], weight[between].double()
+    step = ((chosen - low) * (_STEPS / (high - low))).long()  # ascends with the value
+    sums = torch.zeros(_STEPS + 2, dtype=torch.float64, device=values.device)
+    reached = below + sums.index_add_(0, step + 1, share).cumsum(dim=0)
+    place = int((reached < wanted).sum()) - 1
+    if place > _STEPS:
+        return values.new_tensor(high)
+    near = (step == place).nonzero()[:, 0]
+    chosen, order = chosen[near].sort()
+    reached = reached[place] + share[near][order].cumsum(dim=0)
+    last = min(
+        int((reached < wanted).sum()), len(chosen) - 1
+    )  # sums in another order may fall short
+    return chosen[last]
+
+
+def dead_zone(diameter: Tensor, size: float = DEAD_ZONE) -> Tensor:
+    """``sqrt(max(c^2 - size^2, 0))``: keeps regions in focus unchanged."""
+    excess = diameter.square() - size**2
+    return torch.where(excess > 0, excess.clamp(min=1e-12).sqrt(), 0.0)  # no infinite gradient
+
+
+def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | float) -> Tensor:
+    """Diameter of the disc that turns the blur at `f_source` into that at `f_target` [pixel].
+
+    The circle of confusion grows with 1 / N and squared diameters add: the difference of squares,
+    ``c^2 ((N_1 / N_2)^2 - 1)``, 0 where the aperture closes.
+    """
+    ratio = torch.as_tensor(f_source) / torch.as_tensor(f_target)
+    return diameter * (ratio.square() - 1.0).clamp(min=0.0).sqrt().to(diameter)

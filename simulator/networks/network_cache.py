@@ -1,0 +1,103 @@
+"""What networks found out about sources, kept so that no network runs twice for one result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from simulator.utils.cache import DiskCache, LruCache, cache_key, content_digest
+
+#: ``"memory"``, or ``"disk"``: both in memory and in files that later runs find.
+Where = Literal["memory", "disk"]
+#: Bumped when the networks are run in another way, such that older results no longer hold.
+RESULT_VERSION = 1
+#: What is kept in memory at most; one 24-megapixel frame takes 96 million [byte].
+MEMORY_BYTES = 2**28
+
+
+class NetworkCache:
+    """Results by the content of everything that they depend on: inputs, numbers and weights.
+
+    Args:
+        where: Where results are kept; None keeps nothing.
+        max_bytes: What they may take in memory.
+
+    Raises:
+        ValueError: If `where` is unknown.
+    """
+
+    def __init__(self, where: Where | None, *, max_bytes: int = MEMORY_BYTES) -> None:
+        if where is not None and where not in get_args(Where):
+            raise ValueError(f"`cache` (={where!r}) must be None or one of {list(get_args(Where))}")
+        self.where = where
+        self.memory: LruCache[tuple[Tensor, int]] = LruCache(max_bytes)
+        self._disk = DiskCache() if where == "disk" else None
+        self._fingerprints: dict[int, tuple[list[Any], str]] = {}
+
+    def result(
+        self,
+        kind: str,
+        modules: Sequence[nn.Module],
+        inputs: Mapping[str, Tensor | None],
+        make: Callable[[], Tensor],
+        **numbers: Any,
+    ) -> Tensor:
+        """What `make` gives, or gave when everything was the same: the same values, bit by bit.
+
+        Args:
+            kind: One of `simulator.utils.cache.CACHE_KINDS`.
+            modules: The networks that `make` runs; their weights may change in between.
+            inputs: Tensors that the result depends on; None where there is none.
+            make: Makes the result.
+            numbers: JSON values that the result depends on.
+        """
+        if self.where is None:
+            return make()
+        given = {name: tensor for name, tensor in inputs.items() if tensor is not None}
+        device = next(modules[0].parameters()).device
+        description = {
+            "version": RESULT_VERSION,
+            "kind": kind,
+            "weights": [self._fingerprint(module) for module in modules],
+            "inputs": content_digest(given),
+            "device": device.type,
+            **numbers,
+        }
+        key = cache_key(description)
+        kept = self.memory.get(key)
+        if kept is not None and kept[1] == _changes(kept[0]):
+            return kept[0]
+        stored = None if self._disk is None else self._disk.get(kind, key)
+        if stored is not None and "result" in stored:
+            tensor = stored["result"].to(device)
+        else:
+            tensor = make().contiguous()  # as it comes from disk: later sums round alike
+            if self._disk is not None:
+                self._disk.put(kind, key, {"result": tensor})
+        self.memory.put(key, (tensor, _changes(tensor)), tensor.nbytes)
+        return tensor
+
+    def called(self, kind: str, module: nn.Module, *inputs: Tensor) -> Tensor:
+        """``module(*inputs)``, or what it was when everything was the same; see `result`."""
+        named = {str(i): tensor for i, tensor in enumerate(inputs)}
+        return self.result(kind, [module], named, lambda: module(*inputs))
+
+    def _fingerprint(self, module: nn.Module) -> str:
+        """Digest of the module's weights; worked out again only where one was changed in place."""
+        state = module.state_dict()
+        # Fused optimisers change values without counting it, so the sums are looked at, too.
+        sums = torch.stack([tensor.sum(dtype=torch.float64) for tensor in state.values()])
+        marks = [*sums.tolist(), *((t.data_ptr(), _changes(t)) for t in state.values())]
+        known = self._fingerprints.get(id(module))
+        if known is None or known[0] != marks:
+            known = marks, content_digest(state)
+            self._fingerprints[id(module)] = known
+        return known[1]
+
+
+def _changes(tensor: Tensor) -> int:
+    """How often the tensor was changed in place, as far as torch counts it."""
+    return 0 if torch.is_inference(tensor) else tensor._version

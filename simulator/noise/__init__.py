@@ -1,0 +1,1 @@
+"""Sensor noise: noise level functions, and the generator of frames of noise."""

@@ -1,0 +1,1 @@
+"""Blur: discs, streaks, thin lenses and lamps."""

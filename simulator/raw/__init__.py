@@ -1,0 +1,1 @@
+"""Raw files: reading, decoding, metadata, DNG, developing, noise estimation."""

@@ -1,0 +1,252 @@
+"""What raw files hold before a camera is known: by LibRaw, and DNGs of `write_dng` without it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rawpy
+
+from simulator.camera import BayerPattern
+from simulator.raw.dng import (
+    ORIENTATIONS,
+    OwnRecord,
+    first_numbers,
+    read_black_level,
+    read_colour_matrix,
+    read_long_iso,
+    read_plain_mosaic,
+)
+from simulator.raw.metadata import Content, Directory, describe_file, numbers
+from simulator.utils.files import refuse_bomb
+
+logger = logging.getLogger(__name__)
+
+PHOTOMETRIC, COLOUR_FILTER_ARRAY = 262, 32803
+_BITS, _LINEARISATION, _WHITE_LEVEL = 258, 50712, 50717
+_LETTERS = {0: "R", 1: "G", 2: "B"}
+
+
+class RawFileError(ValueError):
+    """A file that is not a Bayer raw, or not a whole one; the message says what it is."""
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """The mosaic of a file, and what the file says about it."""
+
+    mosaic: np.ndarray  # (H, W) uint16, visible area
+    cfa: BayerPattern
+    black_level: tuple[float, float, float, float]
+    white_level: float
+    white_balance: tuple[float, float, float]
+    white_balance_source: str
+    colour_matrix: tuple[tuple[float, float, float], ...] | None
+    colour_matrix_source: str
+    exposure: tuple[float, float, float]  # ISO, seconds, f-number; 0 where the file does not say
+    extra: dict[str, Any]
+
+
+def decode_own_dng(
+    path: Path, data: Content, directories: list[Directory], own: OwnRecord
+) -> Decoded | None:
+    """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes.
+
+    Returns:
+        None if another program has laid the pixels out anew.
+
+    Raises:
+        RawFileError: If it is damaged.
+    """
+    mosaic = read_plain_mosaic(data, directories)
+    if mosaic is None:
+        return None
+    tile = first_numbers(directories, 33422)
+    letters = "".join(_LETTERS.get(int(colour), "?") for colour in tile)
+    if letters not in {p.value for p in BayerPattern}:
+        raise RawFileError(
+            f"`path` (={path.name!r}) must have a Bayer tile of 0 (R), 1 (G), 2 (B), but its "
+            f"CFAPattern is {tile}: damaged"
+        )
+    black = read_black_level(directories, BayerPattern(letters), (0, 0))
+    if black is None:
+        return None
+    white = next(iter(first_numbers(directories, _WHITE_LEVEL)), 0.0)
+    neutral = first_numbers(directories, 50728)
+    known = len(neutral) == 3 and min(neutral) > 0
+    red, green, blue = neutral if known else (1.0, 1.0, 1.0)
+    flips = {orientation: flip for flip, orientation in ORIENTATIONS.items()}
+    orientation = next(iter(first_numbers(directories, 274)), 1)
+    extra: dict[str, Any] = {"flip": flips.get(int(orientation), 0)}
+    moment = next((str(d[36867][0]) for d in directories if 36867 in d), "")
+    with suppress(ValueError):  # blanks where it is not known
+        extra["datetime"] = datetime.strptime(moment.strip(), "%Y:%m:%d %H:%M:%S").isoformat()
+    focal_length = next(iter(first_numbers(directories, 37386)), 0.0)
+    if focal_length > 0:
+        extra["focal_length"] = float(focal_length)
+    return Decoded(
+        mosaic=mosaic,
+        cfa=BayerPattern(letters),
+        black_level=black,
+        white_level=_white_level(path, white, black, directories),
+        white_balance=(green / red, 1.0, green / blue),
+        white_balance_source="camera" if known else "none",
+        colour_matrix=read_colour_matrix(directories),
+        colour_matrix_source="XYZ to camera RGB, ColorMatrix of the file",
+        exposure=(own.settings.iso, own.settings.exposure_time, own.settings.f_number),
+        extra=extra,
+    )
+
+
+def decode_with_libraw(
+    path: Path, data: Content, directories: list[Directory], opened: ExitStack
+) -> Decoded:
+    """What LibRaw reads; its mosaic lies in LibRaw's memory, which `opened` lets go of."""
+    words = describe_file(data)
+    try:
+        raw = opened.enter_context(rawpy.imread(str(path)))
+        bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, len(data))
+        if bomb:  # no pixel is decoded before one is asked for
+            raise RawFileError(f"`path` (={path.name!r}, {words}) {bomb}")
+        return _from_libraw(path, raw, words, directories)
+    except rawpy.LibRawFileUnsupportedError:
+        raise RawFileError(
+            f"`path` (={path.name!r}) must be a camera raw that LibRaw reads, but is {words}, or "
+            "is truncated"
+        ) from None
+    except (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError) as error:
+        reason = error.args[0] if error.args else error
+        reason = reason.decode() if isinstance(reason, bytes) else reason
+        raise RawFileError(
+            f"`path` (={path.name!r}) must be a whole raw file, but LibRaw says {reason!s}: "
+            f"{words}, truncated or damaged"
+        ) from None
+
+
+def _white_level(
+    path: Path, white: float, black: Sequence[float], directories: list[Directory]
+) -> float:
+    """`white`, or the largest digital number where the file's WhiteLevel cannot be right.
+
+    That is 0, or beyond what the bits of a sample can hold (but for tables of larger values).
+    """
+    where = next((d for d in directories if d.get(PHOTOMETRIC) == (COLOUR_FILTER_ARRAY,)), {})
+    stated = next(iter(numbers(where, _WHITE_LEVEL)), white)
+    bits = next(iter(numbers(where, _BITS)), 16)
+    fits = 8 <= bits <= 16 and _LINEARISATION not in where
+    largest = 2 ** (int(bits) if fits else 16) - 1
+    if not 0 < stated <= largest:
+        logger.warning(
+            "%s: its white level (=%.10g) must be in [1, %d]; %d is used",
+            *(path.name, stated, largest, largest),
+        )
+        white = float(largest)
+    if white <= max(black):
+        raise RawFileError(
+            f"`path` (={path.name!r}) must have a white level above its black levels, but says "
+            f"white {white:g}, black {tuple(black)}"
+        )
+    return float(white)
+
+
+def _from_libraw(path: Path, raw: rawpy.RawPy, words: str, directories: list[Directory]) -> Decoded:
+    sizes = raw.sizes
+    if raw.raw_type != rawpy.RawType.Flat:
+        raise RawFileError(
+            f"`path` (={path.name!r}) must be a Bayer raw, but has every colour at every pixel "
+            f"(linear or Foveon): {words}"
+        )
+    indices = _tile_indices(path, raw, words)
+    letters = "".join(raw.color_desc.decode()[i] for i in indices)
+    cfa = BayerPattern(letters)
+    order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
+    black = [float(raw.black_level_per_channel[i]) for i in order]
+    exact = read_black_level(directories, cfa, (sizes.top_margin, sizes.left_margin))
+    if exact is not None and np.abs(np.sort(exact) - np.sort(black)).max() < 1.0:
+        # LibRaw drops the fraction, and the phase where it moves an odd margin to an even one.
+        black = list(exact)
+    white_balance, source = _white_balance(raw)
+    matrix, matrix_source = _colour_matrix(raw, directories)
+    white = _white_level(path, float(raw.white_level), black, directories)
+    mosaic = raw.raw_image_visible
+    if min(mosaic.shape) < 2:
+        raise RawFileError(f"`path` (={path.name!r}) must hold an image, but is empty: {words}")
+    extra: dict[str, Any] = {"flip": int(sizes.flip)}
+    other = raw.other
+    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
+    if other.timestamp is not None and other.timestamp.timestamp() > 0:
+        extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
+    if np.isfinite(other.focal_length) and other.focal_length > 0:
+        extra["focal_length"] = float(other.focal_length)
+    return Decoded(
+        mosaic=mosaic,
+        cfa=cfa,
+        black_level=tuple(black),  # type: ignore[arg-type]
+        white_level=white,
+        white_balance=white_balance,
+        white_balance_source=source,
+        colour_matrix=matrix,
+        colour_matrix_source=matrix_source,
+        exposure=(iso, other.shutter_speed, other.aperture),
+        extra=extra,
+    )
+
+
+def _tile_indices(path: Path, raw: rawpy.RawPy, words: str) -> list[int]:
+    """LibRaw's colour indices of the 2 x 2 tile at the origin of the visible area."""
+    try:
+        pattern = raw.raw_pattern
+    except NotImplementedError:
+        pattern = None
+    shape = None if pattern is None else pattern.shape
+    if shape == (6, 6):
+        raise RawFileError(
+            f"`path` (={path.name!r}) must be a Bayer raw, but has Fujifilm's X-Trans array"
+        )
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    description = raw.color_desc.decode()
+    if shape == (2, 2):
+        # The visible area may begin on an odd row or column: ask there, not at the sensor's corner.
+        indices = [int(raw.raw_color(top + r, left + c)) for r in (0, 1) for c in (0, 1)]
+        letters = "".join(description[i] for i in indices)
+        if letters in {p.value for p in BayerPattern}:
+            return indices
+        description = letters
+    raise RawFileError(
+        f"`path` (={path.name!r}) must be a Bayer raw (R, G, B in a 2 x 2 tile), but its colour "
+        f"array is {description or 'monochrome'} in {shape or 'no'} tile: {words}"
+    )
+
+
+def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
+    """Gains of R, G, B with green 1: the camera's, else LibRaw's daylight ones, else neutral."""
+    for gains, source in (
+        (raw.camera_whitebalance, "camera"),
+        (raw.daylight_whitebalance, "daylight"),
+    ):
+        red, green, blue = gains[:3]
+        if all(np.isfinite(g) and g > 0 for g in (red, green, blue)):
+            return (red / green, 1.0, blue / green), source
+    return (1.0, 1.0, 1.0), "none"
+
+
+def _colour_matrix(
+    raw: rawpy.RawPy, directories: list[Directory]
+) -> tuple[tuple[tuple[float, float, float], ...] | None, str]:
+    """XYZ to camera RGB and its source: a DNG's own, else LibRaw's table."""
+    stated = read_colour_matrix(directories)
+    if stated is not None:
+        return stated, "XYZ to camera RGB, ColorMatrix of the file"
+    matrix = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
+        return None, ""
+    version = ".".join(map(str, rawpy.libraw_version))
+    # float32 to the nearest short decimal: LibRaw's own tables have four digits.
+    rows = tuple(tuple(round(float(v), 7) for v in row) for row in matrix)
+    return rows, f"XYZ to camera RGB, as LibRaw {version} has it"  # type: ignore[return-value]

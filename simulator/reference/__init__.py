@@ -1,0 +1,1 @@
+"""The reference camera and its sequences: the ground truth."""

@@ -1,0 +1,320 @@
+"""The reference camera: the ground truth that the simulator's error is measured against.
+
+From noise-free light and depth to digital numbers, each step as the physics has it: thin-lens
+defocus with occlusion, the light of the true exposure time and aperture, motion blur, photon noise
+in electrons, full well, read noise, black level, clip, whole digital numbers. Each body has a small
+hidden error of shutter, aperture and black level, as real ones do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from simulator.camera import CameraProfile
+from simulator.capture.exposure import SIGNAL_LIMIT
+from simulator.capture.record import clip_and_quantise
+from simulator.noise.noise_level_function import nlf_tensors, noise_generator
+from simulator.optics.blur import motion_blur
+from simulator.optics.lamps import Lamp
+from simulator.optics.thin_lens import Lens, defocus
+from simulator.raw.image import check_packed
+from simulator.settings import CameraSettings, exposure_ratio
+
+#: A well holds this much more than white at the base ISO: makers set the white level just below it,
+#: so that a saturated pixel reads white in spite of its read noise and of its black level.
+WELL_MARGIN = 0.004
+#: Aperture stops (sixths of the f-number's octave) from f/1 to f/64.
+_STOPS = range(37)
+#: Kind of a scene whose picture is also there without the depth that it was given.
+DRAPED = "draped"
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceScene:
+    """What stands before the camera, without noise and in focus throughout.
+
+    Args:
+        scene_id: Unique name.
+        group: Source group, the unit of splitting (photograph, panorama, physical subject).
+        kind: Sort of source, such as ``"procedural"``.
+        light: (4, H, W) float32 >= 0, linear, in camera colours, at `reference`; 1.0 is sensor
+            white, not clipped.
+        reference: Settings at which `light` is on that scale.
+        depth: (H, W) float32, distance from the lens [m], above its focal length, inf allowed;
+            None if all is in focus.
+        lens: The lens it is photographed with.
+        illuminance: Incident light [lux], if known.
+        white_balance: Gains of R, G, B of the scene's light.
+        source: Where the light comes from.
+
+    Raises:
+        ValueError: If light or depth has the wrong shape or values out of range.
+    """
+
+    scene_id: str
+    group: str
+    kind: str
+    light: torch.Tensor
+    reference: CameraSettings
+    depth: torch.Tensor | None = None
+    lens: Lens = field(default_factory=Lens)
+    illuminance: float | None = None
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        light = check_packed("light", self.light)
+        if bool((light < 0).any()):
+            raise ValueError(f"`light` (minimum {float(light.min()):g}) must be >= 0")
+        object.__setattr__(self, "light", light)
+        if self.depth is None:
+            return
+        if self.depth.shape != light.shape[-2:]:
+            raise ValueError(
+                f"`depth` (shape {tuple(self.depth.shape)}) must have the shape of `light`'s "
+                f"planes, {tuple(light.shape[-2:])}"
+            )
+        nearest = self.lens.focal_length
+        if not bool((self.depth > nearest).all()):  # also refuses NaN
+            raise ValueError(
+                f"`depth` (minimum {float(self.depth.min()):g} m) must be above the focal length "
+                f"({nearest:g} m)"
+            )
+        object.__setattr__(self, "depth", self.depth.to(torch.float32))
+
+
+@dataclass(frozen=True)
+class BodyError:
+    """What one body does differently from what its settings say.
+
+    Args:
+        shutter_delay: Added to every exposure time [s].
+        shutter_scale: Relative error of every exposure time.
+        transmission: Relative error of the light by aperture stop (`CameraSettings.aperture_stop`);
+            a stop that is not there has none.
+        black_offset: Error of the black level on the packed scale, R, G1, G2, B.
+    """
+
+    shutter_delay: float = 0.0
+    shutter_scale: float = 0.0
+    transmission: Mapping[int, float] = field(default_factory=dict)
+    black_offset: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def none(cls) -> BodyError:
+        """A body that does what it says."""
+        return cls()
+
+    @classmethod
+    def draw(cls, camera: CameraProfile, seed: int) -> BodyError:
+        """A body of `camera` as it might leave the factory.
+
+        Shutter: 15 us (standard deviation, at most 60 us, so that 1/8000 s stays open) and 1 %.
+        Light of each aperture stop: 2 %, at most 6 %. Black: up to 2 digital numbers per plane.
+
+        Args:
+            camera: Gives the size of a digital number.
+            seed: Integer >= 0; the same seed gives the same body.
+        """
+        rng = np.random.default_rng([seed, 0xB0D1])
+        errors = np.clip(rng.normal(0.0, 0.02, len(_STOPS)), -0.06, 0.06)
+        offsets = rng.uniform(-2.0, 2.0, 4) / np.array(camera.span)
+        return cls(
+            shutter_delay=float(np.clip(rng.normal(0.0, 15e-6), -60e-6, 60e-6)),
+            shutter_scale=float(np.clip(rng.normal(0.0, 0.01), -0.03, 0.03)),
+            transmission=dict(zip(_STOPS, errors.tolist(), strict=True)),
+            black_offset=tuple(offsets.tolist()),
+        )
+
+    def exposure_time(self, nominal: float) -> float:
+        """True exposure time [s] of a `nominal` one.
+
+        Raises:
+            ValueError: If this body's shutter would not open at all.
+        """
+        time = nominal * (1.0 + self.shutter_scale) + self.shutter_delay
+        if time <= 0.0:
+            raise ValueError(
+                f"`exposure_time` (={nominal!r}) must be above this body's shutter error "
+                f"({self.shutter_delay:g} s and {self.shutter_scale:.1%})"
+            )
+        return time
+
+    def light_error(self, settings: CameraSettings) -> float:
+        """True light at `settings` over the light that they promise."""
+        time = self.exposure_time(settings.exposure_time) / settings.exposure_time
+        return time * (1.0 + self.transmission.get(settings.aperture_stop, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceCapture:
+    """One capture and its truth.
+
+    Args:
+        mean: (4, H, W) without noise, clipped as the capture is, not quantised.
+        sample: (4, H, W) with noise, clipped, whole digital numbers.
+        settings: Nominal settings, as the file would state them.
+    """
+
+    mean: torch.Tensor
+    sample: torch.Tensor
+    settings: CameraSettings
+
+
+class ReferenceCamera:
+    """A body that photographs `ReferenceScene`.
+
+    Args:
+        camera: Sensor, with a noise calibration and, for scenes with depth, a pixel pitch.
+        body: Hidden error of this body.
+        box_factor: Sensor pixels averaged per side and plane into one pixel of a scene's light.
+
+    Raises:
+        ValueError: If the camera has no noise calibration or `box_factor` is below 1.
+    """
+
+    def __init__(
+        self, camera: CameraProfile, *, body: BodyError | None = None, box_factor: int = 1
+    ) -> None:
+        if not camera.nlf_by_iso:
+            raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
+        if box_factor < 1:
+            raise ValueError(f"`box_factor` (={box_factor!r}) must be >= 1")
+        self.camera = camera
+        self.body = BodyError.none() if body is None else body
+        self.box_factor = box_factor
+
+    def blur_diameter(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+        """Diameter of the circle of confusion, (H, W), in pixels of ``scene.light``, >= 0.
+
+        Args:
+            scene: What is photographed.
+            f_number: As marked on the lens; the blur is that of the stop that it stands for.
+        """
+        return self._signed_diameter(scene, f_number).abs().to(torch.float32)
+
+    def _signed_diameter(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+        if scene.depth is None:
+            return torch.zeros_like(scene.light[0], dtype=torch.float64)
+        if self.camera.pixel_pitch_um is None:
+            raise ValueError(f"`camera` (={self.camera.name!r}) must have a pixel pitch")
+        exact = CameraSettings(100.0, 1.0, f_number).effective_f_number
+        pitch = 2e-6 * self.camera.pixel_pitch_um * self.box_factor  # two sensor pixels a plane's
+        return scene.lens.circle_of_confusion(scene.depth.double(), exact) / pitch
+
+    def optics(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+        """Light on the sensor behind the aperture `f_number`, (4, H, W): defocus and nothing else.
+
+        Still at the exposure of ``scene.reference``, unclipped and without noise: one result serves
+        every ISO and exposure time.
+        """
+        if scene.depth is None:
+            return scene.light
+        return defocus(scene.light, self._signed_diameter(scene, f_number))
+
+    def expose(
+        self,
+        light: torch.Tensor,
+        reference: CameraSettings,
+        settings: CameraSettings,
+        *,
+        image_speed: float = 0.0,
+        lamp: Lamp | None = None,
+        start: float = 0.0,
+    ) -> torch.Tensor:
+        """Signal without noise at `settings`, with this body's hidden errors, unclipped.
+
+        Where the image moves in light that changes, each is integrated by itself.
+
+        Args:
+            light: (..., 4, H, W) at the exposure of `reference`, as `optics` gives it.
+            reference: Settings of `light`.
+            settings: Nominal settings of the capture.
+            image_speed: Speed of the image along the rows [frame heights per second].
+            lamp: What lights the scene, whose long-term mean `light` is; None for steady light.
+                Rows are read one after the other (`CameraProfile.row_time`).
+            start: When the first row begins its exposure [s].
+        """
+        ratio = exposure_ratio(reference, settings) * self.body.light_error(settings)
+        time = self.body.exposure_time(settings.exposure_time)
+        moved = motion_blur(light, image_speed * time * light.shape[-2])
+        if lamp is not None:
+            bands = lamp.row_light(
+                start, time, light.shape[-2], self.camera.row_time, 2 * self.box_factor
+            )
+            moved = moved * torch.from_numpy(bands).to(moved)[:, None]
+        return moved * ratio + self._black_offset(light)
+
+    def _black_offset(self, signal: torch.Tensor) -> torch.Tensor:
+        return torch.tensor(self.body.black_offset).to(signal)[:, None, None]
+
+    def record(self, signal: torch.Tensor, iso: float, generator: torch.Generator) -> torch.Tensor:
+        """Digital numbers of `signal`, on the scale where sensor white is 1.
+
+        The variance is that of the camera's noise level function: the noise of the rounding to
+        whole numbers is part of the calibrated read noise, and is not counted twice.
+
+        Args:
+            signal: (..., 4, H, W), as `expose` gives it.
+            iso: ISO speed.
+            generator: Source of the noise, on the device of `signal`.
+        """
+        shot, read = nlf_tensors(self.camera.nlf(iso).scaled(1 / self.box_factor**2), signal.device)
+        black, well = self._black_offset(signal), self._well(signal, iso)
+        # What is far above a full well fills it in any case; a count of it would overflow.
+        light = torch.minimum((signal - black).clamp(min=0.0), 2.0 * well)
+        electrons = torch.where(shot > 0, 1.0 / shot, 1.0)  # per unit of signal
+        counted = torch.poisson(light * electrons, generator=generator) / electrons
+        collected = torch.minimum(torch.where(shot > 0, counted, light), well)
+        span = torch.tensor(self.camera.span).to(signal)[:, None, None]
+        sigma = (read - 1.0 / (12.0 * span**2)).clamp(min=0.0).sqrt()
+        normal = torch.empty_like(collected).normal_(generator=generator)
+        return clip_and_quantise(collected + sigma * normal + black, self.camera)
+
+    def _well(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
+        """Signal of a full well, (4, 1, 1): just above white at the base ISO, more beyond it."""
+        base = self.camera.nlf(min(self.camera.nlf_by_iso)).shot
+        wells = [
+            (1.0 + WELL_MARGIN) * shot / lowest if shot > 0 and lowest > 0 else SIGNAL_LIMIT
+            for shot, lowest in zip(self.camera.nlf(iso).shot, base, strict=True)
+        ]
+        return torch.tensor(wells).to(signal)[:, None, None]
+
+    def clip(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
+        """`signal` (..., 4, H, W) within what a capture at `iso` can show: [-pedestal, 1]."""
+        black = self._black_offset(signal)
+        held = torch.minimum(signal, self._well(signal, iso) + black)
+        pedestal = torch.tensor(self.camera.pedestal).to(signal)[:, None, None]
+        return torch.maximum(held, -pedestal).clamp(max=1.0)
+
+    def capture(
+        self,
+        scene: ReferenceScene,
+        settings: CameraSettings,
+        seed: int,
+        *,
+        light: torch.Tensor | None = None,
+        lamp: Lamp | None = None,
+        start: float = 0.0,
+    ) -> ReferenceCapture:
+        """Photographs a scene that stands still.
+
+        Args:
+            scene: What is photographed.
+            settings: Nominal settings.
+            seed: Seed of the noise, >= 0; the noise is a function of it and of the settings.
+            light: What ``optics(scene, settings.f_number)`` gave, where it is at hand: it serves
+                every capture at that f-number.
+            lamp: See `expose`.
+            start: See `expose`.
+        """
+        if light is None:
+            light = self.optics(scene, settings.f_number)
+        signal = self.expose(light, scene.reference, settings, lamp=lamp, start=start)
+        generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
+        sample = self.record(signal, settings.iso, generator)
+        return ReferenceCapture(self.clip(signal, settings.iso), sample, settings)

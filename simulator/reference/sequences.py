@@ -1,0 +1,266 @@
+"""Sequences of captures of one scene, and which two of them a module is trained and tested on."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+from collections.abc import Iterator
+from collections.abc import Sequence as SequenceOf
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, sensor_signal
+
+if TYPE_CHECKING:
+    from simulator.reference.reference_camera import ReferenceScene
+
+Stage = Literal["exposure", "noise", "aperture", "all"]
+
+#: ISO speeds, third stops as cameras mark them.
+# fmt: off
+ISO_SPEEDS = (
+    100, 125, 160, 200, 250, 320, 400, 500, 640, 800, 1000, 1250, 1600, 2000, 2500, 3200, 4000,
+    5000, 6400, 8000, 10000, 12800, 16000,
+)
+# fmt: on
+#: Exposure times [s]: the exact third stops that the marked 1/8000 ... 4 s stand for.
+EXPOSURE_TIMES = tuple(2.0 ** (k / 3) for k in range(-39, 7))
+#: F-numbers, whole stops as lenses mark them.
+F_NUMBERS = (4.0, 5.6, 8.0, 11.0, 16.0, 22.0)
+#: Captures in a sequence, fewest and most.
+CAPTURES = (20, 25)
+#: Illuminance [lux] of the darkest and brightest scene that the paper photographed.
+ILLUMINANCE = (1.0, 20_000.0)
+
+#: Exposure error [EV]: a normal distribution of this standard deviation, cut at `_LARGEST_ERROR`.
+_ERROR_SPREAD = 2.0
+_LARGEST_ERROR = 3.0
+#: ISO, in stops above 100, that the draw centres on in the darkest and in the brightest scene.
+_ISO_CENTRES, _ISO_SPREAD = (5.0, 1.5), 2.5
+#: Aperture, in stops below f/4, likewise.
+_APERTURE_CENTRES, _APERTURE_SPREAD = (1.0, 4.0), 2.0
+#: Noise beyond the calibrated ISOs is extrapolated: this far, and no further.
+_ISO_BEYOND = 2.5
+
+#: Highest ISO of a target with little noise (paper, section 4.2: 100, 200 and 400).
+_LOW_ISO = 400.0
+#: Its noise variance, relative to the source's at the same exposure, is at most this.
+_LOW_NOISE = 0.25
+#: Exposure error [EV] of a target that is neither grossly dark nor grossly clipped.
+_FAIR_ERROR = (-3.0, 2.0)
+#: Share of pairs without a change of aperture among those of the aperture stage.
+_SAME_APERTURE = 0.1
+_GREY = 0.18
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One scene and the settings it is captured with.
+
+    Args:
+        scene: What is photographed.
+        settings: The settings of each capture, at least two.
+    """
+
+    scene: ReferenceScene
+    settings: tuple[CameraSettings, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "settings", tuple(self.settings))
+        if len(self.settings) < 2:
+            raise ValueError(f"`settings` (={self.settings}) must be at least 2 captures")
+
+
+@dataclass(frozen=True, order=True)
+class Pair:
+    """Two captures of one sequence: what goes in, and what should come out.
+
+    Args:
+        sequence: Index of the sequence.
+        source: Index of the input among the sequence's settings.
+        target: Index of the output among them.
+    """
+
+    sequence: int
+    source: int
+    target: int
+
+
+def exposure_error(illuminance: float, settings: CameraSettings) -> float:
+    """By how many EV `settings` expose more (> 0) or less than an incident-light meter says.
+
+    Args:
+        illuminance: Light on the scene [lux].
+        settings: The settings; the f-number counts as the exact stop that it stands for.
+
+    >>> exposure_error(2.5 * 2**13, CameraSettings(iso=100, exposure_time=1 / 64, f_number=8))
+    1.0
+    """
+    return incident_ev100(illuminance) + settings.log2_exposure
+
+
+def draw_settings(
+    illuminance: float, rng: np.random.Generator, camera: CameraProfile
+) -> list[CameraSettings]:
+    """Settings of one sequence, as the paper captured its own (section 4.1).
+
+    20 to 25 different triples of ISO 100 to 16000, 1/8000 to 4 s and f/4 to f/22, all discrete. A
+    triple is drawn with a weight that falls with its exposure error (normal, 2 EV, none beyond
+    3 EV) and with its distance from an ISO and an aperture that depend on the light: the brighter
+    the scene, the lower the ISO, the shorter the time and the smaller the aperture on average.
+
+    Args:
+        illuminance: Light on the scene [lux], 1 to 20,000 in the paper.
+        rng: Where the randomness comes from.
+        camera: The body. ISOs above 2.5 times its highest calibrated one are not drawn.
+
+    Returns:
+        The settings in ascending order (ISO, then time, then f-number).
+
+    Raises:
+        ValueError: If `camera` has no noise calibration, or fewer than 25 triples expose such a
+            scene to within 3 EV.
+
+    >>> from simulator import get_camera
+    >>> sequence = draw_settings(320.0, np.random.default_rng(0), get_camera("nikon_z6"))
+    >>> 20 <= len(sequence) <= 25
+    True
+    """
+    if not camera.nlf_by_iso:
+        raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
+    candidates, stops = _candidates(min(camera.nlf_by_iso), _ISO_BEYOND * max(camera.nlf_by_iso))
+    weights = _weights(stops, incident_ev100(illuminance))
+    if np.count_nonzero(weights) < CAPTURES[1]:
+        raise ValueError(
+            f"`illuminance` (={illuminance}) must let at least {CAPTURES[1]} settings expose to "
+            f"within {_LARGEST_ERROR:g} EV; {np.count_nonzero(weights)} do"
+        )
+    count = int(rng.integers(CAPTURES[0], CAPTURES[1] + 1))
+    drawn = rng.choice(len(candidates), count, replace=False, p=weights / weights.sum())
+    return sorted(candidates[i] for i in drawn)
+
+
+@functools.cache
+def _candidates(lowest_iso: float, highest_iso: float) -> tuple[list[CameraSettings], np.ndarray]:
+    """Every triple, in ascending order, and (n, 3): log2 exposure, ISO and aperture in stops."""
+    candidates = [
+        CameraSettings(iso, time, f_number)
+        for iso in ISO_SPEEDS
+        if lowest_iso <= iso <= highest_iso
+        for time in EXPOSURE_TIMES
+        for f_number in F_NUMBERS
+    ]
+    widest = 4  # f/4 lets 4 stops less light through than f/1
+    stops = [
+        (s.log2_exposure, math.log2(s.iso / 100.0), s.aperture_stop / 3 - widest)
+        for s in candidates
+    ]
+    return candidates, np.array(stops)
+
+
+def _weights(stops: np.ndarray, light: float) -> np.ndarray:
+    """How likely each candidate is drawn, up to a factor, in a scene of EV100 `light`."""
+    low, high = (incident_ev100(e) for e in ILLUMINANCE)
+    brightness = min(max((light - low) / (high - low), 0.0), 1.0)
+    error = light + stops[:, 0]
+    iso = stops[:, 1] - _between(_ISO_CENTRES, brightness)
+    aperture = stops[:, 2] - _between(_APERTURE_CENTRES, brightness)
+    distance = (
+        (error / _ERROR_SPREAD) ** 2 + (iso / _ISO_SPREAD) ** 2 + (aperture / _APERTURE_SPREAD) ** 2
+    )
+    return np.where(np.abs(error) <= _LARGEST_ERROR, np.exp(-0.5 * distance), 0.0)
+
+
+def _between(ends: tuple[float, float], share: float) -> float:
+    return ends[0] + (ends[1] - ends[0]) * share
+
+
+def select_pairs(
+    sequences: SequenceOf[Sequence], stage: Stage, camera: CameraProfile
+) -> list[Pair]:
+    """The pairs that a stage of the training uses (paper, section 4.2, "Pair selection").
+
+    Args:
+        sequences: Where to choose from.
+        stage: ``"exposure"`` or ``"all"``: any two captures of a sequence, in either direction.
+            ``"noise"``: the same f-number, so that defocus does not differ; a target with little
+            noise: ISO 400 or less, and at mid grey at most a quarter of the source's noise variance
+            once both are at the same exposure; the target exposed to within -3 to +2 EV.
+            ``"aperture"``: a target with a smaller f-number than the source, and up to a tenth of
+            pairs with the same one, for which nothing should change.
+        camera: The body that takes the sequences; its noise decides what little noise is.
+
+    Returns:
+        The pairs in ascending order; the same arguments give the same pairs.
+
+    Raises:
+        ValueError: If there is no such stage, or `camera` has no noise calibration and `stage` is
+            ``"noise"``.
+    """
+    known = get_args(Stage)
+    if stage not in known:
+        near = difflib.get_close_matches(str(stage), known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"`stage` (={stage!r}) must be one of {', '.join(known)}{hint}")
+    pairs = [
+        Pair(index, source, target)
+        for index, sequence in enumerate(sequences)
+        for source in range(len(sequence.settings))
+        for target in range(len(sequence.settings))
+        if source != target
+    ]
+    if stage == "noise":
+        return list(_little_noise(sequences, pairs, camera))
+    if stage == "aperture":
+        return _more_open(sequences, pairs)
+    return pairs
+
+
+def grey_signal(scene: ReferenceScene, settings: CameraSettings) -> float:
+    """Signal of a grey card (18 %) in the scene's light, 1.0 at sensor white; unclipped.
+
+    Where the scene's illuminance is unknown, the median of its light stands for the card.
+    """
+    if scene.illuminance is not None:
+        return sensor_signal(_GREY * scene.illuminance / math.pi, settings)
+    return float(scene.light.median()) * exposure_ratio(scene.reference, settings)
+
+
+def _little_noise(
+    sequences: SequenceOf[Sequence], pairs: list[Pair], camera: CameraProfile
+) -> Iterator[Pair]:
+    # An 18 % card at the exposure that an incident-light meter gives, 0.119 of sensor white.
+    right = sensor_signal(_GREY * 2.5 / math.pi, CameraSettings(100, 1.0, 1.0))
+    for pair in pairs:
+        sequence = sequences[pair.sequence]
+        source, target = sequence.settings[pair.source], sequence.settings[pair.target]
+        if source.aperture_stop != target.aperture_stop or target.iso > _LOW_ISO:
+            continue
+        grey = grey_signal(sequence.scene, target)
+        error = math.log2(grey / right) if grey > 0 else -math.inf
+        if not _FAIR_ERROR[0] <= error <= _FAIR_ERROR[1]:
+            continue
+        exposed = camera.nlf(source.iso).exposed(exposure_ratio(source, target))
+        if _variance(camera.nlf(target.iso), grey) <= _LOW_NOISE * _variance(exposed, grey):
+            yield pair
+
+
+def _variance(nlf: NoiseLevelFunction, signal: float) -> float:
+    return sum(r + s * signal for r, s in zip(nlf.read, nlf.shot, strict=True)) / 4
+
+
+def _more_open(sequences: SequenceOf[Sequence], pairs: list[Pair]) -> list[Pair]:
+    def stops(pair: Pair) -> int:
+        settings = sequences[pair.sequence].settings
+        return settings[pair.source].aperture_stop - settings[pair.target].aperture_stop
+
+    opened = [p for p in pairs if stops(p) > 0]
+    same = [p for p in pairs if stops(p) == 0]
+    room = int(len(opened) * _SAME_APERTURE / (1 - _SAME_APERTURE))
+    # Evenly spaced, so that every sequence has its share.
+    kept = [same[i * len(same) // room] for i in range(room)] if room < len(same) else same
+    return sorted(opened + kept)

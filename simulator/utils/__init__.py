@@ -1,0 +1,1 @@
+"""Cache, files, results, tiles, threads and compiled kernels."""

@@ -1,0 +1,362 @@
+"""What the cameras record: the batched fast path against the simulator's own frames."""
+
+from __future__ import annotations
+
+import copy
+import multiprocessing
+import pickle
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.episodes import core as core_module
+from ae_env.episodes import recorder as recorder_module
+from ae_env.observation import encode_observation
+from ae_env.options import EnvOptions
+from ae_env.scorers.score_table import scene_latent
+from simulator import get_camera
+from simulator.capture.record import exposed_light
+from simulator.noise.generator import FrameNoise, noise_keys
+
+ID = "ae_env/AutoExposure-v0"
+SMALL = {"scenes": "bundled:small", "resolution": 40}
+
+
+def _vector(num_envs: int = 5, **arguments: Any) -> Any:
+    return gym.make_vec(ID, num_envs=num_envs, **{**SMALL, **arguments})
+
+
+def _frames(env: Any, steps: int = 10, seed: int = 3) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    observation, info = env.reset(seed=seed)
+    frames = [observation["raw"], info["clipped_high"], info["excess_noise"]]
+    for _ in range(steps):
+        observation, _, _, _, info = env.step(rng.integers(64, size=env.num_envs))
+        frames += [observation["raw"], info["clipped_high"], info["excess_noise"]]
+    return frames
+
+
+def _assert_equal(first: list[np.ndarray], second: list[np.ndarray]) -> None:
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("noise", [True, "exact"])
+@pytest.mark.parametrize("tolerance", [0.0, 0.1])
+@pytest.mark.parametrize("lighting", ["static", "sine"])
+def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lighting: str) -> None:
+    """Light of `Latent`, noise from the bank or drawn, step by step in float64."""
+    envs = _vector(noise=noise, tolerance=tolerance, lighting=lighting, observation="dn")
+    core = envs.core
+    span = np.array(core.camera.span)[:, None, None]
+    black = np.array(core.camera.black_level)[:, None, None]
+    rng = np.random.default_rng(1)
+    envs.reset(seed=2)
+    different = total = 0
+    for _ in range(7):
+        observation, *_ = envs.step(rng.integers(64, size=5))
+        for i in range(5):
+            episode, raw = core.episode(i), observation["raw"][i]
+            state = core.grid[episode.state]
+            latent = scene_latent(
+                core.scenes[episode.scene],
+                core.camera,
+                speed=episode.speed,
+                defocus=episode.defocus,
+                gain=core.lighting.gain(episode.frame, state.exposure_time, episode.phase),
+            )
+            latent = replace(latent, tolerance=tolerance)
+            exposure = latent.exposure(state)
+            light = exposed_light(latent.optics.blurred(exposure), exposure).double().numpy()
+            key = int(noise_keys(episode.noise_seed, episode.frame)[0])
+            kind = "exact" if noise == "exact" else "bank"
+            normals = FrameNoise(key, kind).normals((4, 40, 40))
+            shot, read = (
+                np.array(v)[:, None, None] for v in (exposure.target.shot, exposure.target.read)
+            )
+            noisy = light + np.sqrt(np.maximum(light, 0) * shot + read) * normals
+            numbers = np.clip(np.rint(noisy * span + black), 0, core.camera.white_level)
+            assert np.abs(raw - numbers).max() <= 1
+            different, total = different + (raw != numbers).sum(), total + raw.size
+    assert different < 1e-3 * total  # float32 against float64, where rounding is close
+
+
+def test_observations_are_codes_of_the_same_digital_numbers() -> None:
+    """The three kinds of observation show one capture."""
+    codes, numbers, signals = (
+        _frames(_vector(observation=kind)) for kind in ("uint8", "dn", "linear")
+    )
+    camera = EnvOptions().make_camera()
+    black, span = camera.black_level[0], camera.span[0]
+    for code, number, signal in zip(codes[::3], numbers[::3], signals[::3], strict=True):
+        exact = (number.astype(np.float32) - np.float32(black)) / np.float32(span)
+        np.testing.assert_array_equal(code, encode_observation(torch.from_numpy(exact)).numpy())
+        np.testing.assert_array_equal(signal, np.maximum(exact, np.float32(-1 / 1024)))
+
+
+def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
+    seen: list[torch.Tensor] = []
+
+    class Watching:
+        domain = "raw"
+
+        def __call__(self, images: torch.Tensor, captures: Any) -> torch.Tensor:
+            seen.append(images.clone())
+            return torch.full((len(images),), 0.5)
+
+    envs = _vector(scorer=Watching(), with_oracle=False)
+    plain = _frames(_vector())
+    watched = _frames(envs)
+    _assert_equal(watched, plain)
+    images = torch.cat(seen[: len(seen)])
+    assert float(images.min()) >= 0.0
+    codes = torch.from_numpy(watched[0])
+    first = encode_observation(images[: len(codes)])
+    assert (first.int() - codes.int()).clamp(max=0).max() == 0  # shadows below black show as black
+    bright = codes > 20
+    assert torch.equal(first[bright], codes[bright])
+
+
+@pytest.mark.parametrize("noise", [True, "bank", "exact", False])
+def test_one_environment_or_many_on_one_thread_or_more(noise: Any) -> None:
+    """uint8 frames are bit-equal however they are made."""
+    together, alone = _frames(_vector(noise=noise)), []
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        _assert_equal(_frames(_vector(noise=noise)), together)
+        _assert_equal(_frames(_vector(2, noise=noise))[:3], [f[:2] for f in together[:3]])
+    finally:
+        torch.set_num_threads(threads)
+    for i in range(5):
+        observation, _ = gym.make(ID, **SMALL, noise=noise).reset(seed=3 + i)
+        alone.append(observation["raw"])
+    np.testing.assert_array_equal(np.stack(alone), together[0])
+
+
+def test_kinds_of_noise() -> None:
+    bank, named, exact, clean = (
+        _frames(_vector(noise=noise, motion="none", depth="far"), steps=1)[0].astype(int)
+        for noise in (True, "bank", "exact", False)
+    )
+    np.testing.assert_array_equal(bank, named)
+    assert (bank != exact).mean() > 0.1
+    for noisy in (bank, exact):  # the same light: the noise has no bias
+        assert abs((noisy - clean).mean()) < 1.0
+
+
+def test_tolerance_zero_and_small_blur() -> None:
+    """A blur that a tolerance leaves out is named in `info`, and in none of the frames."""
+    arguments = {"motion": 1e-3, "depth": "far"}
+    strict, loose = (_vector(tolerance=t, **arguments) for t in (0.0, 0.1))
+    state = next(
+        i for i, s in enumerate(strict.grid) if (s.iso, s.exposure_time) == (6400, 1 / 1000)
+    )
+    _, strict_info = strict.reset(seed=0, options={"state": state})
+    _, loose_info = loose.reset(seed=0, options={"state": state})
+    assert all("motion_blur" in m for m in strict_info["modules"])
+    assert not any("motion_blur" in m for m in loose_info["modules"])
+
+
+def test_held_state_of_a_scene_at_rest_needs_no_memory_of_its_own() -> None:
+    envs = _vector(motion="none", depth="far", tolerance=0.0)
+    envs.reset(seed=0)
+    episodes, plans = envs.core.episodes, envs.core.recorder._plans
+    for row, scene in zip(episodes.slot * 64 + episodes.state, episodes.scene, strict=True):
+        assert plans.light[row].data_ptr() == envs.core.scenes[scene].light.data_ptr()
+
+
+def test_memory_of_ended_episodes_is_used_again() -> None:
+    envs = _vector(4, autoreset_mode="SAME_STEP", motion=0.5, depth=2.0, tolerance=0.0)
+    _frames(envs, steps=40)
+    assert len(envs.core.recorder._buffers._free) <= 4 * 5
+
+
+def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
+    arguments = {"motion": 0.5, "depth": 2.0, "tolerance": 0.0, "autoreset_mode": "DISABLED"}
+    envs, plain = _vector(3, **arguments), _vector(3, **arguments)
+    for env in (envs, plain):
+        env.reset(seed=0, options={"state": 10})
+    before = [envs.core.episode(i) for i in range(3)]
+    for wrong in ({"state": [1, 2, 64]}, {"frame": [0, 0, -1]}, {"scene": [0, 0, "none"]}):
+        with pytest.raises(ValueError, match="options"):
+            envs.reset(options=wrong)
+        assert [envs.core.episode(i) for i in range(3)] == before
+    assert not envs.core.recorder._buffers._free
+    for actions in (np.full(3, 10), np.full(3, 21)):
+        np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
+    envs.core.recorder.end(np.array([1]))
+    assert len(envs.core.recorder._buffers._free) == 2 + 1  # two apertures and a streak
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize("stage", ["blur_many", "_modules"])
+def test_an_interrupted_frame_is_made_again(
+    monkeypatch: pytest.MonkeyPatch, error: type[BaseException], stage: str
+) -> None:
+    """While the light is blurred, or while the plan of a later episode is made."""
+    arguments = {"motion": 0.5, "depth": 2.0, "tolerance": 0.0}
+    envs, plain = _vector(3, **arguments), _vector(3, **arguments)
+    for env in (envs, plain):
+        env.reset(seed=0, options={"state": 10})
+    calls: list[Any] = []
+    original = getattr(recorder_module, stage)
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args)
+        if stage == "_modules" and len(calls) < 3:
+            return original(*args, **kwargs)
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr(recorder_module, stage, fail)
+        with pytest.raises(error):
+            envs.step(np.full(3, 27))
+    plain.step(np.full(3, 27))
+    for state in (27, 10):
+        actions = np.full(3, state)
+        np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
+
+
+@pytest.mark.parametrize("motion", ["none", 0.5])
+def test_wide_discs_are_those_of_the_sum(monkeypatch: pytest.MonkeyPatch, motion: Any) -> None:
+    arguments = {"resolution": 64, "motion": motion, "depth": 48.0, "noise": False}
+    options = {"state": 0}  # f/4
+    fourier, direct = _vector(2, **arguments), _vector(2, **arguments)
+    wide = recorder_module._WIDE_PX
+    fourier.reset(seed=0, options=options)
+    monkeypatch.setattr(recorder_module, "_WIDE_PX", 1e9)
+    direct.reset(seed=0, options=options)
+    plans = [env.core.recorder._plans for env in (fourier, direct)]
+    rows = fourier.core.recorder._shown
+    assert all(exposure.defocus_px > wide for exposure in plans[0].exposure[rows])
+    for mine, wanted in zip(plans[0].light[rows], plans[1].light[rows], strict=True):
+        torch.testing.assert_close(mine, wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_white_is_1_whatever_the_black_level() -> None:
+    """In float32 (1023 - 103.34) / (1023 - 103.34) is 1.0000001."""
+    camera = replace(get_camera("nikon_z6"), black_level=(103.34,) * 4, white_level=1023.0)
+    envs = _vector(camera=camera, observation="linear", depth="far", motion="none")
+    observation, info = envs.reset(seed=0, options={"state": 63})
+    assert info["clipped_high"].max() > 0
+    assert observation["raw"].max() == 1.0
+    assert envs.observation_space.contains(observation)
+
+
+def test_batches_in_changing_light_are_worked_out_in_chunks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(core_module, "CHUNK_SAMPLES", 2 * 4 * 40 * 40)
+    sizes: list[int] = []
+
+    def light(images: Any, captures: Any) -> torch.Tensor:
+        sizes.append(len(captures))
+        return captures.light.mean(dim=(1, 2, 3)).clamp(0.0, 1.0)
+
+    light.domain, light.depends_on = "raw", "light"  # type: ignore[attr-defined]
+    _vector(lighting="sine", scorer=light).reset(seed=0)
+    assert sizes == [2, 2, 1]
+
+
+@pytest.mark.parametrize("arguments", [{"motion": "none", "depth": "far"}, {}])
+def test_rewards_are_the_closed_forms_of_the_running_episodes(arguments: dict[str, Any]) -> None:
+    """Over several episodes at each place, some of which show the same scene."""
+    envs = _vector(8, autoreset_mode="SAME_STEP", max_episode_steps=2, **arguments)
+    core, rng = envs.core, np.random.default_rng(0)
+    envs.reset(seed=0)
+    for _ in range(7):
+        info = envs.step(rng.integers(64, size=8))[4]
+        for i in range(8):
+            episode = core.episode(i)
+            scene = core.scenes[episode.scene]
+            wanted = core.tables.table(scene, speed=episode.speed, defocus=episode.defocus)
+            for name, scores in wanted.parts.items():
+                assert info["rewards"][name][i] == pytest.approx(scores[episode.state], abs=1e-12)
+            score = wanted.mean[episode.state]
+            assert info["rewards"]["score"][i] == pytest.approx(score, abs=1e-12)
+
+
+def test_interrupted_scores_are_worked_out_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    envs, plain = _vector(3), _vector(3)
+    closed_parts, calls = envs.core.tables.closed_parts, []
+
+    def fail(*args: Any, **kwargs: Any) -> Any:
+        calls.append(args)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return closed_parts(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(envs.core.tables, "closed_parts", fail)
+        with pytest.raises(KeyboardInterrupt):
+            envs.reset(seed=0)
+    plain.reset(seed=0)
+    actions = np.array([3, 20, 40])
+    np.testing.assert_array_equal(envs.step(actions)[1], plain.step(actions)[1])
+
+
+def test_a_copy_goes_on_like_the_original() -> None:
+    envs = _vector(3, motion=0.5, depth=2.0, delay=1)
+    envs.reset(seed=0)
+    envs.step(np.array([3, 20, 40]))
+    other = copy.deepcopy(envs)
+    for actions in (np.array([5, 6, 7]), np.array([3, 20, 40])):
+        mine, theirs = envs.step(actions), other.step(actions)
+        np.testing.assert_array_equal(mine[0]["raw"], theirs[0]["raw"])
+        np.testing.assert_array_equal(mine[1], theirs[1])
+
+
+def test_environment_survives_pickling_before_and_after_steps() -> None:
+    env = gym.make(ID, **SMALL).unwrapped
+    first, _ = env.reset(seed=1)
+    copy = pickle.loads(pickle.dumps(env))
+    again, _ = copy.reset(seed=1)
+    np.testing.assert_array_equal(first["raw"], again["raw"])
+    for _ in range(3):
+        np.testing.assert_array_equal(env.step(5)[0]["raw"], copy.step(5)[0]["raw"])
+
+
+def _step_twice(env: Any, queue: Any) -> None:
+    queue.put([env.step(action)[0]["raw"] for action in (20, 33)])
+
+
+@pytest.mark.parametrize("arguments", [{"motion": "none", "depth": "far"}, {}])
+def test_running_episodes_move_to_another_process(arguments: dict[str, Any]) -> None:
+    env = gym.make(ID, **SMALL, **arguments).unwrapped
+    env.reset(seed=1)
+    env.step(20)
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    child = context.Process(target=_step_twice, args=(env, queue))
+    child.start()
+    there = queue.get(timeout=120)
+    child.join(timeout=60)
+    for action, raw in zip((20, 33), there, strict=True):
+        np.testing.assert_array_equal(env.step(action)[0]["raw"], raw)
+
+
+def _first_frame(queue: Any) -> None:
+    queue.put(_frames(_vector(), steps=2)[-3])
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
+def test_other_processes_give_the_same_frames(method: str) -> None:
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        wanted = _frames(_vector(), steps=2)[-3]
+    finally:
+        torch.set_num_threads(threads)
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    child = context.Process(target=_first_frame, args=(queue,))  # type: ignore[attr-defined]
+    child.start()
+    np.testing.assert_array_equal(queue.get(timeout=120), wanted)
+    child.join(timeout=60)

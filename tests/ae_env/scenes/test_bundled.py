@@ -1,0 +1,228 @@
+"""Bundled scenes: statistics, splits, determinism, cache."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.bundled import _entries
+from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
+from ae_env.scenes.photographs import PHOTOGRAPHS, unprocess
+from ae_env.scenes.procedural import HARD_KINDS, draw, list_kinds
+from simulator.camera import get_camera
+from simulator.utils.cache import cache_dir
+
+CAMERA = get_camera("nikon_z6")
+WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
+
+
+@pytest.fixture(scope="module")
+def test_scenes(tmp_path_factory: pytest.TempPathFactory) -> list[Scene]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AE_ENV_CACHE", str(tmp_path_factory.mktemp("bundled")))
+        return load_scenes("bundled", "test", camera=CAMERA)
+
+
+def slope(picture: np.ndarray) -> float:
+    """Exponent of the radial power spectrum over 4 to 64 cycles per picture."""
+    size = picture.shape[0]
+    window = np.outer(np.hanning(size), np.hanning(size))
+    power = np.abs(np.fft.fft2((picture - picture.mean()) * window)) ** 2
+    frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(size, 1 / size)] * 2))
+    bands = np.arange(4, 65)
+    mean = [power[np.abs(frequency - band) < 0.5].mean() for band in bands]
+    return float(np.polyfit(np.log(bands), np.log(mean), 1)[0])
+
+
+def test_dead_leaves_have_the_spectrum_of_nature() -> None:
+    """Field 1987, Ruderman 1997: the power of natural pictures falls about as f**-2."""
+    slopes = [slope(dead_leaves(np.random.default_rng(i), 256)[1]) for i in range(8)]
+    assert np.mean(slopes) == pytest.approx(-2.0, abs=0.25)
+
+
+def test_fractal_noise_has_the_slope_asked_for() -> None:
+    slopes = [slope(fractal_noise(np.random.default_rng(i), 256, 1.0)) for i in range(8)]
+    assert np.mean(slopes) == pytest.approx(-2.0, abs=0.1)
+
+
+def test_dead_leaves_are_reflectances_with_the_mean_asked_for() -> None:
+    for mean in (0.1, 0.17, 0.4):
+        leaves = dead_leaves(np.random.default_rng(3), 128, LeafStyle(mean=mean))
+        assert leaves[1].mean() == pytest.approx(mean, rel=0.02)
+        assert leaves.min() >= 0.005
+        assert leaves.max() <= 0.97
+
+
+def test_split_has_enough_groups_and_half_of_them_are_hard(test_scenes: list[Scene]) -> None:
+    groups = {scene.group: scene.hard for scene in test_scenes}
+    assert len(groups) >= 90
+    assert 0.4 <= np.mean(list(groups.values())) <= 0.6
+    for scene in test_scenes:
+        assert scene.hard == (scene.kind in HARD_KINDS)
+        assert scene.light.shape == (4, 64, 64)
+        assert scene.box_factor == 4
+        assert scene.noise_free
+        assert scene.light.min() >= 0
+        assert scene.median_speed == (1.0 if scene.kind == "motion" else 0.125)
+    assert len({scene.scene_id for scene in test_scenes}) == len(test_scenes)
+
+
+def test_splits_share_no_group(test_scenes: list[Scene]) -> None:
+    train = {f"{e.kind}-{e.index:03d}" for e in _entries("train", "large")}
+    train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
+    assert len(train) >= 195
+    assert not train & {scene.group for scene in test_scenes}
+
+
+def test_illuminance_covers_night_to_full_sun(test_scenes: list[Scene]) -> None:
+    lux = np.array([scene.illuminance for scene in test_scenes], float)
+    assert 1.0 <= lux.min() < 5.0
+    assert 50_000 < lux.max() <= 100_000
+
+
+def metering_error(scene: Scene) -> float:
+    """EV by which a meter on the mean of the clipped frame would expose too little."""
+    return float(np.log2(scene.light[1].clamp(max=1.0).mean().item() / 0.12))
+
+
+def test_hard_kinds_fool_a_meter_and_easy_ones_do_not(test_scenes: list[Scene]) -> None:
+    errors = {
+        kind: np.array([metering_error(s) for s in test_scenes if s.kind == kind])
+        for kind in (*list_kinds(), "photograph")
+    }
+    for kind in ("dead_leaves", "indoor", "motion", "photograph"):
+        assert abs(np.median(errors[kind])) < 0.35, kind
+    assert np.all(errors["snow"] > 1.5)
+    assert np.median(errors["back_light"]) > 1.2
+    assert np.median(errors["night"]) < -1.2
+    assert np.median(errors["spot_light"]) < -1.5
+    assert max(np.abs(e).max() for e in errors.values()) < 5.0
+
+
+def test_hard_kinds_are_what_they_say(test_scenes: list[Scene]) -> None:
+    for scene in test_scenes:
+        reflectance = scene.light[1] / WHITE
+        if scene.kind == "snow":
+            assert 0.7 <= reflectance.median().item() <= 0.95
+            assert 0.6 <= reflectance.mean().item() <= 0.95
+        if scene.kind == "night":
+            assert scene.illuminance is not None
+            assert 1 <= scene.illuminance <= 50
+            assert reflectance.max() > 5
+            assert (scene.light.amax(dim=0) > 1).float().mean() < 0.08
+        if scene.kind == "back_light":
+            assert 0.1 < (reflectance > 1.0).float().mean() < 0.75
+        if scene.kind == "spot_light":
+            assert reflectance.median() < 0.02
+
+
+def test_a_scene_is_the_same_wherever_it_is_asked_for(test_scenes: list[Scene]) -> None:
+    small = load_scenes("bundled:small", "all", camera=CAMERA)
+    assert len({s.group for s in small}) == 2 * 2 * 8
+    by_id = {scene.scene_id: scene for scene in test_scenes}
+    shared = [scene for scene in small if scene.scene_id in by_id]
+    assert len(shared) == 2 * 7 + 2 * 3
+    for scene in shared:
+        assert torch.equal(scene.light, by_id[scene.scene_id].light)
+        assert scene.reference == by_id[scene.scene_id].reference
+
+
+def test_drawing_depends_on_the_generator_alone() -> None:
+    for kind in list_kinds():
+        first, second, other = (draw(kind, np.random.default_rng(i), 64) for i in (5, 5, 6))
+        assert np.array_equal(first.light, second.light)
+        assert first.illuminance == second.illuminance
+        assert not np.array_equal(first.light, other.light)
+        assert first.light.dtype == np.float32
+    with pytest.raises(ValueError, match="did you mean 'night'"):
+        draw("nights", np.random.default_rng(0))
+
+
+def test_unprocess_inverts_tone_and_gamma() -> None:
+    """0.5 is a fixed point of the tone curve; sRGB 0.5 is 0.2140 linear (IEC 61966-2-1)."""
+    rng = np.random.default_rng(0)
+    grey = unprocess(np.full((64, 64), 127, np.uint8), rng)
+    grey += unprocess(np.full((64, 64), 128, np.uint8), rng)
+    assert grey.mean() / 2 == pytest.approx(0.2140, abs=2e-4)
+    assert grey.std() > 1e-4  # dithered
+    shown = np.random.default_rng(1).integers(10, 240, (32, 32, 3)).astype(np.uint8)
+    flat = unprocess(shown, rng).transpose(1, 2, 0).astype(float)
+    gamma = np.where(flat <= 0.0031308, 12.92 * flat, 1.055 * flat ** (1 / 2.4) - 0.055)
+    again = 3 * gamma**2 - 2 * gamma**3  # the smooth step of Brooks et al. 2019
+    assert np.abs(again * 255 - shown).max() <= 0.51
+    with pytest.raises(ValueError, match="`image`"):
+        unprocess(np.zeros((4, 4)), rng)
+
+
+def test_photographs_of_one_picture_stay_in_one_group(test_scenes: list[Scene]) -> None:
+    groups: dict[str, int] = {}
+    for scene in test_scenes:
+        if scene.kind == "photograph":
+            groups[scene.group] = groups.get(scene.group, 0) + 1
+            assert "scikit-image" in scene.source
+    assert len(groups) == 4
+    assert set(groups.values()) == {3}
+
+
+def cached_files() -> list[Path]:
+    return sorted((cache_dir() / "scenes").glob("*.safetensors"))
+
+
+def test_cached_scenes_equal_fresh_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    fresh = load_scenes("bundled:small", "test", camera=CAMERA, resolution=48)
+    (file,) = cached_files()
+    caplog.set_level(logging.INFO)
+    cached = load_scenes("bundled:small", "test", camera=CAMERA, resolution=48)
+    assert not caplog.records
+    for a, b in zip(fresh, cached, strict=True):
+        assert torch.equal(a.light, b.light)
+        assert replace(a, light=b.light).__dict__.keys() == b.__dict__.keys()
+        for name in ("scene_id", "group", "reference", "illuminance", "white_balance", "kind"):
+            assert getattr(a, name) == getattr(b, name)
+        assert (a.hard, a.median_speed, a.box_factor) == (b.hard, b.median_speed, b.box_factor)
+        assert a.source == b.source
+
+    content = bytearray(file.read_bytes())
+    for damaged in (bytes(content[: len(content) // 2]), b"", bytes(content[:-3]) + b"abc"):
+        file.write_bytes(damaged)
+        caplog.clear()
+        again = load_scenes("bundled:small", "test", camera=CAMERA, resolution=48)
+        assert "damaged" in caplog.text
+        assert all(torch.equal(a.light, b.light) for a, b in zip(fresh, again, strict=True))
+        caplog.clear()
+        load_scenes("bundled:small", "test", camera=CAMERA, resolution=48)
+        assert not caplog.records
+
+
+def test_every_argument_has_its_own_cache_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    other = replace(CAMERA, colour_matrix=None)
+    seen = []
+    for camera, resolution, crop in (
+        *((CAMERA, 32, "box"), (CAMERA, 64, "box"), (CAMERA, 32, "native")),
+        *((other, 32, "box"), (get_camera("canon_70d"), 32, "box")),
+    ):
+        scenes = load_scenes(
+            "bundled:small", "test", camera=camera, resolution=resolution, crop=crop
+        )  # type: ignore[arg-type]
+        seen.append(scenes[0].light.mean().item())
+        assert scenes[0].camera is camera
+    assert len(cached_files()) == len(seen) == len(set(seen))
+
+
+def test_a_read_only_cache_is_not_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "file"))
+    assert load_scenes("bundled:small", "test", camera=CAMERA, resolution=32)
+    assert "could not be cached" in caplog.text

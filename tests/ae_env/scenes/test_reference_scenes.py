@@ -1,0 +1,246 @@
+"""Scenes of the reference camera: splits, light, depth of real photographs."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ae_env.scenes.photographs import PHOTOGRAPHS
+from ae_env.scenes.reference_scenes import (
+    RADIANCE_MAPS,
+    assumed_illuminance,
+    depth_photographs,
+    fill_from_nearest,
+    packed_pitch,
+    reference_scenes,
+)
+from simulator.camera import get_camera
+from simulator.reference.reference_camera import ReferenceScene
+from simulator.settings import CameraSettings
+
+CAMERA = get_camera("nikon_z6")
+SPLITS = ("train", "validation", "test")
+WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
+
+
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, list[ReferenceScene]]:
+    return {split: reference_scenes(split, CAMERA, number=28, size=48) for split in SPLITS}
+
+
+def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
+    """Circle of confusion at f/11 [packed pixels] by the thin-lens formula."""
+    assert scene.depth is not None
+    f, s, z = scene.lens.focal_length, scene.lens.focus_distance, scene.depth.double().numpy()
+    return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
+
+
+def write_exr(path: Path, image: np.ndarray) -> None:
+    openexr = pytest.importorskip("OpenEXR")
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    with openexr.File(header, {"RGB": image.astype(np.float32)}) as file:
+        file.write(str(path))
+
+
+def test_no_source_is_in_two_splits(scenes: dict[str, list[ReferenceScene]]) -> None:
+    groups = [{s.group for s in scenes[split]} for split in SPLITS]
+    assert all(groups)
+    assert sum(map(len, groups)) == len(set().union(*groups))
+    stems = [set(RADIANCE_MAPS[split]) for split in SPLITS]
+    assert [len(s) for s in stems] == [4, 2, 7]
+    assert len(set().union(*stems)) == 13
+    ids = [s.scene_id for split in SPLITS for s in scenes[split]]
+    assert len(ids) == len(set(ids))
+
+
+def test_photographs_keep_their_split_and_one_validates(
+    scenes: dict[str, list[ReferenceScene]],
+) -> None:
+    names = {p.name for p in PHOTOGRAPHS}
+    found = {split: {s.group for s in scenes[split]} & names for split in SPLITS}
+    assert found["test"] == {"chelsea", "coins", "grass", "rocket"}
+    assert found["validation"] == {"coffee"}
+    assert found["train"] == {"astronaut", "brick", "camera", "gravel"}
+
+
+def test_scenes_are_reproducible_and_more_of_them_keep_the_first(
+    scenes: dict[str, list[ReferenceScene]],
+) -> None:
+    fewer = reference_scenes("test", CAMERA, number=5, size=48)[:5]
+    for scene, again in zip(scenes["test"], fewer, strict=False):
+        assert scene.scene_id == again.scene_id
+        assert torch.equal(scene.light, again.light)
+        assert (scene.depth is None) == (again.depth is None)
+        assert scene.depth is None or torch.equal(scene.depth, again.depth)
+        assert scene.lens == again.lens
+    other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
+    assert other.group != fewer[0].group
+    assert not torch.equal(other.light, fewer[0].light)
+
+
+def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
+    train = scenes["train"]
+    kinds = [s.kind for s in train]
+    assert kinds.count("depth") == 21
+    assert set(kinds) == {
+        *("depth", "photograph", "dead_leaves", "indoor", "back_light", "snow", "night"),
+        *("spot_light", "motion"),
+    }
+    for scene in train:
+        assert scene.light.shape == (4, 48, 48)
+        assert scene.light.dtype == torch.float32
+        assert bool((scene.light >= 0).all())
+        assert (scene.depth is not None) == (scene.kind == "depth")
+        assert scene.illuminance is not None
+        assert 1.0 <= scene.illuminance <= 20_000.0
+        # The incident-light exposure, E = 2.5 * 2**EV100, with ISO 12232's 120 for white.
+        exposure = 2.0**scene.reference.log2_exposure
+        assert scene.illuminance * exposure / 2.5 == pytest.approx(1.0, rel=1e-6)
+    surfaces = [s.light[1].median().item() / WHITE for s in train if s.kind == "depth"]
+    assert 0.05 < np.median(surfaces) < 0.3  # reflectances of nature
+
+
+def test_a_third_of_the_depth_scenes_is_in_focus(scenes: dict[str, list[ReferenceScene]]) -> None:
+    largest = [blur(s).max() for s in scenes["train"] if s.kind == "depth"]
+    assert sum(c < 0.301 for c in largest) == 7
+    assert all(c <= 7.01 for c in largest)
+    assert sum(c > 1.0 for c in largest) >= 12
+
+
+def test_blur_in_pixels_is_that_of_the_camera() -> None:
+    """A finer sensor has its own distances, and the same blur in its own pixels."""
+    canon = get_camera("canon_70d")
+    assert packed_pitch(canon) == pytest.approx(8.22e-6)
+    ours, theirs = (reference_scenes("train", c, number=2, size=48)[1] for c in (CAMERA, canon))
+    assert ours.depth is not None
+    assert theirs.depth is not None
+    assert not torch.equal(ours.depth, theirs.depth)
+    np.testing.assert_allclose(blur(ours), blur(theirs, 8.22e-6), atol=1e-3)
+    with pytest.raises(ValueError, match=r"`pixel_pitch_um` \(=None\)"):
+        reference_scenes("train", replace(CAMERA, pixel_pitch_um=None), number=1, size=16)
+
+
+def test_scenes_without_depth_are_as_sharp_as_those_in_focus() -> None:
+    """Otherwise softness of a lens would be labelled as being in focus."""
+
+    def ratio(scene: ReferenceScene) -> float:
+        log = scene.light[1].clamp(min=1e-4).log()
+        return float(
+            (log[:, 1:] - log[:, :-1]).square().mean() / (log[:, 2:] - log[:, :-2]).square().mean()
+        )
+
+    made = reference_scenes("train", CAMERA, number=28, size=128)[:28]
+    flat = [ratio(s) for s in made if s.kind in ("dead_leaves", "indoor", "motion")]
+    focused = [ratio(s) for s in made if s.kind == "depth" and blur(s).max() < 0.301]
+    assert np.mean(flat) == pytest.approx(np.mean(focused), abs=0.1)
+
+
+def test_radiance_maps_by_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "maps").mkdir()
+    panorama = np.full((256, 512, 3), 0.5)
+    panorama[:, 192:320] = 4.0  # the quarter ahead
+    write_exr(tmp_path / "maps" / "city.exr", panorama)
+    write_exr(tmp_path / "maps" / "unknown.exr", panorama)
+    with caplog.at_level(logging.WARNING):
+        found = reference_scenes("validation", CAMERA, number=0, size=64, radiance=tmp_path)
+    assert "no radiance map 'StillLife'" in caplog.text
+    views = [s for s in found if s.kind == "radiance"]
+    assert [s.scene_id for s in views] == ["city-000", "city-090", "city-180", "city-270"]
+    assert {s.group for s in views} == {"city"}
+    for view in views:
+        assert view.depth is None
+        assert view.light.shape == (4, 64, 64)
+        assert view.light[1].mean().item() == pytest.approx(0.12, rel=0.01)  # flat in 90 degrees
+        assert f"{view.illuminance:g} lux assumed" in view.source
+        assert view.reference.log2_exposure == pytest.approx(-np.log2(view.illuminance / 2.5))
+    train = reference_scenes("train", CAMERA, number=0, size=64, radiance=tmp_path)
+    assert all(s.kind == "photograph" for s in train)
+    with pytest.raises(FileNotFoundError, match="`radiance`"):
+        reference_scenes("train", CAMERA, number=0, radiance=tmp_path / "none")
+
+
+def test_assumed_light_covers_the_range() -> None:
+    lux = np.log([assumed_illuminance(f"map{i}") for i in range(300)]) / np.log(20_000.0)
+    np.testing.assert_allclose(np.quantile(lux, [0.0, 0.5, 1.0]), [0.0, 0.5, 1.0], atol=0.06)
+
+
+def test_motorcycle_has_the_depth_of_its_calibration() -> None:
+    """z = baseline * focal length / (disparity + offset), as scikit-image's documentation says."""
+    from skimage.data import stereo_motorcycle
+
+    _, _, disparity = stereo_motorcycle()
+    front, middle = depth_photographs(CAMERA)
+    assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
+    assert front.group == middle.group == "motorcycle"
+    assert front.light.shape == (4, 250, 370)
+    assert front.depth is not None
+    assert torch.equal(front.depth, middle.depth)
+    depth = 0.193001 * 994.978 / (np.where(np.isfinite(disparity), disparity, np.nan) + 31.086)
+    four = depth[:500, :740].reshape(250, 2, 370, 2).transpose(0, 2, 1, 3).reshape(250, 370, 4)
+    known = np.isfinite(four).all(axis=2)
+    ours = front.depth.numpy()[known]
+    # One of the four depths, the second farthest: never a mean of two sides of an edge.
+    np.testing.assert_allclose(ours, np.sort(four[known], axis=1)[:, 2], rtol=1e-5)
+    assert 1.8 < front.depth.min() < front.depth.max() < 6.0
+    assert bool((front.light >= 0).all())
+
+
+@pytest.mark.parametrize("name", ["nikon_z6", "canon_70d"])
+def test_focus_of_the_photographs(name: str) -> None:
+    camera = get_camera(name)
+    front, middle = depth_photographs(camera)
+    for scene in (front, middle):
+        c = blur(scene, 2e-6 * camera.pixel_pitch_um)
+        assert np.quantile(c, 0.01) < 0.3
+        assert 4.5 < np.quantile(c, 0.97) < 6.3
+        assert 0.03 < scene.lens.focal_length < 0.12
+        assert scene.reference == CameraSettings(100, scene.reference.exposure_time, 4)
+    assert front.depth is not None
+    assert (front.depth < front.lens.focus_distance).float().mean().item() < 0.06
+    share = (middle.depth < middle.lens.focus_distance).float().mean().item()
+    assert share == pytest.approx(0.5, abs=0.02)
+
+
+def test_gaps_take_the_nearest_value() -> None:
+    values = np.array([[1.0, np.nan, np.inf, 7.0], [1.0, 2.0, np.nan, 7.0]])
+    filled = fill_from_nearest(values)
+    assert filled[0, 1] in (1.0, 2.0)
+    assert filled[0, 2] == 7.0
+    assert filled[1, 2] in (2.0, 7.0)
+    np.testing.assert_array_equal(filled[np.isfinite(values)], values[np.isfinite(values)])
+    with pytest.raises(ValueError, match="finite"):
+        fill_from_nearest(np.full((2, 2), np.nan))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("split", "trian"), ("number", -1), ("size", 8), ("seed", -1)]
+)
+def test_errors_name_the_argument(field: str, value: object) -> None:
+    arguments = {"split": "train", "number": 1, "size": 32, "seed": 0} | {field: value}
+    with pytest.raises(ValueError, match=f"`{field}` "):
+        reference_scenes(arguments.pop("split"), CAMERA, **arguments)
+
+
+@pytest.mark.real_data
+def test_real_maps_and_cones(data_dir: Path) -> None:
+    pytest.importorskip("cv2")
+    pytest.importorskip("OpenEXR")
+    views = reference_scenes("test", CAMERA, number=0, radiance=data_dir)
+    radiance = [s for s in views if s.kind == "radiance"]
+    assert len(radiance) == 25
+    assert {s.group for s in radiance} == set(RADIANCE_MAPS["test"])
+    for view in radiance:
+        assert view.light.shape == (4, 128, 128)  # halved: sharp to the pixel
+        # Averaging small lamps before they clip raises the clipped mean.
+        assert view.light[1].clamp(max=1.0).mean().item() == pytest.approx(0.14, abs=0.06)
+    cones = depth_photographs(CAMERA, data=data_dir)[2:]
+    assert [s.scene_id for s in cones] == ["cones-front", "cones-middle"]
+    for scene in cones:
+        assert scene.light.shape == (4, 187, 225)
+        assert scene.depth is not None
+        assert scene.depth.shape == (187, 225)
+        assert bool(torch.isfinite(scene.depth).all())
+        assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3

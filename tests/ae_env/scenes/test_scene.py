@@ -1,0 +1,232 @@
+"""Scene: normalisation, colours, resizing."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from skimage.color import rgb2xyz
+
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes.colour import camera_from_srgb, temperature_tint
+from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
+from simulator.camera_simulator import CameraSimulator
+from simulator.raw.image import RawImage
+from simulator.settings import CameraSettings
+
+CAMERA = get_camera("nikon_z6")
+PLAIN = CameraProfile("plain", "RGGB", 0, 1023, 10)
+
+
+def radiance_scene(rgb: np.ndarray, camera: CameraProfile = CAMERA, **fields: object) -> Scene:
+    return Scene.from_radiance(rgb, camera, scene_id="s", **fields)
+
+
+def array_scene(light: torch.Tensor, **fields: object) -> Scene:
+    settings = CameraSettings(100, 1 / 64, 4)
+    return Scene.from_array(light, settings, PLAIN, scene_id="s", **fields)
+
+
+@pytest.mark.parametrize("illuminance", [1.0, 320.0, 100_000.0])
+@pytest.mark.parametrize("tint", [0.0, 1.0])
+def test_grey_card_under_known_light(illuminance: float, tint: float) -> None:
+    """ISO 12232: H = 0.65 L t / N^2 against H_sat = 78 / ISO, for L = R E / pi."""
+    card = np.full((3, 4, 4), 0.18, np.float32)
+    scene = radiance_scene(card, illuminance=illuminance, illuminant=temperature_tint(tint))
+    ref = scene.reference
+    luminance = 0.18 * illuminance / math.pi
+    exposure = 0.65 * luminance * ref.exposure_time / ref.f_number**2
+    assert scene.light[1].mean().item() == pytest.approx(exposure / (78 / ref.iso), rel=1e-5)
+    assert scene.light[1].mean().item() == pytest.approx(0.119, abs=0.0006)
+    assert -ref.log2_exposure == pytest.approx(math.log2(illuminance / 2.5), abs=1e-9)
+    assert scene.ev100 == pytest.approx(math.log2(illuminance / 2.5), abs=1e-9)
+    balanced = scene.light[[0, 1, 3], 0, 0].numpy() * np.array(scene.white_balance)
+    np.testing.assert_allclose(balanced, balanced[1], rtol=1e-5)
+    assert torch.equal(scene.light[1], scene.light[2])
+
+
+def test_colours_go_through_xyz_to_the_camera() -> None:
+    rng = np.random.default_rng(0)
+    encoded = rng.uniform(0.3, 0.7, (1, 5, 3))
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    matrix, white = camera_from_srgb(CAMERA)
+    raw = rgb2xyz(encoded)[0] @ np.array(CAMERA.colour_matrix).T
+    raw_white = rgb2xyz(np.ones((1, 1, 3)))[0, 0] @ np.array(CAMERA.colour_matrix).T
+    np.testing.assert_allclose(linear[0] @ matrix.T, raw / raw_white[1], rtol=2e-3)
+    np.testing.assert_allclose(white, raw_white / raw_white[1], rtol=2e-3)
+
+
+def test_camera_without_colour_matrix_keeps_the_colours() -> None:
+    rgb = np.random.default_rng(1).uniform(0.0, 2.0, (3, 6, 6)).astype(np.float32)
+    scene = radiance_scene(rgb, PLAIN, illuminance=100.0)
+    factor = 250 / (120 * math.pi)
+    np.testing.assert_allclose(scene.light[[0, 1, 3]], rgb * factor, rtol=1e-5)
+    assert scene.white_balance == (1.0, 1.0, 1.0)
+
+
+def test_colours_outside_the_gamut_stay_light() -> None:
+    red = np.zeros((3, 2, 2), np.float32)
+    red[2] = 1.0
+    assert radiance_scene(red, illuminance=10.0).light.min() >= 0
+
+
+def test_unknown_light_is_anchored_to_the_mean() -> None:
+    rgb = np.random.default_rng(2).uniform(0.5, 1.5, (3, 8, 8)).astype(np.float32) * 1e5
+    scene = radiance_scene(rgb, PLAIN, ev100=7.5)
+    assert scene.illuminance is None
+    assert scene.light[1].mean().item() == pytest.approx(0.12, rel=1e-5)
+    assert -scene.reference.log2_exposure == pytest.approx(7.5)
+    assert scene.ev100 == pytest.approx(7.5, abs=1e-5)
+
+
+def test_a_sun_does_not_decide_the_anchor() -> None:
+    rgb = np.ones((3, 10, 10), np.float32)
+    rgb[:, 0, 0] = 1e6  # one pixel in a hundred: clipped it counts 1, the others share 0.11
+    scene = radiance_scene(rgb, PLAIN)
+    assert scene.light[1, 5, 5].item() == pytest.approx((0.12 * 100 - 1) / 99, rel=1e-5)
+
+
+def test_resized_conserves_the_mean_and_divides_the_noise() -> None:
+    light = torch.rand(4, 24, 24, generator=torch.Generator().manual_seed(0))
+    nlf = NoiseLevelFunction((1e-4, 2e-4, 3e-4, 4e-4), (1e-6,) * 4)
+    small = array_scene(light, nlf=nlf, box_factor=2).resized(8)
+    torch.testing.assert_close(small.light.mean(dim=(1, 2)), light.mean(dim=(1, 2)))
+    torch.testing.assert_close(small.light[2, 1, 3], light[2, 3:6, 9:12].mean())
+    assert small.nlf.shot == pytest.approx([v / 9 for v in nlf.shot])
+    assert small.nlf.read == pytest.approx([v / 9 for v in nlf.read])
+    assert small.box_factor == 6
+
+
+def test_resized_takes_the_central_square() -> None:
+    light = torch.zeros(4, 10, 22)
+    light[:, 1:9, 7:15] = 1.0
+    assert array_scene(light).resized(4).light.min() == 1.0  # k = 2: 8 x 8 out of 10 x 22
+    native = array_scene(light).resized(4, crop="native")
+    assert native.light.shape == (4, 4, 4)
+    assert native.box_factor == 1
+    assert array_scene(light).resized(None).light.shape == (4, 10, 22)
+
+
+def test_saturated_pixels_survive_resizing() -> None:
+    data = torch.full((4, 8, 8), 0.5)
+    data[3, 2, 5] = 1.0
+    noise = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
+    raw = RawImage(data, CameraSettings(200, 0.01, 2.8), PLAIN, nlf=noise)
+    scene = Scene.from_raw(raw, scene_id="r").resized(4)
+    assert scene.saturated is not None
+    assert scene.saturated.nonzero().tolist() == [[1, 2]]
+    assert scene.illuminance is None
+    assert scene.nlf.shot[0] == pytest.approx(1e-4 / 4)
+    assert scene.reference == raw.settings
+    clean = RawImage(data.clamp(max=0.5), raw.settings, PLAIN, nlf=noise)
+    assert Scene.from_raw(clean, scene_id="r").saturated is None
+
+
+def test_resized_averages_what_the_networks_found() -> None:
+    """Denoised light like light; blur by its second moment, in pixels of the new light."""
+    rng = np.random.default_rng(0)
+    light, denoised = (rng.uniform(0.0, 2.0, (4, 6, 9)).astype(np.float32) for _ in range(2))
+    diameter = rng.uniform(0.0, 5.0, (6, 9)).astype(np.float32)
+    scene = array_scene(
+        torch.from_numpy(light),
+        denoised=torch.from_numpy(denoised),
+        defocus_map=torch.from_numpy(diameter),
+    )
+    small = scene.resized(2)
+    assert small.denoised is not None
+    assert small.defocus_map is not None
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        rows, columns = slice(3 * i, 3 * i + 3), slice(1 + 3 * j, 4 + 3 * j)
+        mean = denoised[:, rows, columns].mean(axis=(1, 2))
+        np.testing.assert_allclose(small.denoised[:, i, j], mean, rtol=1e-5)
+        blur = math.sqrt((diameter[rows, columns] ** 2).mean()) / 3
+        assert float(small.defocus_map[i, j]) == pytest.approx(blur, rel=1e-5)
+    flat = array_scene(torch.ones(4, 8, 8), defocus_map=torch.full((8, 8), 6.0))
+    assert torch.equal(flat.resized(4).defocus_map, torch.full((4, 4), 3.0))  # type: ignore[arg-type]
+    assert torch.equal(flat.resized(4, "native").defocus_map, torch.full((4, 4), 6.0))  # type: ignore[arg-type]
+
+
+def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
+    diameter = torch.tensor([[1.0, 7.0], [5.0, 5.0]])  # mean square 25
+    scene = array_scene(torch.ones(4, 2, 2), defocus_map=diameter)  # at f/4
+    assert scene.own_blur(2.0) == pytest.approx(10.0)
+    assert scene.own_blur(4.0) == scene.own_blur(11.0) == pytest.approx(5.0)
+    assert array_scene(torch.ones(4, 2, 2)).own_blur(2.0) == 0.0
+
+
+def test_a_scene_can_be_photographed_by_the_simulator() -> None:
+    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
+    fields = {"denoised": torch.full((4, 8, 8), 0.2), "defocus_map": torch.ones(8, 8)}
+    scene = array_scene(torch.full((4, 8, 8), 0.1), nlf=nlf, box_factor=3, **fields)
+    latent = CameraSimulator(device="cpu").prepare(scene)
+    assert (latent.camera, latent.nlf, latent.box_factor) == (PLAIN, nlf, 3)
+    assert latent.denoised is not None
+    assert latent.denoised.light is scene.denoised
+    assert latent.opening is not None
+    assert latent.opening.f_number == 4.0
+    assert array_scene(torch.ones(4, 8, 8)).latent.opening is None
+
+
+def test_noise_free() -> None:
+    assert array_scene(torch.ones(4, 2, 2)).noise_free
+    nlf = NoiseLevelFunction((0.0,) * 4, (1e-9,) * 4)
+    assert not array_scene(torch.ones(4, 2, 2), nlf=nlf).noise_free
+
+
+def test_reference_settings_carry_the_ev() -> None:
+    for ev in (-1.3, 0.0, 15.3):
+        assert reference_settings(ev).log2_exposure == pytest.approx(-ev)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"illuminance": 0.0}, "`illuminance` (=0.0)"),
+        ({"white_balance": (1.0, -1.0, 1.0)}, "`white_balance`"),
+        ({"median_speed": -1.0}, "`median_speed` (=-1.0)"),
+        ({"box_factor": 0}, "`box_factor` (=0)"),
+        ({"group": ""}, "`group` (='')"),
+        ({"saturated": torch.zeros(2, 2)}, "`saturated`"),
+        ({"denoised": torch.zeros(4, 2, 3)}, "`denoised` (shape (4, 2, 3))"),
+        ({"defocus_map": torch.zeros(2, 3)}, "`defocus_map` (shape (2, 3))"),
+        ({"defocus_map": torch.full((2, 2), -1.0)}, "`defocus_map`"),
+        ({"defocus_map": torch.full((2, 2), math.inf)}, "`defocus_map`"),
+    ],
+)
+def test_invalid_fields_are_named(fields: dict[str, object], words: str) -> None:
+    with pytest.raises(ValueError, match="must be") as error:
+        array_scene(torch.ones(4, 2, 2), **fields)
+    assert words in str(error.value)
+
+
+def test_invalid_arrays_and_sizes_are_named() -> None:
+    with pytest.raises(ValueError, match=r"`resolution` \(=5\)"):
+        array_scene(torch.ones(4, 8, 4)).resized(5)
+    with pytest.raises(ValueError, match=r"`resolution` \(=0\)"):
+        array_scene(torch.ones(4, 8, 4)).resized(0)
+    with pytest.raises(ValueError, match="`crop`"):
+        array_scene(torch.ones(4, 8, 4)).resized(2, crop="centre")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="`rgb`"):
+        radiance_scene(np.full((3, 2, 2), np.nan))
+    with pytest.raises(ValueError, match="uint8"):
+        radiance_scene(np.zeros((3, 2, 2), np.uint8))
+    with pytest.raises(ValueError, match="no exposure brings its mean"):
+        radiance_scene(np.zeros((3, 2, 2), np.float32))
+    with pytest.raises(ValueError, match="`illuminant`"):
+        radiance_scene(np.ones((3, 2, 2)), illuminance=1.0, illuminant=(1.0, 0.0, 1.0))
+
+
+def test_content_is_that_of_the_tensors() -> None:
+    light = torch.rand(4, 6, 8, generator=torch.Generator().manual_seed(0))
+    scene = array_scene(light)
+    same = [array_scene(light.clone()), replace(scene, scene_id="t", illuminance=5.0)]
+    assert {s.content for s in same} == {scene.content}
+    others = [
+        array_scene(light * 2.0),
+        array_scene(light.reshape(4, 8, 6)),
+        array_scene(light, denoised=light),
+        array_scene(light, denoised=light * 0.9),
+        array_scene(light, defocus_map=light[0]),
+    ]
+    assert len({s.content for s in [scene, *others]}) == 1 + len(others)

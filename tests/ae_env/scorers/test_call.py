@@ -1,0 +1,248 @@
+"""Scorers of the user's own that raise, return rubbish, hang, or write to what they are given."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+import sys
+import threading
+import time
+from functools import cached_property
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ae_env import AutoExposureEnv, AutoExposureVectorEnv
+from ae_env.scorers import Balanced, CompositeScorer, list_scorers, make_scorer, registry
+from ae_env.scorers import composite as scorer_call
+from ae_env.scorers.protocol import Captures
+from ae_env.utils.checks import UserCodeError
+
+SMALL: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
+
+
+class Own:
+    """Does what it is told with its images and captures."""
+
+    domain = "raw"
+
+    def __init__(self, do: Any = None, domain: str = "raw", depends_on: str = "image") -> None:
+        self.do, self.domain, self.depends_on = do, domain, depends_on
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> Any:
+        return torch.full((len(captures),), 0.5) if self.do is None else self.do(images, captures)
+
+
+def _mean(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+    return images.mean(dim=(1, 2, 3))
+
+
+@pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
+def test_a_scorer_that_raises_is_named_with_its_cause(depends_on: str) -> None:
+    def divide(images: Any, captures: Captures) -> Any:
+        return 1 / 0
+
+    env = AutoExposureEnv(scorer=Own(divide, depends_on=depends_on), **SMALL)
+    with pytest.raises(UserCodeError, match="scorer 'Own' raised ZeroDivisionError") as caught:
+        env.reset(seed=0)
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (None, "NoneType"),
+        (0.5, "float"),
+        ([0.5], "list"),
+        (np.full(1, 0.5), "ndarray"),
+        (torch.full((1, 1), 0.5), r"\(1, 1\)"),
+        (torch.tensor(0.5), r"\(\) torch.float32"),
+        (torch.full((2,), 0.5), r"must return a tensor \(1,\)"),
+        (torch.full((1,), 0.5 + 0j), "complex"),
+        (torch.full((1,), math.nan), "NaN"),
+        (torch.full((1,), math.inf), "inf"),
+        (torch.full((1,), -0.01), r"from -0.0"),
+        (torch.full((1,), 2), r"to 2.0: rule is \[0, 1\]"),
+    ],
+)
+def test_rubbish_is_refused(returned: Any, message: str) -> None:
+    env = AutoExposureEnv(scorer=Own(lambda *_: returned), **SMALL)
+    with pytest.raises(UserCodeError, match=rf"scorer 'Own' returned .*{message}"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64, torch.int64, torch.bool])
+def test_any_real_numbers_are_scores(dtype: torch.dtype) -> None:
+    env = AutoExposureEnv(scorer=Own(lambda i, _: torch.ones(len(i), dtype=dtype)), **SMALL)
+    env.reset(seed=0)
+    assert env.step(0)[1] == 1.0
+
+
+def test_the_gradient_of_a_network_is_left() -> None:
+    weight = torch.tensor(0.25, requires_grad=True)
+    env = AutoExposureEnv(scorer=Own(lambda i, _: weight.expand(len(i))), **SMALL)
+    env.reset(seed=0)
+    assert env.step(0)[1] == 0.25
+
+
+@pytest.mark.parametrize("observation", ["uint8", "linear", "dn"])
+def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) -> None:
+    """Neither the observation nor the other scorers see it."""
+
+    def blacken(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        images.numpy()[:] = 0.0  # past torch's own counting
+        return images.new_zeros(len(images))
+
+    for domain in ("raw", "srgb"):
+        frames = []
+        for first in (None, blacken):
+            parts = {"first": Own(first, domain), "mean": Own(_mean, domain)}
+            scorer = CompositeScorer(parts)
+            envs = AutoExposureVectorEnv(
+                num_envs=3, scorer=scorer, observation=observation, **SMALL
+            )
+            envs.reset(seed=0)
+            frames.append(envs.step(np.array([3, 20, 40])))
+        (plain, _, _, _, info), (black, _, _, _, black_info) = frames
+        np.testing.assert_array_equal(plain["raw"], black["raw"])
+        np.testing.assert_array_equal(info["rewards"]["mean"], black_info["rewards"]["mean"])
+    envs = AutoExposureVectorEnv(num_envs=3, scorer=Own(blacken), observation=observation, **SMALL)
+    envs.reset(seed=0)
+    np.testing.assert_array_equal(envs.step(np.array([3, 20, 40]))[0]["raw"], plain["raw"])
+
+
+FIELDS = ["scene_light", "ratio", "proper_ev", "blur_px", "white_balance", "row_gain"]
+
+
+@pytest.mark.parametrize("name", [*FIELDS, "light", "log2_light", "ev100"])
+@pytest.mark.parametrize("depends_on", ["image", "light", "blur"])
+def test_captures_must_not_be_written_to(name: str, depends_on: str) -> None:
+    """The scene, which other environments show too, stays as it is."""
+
+    def write(images: Any, captures: Captures) -> torch.Tensor:
+        getattr(captures, name)[0] *= 0.5
+        return torch.zeros(len(captures))
+
+    lighting = "flicker" if name == "row_gain" else "static"
+    env = AutoExposureEnv(scorer=Own(write, depends_on=depends_on), lighting=lighting, **SMALL)
+    before = [scene.clean_light.clone() for scene in env.scenes]
+    with pytest.raises(UserCodeError, match="scorer 'Own' changed its `captures` in place"):
+        env.reset(seed=0)
+    assert all(torch.equal(s.clean_light, b) for s, b in zip(env.scenes, before, strict=True))
+
+
+def test_every_tensor_of_the_captures_is_watched() -> None:
+    """A field or property that is added must be in the test above, too."""
+    fields = {f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type)}
+    cached = {name for name, value in vars(Captures).items() if isinstance(value, cached_property)}
+    assert fields == set(FIELDS)
+    assert cached == {"light", "log2_light", "ev100"}
+
+
+def test_a_slow_scorer_is_told_of_once_and_while_it_runs(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(scorer_call, "SLOW_SECONDS", 0.05)
+    monkeypatch.setattr(scorer_call, "_called", set())
+    monkeypatch.setattr(scorer_call, "_slow", set())
+    told = threading.Event()
+
+    class Handler(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            told.set()
+
+    def wait(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        assert told.wait(20.0)
+        time.sleep(0.06)
+        return torch.zeros(len(images))
+
+    handler = Handler()
+    scorer_call.logger.addHandler(handler)
+    try:
+        env = AutoExposureEnv(scorer=Own(wait), **SMALL)
+        env.reset(seed=0)
+        env.step(0)
+        scorer_call._slow.clear()  # as if only a later batch were slow
+        env.step(0)
+        env.step(0)
+    finally:
+        scorer_call.logger.removeHandler(handler)
+    assert [r.levelname for r in caplog.records if r.name == scorer_call.logger.name] == (
+        ["WARNING"] * 2
+    )
+    assert "scorer 'Own' takes more than 0.05 s for one batch" in caplog.text
+
+
+def test_scorers_of_packages_that_are_broken(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "breaks_on_import.py").write_text("raise OSError('no licence')\n")
+    (tmp_path / "does_not_parse.py").write_text("def (:\n")
+    (tmp_path / "cannot_be_made.py").write_text("class Mine:\n    def __init__(self, size): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = ("not_installed_at_all", "breaks_on_import", "does_not_parse", "cannot_be_made")
+    points = [EntryPoint(name, f"{name}:Mine", registry.ENTRY_POINT_GROUP) for name in modules]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points)
+    assert {"balanced", *modules} <= set(list_scorers())
+    assert isinstance(make_scorer("balanced"), Balanced)
+    causes = (ModuleNotFoundError, OSError, SyntaxError, TypeError)
+    for name, cause in zip(modules, causes, strict=True):
+        for spec in (name, {name: 1.0}, f"{name}:Mine"):
+            with pytest.raises(ValueError, match=rf"`scorer` \(='{name}.*{cause.__name__}") as e:
+                make_scorer(spec)
+            assert isinstance(e.value.__cause__, cause)
+    assert "breaks_on_import" not in sys.modules
+
+
+def test_misspelt_attributes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"scorer 'Own' has `depends_on` \(='imgae'\)"):
+        make_scorer(Own(depends_on="imgae"))
+    with pytest.raises(ValueError, match=r"scorer 'a' has `domain` \(='RGB'\)"):
+        CompositeScorer({"a": Own(domain="RGB")})
+    with pytest.raises(ValueError, match=r"`scorer` \(='a'\) must be callable"):
+        CompositeScorer({"a": 3})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind: Any) -> None:
+    highlights = np.exp(-1.0 / 0.15) * (1.0 - np.array([0.0, 1e-16, 1e-15, 1e-12, 1e-9]))
+    scores = {"highlights": highlights}
+    scores |= {name: np.ones(5) for name in ("brightness", "shadows", "noise", "sharpness")}
+    blown = -0.15 * np.log(highlights)
+    assert (blown > 1.0).any()  # else this shows nothing
+    totals = Balanced().combine({name: kind(values) for name, values in scores.items()})
+    assert 0.0 <= float(totals.min()) <= float(totals.max()) <= 1.0
+    best = Balanced().combine(dict.fromkeys(scores, kind(np.ones(3))))
+    assert best.tolist() == [1.0] * 3
+
+
+def test_weighted_means_stay_in_their_range() -> None:
+    rng = np.random.default_rng(0)
+    for weights in rng.uniform(0.1, 3.0, (200, 7)):
+        names = [f"s{i}" for i in range(7)]
+        scorer = CompositeScorer({n: Own() for n in names}, dict(zip(names, weights, strict=True)))
+        assert float(scorer.combine({n: np.ones(1) for n in names})[0]) <= 1.0
+
+
+def test_numbers_are_combined_too() -> None:
+    assert make_scorer({"noise": 1, "shadows": 1}).combine({"noise": 0.5, "shadows": 0.5}) == 0.5
+    scorer = Balanced()
+    assert 0.0 < scorer.combine(dict.fromkeys(scorer.parts, 0.9)) < 1.0
+
+
+@pytest.mark.parametrize("total", [math.nan, math.inf, -0.1, 1.1])
+@pytest.mark.parametrize("part", ["noise", "own"])
+def test_a_combination_of_ones_own_is_checked(total: float, part: str) -> None:
+    class Mine(CompositeScorer):
+        def combine(self, scores: Any) -> Any:
+            return scores[part] * 0.0 + total
+
+    parts = {"noise": make_scorer("noise"), "own": Own()}
+    env = AutoExposureEnv(scorer=Mine({part: parts[part]}), **SMALL)
+    with pytest.raises(UserCodeError, match=r"scorer 'Mine': `combine` returned .* \[0, 1\]"):
+        env.reset(seed=0)

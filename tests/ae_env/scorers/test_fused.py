@@ -1,0 +1,174 @@
+"""Closed forms by a fused kernel, against the scorers that are written in torch."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scorers import CompositeScorer, make_scorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.fused import FusedScores
+from ae_env.scorers.protocol import Captures
+from ae_env.scorers.score_table import ScoreTables
+from ae_env.scorers.terms import Highlights, Noise, Shadows
+from simulator import get_camera
+
+CAMERA = get_camera("nikon_z6")
+GRID = ExposureGrid.default()
+TERMS = dict.fromkeys(("brightness", "highlights", "shadows", "noise", "sharpness"), 1.0)
+
+
+def _scene(seed: int = 0, size: int = 40) -> Scene:
+    """18 stops, some black and some negative pixels, a size that no block divides."""
+    light = 2.0 ** np.random.default_rng(seed).uniform(-14, 4, (4, size, size))
+    light[:, 0, :5], light[:, 1, :5] = 0.0, -0.01
+    return Scene.from_array(
+        light.astype(np.float32),
+        reference_settings(8.0),
+        CAMERA,
+        scene_id=f"test-{seed}",
+        illuminance=640.0,
+    )
+
+
+def _captures(scenes: list[Scene], rows: np.ndarray | None, gain: float = 1.0) -> Captures:
+    states = [GRID[(7 * i) % 64] for i in range(len(scenes))]
+    count = len(scenes)
+    return describe_captures(
+        scenes,
+        states,
+        CAMERA,
+        speed=np.full(count, 0.1),
+        defocus=np.ones(count),
+        gain=np.full(count, gain),
+        row_gain=rows,
+    )
+
+
+@pytest.mark.parametrize("size", [40, 67])
+@pytest.mark.parametrize("bands", [False, True])
+@pytest.mark.parametrize("scorer", [TERMS, {"balanced": 0.7, "banding": 0.3}])
+def test_scores_are_those_of_the_terms(scorer: Any, bands: bool, size: int) -> None:
+    made, rng = make_scorer(scorer), np.random.default_rng(1)
+    one, other = _scene(0, size), _scene(1, size)
+    scenes = [one] * 5 + [other] * 3 + [one]
+    rows = np.exp(rng.normal(0.0, 1.0, (9, size))) if bands else None
+    scores = FusedScores(made)
+    assert set(scores.parts) == set(made.parts)
+    for gain in (2.0**-64, 2.0**-20, 0.7, 1.0, 30.0, 2.0**64):
+        captures = _captures(scenes, rows, gain)
+        wanted = made.score_parts(None, captures)
+        for name, found in scores.scores(captures, scores.means(scenes, captures)).items():
+            np.testing.assert_allclose(found, wanted[name], atol=1e-6, err_msg=f"{name} {gain}")
+
+
+def test_scorers_of_ones_own_are_called() -> None:
+    class Strict(Noise):
+        def __call__(self, images: Any, captures: Captures) -> torch.Tensor:
+            return super().__call__(images, captures) ** 2
+
+    tables = ScoreTables(GRID, CAMERA, CompositeScorer({"strict": Strict(), "noise": Noise()}))
+    assert set(tables.fused.parts) == {"noise"}
+    parts = tables.table(_scene(), gain=3.0).parts
+    np.testing.assert_allclose(parts["strict"], parts["noise"] ** 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("on_the_class", [True, False])
+def test_constants_are_those_of_the_terms(
+    on_the_class: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts: dict[str, Any] = {"highlights": Highlights(), "shadows": Shadows(), "noise": Noise()}
+    tables = ScoreTables(GRID, CAMERA, CompositeScorer(parts), use_cache=False)
+    before = tables.table(_scene()).parts
+    for name, constant, value in (
+        ("highlights", "scale", 0.3),
+        ("highlights", "width", 0.5),
+        ("shadows", "scale", 0.1),
+        ("shadows", "depth", 6.0),
+        ("shadows", "width", 1.5),
+        ("noise", "half_snr", 40.0),
+    ):
+        part = parts[name]
+        monkeypatch.setattr(type(part) if on_the_class else part, constant, value)
+    made = CompositeScorer(parts)
+    found = ScoreTables(GRID, CAMERA, made, use_cache=False).table(_scene()).parts
+    states = list(GRID)
+    nothing = np.zeros(64)
+    captures = describe_captures(
+        [_scene()] * 64, states, CAMERA, speed=nothing, defocus=nothing, gain=nothing + 1.0
+    )
+    for name, wanted in made.score_parts(None, captures).items():
+        np.testing.assert_allclose(found[name], wanted, atol=1e-6, err_msg=name)
+        assert np.abs(found[name] - before[name]).max() > 0.02
+
+
+def test_static_and_changing_light_are_scored_by_the_same_kernel(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However deep in a mean the terms are: in torch, all states take some 20 times as long."""
+    scorer = make_scorer({"balanced": 0.8, "noise": 0.2})
+    alone = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
+    tables = ScoreTables(GRID, CAMERA, scorer, use_cache=False)
+    for term in (Highlights, Shadows, Noise):
+        monkeypatch.setattr(term, "__call__", None)  # would fail if it were called
+    found = tables.table(_scene(), speed=0.1)
+    for gain in (1.0, np.ones(64)):
+        other = alone.table(_scene(), speed=0.1, gain=gain)
+        np.testing.assert_array_equal(found.parts["balanced"], other.mean)
+        np.testing.assert_allclose(found.mean, 0.8 * other.mean + 0.2 * other.parts["noise"])
+
+
+def test_another_scene_of_the_same_id_is_not_taken_for_it() -> None:
+    scores = FusedScores(make_scorer("noise"))
+    for seed in range(5):  # each may get the memory, and so the id(), of the one before
+        scene = _scene(seed)
+        captures = _captures([scene], None, 2.0)
+        wanted = make_scorer("noise").score_parts(None, captures)["noise"]
+        found = scores.scores(captures, scores.means([scene], captures))["noise"]
+        np.testing.assert_allclose(found, wanted, atol=1e-6)
+        del scene, captures
+
+
+@pytest.mark.parametrize("gain", [0.3, 2.0])
+def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: float) -> None:
+    """What the whole table says, against another scene in its own light."""
+    from dataclasses import replace
+
+    scene = _scene()
+    lit = replace(scene, light=scene.light * gain, illuminance=640.0 * gain)
+    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
+    changed = tables.table(scene, speed=0.2, defocus=1.0, gain=gain)
+    wanted = tables.table(lit, speed=0.2, defocus=1.0)
+    np.testing.assert_allclose(changed.mean, wanted.mean, atol=1e-6)
+    assert changed.oracle == wanted.oracle
+
+
+def test_what_is_compiled_and_what_is_loaded_agree_to_the_last_bit(tmp_path: Path) -> None:
+    """The first process of a fresh installation compiles; all others load what it kept."""
+    code = (
+        "import sys, numpy as np; from ae_env.scorers.fused import fused_means as f\n"
+        "rng = np.random.default_rng(0); n = np.float32\n"
+        "light, dark = rng.random((2, 4, 1, 900)).astype(n)\n"
+        "means, ratio = np.empty((3, 3)), rng.random((3, 1))\n"
+        "f(0, 3, light, dark, rng.random((1, 900)), ratio.astype(n), ratio.astype(n), ratio,\n"
+        "  np.full((3, 4), 1e-3, n), np.full((3, 4), 1e-6, n), n(76.0), means)\n"
+        "sys.stdout.buffer.write(means.tobytes())\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, check=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert len(outputs[0]) == 72
+    assert outputs[0] == outputs[1]

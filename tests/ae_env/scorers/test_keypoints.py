@@ -1,0 +1,142 @@
+"""Keypoints and matches: counts by hand, and what noise, blur and a shift do to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scorers import make_scorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.keypoints import reference_pictures
+from ae_env.scorers.protocol import Captures
+from simulator import CameraSettings, get_camera, incident_ev100
+
+pytest.importorskip("cv2")
+CAMERA = get_camera("nikon_z6")
+GRID = ExposureGrid.default()
+EV = incident_ev100(1000.0)
+
+
+def _scene(light: np.ndarray, name: str = "test") -> Scene:
+    packed = torch.from_numpy(np.repeat(light[None].astype(np.float32), 4, axis=0))
+    return Scene.from_array(
+        packed, reference_settings(EV), CAMERA, scene_id=name, illuminance=1000.0
+    )
+
+
+def _captures(scenes: list[Scene], states: list[CameraSettings]) -> Captures:
+    count = len(scenes)
+    zeros = np.zeros(count)
+    return describe_captures(
+        scenes, states, CAMERA, speed=zeros, defocus=zeros, gain=np.ones(count)
+    )
+
+
+def _camera_man(size: int = 128) -> np.ndarray:
+    return 0.6 * (skimage.data.camera()[: 4 * size : 4, : 4 * size : 4] / 255.0) ** 2.2
+
+
+def _squares(count: int) -> torch.Tensor:
+    """sRGB (1, 3, 100, 100): `count` single bright pixels of corners, well apart."""
+    picture = torch.full((1, 3, 100, 100), 0.2)
+    for i in range(count):
+        row, column = divmod(i, 4)
+        picture[..., 20 + 16 * row : 26 + 16 * row, 20 + 16 * column : 26 + 16 * column] = 0.9
+    return picture
+
+
+def test_the_count_is_mapped() -> None:
+    """Each small square has its corners; with nothing there is nothing."""
+    scorer = make_scorer("keypoints").parts["keypoints"]
+    scores = [float(scorer(_squares(n), None)) for n in (0, 1, 4, 12)]  # type: ignore[arg-type]
+    assert scores[0] == 0.0
+    assert scores == sorted(scores)
+    counts = -np.log(1.0 - np.array(scores)) * 15.0 * (100 - 2 * 15) ** 2 / 1000.0
+    np.testing.assert_allclose(counts, counts.round(), atol=1e-6)  # whole numbers of keypoints
+    assert counts[1] >= 1
+    assert counts[2] == pytest.approx(4 * counts[1], rel=0.5)
+
+
+def test_the_reference_is_the_right_exposure_without_noise() -> None:
+    """Whatever the state, and a grey card under incident light is 18 % grey in it."""
+    scene = _scene(np.full((40, 40), 0.18 * 0.6635))
+    captures = _captures([scene] * 3, [GRID[i] for i in (0, 30, 63)])
+    pictures = reference_pictures(captures, [0, 1, 2])
+    # sRGB of 18 %: 1.055 * 0.18 ** (1 / 2.4) - 0.055.
+    np.testing.assert_allclose(pictures.numpy(), 0.4614, atol=2e-3)
+
+
+def test_a_perfect_capture_finds_all_again() -> None:
+    scene = _scene(_camera_man())
+    captures = _captures([scene] * 4, [reference_settings(EV)] * 4)
+    light = captures.light.clamp(0.0, 1.0)
+    generator = torch.Generator().manual_seed(0)
+    noisy = (light + 0.05 * torch.randn(light.shape, generator=generator)).clamp(0.0, 1.0)
+    blurred = torch.nn.functional.avg_pool2d(light, 5, stride=1, padding=2)
+    shifted = light.roll(12, dims=3)  # all are found, none at its place
+    images = torch.stack([light[0], noisy[1], blurred[2], shifted[3]])
+    perfect, with_noise, with_blur, elsewhere = make_scorer("matches")(images, captures).tolist()
+    assert perfect == 1.0
+    assert 0.0 < with_noise < 0.9
+    assert 0.0 < with_blur < 0.9
+    assert elsewhere < 0.1
+    keypoints = make_scorer("keypoints")(images, captures)
+    assert keypoints[2] < keypoints[0] < keypoints[1]  # noise is taken for corners
+
+
+def test_under_and_over_exposure_lose_matches() -> None:
+    scene = _scene(_camera_man())
+    reference = reference_settings(EV)
+    stops = (-7, -4, 0, 4, 7)
+    states = [replace(reference, exposure_time=reference.exposure_time * 2.0**s) for s in stops]
+    captures = _captures([scene] * len(states), states)
+    images = (captures.light.clamp(0.0, 1.0) * 255.0).round() / 255.0
+    scores = make_scorer("matches")(images, captures).tolist()
+    assert scores[0] < scores[1] < scores[2] > scores[3] > scores[4]
+    assert scores[2] > 0.5
+
+
+def test_each_capture_is_compared_with_its_own_scene() -> None:
+    first, second = _scene(_camera_man(), "a"), _scene(_camera_man()[::-1].copy(), "a")
+    scenes = [first, second, first, second]
+    captures = _captures(scenes, [reference_settings(EV)] * 4)
+    scores = make_scorer("matches")(captures.light.clamp(0.0, 1.0), captures)
+    assert scores.tolist() == [1.0] * 4  # though the two have one name
+    swapped = make_scorer("matches")(captures.light[[1, 0, 3, 2]].clamp(0.0, 1.0), captures)
+    assert float(swapped.max()) < 0.3
+
+
+@pytest.mark.parametrize("name", ["keypoints", "matches"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 31), (37, 64), (65, 41)])
+def test_any_frame_is_scored(name: str, size: tuple[int, int]) -> None:
+    light = np.full(size, 0.1)
+    captures = _captures([_scene(light)] * 3, [GRID[20]] * 3)
+    images = torch.zeros(3, 4, *size)
+    images[1] = 1.0
+    images[2] = torch.rand(4, *size)
+    scores = make_scorer(name)(images, captures)
+    assert scores[:2].tolist() == [0.0, 0.0]
+    assert 0.0 <= float(scores[2]) <= 1.0
+    assert torch.equal(scores, make_scorer(name)(images, captures))
+
+
+def test_a_frame_scores_alike_alone_and_in_a_batch() -> None:
+    scene = _scene(_camera_man())
+    states = [GRID[i] for i in (5, 21, 37, 53)]
+    captures = _captures([scene] * 4, states)
+    images = captures.light.clamp(0.0, 1.0)
+    for name in ("keypoints", "matches"):
+        together = make_scorer(name)(images, captures)
+        alone = [
+            make_scorer(name)(images[i, None], _captures([scene], [s]))
+            for i, s in enumerate(states)
+        ]
+        assert torch.equal(together, torch.cat(alone))
+    assert math.isfinite(float(together.sum()))

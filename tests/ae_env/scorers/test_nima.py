@@ -1,0 +1,197 @@
+"""NIMA against Keras: the same network with the same random weights, from files that Keras wrote.
+
+Keras runs in a process of its own: it warns when it is imported.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from ae_env.scorers import make_scorer
+from ae_env.scorers.nima import (
+    NUMBER_OF_VALUES,
+    PUBLISHED,
+    NimaMobileNet,
+    convert_nima,
+    git_blob_id,
+    mean_rating,
+    nima_network,
+    published_as,
+    read_weights,
+)
+
+KERAS = """
+    import os, sys
+    os.environ["KERAS_BACKEND"] = "torch"
+    import h5py, keras, numpy as np, torch
+    from keras.src.legacy.saving import legacy_h5_format
+    torch.set_num_threads(1)
+    folder = sys.argv[1]
+    base = keras.applications.MobileNet(
+        (224, 224, 3), include_top=False, pooling="avg", weights=None
+    )
+    dropped = keras.layers.Dropout(0.75)(base.output)
+    head = keras.layers.Dense(10, activation="softmax", name="dense_1")
+    model = keras.Model(base.inputs, head(dropped))
+    rng = np.random.default_rng(0)
+    for layer in model.layers:
+        values = []
+        for w in layer.weights:
+            shape, name = tuple(w.shape), w.name
+            if name == "moving_variance":
+                values.append(rng.uniform(0.5, 2.0, shape))
+            elif name == "gamma":
+                values.append(rng.uniform(0.8, 1.6, shape))
+            elif name in ("beta", "moving_mean"):
+                values.append(rng.normal(0.2, 0.3, shape))
+            elif name == "bias":
+                values.append(rng.normal(0.0, 0.1, shape))
+            else:  # He's scale, or the signal dies in the depth
+                fan = np.prod(shape[:2]) if "dw" in layer.name else np.prod(shape[:-1])
+                gain = 12.0 if layer.name == "dense_1" else 2.0
+                values.append(rng.normal(0.0, np.sqrt(gain / fan), shape))
+        layer.set_weights(values)
+    assert model.count_params() == 3_239_114
+    with h5py.File(f"{folder}/weights.h5", "w") as file:  # of `save_weights` in Keras 2
+        legacy_h5_format.save_weights_to_hdf5_group(file, model)
+        for layer in model.layers:
+            group = file[layer.name]
+            if layer.name not in group:  # a layer without weights
+                continue
+            own = group[layer.name]
+            for array in list(own):
+                depthwise = layer.name.startswith("conv_dw") and array == "kernel"
+                own.move(array, "depthwise_kernel:0" if depthwise else f"{array}:0")
+            group.attrs["weight_names"] = [f"{layer.name}/{array}".encode() for array in own]
+    model.save(f"{folder}/whole.h5")
+    pictures = np.load(f"{folder}/pictures.npy")
+    np.save(f"{folder}/shares.npy", model.predict(pictures * 255.0 / 127.5 - 1.0, verbose=0))
+"""
+
+
+@pytest.fixture(scope="module")
+def keras_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """weights.h5 and whole.h5 of one network, and its answers to pictures.npy (N, H, W, 3)."""
+    folder = tmp_path_factory.mktemp("keras")
+    rng = np.random.default_rng(1)
+    pictures = rng.random((4, 224, 224, 3)) * np.array([1.0, 0.5, 0.2, 1.0])[:, None, None, None]
+    pictures[3] = np.linspace(0.0, 1.0, 224)[None, :, None] ** np.array([0.5, 1.0, 2.0])
+    np.save(folder / "pictures.npy", pictures.astype(np.float32))
+    script = folder / "write.py"
+    script.write_text(textwrap.dedent(KERAS))
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(script), str(folder)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def _pictures(folder: Path) -> torch.Tensor:
+    return torch.from_numpy(np.load(folder / "pictures.npy")).permute(0, 3, 1, 2)
+
+
+@pytest.mark.parametrize("name", ["weights.h5", "whole.h5"])
+def test_the_network_is_that_of_keras(keras_files: Path, name: str) -> None:
+    expected = np.load(keras_files / "shares.npy")
+    means = expected @ np.arange(1.0, 11.0)
+    assert np.ptp(means) > 0.3  # else this shows nothing
+    weights = read_weights(keras_files / name)
+    assert sum(values.numel() for values in weights.values()) == NUMBER_OF_VALUES == 3_239_114
+    network = nima_network(weights)
+    pictures = _pictures(keras_files)
+    shares = network(2.0 * pictures - 1.0).numpy()
+    np.testing.assert_allclose(shares, expected, atol=2e-5)
+    np.testing.assert_allclose(mean_rating(network, pictures).numpy(), means, atol=1e-4)
+
+
+def test_axes_are_put_in_torchs_order(keras_files: Path) -> None:
+    weights = read_weights(keras_files / "weights.h5")
+    with h5py.File(keras_files / "whole.h5") as file:
+        stored = file["model_weights"]
+        depthwise = stored["conv_dw_3/conv_dw_3/kernel"][()]
+        pointwise = stored["conv_pw_3/conv_pw_3/kernel"][()]
+    assert weights["features.5.1.weight"][7, 0, 2, 1] == depthwise[2, 1, 7, 0]
+    assert weights["features.6.1.weight"][90, 7, 0, 0] == pointwise[0, 0, 7, 90]
+
+
+def test_a_scorer_from_the_converted_file(
+    keras_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
+    for name in ("nima_aesthetic", "nima_technical"):
+        with pytest.raises(ValueError, match=rf"{name}.*AE_ENV_{name.upper()}.*{PUBLISHED[name]}"):
+            make_scorer(name)
+    out = tmp_path / "cache" / "nima_technical.safetensors"
+    assert convert_nima(keras_files / "weights.h5", out) is None  # not the published file
+    converted, read = load_file(out), read_weights(keras_files / "whole.h5")
+    assert converted.keys() == read.keys()
+    assert all(torch.equal(values, read[key]) for key, values in converted.items())
+    monkeypatch.setenv("AE_ENV_NIMA_AESTHETIC", str(keras_files / "whole.h5"))
+    means = np.load(keras_files / "shares.npy") @ np.arange(1.0, 11.0)
+    pictures = _pictures(keras_files)
+    for name in ("nima_aesthetic", "nima_technical"):
+        scorer = make_scorer(name).parts[name]
+        scores = scorer(pictures, None)  # type: ignore[arg-type]
+        np.testing.assert_allclose(scores.numpy(), (means - 1.0) / 9.0, atol=2e-5)
+        alone = torch.cat([scorer(p[None], None) for p in pictures])  # type: ignore[arg-type]
+        torch.testing.assert_close(alone, scores, rtol=0.0, atol=1e-6)
+        for size in (1, 37, 300):  # any picture is resized
+            flat = scorer(torch.full((2, 3, size, size + 1), 0.5), None)  # type: ignore[arg-type]
+            assert flat[0] == flat[1]
+            assert 0.0 < float(flat[0]) < 1.0
+
+
+def _random_weights() -> dict[str, torch.Tensor]:
+    state = NimaMobileNet().state_dict()
+    return {k: v.clone() for k, v in state.items() if "num_batches" not in k}
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    text = tmp_path / "text.h5"
+    text.write_text("no HDF5")
+    with pytest.raises(ValueError, match=r"text.h5'\) must be HDF5"):
+        read_weights(text)
+    empty = tmp_path / "empty.hdf5"
+    with h5py.File(empty, "w") as file:
+        file["conv1/conv1/kernel:0"] = np.zeros((3, 3, 3, 32))
+    with pytest.raises(ValueError, match=r"136 of its 137 arrays are missing"):
+        read_weights(empty)
+    with h5py.File(empty, "a") as file:
+        file["conv1_bn/conv1_bn/gamma:0"] = np.zeros(64)
+    with pytest.raises(ValueError, match=r"gamma:0 \(=\(64,\)\) must have the shape \(32,\)"):
+        read_weights(empty)
+    weights = _random_weights()
+    weights["head.bias"][3] = float("nan")
+    save_file(weights, tmp_path / "nan.safetensors")
+    with pytest.raises(ValueError, match=r"head.bias must be finite"):
+        read_weights(tmp_path / "nan.safetensors")
+    with pytest.raises(ValueError, match=r"cannot be read"):
+        read_weights(tmp_path / "nothing.safetensors")
+    with pytest.raises(ValueError, match=r"must end in .safetensors"):
+        convert_nima(text, tmp_path / "out.h5")
+
+
+def test_h5py_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "weights.h5"
+    file.write_bytes(b"\x89HDF\r\n\x1a\n")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match=r"pip install 'ae-env\[nima\]'"):
+        read_weights(file)
+
+
+def test_files_are_known_by_gits_blob_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The ids of git hash-object for an empty file and for one line.
+    assert git_blob_id(b"") == "e69de29bb2d1d6434b8b29ae775ad8c2e48c5391"
+    assert git_blob_id(b"hello\n") == "ce013625030ba8dba906f756967f9e9ca394464a"
+    assert published_as(b"hello\n") is None
+    monkeypatch.setitem(PUBLISHED, "nima_technical", git_blob_id(b"hello\n"))
+    assert published_as(b"hello\n") == "nima_technical"

@@ -1,0 +1,121 @@
+"""`ae-env evaluate`: how its options become a plan, presets, and benchmarks."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from agents.cli.evaluate import _plan
+
+BASE = """\
+name: mine
+environment: {scenes: "bundled:small", split: test, resolution: 36}
+max_scenes: 4
+conditions:
+  static: {}
+  step+4: {lighting: {kind: step, stops: 4, at: 2}}
+delays: [0, 1]
+starts: [dark, bright]
+frames: 7
+policies: ["matrix:P", random, oracle]
+other_scorers: [brightness]
+other_scorer_scenes: 2
+"""
+
+
+@pytest.fixture
+def preset(tmp_path: Path) -> str:
+    (tmp_path / "mine.yaml").write_text(BASE)
+    return str(tmp_path / "mine.yaml")
+
+
+def test_plain_options_mean_one_condition():
+    plan = _plan(None, None, ["random"], {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5})
+    assert {n: (c.lighting, c.delay) for n, c in plan.all_conditions.items()} == {
+        "sine": ("sine", 2)
+    }
+    assert (plan.starts, plan.frames, plan.seeds) == (("random",), 8, (5, 6, 7))
+    assert plan.environment == {"scenes": "bundled", "resolution": 64}
+
+
+def test_options_replace_what_a_preset_says(preset):
+    plan = _plan(preset, None, [], {})
+    assert list(plan.all_conditions) == ["static", "step+4", "static/delay1", "step+4/delay1"]
+    assert plan.policies == ("matrix:P", "random", "oracle")
+    changed = _plan(preset, None, ["random"], {"scorer": "noise", "frames": 3, "lighting": "ramp"})
+    assert changed.environment["scorer"] == "noise"
+    assert changed.environment["scenes"] == "bundled:small"
+    assert (changed.policies, changed.frames) == (("random",), 3)
+    assert list(changed.all_conditions) == ["ramp"]
+
+
+def test_an_environment_is_the_base(tmp_path):
+    (tmp_path / "env.yaml").write_text(
+        "scenes: 'bundled:small'\nresolution: 40\nlighting: {kind: tunnel}\ndelay: 1\n"
+        "max_episode_steps: 30\n"
+    )
+    plan = _plan(None, str(tmp_path / "env.yaml"), ["random"], {"delay": 0})
+    assert plan.environment == {"scenes": "bundled:small", "resolution": 40}
+    assert {n: c.delay for n, c in plan.all_conditions.items()} == {"tunnel": 0}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--preset", "standrad"), "did you mean 'standard'"),
+        (("--preset", "ae_bench_v1", "--frames", 3), "is a fixed benchmark: it does not take --fr"),
+        (("--preset", "mine.yaml", "--append", "x.csv"), "takes the results of a benchmark only"),
+        (("--policy", "random", "--scorer", "nois"), "did you mean 'noise'"),
+        (("--preset", "broken.yaml"), "starts"),
+        (("--policy", "random", "--author", "me"), "give --append too"),
+        (("--preset", "ae_bench_v1", "--append", "."), "must be a file, but it is a folder"),
+    ],
+)
+def test_mistakes_are_one_line(ae_env, tmp_path, arguments, message):
+    (tmp_path / "mine.yaml").write_text(BASE)
+    (tmp_path / "broken.yaml").write_text(BASE.replace("dark", "drak"))
+    code, _, error = ae_env("evaluate", *arguments)
+    assert code == 2
+    assert len(error.strip().splitlines()) == 1, error
+    assert message in error
+    assert not (tmp_path / "evaluation").exists()
+
+
+def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
+    code, text, _ = ae_env("evaluate", "--preset", preset, "--out", "first")
+    assert code == 0
+    assert "over 4 conditions" in text
+    folder = tmp_path / "first"
+    content = json.loads((folder / "results.json").read_text())
+    conditions = {row["condition"] for row in content["rows"]}
+    assert conditions == {"all", "hard", "rest", "step+4", "static/delay1", "step+4/delay1"}
+    assert [one["policy"] for one in content["meta"]["ranking"]] == ["matrix:P", "random"]
+    assert set(content["meta"]["other_scorers"]["brightness"]) == {"matrix:P", "random", "oracle"}
+    assert content["meta"]["plan"]["starts"] == ["dark", "bright"]
+    oracle = next(r for r in content["rows"] if (r["policy"], r["condition"]) == ("oracle", "all"))
+    assert oracle["normalised_score"] == pytest.approx(1.0)
+    with (folder / "metrics.csv").open(newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    assert len(lines) == len(content["rows"])
+    assert {"regret_given_ev", "regret_delayed", "converged", "ms_alone"} <= set(lines[0])
+    late = [r for r in lines if (r["policy"], r["condition"]) == ("oracle", "static/delay1")]
+    assert float(late[0]["regret_delayed"]) == pytest.approx(0.0, abs=1e-9)
+    assert float(late[0]["regret"]) > 0.01
+    text = (folder / "report.md").read_text()
+    for title in ("Ranking", "Conditions", "Score against time", "Clipping", "Under other scorers"):
+        assert f"## {title}" in text
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == text.count("![")
+    # Again, from what is there: the same but for times and dates.
+    code, _, _ = ae_env("evaluate", "--preset", preset, "--out", "first")
+    assert code == 0
+    again = json.loads((folder / "results.json").read_text())
+    assert again["rows"] == content["rows"]  # even times: nothing was run
+    code, _, _ = ae_env("evaluate", "--preset", preset, "--out", "second")
+    other = json.loads((tmp_path / "second" / "results.json").read_text())
+    for first, second in zip(content["rows"], other["rows"], strict=True):
+        first.pop("ms_per_decision"), second.pop("ms_per_decision")
+        assert first == second

@@ -1,0 +1,260 @@
+"""Agents on disk: safetensors and JSON, and clear words when they do not fit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save
+from torch import nn
+
+from ae_env.grid import ExposureGrid
+from agents.learning.agent_weights import (
+    describe_context,
+    load_agent,
+    load_into,
+    save_agent,
+    sibling,
+)
+from agents.learning.regression import ScoreRegressor, save_regression
+from agents.policy import PolicyContext, make_policy
+
+
+def make_network(context: PolicyContext) -> ScoreRegressor:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return ScoreRegressor(context.observation_space, context.grid, width=8)
+
+
+@pytest.fixture
+def agent(context: PolicyContext, tmp_path: Path) -> Path:
+    network = make_network(context)
+    path = tmp_path / "regression-0.5"
+    save_regression(path, network, context, {"agent": "regression"})
+    return path
+
+
+def test_round_trip(agent: Path, context: PolicyContext) -> None:
+    assert sorted(p.name for p in agent.parent.iterdir()) == [
+        "regression-0.5.json",
+        "regression-0.5.safetensors",
+    ]
+    tensors, card = load_agent(agent, "regression")
+    on_disk = load_file(sibling(agent, ".safetensors"))
+    assert set(tensors) == set(on_disk)
+    assert all(torch.equal(tensors[name], on_disk[name]) for name in on_disk)
+    assert card["width"] == 8
+    assert card["training"] == {"agent": "regression"}
+    assert card["context"] == describe_context(context)
+    network = make_network(context)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.zero_()
+    load_into(network, tensors, agent)
+    assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
+
+
+@pytest.mark.parametrize("ending", ["", ".safetensors", ".json"])
+def test_any_of_the_two_files_names_the_agent(agent: Path, ending: str) -> None:
+    tensors, _ = load_agent(f"{agent}{ending}", "regression")
+    assert set(tensors) == set(load_file(sibling(agent, ".safetensors")))
+
+
+def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
+    module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
+    module["again"] = module["a"]
+    save_agent(tmp_path / "m", "ppo", module, {"width": 2, "context": {}, "training": {}})
+    assert len(load_file(tmp_path / "m.safetensors")) == 4
+    tensors, _ = load_agent(tmp_path / "m", "ppo")
+    assert set(tensors) == set(module.state_dict())
+    assert torch.equal(tensors["again.weight"], module["a"].weight)
+
+
+def test_no_pickle(agent: Path) -> None:
+    content = sibling(agent, ".safetensors").read_bytes()
+    header = int.from_bytes(content[:8], "little")
+    entries = json.loads(content[8 : 8 + header])
+    assert {entry["dtype"] for entry in entries.values()} == {"F32"}
+    sources = Path(__file__).parents[2] / "agents"
+    for file in sources.glob("*.py"):
+        assert not re.search(r"import pickle|torch\.load\(|torch\.save\(", file.read_text())
+
+
+@pytest.mark.parametrize("suffix", [".json", ".safetensors"])
+def test_missing_file(agent: Path, suffix: str) -> None:
+    sibling(agent, suffix).unlink()
+    with pytest.raises(FileNotFoundError, match=rf"there is no regression-0.5{suffix}.*ae-env"):
+        load_agent(agent, "regression")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "message"),
+    [
+        (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
+        (".safetensors", b"{}" * 40, "the hash of regression-0.5.safetensors .* train or copy"),
+        (".json", b"{", "regression-0.5.json is damaged"),
+        (".json", b"\xff\xfe", "regression-0.5.json is damaged"),
+        (".json", b"[" * 10**6, "regression-0.5.json is damaged"),
+        (".json", b"[1]", "must hold a JSON object"),
+        (".json", b"{}", "must be a regression agent of format 1, got None"),
+        (".json", b'{"kind": "regression", "format": 1}', r"lacks \['width', 'context'"),
+        (".json", b'{"kind": "regression", "format": 2}', "format 1, got 'regression' of format 2"),
+    ],
+)
+def test_damaged_file(agent: Path, suffix: str, content: bytes, message: str) -> None:
+    sibling(agent, suffix).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        load_agent(agent, "regression")
+
+
+def test_file_cut_short(agent: Path) -> None:
+    file = sibling(agent, ".safetensors")
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="the hash of"):
+        load_agent(agent, "regression")
+    change_card(agent, sha256=None)  # as agents of earlier versions are
+    with pytest.raises(ValueError, match=r"regression-0.5.safetensors cannot be read"):
+        load_agent(agent, "regression")
+
+
+def change_card(agent: Path, **entries: Any) -> None:
+    """Replaces entries of the card, or removes those that are None."""
+    card = json.loads(sibling(agent, ".json").read_text()) | entries
+    text = json.dumps({name: value for name, value in card.items() if value is not None})
+    sibling(agent, ".json").write_text(text)
+
+
+def test_card_of_an_earlier_version(agent: Path, context: PolicyContext) -> None:
+    change_card(agent, sha256=None)
+    assert make_policy(f"regression:{agent}", context).name == "regression"
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"aliases": 3}, r"regression-0.5.json: `aliases` \(=3\) must be a JSON object"),
+        ({"aliases": {"a": [1]}}, "`aliases` must map names to names"),
+        ({"context": []}, r"`context` \(=\[\]\) must be a JSON object"),
+        ({"training": "x"}, r"`training` \(='x'\) must be a JSON object"),
+        ({"width": "8"}, r"`width` \(='8'\) must be an integer"),
+        ({"width": True}, r"`width` \(=True\) must be an integer"),
+        ({"width": 10**9}, r"`width` \(=1000000000\) must be in \[1, 65536\]"),
+        ({"width": 9}, "do not fit the network"),
+        ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
+        ({"context": {"resolution": [4]}}, r"trained with resolution = \[4\]"),
+        ({"kind": ["regression"]}, r"must be a regression agent .* got \['regression'\]"),
+    ],
+)
+def test_wrong_types_in_the_card(
+    agent: Path, context: PolicyContext, entries: dict[str, Any], message: str
+) -> None:
+    change_card(agent, **entries)
+    with pytest.raises(ValueError, match=message):
+        make_policy(f"regression:{agent}", context)
+
+
+def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> None:
+    before = sibling(agent, ".safetensors").read_bytes()
+    network = make_network(context)
+    with torch.no_grad():
+        next(network.parameters()).fill_(float("nan"))
+    with pytest.raises(ValueError, match="must be finite: their training has failed"):
+        save_regression(agent, network, context, {})
+    assert sibling(agent, ".safetensors").read_bytes() == before
+    sibling(agent, ".safetensors").write_bytes(save(network.state_dict()))
+    change_card(agent, sha256=None)
+    with pytest.raises(ValueError, match="must be finite"):
+        load_agent(agent, "regression")
+
+
+def test_a_folder_is_no_file(agent: Path) -> None:
+    sibling(agent, ".safetensors").unlink()
+    sibling(agent, ".safetensors").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"there is no regression-0.5.safetensors"):
+        load_agent(agent, "regression")
+
+
+def test_wrong_kind(agent: Path) -> None:
+    with pytest.raises(ValueError, match="must be a ppo agent of format 1, got 'regression'"):
+        load_agent(agent, "ppo")
+
+
+def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None:
+    file = sibling(agent, ".safetensors")
+    tensors = load_file(file)
+    name = next(iter(tensors))
+    tensors[name] = torch.zeros(63, 7)
+    file.write_bytes(save(tensors))
+    change_card(agent, sha256=hashlib.sha256(file.read_bytes()).hexdigest())
+    message = rf"do not fit the network: .*{re.escape(name)}"
+    with pytest.raises(ValueError, match=message) as caught:
+        make_policy(f"regression:{agent}", context)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"isos": (50, 200)}, "trained with isos from 100 to 6400, the environment has 50 to 200"),
+        ({"exposure_times": (0.01, 1.0)}, "exposure_times from 0.001 to 0.5.* has 0.01 to 1"),
+        ({"f_numbers": (4.0, 16.0)}, "trained with f_numbers from 4 to 11.* has 4 to 16"),
+    ],
+)
+def test_a_grid_beyond_the_trained_range(
+    agent: Path, context: PolicyContext, values: dict[str, Any], message: str
+) -> None:
+    inside = {"isos": (100, 200), "exposure_times": (0.01, 0.1), "f_numbers": (4.0, 8.0)}
+    grid = ExposureGrid(**{**inside, **values})
+    with pytest.raises(ValueError, match=message):
+        make_policy(f"regression:{agent}", replace(context, grid=grid))
+
+
+@pytest.mark.parametrize("name", ["regression", "ppo"])
+def test_a_finer_grid_gives_known_states_their_values(name: str, context: PolicyContext) -> None:
+    """The states' scale is that of the training: it is not worked out anew from the grid."""
+    coarse = context.grid
+    finer = ExposureGrid(
+        tuple(sorted({*coarse.isos, 200.0, 3200.0})),
+        tuple(sorted({*coarse.exposure_times, 1 / 30})),
+        coarse.f_numbers[:3],
+    )
+    generator = torch.Generator().manual_seed(4)
+    frame = {
+        "raw": torch.rand(2, 4, 64, 64, generator=generator),
+        "settings": torch.rand(2, 3, generator=generator) * 2 - 1,
+        "sensors": torch.rand(2, 2, generator=generator) * 2 - 1,
+    }
+    values = []
+    for grid in (coarse, finer):
+        network = make_policy(name, replace(context, grid=grid)).network
+        with torch.inference_mode():
+            if name == "ppo":
+                codes = {**frame, "raw": frame["raw"] * 255}
+                values.append(network.get_distribution(codes).distribution.logits)
+            else:
+                values.append(network(*frame.values())[0])
+    pairs = [(i, finer.states.index(s)) for i, s in enumerate(coarse) if s.f_number < 11]
+    first, second = (list(index) for index in zip(*pairs, strict=True))
+    known, found = values[0][:, first], values[1][:, second]
+    if name == "ppo":  # logits are known up to their norm
+        known, found = known - known[:, :1], found - found[:, :1]
+    torch.testing.assert_close(found, known, rtol=1e-5, atol=1e-5)
+
+
+def test_other_observation(agent: Path, context: PolicyContext) -> None:
+    space = dict(context.observation_space.spaces)
+    del space["sensors"]
+    blind = replace(context, observation_space=type(context.observation_space)(space))
+    with pytest.raises(ValueError, match="trained with sensors = True, the environment has False"):
+        make_policy(f"regression:{agent}", blind)
+
+
+def test_an_agent_needs_a_name() -> None:
+    with pytest.raises(ValueError, match="must have a name"):
+        sibling("runs/.safetensors", ".json")

@@ -1,0 +1,129 @@
+"""The CNN features: what they see of a real environment, and which sizes they take."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from ae_env.grid import ExposureGrid
+from ae_env.observation import encode_sensors
+from agents.learning.networks import ExposureFeatures, StateHead
+from agents.learning.regression import observation_tensors
+
+
+def space(size: int, *, sensors: bool = True, dtype: type = np.uint8) -> gym.spaces.Dict:
+    spaces: dict[str, gym.Space] = {
+        "raw": gym.spaces.Box(0, 255, (4, size, size), dtype),
+        "settings": gym.spaces.Box(-1, 1, (3,), np.float32),
+    }
+    if sensors:
+        spaces["sensors"] = gym.spaces.Box(-1, 1, (2,), np.float32)
+    return gym.spaces.Dict(spaces)
+
+
+@pytest.mark.parametrize("size", [36, 37, 64])
+@pytest.mark.parametrize("sensors", [True, False])
+def test_shapes(size: int, sensors: bool) -> None:
+    features = ExposureFeatures(space(size, sensors=sensors), width=24)
+    speed = torch.zeros(5, 2) if sensors else None
+    values = features(torch.rand(5, 4, size, size), torch.zeros(5, 3), speed)
+    assert values.shape == (5, 24)
+    assert torch.isfinite(values).all()
+    values.sum().backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in features.parameters())
+
+
+def test_features_are_convolutional() -> None:
+    features = ExposureFeatures(space(64))
+    layers = [layer for layer in features.cnn if isinstance(layer, nn.Conv2d)]
+    assert len(layers) >= 3
+    assert layers[0].in_channels == 6  # 4 planes, mean and maximum of the luminance
+    assert all(layer.kernel_size == (3, 3) for layer in layers)
+    # The raw reaches the dense layer as coarse features, not pixel by pixel.
+    assert features.head[0].in_features < 4 * 64 * 64 // 8
+
+
+def test_black_and_white_frames_are_finite() -> None:
+    features = ExposureFeatures(space(36))
+    for level in (0.0, 1.0):
+        codes = torch.full((1, 4, 36, 36), level)
+        assert torch.isfinite(features(codes, torch.ones(1, 3), -torch.ones(1, 2))).all()
+
+
+def test_other_observations_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`.*must be a uint8 image"):
+        ExposureFeatures(space(36, dtype=np.float32))
+
+
+def planes_of(features: ExposureFeatures, frames: dict[str, np.ndarray]) -> torch.Tensor:
+    """The six planes that enter the network."""
+    seen = []
+    handle = features.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    with torch.no_grad():
+        features(*observation_tensors(frames))
+    handle.remove()
+    return seen[0]
+
+
+def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> None:
+    # One scene at four states, four stops apart in all, without noise and blur.
+    envs = make_tiny_envs(num_envs=4, noise=False, motion="none", depth="far", split="test")
+    base = envs.unwrapped
+    scene = next(s for s in base.scenes if s.kind == "dead_leaves")
+    exposure = scene.ev100 - np.array(base.grid.ev100)  # stops above the proper one
+    wanted = [int(np.argmin(np.abs(exposure - stops))) for stops in (-2.5, -1.5, -0.5, 0.5)]
+    frames, _ = envs.reset(seed=0, options={"scene": scene.scene_id, "state": wanted})
+    planes = planes_of(ExposureFeatures(base.single_observation_space), frames)
+    raw, luminance = planes[:, :4], planes[:, 4]
+    # Only where the darkest frame has many codes and the brightest is not clipped.
+    usable = (raw[:, 1:3].amin(dim=(0, 1)) > 12 / 255) & (raw[:, 1:3].amax(dim=(0, 1)) < 0.95)
+    assert usable.float().mean() > 0.2
+    spread = luminance[:, usable].std(dim=0, unbiased=False)
+    brightness = raw[:, 1][:, usable].mean(dim=1)
+    assert brightness.max() / brightness.min() > 2.0  # the frames themselves do differ
+    assert spread.mean() * 8.0 < 0.15  # stops: quantisation and marked f-numbers remain
+    # It is log2 x + EV100 as the decoded signal says: 18 % grey at 0.119 of white.
+    light = torch.log2(scene.light[1:3].mean(dim=0)) - scene.reference.log2_exposure
+    block = light.shape[-1] // luminance.shape[-1]
+    expected = nn.functional.avg_pool2d(light[None], block)[0][usable]
+    error = luminance[:, usable].mean(dim=0) * 8.0 + 3.0 - expected
+    assert error.abs().median() < 0.15
+
+
+@pytest.mark.parametrize("grid", [ExposureGrid.default(), ExposureGrid((100, 3200), (0.01,), (4,))])
+@pytest.mark.parametrize("sensors", [True, False])
+def test_state_head_values_every_state(grid: ExposureGrid, sensors: bool) -> None:
+    head = StateHead(grid, 6, sensors, outputs=2, width=5)
+    speed = torch.zeros(3, 2) if sensors else None
+    values = head(torch.randn(3, 6), speed)
+    assert values.shape == (3, len(grid), 2)
+    assert torch.isfinite(values).all()
+
+
+def test_state_head_needs_the_sensors_it_was_made_for() -> None:
+    with pytest.raises(ValueError, match="`sensors` must be given"):
+        StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
+
+
+def test_state_head_tells_states_of_equal_exposure_apart() -> None:
+    grid = ExposureGrid((100, 400), (1 / 64, 1 / 16), (4.0,))
+    assert grid.ev100[1] == pytest.approx(grid.ev100[2])  # ISO 100, 1/16 s and ISO 400, 1/64 s
+    values = StateHead(grid, 6, False)(torch.randn(1, 6), None)[0, :, 0]
+    assert values[1] != values[2]
+
+
+def test_foretold_blur_is_that_of_the_scorer() -> None:
+    grid = ExposureGrid.default()
+    head = StateHead(grid, 6, True)
+    speed, defocus = np.array([0.125, 2.0]), np.array([1.0, 0.5])
+    sensors = torch.from_numpy(encode_sensors(speed, defocus, np.zeros((2, 2))))
+    foretold = head._blur(sensors.float())
+    times = np.array([s.exposure_time for s in grid])
+    openings = np.array([4.0 / s.effective_f_number for s in grid])
+    # Blur of the `sharpness` term in 64 pixels: sqrt((v t)^2 + (4 D / N)^2); marked N here.
+    blur = np.hypot(64.0 * speed[:, None] * times, defocus[:, None] * openings)
+    np.testing.assert_allclose(foretold[..., 0].numpy() * 4.0, np.log2(blur), atol=0.05)
+    np.testing.assert_allclose(foretold[..., 1].numpy() * 2.0, np.log1p(blur**2), atol=0.05)

@@ -1,0 +1,160 @@
+"""The PPO agent: a CNN, deterministic, resumable, the same after saving."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+from torch import nn
+
+from agents.learning.ppo import ExposureExtractor, PPOPolicy, PPOTraining, save_ppo, train_ppo
+from agents.learning.sb3_adapter import SB3VectorAdapter
+from agents.policy import PolicyContext, make_policy
+from simulator.utils.checkpoint import Checkpoint
+
+TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
+
+
+@pytest.fixture(autouse=True)
+def global_random_state_is_restored():
+    """SB3 seeds the global generators."""
+    import random
+
+    states = random.getstate(), np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng():
+        yield
+    random.setstate(states[0])
+    np.random.set_state(states[1])  # noqa: NPY002
+
+
+def test_progress_and_determinism(make_tiny_envs) -> None:
+    seen: list[tuple[int, int, dict[str, float]]] = []
+    first = train_ppo(make_tiny_envs(), TRAINING, progress=lambda *a: seen.append(a)).state_dict()
+    assert [done for done, _, _ in seen] == list(range(4, 97, 4))
+    assert {total for _, total, _ in seen} == {96}
+    assert all(0.0 <= values["reward"] <= 1.0 for _, _, values in seen)
+    again = train_ppo(make_tiny_envs(), TRAINING).state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    other = PPOTraining(**{**TRAINING.__dict__, "seed": 4})
+    weights = train_ppo(make_tiny_envs(), other).state_dict()
+    assert any(not torch.equal(first[name], weights[name]) for name in first)
+
+
+@pytest.mark.slow
+def test_it_learns(make_tiny_envs) -> None:
+    rewards: list[float] = []
+    training = PPOTraining(
+        total_timesteps=2048, n_steps=8, batch_size=64, n_epochs=4, width=32, learning_rate=3e-3
+    )
+    # Always sharp: short times and small apertures gain nothing, low ISO does.
+    envs = make_tiny_envs(num_envs=16, motion="none", depth="far")
+    train_ppo(envs, training, progress=lambda d, t, values: rewards.append(values["reward"]))
+    assert rewards[-1] > rewards[15] + 0.1
+
+
+def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path) -> None:
+    envs = make_tiny_envs(num_envs=6)
+    context = PolicyContext.from_envs(envs)
+    network = train_ppo(envs, PPOTraining(**{**TRAINING.__dict__, "n_steps": 4, "batch_size": 12}))
+    save_ppo(tmp_path / "ppo", network, context, {})
+    assert {p.name for p in tmp_path.iterdir()} == {"ppo.json", "ppo.safetensors"}
+    loaded = make_policy(f"ppo:{tmp_path / 'ppo'}", context)
+    assert isinstance(loaded, PPOPolicy)
+    ours = PPOPolicy(context, network=network)
+    names = network.state_dict()
+    assert all(torch.equal(v, names[k]) for k, v in loaded.network.state_dict().items())
+    # The three extractors of SB3's policy are one again.
+    extractor = loaded.network.features_extractor
+    assert loaded.network.pi_features_extractor is extractor
+    rng = np.random.default_rng(0)
+    observations, _ = envs.reset(seed=9)
+    for policy in (ours, loaded):
+        policy.reset(6)
+    for _ in range(5):
+        chosen = ours.act(observations)
+        assert chosen.dtype == np.int64
+        assert np.array_equal(chosen, loaded.act(observations))
+        # SB3's own deterministic prediction is the same.
+        assert np.array_equal(chosen, network.predict(observations, deterministic=True)[0])
+        masks = rng.random((6, 64)) < 0.3
+        masks[:, 5] = True
+        allowed = loaded.act(observations, masks)
+        assert masks[np.arange(6), allowed].all()
+        observations, *_ = envs.step(chosen)
+
+
+def test_features_are_convolutional(make_tiny_envs) -> None:
+    envs = make_tiny_envs(resolution=64)
+    network = train_ppo(envs, PPOTraining(**{**TRAINING.__dict__, "total_timesteps": 16}))
+    extractor = network.features_extractor
+    assert isinstance(extractor, ExposureExtractor)
+    convolutions = [m for m in extractor.modules() if isinstance(m, nn.Conv2d)]
+    assert len(convolutions) >= 3
+    assert not any(isinstance(m, nn.Flatten) for m in list(extractor.children()))
+    widest = max(m.in_features for m in network.modules() if isinstance(m, nn.Linear))
+    assert widest < 4 * 64 * 64 // 8  # no layer takes the raw pixel by pixel
+    seen: list[torch.Tensor] = []
+    extractor.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]["raw"]))
+    observations, _ = envs.reset(seed=0)
+    network.predict(observations)
+    assert seen[0].shape == (4, 4, 64, 64)  # an image still
+    assert torch.equal(seen[0], torch.from_numpy(observations["raw"]).float() / 255.0)  # once
+
+
+def test_sb3s_default_network_is_a_cnn_too(make_tiny_envs) -> None:
+    envs = SB3VectorAdapter(make_tiny_envs())
+    model = PPO("MultiInputPolicy", envs, n_steps=4, batch_size=8, seed=0, device="cpu")
+    extractors = model.policy.features_extractor.extractors
+    assert any(isinstance(m, nn.Conv2d) for m in extractors["raw"].modules())
+    model.learn(16)
+
+
+def test_a_killed_training_goes_on(make_tiny_envs, tmp_path: Path, monkeypatch) -> None:
+    """Ctrl-C keeps the state, however short a time ago the last checkpoint was."""
+    path = tmp_path / "ppo.checkpoint"
+
+    def stop(done: int, total: int, values: dict[str, float]) -> None:
+        if done == 56:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_ppo(make_tiny_envs(), TRAINING, checkpoint=path, progress=stop)
+    restored = Checkpoint.restore
+    steps: list[int] = []
+    monkeypatch.setattr(
+        Checkpoint, "restore", lambda self: steps.append(restored(self)) or steps[-1]
+    )
+    seen: list[int] = []
+    network = train_ppo(
+        make_tiny_envs(), TRAINING, checkpoint=path, progress=lambda *a: seen.append(a[0])
+    )
+    assert steps == [48]  # the last complete update of 4 x 4 frames before frame 56
+    assert seen == list(range(52, 97, 4))
+    # The learning rate falls over the whole training, not anew from its top.
+    optimiser = network.optimizer.param_groups[0]
+    assert optimiser["lr"] < 0.3 * TRAINING.learning_rate
+    again = train_ppo(make_tiny_envs(), TRAINING, checkpoint=path).state_dict()
+    assert steps == [48, 96]
+    assert all(torch.equal(again[k], v) for k, v in network.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"gamma": 1.5}, r"`gamma` \(=1.5\) must be in \[0, 1\]"),
+        ({"batch_size": 1}, r"`batch_size` \(=1\) must be in"),
+        ({"total_timesteps": -4}, r"`total_timesteps` \(=-4\) must be in"),
+        ({"learning_rate": float("nan")}, r"`learning_rate` \(=nan\) must be in"),
+    ],
+)
+def test_bad_hyperparameters(wrong: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PPOTraining(**wrong)
+
+
+def test_batches_must_divide_the_rollout(make_tiny_envs) -> None:
+    with pytest.raises(ValueError, match=r"`batch_size` \(=256\) must divide .*16 \* 4 = 64"):
+        train_ppo(make_tiny_envs(), PPOTraining())

@@ -1,0 +1,98 @@
+"""The native vector environment in SB3's shape: the same rollouts as SB3's own wrapper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from agents.learning.sb3_adapter import SB3VectorAdapter
+
+STEPS = 3  # of an episode
+
+
+def single() -> gym.Env:
+    return gym.make(
+        "ae_env/AutoExposure-v0", scenes="bundled:small", resolution=36, max_episode_steps=STEPS
+    )
+
+
+def assert_same(ours: Any, theirs: Any, where: str) -> None:
+    if isinstance(theirs, dict):
+        assert set(ours) == set(theirs), where
+        for key in theirs:
+            assert_same(ours[key], theirs[key], f"{where}/{key}")
+    elif isinstance(theirs, np.ndarray):
+        assert ours.dtype == theirs.dtype, where
+        np.testing.assert_array_equal(ours, theirs, err_msg=where)
+    else:
+        assert type(ours) is type(theirs), where
+        assert ours == theirs, where
+
+
+def assert_same_rollout(ours: VecEnv, theirs: VecEnv, steps: int) -> None:
+    rng = np.random.default_rng(1)
+    assert_same(dict(ours.reset()), dict(theirs.reset()), "reset")
+    assert_same(ours.reset_infos[1], theirs.reset_infos[1], "reset info")
+    for step in range(steps):
+        actions = rng.integers(64, size=ours.num_envs)
+        mine, other = ours.step(actions), theirs.step(actions)
+        assert_same(dict(mine[0]), dict(other[0]), f"{step}: observation")
+        assert mine[1].dtype == other[1].dtype == np.float32
+        np.testing.assert_array_equal(mine[1], other[1])
+        np.testing.assert_array_equal(mine[2], other[2])
+        for i in range(ours.num_envs):
+            assert_same(mine[3][i], other[3][i], f"{step}: info {i}")
+            ended = bool(other[2][i])
+            assert ("terminal_observation" in mine[3][i]) == ended
+            assert mine[3][i]["TimeLimit.truncated"] == ended
+            assert_same(ours.reset_infos[i], theirs.reset_infos[i], f"{step}: reset info {i}")
+
+
+def test_rollouts_equal_those_of_single_environments(make_tiny_envs) -> None:
+    ours = SB3VectorAdapter(make_tiny_envs(num_envs=3, max_episode_steps=STEPS))
+    theirs = DummyVecEnv([single] * 3)
+    for envs in (ours, theirs):
+        envs.seed(11)
+    assert_same_rollout(ours, theirs, 8)
+    for envs in (ours, theirs):  # once seeded, a reset goes on with the same generators
+        envs.set_options([{"scene": 0, "state": 5}, {"state": 6}, {}])
+    assert_same_rollout(ours, theirs, 4)
+    assert_same_rollout(ours, theirs, 1)  # the options were for one reset
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "DISABLED"])
+def test_other_autoreset_modes_are_refused(make_tiny_envs, mode: str) -> None:
+    with pytest.raises(ValueError, match=r"autoreset_mode='SAME_STEP', got .*" + mode):
+        SB3VectorAdapter(make_tiny_envs(mode=mode))
+
+
+def test_attributes_and_methods(make_tiny_envs) -> None:
+    envs = SB3VectorAdapter(make_tiny_envs(num_envs=3))
+    envs.seed(0)
+    envs.reset()
+    assert [len(grid) for grid in envs.get_attr("grid", [0, 2])] == [64, 64]
+    assert envs.get_attr("grid", 1)[0] is envs.envs.unwrapped.grid
+    masks = envs.env_method("action_masks")
+    assert len(masks) == 3
+    assert masks[0].shape == (64,)
+    assert len(envs.env_method("expected_scores", indices=[1])) == 1
+    assert envs.env_is_wrapped(gym.Wrapper) == [False] * 3
+    with pytest.raises(AttributeError, match="`grid` cannot be set"):
+        envs.set_attr("grid", None)
+
+
+def test_pictures(make_tiny_envs) -> None:
+    envs = SB3VectorAdapter(make_tiny_envs(num_envs=2, render_mode="rgb_array"))
+    envs.seed(0)
+    envs.reset()
+    pictures = envs.get_images()
+    assert len(pictures) == 2
+    assert pictures[0].dtype == np.uint8
+    assert pictures[0].shape[2] == 3
+    assert envs.render("rgb_array").ndim == 3  # SB3 tiles them
+    silent = SB3VectorAdapter(make_tiny_envs(num_envs=2))
+    assert list(silent.get_images()) == [None, None]

@@ -1,0 +1,158 @@
+"""From YAML to an agent: what is accepted, what is refused and how, and that nothing is redone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import agents.learning.regression_training
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+
+from agents.learning.ppo import PPOTraining
+from agents.learning.regression import RegressionTraining
+from agents.learning.training import AgentConfig, is_trained, load_config, train_agent
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+ENVIRONMENT = {"scenes": "bundled:small", "resolution": 36}
+HYPERPARAMETERS: dict[str, dict[str, Any]] = {
+    "regression": {"frames": 24, "width": 8},
+    "ppo": {"total_timesteps": 32, "n_steps": 4, "batch_size": 8, "n_epochs": 1, "width": 8},
+}
+
+
+def tiny(agent: str = "regression", **training: Any) -> AgentConfig:
+    return AgentConfig(
+        agent=agent,  # type: ignore[arg-type]
+        num_envs=4,
+        environment=ENVIRONMENT,
+        training=HYPERPARAMETERS[agent] | training,
+    )
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_shipped_configs(path: Path) -> None:
+    config = load_config(path)
+    text = yaml.safe_load(path.read_text())
+    kind = {"regression": RegressionTraining, "ppo": PPOTraining}[config.agent]
+    hyperparameters = config.hyperparameters()
+    assert isinstance(hyperparameters, kind)
+    for name, value in text["training"].items():
+        assert getattr(hyperparameters, name) == value
+    assert config.environment["split"] == "train"
+    assert config.with_seed(7).hyperparameters().seed == 7
+    assert json.loads(json.dumps(config.card())) == config.card()
+
+
+def test_a_seed_out_of_range_is_told_before_the_training() -> None:
+    with pytest.raises(ValueError, match=r"`seed` \(=4294967296\)"):
+        tiny("ppo").with_seed(2**32)
+
+
+def test_there_is_a_config_for_each_agent() -> None:
+    assert {load_config(path).agent for path in CONFIGS} == {"regression", "ppo"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
+        ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression' or 'ppo'"),
+        ("{}", r"agent: Field required"),
+        ("", r"is empty: it must have entries"),
+        ("[1, 2]", r"holds \[1, 2\]: it must have entries"),
+        ("agent: [", r"is not YAML"),
+        ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
+        ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step is unknown.*mean 'n_steps'"),
+        ("agent: ppo\ntraining: {gamma: much}", r"training.gamma \(='much'\): .*valid number"),
+        ("agent: ppo\ntraining: {gamma: 2}", r"`gamma` \(=2.0\) must be in \[0, 1\]"),
+        ("agent: ppo\ntraining: {batch_size: 100}", r"`batch_size` \(=100\) must divide"),
+        ("agent: regression\ntraining: {frames: -1}", r"`frames` \(=-1\) must be in"),
+        ("agent: regression\ntraining: {frames: 1.5}", r"training.frames \(=1.5\)"),
+        ("agent: ppo\nenvironment: {resolutoin: 64}", r"`resolutoin`.*mean `resolution`"),
+        ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be an integer in"),
+        ("agent: ppo\nenvironment: {scorer: balnced}", r"environment: .*balnced"),
+        ("agent: ppo\nenvironment: {camera: leica}", r"environment: .*leica"),
+        ("agent: ppo\nenvironment: {costs: 3}", r"environment: `costs` \(=3\) must map"),
+        ("agent: ppo\nenvironment: {lighting: {kind: sine, period: 0}}", r"lighting\['period'\]"),
+        ("agent: ppo\nenvironment: {grid: [1]}", r"environment: `grid` \(=\[1\]\) must be"),
+        ("agent: ppo\nnum_envs: true", r"num_envs \(=True\)"),
+        ("agent: ppo\ntraining: {n_epochs: true}", r"training.n_epochs \(=True\)"),
+        ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
+        ("agent: ppo\nenvironment: {1: 2}", r"environment.*valid string"),
+    ],
+)
+def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_config(path)
+    assert "mine.yaml" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_binary_files(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"none.yaml'\): there is no such file"):
+        load_config(tmp_path / "none.yaml")
+    (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(ValueError, match=r"a.yaml'\) is not YAML"):
+        load_config(tmp_path / "a.yaml")
+
+
+def test_entries_must_be_json_values() -> None:
+    with pytest.raises(ValueError, match="must be a JSON value"):
+        AgentConfig(agent="regression", environment={"scenes": Path("raws")})
+
+
+@pytest.mark.parametrize("agent", ["regression", "ppo"])
+def test_trained_once(agent: str, tmp_path: Path) -> None:
+    config, out = tiny(agent), tmp_path / "runs" / f"{agent}-0.1"
+    assert not is_trained(config, out)
+    calls: list[int] = []
+    with torch.random.fork_rng():
+        train_agent(config, out, progress=lambda done, total, values: calls.append(done))
+    assert calls
+    assert calls[-1] == {"regression": 24, "ppo": 32}[agent]
+    names = {path.name for path in out.parent.iterdir()}
+    assert names == {f"{agent}-0.1.json", f"{agent}-0.1.safetensors"}  # no checkpoint is left
+    assert is_trained(config, out)
+    stamp = (out.parent / f"{agent}-0.1.safetensors").stat().st_mtime_ns
+    again: list[int] = []
+    train_agent(config, out, progress=lambda done, total, values: again.append(done))
+    assert again == []
+    assert (out.parent / f"{agent}-0.1.safetensors").stat().st_mtime_ns == stamp
+    # Another training, or a damaged file, is not taken for this one.
+    assert not is_trained(config.with_seed(1), out)
+    assert not is_trained(tiny(agent, width=9), out)
+    (out.parent / f"{agent}-0.1.json").write_text("[]")
+    assert not is_trained(config, out)
+
+
+def test_a_failed_save_keeps_the_training(tmp_path: Path, monkeypatch) -> None:
+    def full(*args: Any) -> None:
+        raise OSError("no space left on device")
+
+    config, out = tiny(), tmp_path / "agent"
+    with monkeypatch.context() as patch:
+        patch.setattr(agents.learning.regression_training, "save_regression", full)
+        with pytest.raises(OSError, match="no space"):
+            train_agent(config, out)
+    calls: list[int] = []
+    train_agent(config, out, progress=lambda *a: calls.append(a[0]))
+    assert calls == []  # all the frames had been seen
+    assert is_trained(config, out)
+
+
+def test_seed_and_tensorboard(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    for name, seed in (("a", 0), ("b", 1)):
+        train_agent(tiny().with_seed(seed), tmp_path / name, tensorboard=tmp_path / "log")
+    first, second = (load_file(tmp_path / f"{name}.safetensors") for name in "ab")
+    assert any(not torch.equal(first[name], second[name]) for name in first)
+    assert json.loads((tmp_path / "b.json").read_text())["training"]["training"]["seed"] == 1
+    events = list((tmp_path / "log").glob("events*"))
+    assert events
+    assert all(path.stat().st_size > 200 for path in events)

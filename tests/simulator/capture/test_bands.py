@@ -1,0 +1,227 @@
+"""Bands of flickering light, in frames, scores and tables, against the reference camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scorers import make_scorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.score_table import ScoreTables, scene_latent
+from simulator import CameraSettings, get_camera
+from simulator.capture.batch import expose_in_bands
+from simulator.capture.prepared_scene import Latent
+from simulator.noise.generator import noise_keys
+from simulator.optics.lamps import MainsLamp, PulsedLamp
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+
+ID = "ae_env/AutoExposure-v0"
+CAMERA = get_camera("nikon_z6")
+LED = {"kind": "flicker", "frequency": 250.0, "duty": 0.3, "frame_rate": 24.0}
+
+
+def _scene(box_factor: int = 4) -> Scene:
+    light = 0.05 + 0.3 * np.random.default_rng(0).random((4, 40, 40), np.float32)
+    return Scene.from_array(
+        torch.from_numpy(light),
+        reference_settings(8.0),
+        CAMERA,
+        scene_id="grey",
+        illuminance=640.0,
+        box_factor=box_factor,
+    )
+
+
+def _env(**arguments: Any) -> Any:
+    given = {"scenes": [_scene()], "resolution": 40, "motion": "none", "depth": "far"}
+    return gym.make(ID, **{**given, **arguments}).unwrapped
+
+
+@pytest.mark.parametrize(
+    ("lighting", "make_lamp"),
+    [
+        ({"kind": "flicker", "depth": 1.0}, lambda phase: MainsLamp(100.0, 1.0, phase)),
+        (LED, lambda phase: PulsedLamp(250.0, 0.3, phase)),
+    ],
+)
+def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any) -> None:
+    env, scene = _env(lighting=lighting, noise=False, observation="linear"), _scene()
+    reference = ReferenceCamera(CAMERA, box_factor=4)
+    before = ReferenceScene("grey", "grey", "test", scene.light, scene.reference)
+    env.reset(seed=4)
+    rate = lighting.get("frame_rate", 30.0)
+    for frame, state in enumerate((0, 17, 22, 37, 50, 63), start=1):
+        observation, *_ = env.step(state)
+        lamp = make_lamp(env.core.episode(0).phase)
+        wanted = reference.capture(before, env.grid[state], 0, lamp=lamp, start=frame / rate).mean
+        step = 1.0 / min(CAMERA.span)  # the mean is not rounded to digital numbers
+        np.testing.assert_allclose(observation["raw"], wanted, atol=0.51 * step)
+
+
+def test_rows_are_those_of_the_lamp() -> None:
+    env = _env(lighting={"kind": "flicker"}, noise=False, observation="linear")
+    steady = _env(noise=False, observation="linear")
+    for made in (env, steady):
+        made.reset(seed=4)
+    raw, plain = env.step(16)[0]["raw"], steady.step(16)[0]["raw"]  # 1/1000 s
+    lamp = MainsLamp(100.0, 0.8, env.core.episode(0).phase)
+    # Eight sensor rows of 11 us are in each row of the frame.
+    bands = lamp.row_light(1 / 30, 1e-3, 40, CAMERA.row_time, 8)
+    measured = raw.mean(axis=(0, 2)) / plain.mean(axis=(0, 2))
+    np.testing.assert_allclose(measured, bands, atol=2e-3)
+    assert np.ptp(bands) > 0.5
+
+
+@pytest.mark.parametrize("source_iso", [None, 400.0])
+def test_noise_is_that_of_the_banded_signal(source_iso: float | None) -> None:
+    """Also where the source brings some, which the bands make more or less."""
+    reference, target = CameraSettings(400, 0.01, 4), CameraSettings(800, 0.005, 4)
+    light = torch.full((4, 3, 40_000), 0.3)
+    nlf = CAMERA.nlf(400)
+    if source_iso is not None:
+        shot, read = (torch.tensor(v)[:, None, None] for v in (nlf.shot, nlf.read))
+        normals = torch.randn(light.shape, generator=torch.Generator().manual_seed(0))
+        light = light + normals * (shot * 0.3 + read).sqrt()
+    rows = np.array([[0.4, 1.0, 1.6]])
+    latent = Latent(light, reference, CAMERA, nlf if source_iso else nlf.zero())
+    frame = expose_in_bands([latent], [target], rows, seed=1)[0].double()
+    goal = CAMERA.nlf(800)
+    for row, gain in enumerate(rows[0]):
+        mean, variance = frame[1, row].mean(), frame[1, row].var()
+        assert float(mean) == pytest.approx(0.3 * gain, rel=2e-3)
+        wanted = goal.shot[1] * 0.3 * gain + goal.read[1]
+        assert float(variance) == pytest.approx(wanted, rel=0.035)  # 5 sigma of 40,000 samples
+
+
+def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit for bit what `expose_in_bands`, tested above, makes of the same noise."""
+    scene = replace(_scene(), nlf=CAMERA.nlf(100).scaled(1 / 16))
+    env = _env(
+        scenes=[scene],
+        lighting={"kind": "flicker"},
+        observation="linear",
+        noise="exact",
+        simulator=None,
+        tolerance=0.0,
+    )
+    env.reset(seed=4)
+    for state in (52, 53, 37):
+        observation, *_ = env.step(state)
+        episode, settings = env.core.episode(0), env.grid[state]
+        keys = noise_keys(episode.noise_seed, episode.frame)
+        monkeypatch.setattr("simulator.capture.batch.sweep_keys", lambda *_, keys=keys: keys)
+        lamp = MainsLamp(100.0, 0.8, episode.phase)
+        rows = lamp.row_light(episode.frame / 30, settings.exposure_time, 40, CAMERA.row_time, 8)
+        latent = scene_latent(scene, CAMERA, gain=float(rows.mean()))
+        latent = replace(latent, tolerance=0.0)
+        wanted = expose_in_bands([latent], [settings], rows[None] / rows.mean(), seed=0)[0]
+        wanted = wanted.clamp(-1 / 1024, 1.0).numpy()
+        different = observation["raw"] != wanted  # the rounding of the lamp's light
+        assert different.mean() < 1e-3
+        np.testing.assert_allclose(observation["raw"], wanted, atol=1.1 / min(CAMERA.span))
+
+
+def _captures(row_gain: list[float] | None, stops: float) -> Any:
+    state = CameraSettings(100, 1 / 128, 8.0)  # EV100 13
+    light = torch.full((4, len(row_gain or [1, 1]), 40), 0.1)
+    scene = Scene.from_array(
+        light, state, CAMERA, scene_id="a", illuminance=2.5 * 2.0 ** (13 + stops)
+    )
+    rows = None if row_gain is None else np.array([row_gain])
+    nothing = np.zeros(1)
+    return describe_captures(
+        [scene], [state], CAMERA, speed=nothing, defocus=nothing, gain=np.ones(1), row_gain=rows
+    )
+
+
+def test_brightness_is_the_mean_over_the_rows() -> None:
+    """One stop over; rows half a stop less and more: exp(1 - sqrt(1 + e^2)) of e 0.5 and 1.5."""
+    score = make_scorer("brightness")(None, _captures([2.0**-0.5, 2.0**0.5], 1.0))
+    wanted = (math.exp(1 - math.sqrt(1.25)) + math.exp(1 - math.sqrt(3.25))) / 2
+    assert float(score) == pytest.approx(wanted, rel=1e-9)
+    plain = make_scorer("brightness")(None, _captures(None, 1.0))
+    assert float(plain) == pytest.approx(math.exp(1 - math.sqrt(2)), rel=1e-9)
+
+
+def test_banding_score() -> None:
+    """Rows half a stop below and above the mean of their logarithms: s = 0.5, s0 = 0.1."""
+    bands = make_scorer("banding")(None, _captures([1.0, 2.0, 2.0, 1.0], 0.0))
+    assert float(bands) == pytest.approx(1.0 / 26.0)
+    assert float(make_scorer("banding")(None, _captures(None, 0.0))) == 1.0
+
+
+def test_light_of_captures_has_the_bands() -> None:
+    captures = _captures([0.5, 1.5], 0.0)
+    np.testing.assert_allclose(captures.light[0, 2, :, 0], [0.05, 0.15], rtol=1e-6)
+    np.testing.assert_allclose(captures.log2_light.exp2(), captures.light, rtol=1e-5)
+
+
+@pytest.mark.parametrize("scorer", ["balanced", {"balanced": 0.7, "banding": 0.3}])
+def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> None:
+    env = _env(lighting=LED, scorer=scorer, with_oracle=True, motion=0.05, depth=0.5)
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(18)
+    lamp, scene = PulsedLamp(250.0, 0.3, env.core.episode(0).phase), _scene()
+    q = env.expected_scores()
+    for state in (0, 9, 18, 30, 63):
+        settings = env.grid[state]
+        rows = lamp.row_light(1 / 24, settings.exposure_time, 40, CAMERA.row_time, 8)
+        captures = describe_captures(
+            [scene],
+            [settings],
+            CAMERA,
+            speed=np.array([0.05]),
+            defocus=np.array([0.5]),
+            gain=np.array([rows.mean()]),
+            row_gain=rows[None] / rows.mean(),
+        )
+        wanted = float(make_scorer(scorer)(None, captures))
+        assert q[state] == pytest.approx(wanted, abs=1e-6)
+    assert reward == pytest.approx(q[18], abs=1e-9)
+    assert info["regret"] == pytest.approx(q.max() - q[18], abs=1e-6)
+
+
+class MeanSignal:
+    domain = "raw"
+
+    def __call__(self, images: torch.Tensor, captures: Any) -> torch.Tensor:
+        return images.mean(dim=(1, 2, 3), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("noise", [True, False])
+def test_scores_of_images_are_those_of_banded_ones(noise: bool) -> None:
+    grid = ExposureGrid((100,), (1 / 60, 1 / 15), (5.6, 8))
+    tables = ScoreTables(grid, CAMERA, make_scorer(MeanSignal()), noise=noise)
+    flat = replace(_scene(), light=torch.full((4, 40, 40), 0.4))
+    gain, rows = np.array([0.5, 0.5, 1.5, 1.5]), np.ones((4, 40))
+    rows[:, :20], rows[:, 20:] = 1.8, 0.2
+    plain = tables.table(flat).mean
+    banded = tables.table(flat, gain=gain, row_gain=rows).mean
+    # The bright half is white where 1.8 times the gain takes it there.
+    wanted = [(min(1.8 * g * p, 1.0) + 0.2 * g * p) / 2 for g, p in zip(gain, plain, strict=True)]
+    np.testing.assert_allclose(banded, wanted, rtol=5e-3)
+
+
+def test_steady_rows_among_banded_ones_are_as_in_steady_light() -> None:
+    """1/50 s beside 1/1000 s, in one batch."""
+    grid = {"isos": [100, 400], "exposure_times": [0.001, 0.02], "f_numbers": [4, 8]}
+    arguments = {"scenes": [_scene()], "resolution": 40, "grid": grid}
+    envs, plain = (
+        gym.make_vec(ID, num_envs=2, lighting=lighting, **arguments)
+        for lighting in ("flicker", "static")
+    )
+    for made in (envs, plain):
+        made.reset(seed=3)
+    first, second = envs.step(np.array([0, 2])), plain.step(np.array([0, 2]))
+    np.testing.assert_array_equal(first[0]["raw"][1], second[0]["raw"][1])
+    assert (first[0]["raw"][0] != second[0]["raw"][0]).mean() > 0.3
+    assert first[1][1] == pytest.approx(second[1][1], abs=1e-6)

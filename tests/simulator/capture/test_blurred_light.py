@@ -1,0 +1,130 @@
+"""Light behind apertures and streaks: made once, kept within bounds, the same either way."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import pytest
+import torch
+
+from simulator.camera import NoiseLevelFunction
+from simulator.capture import blurred_light as optics_module
+from simulator.capture.aperture_blur import MapOpening
+from simulator.capture.blurred_light import Optics, blur_key
+from simulator.capture.denoised import Denoised
+from simulator.capture.exposure import LATENT_LIMIT, Exposure
+from simulator.optics.blur import disc_blur, motion_blur
+
+ZERO = NoiseLevelFunction.zero()
+STILL = Exposure(2.0, ZERO, ZERO)
+LIGHT = torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(0))
+CLEAN = Denoised(LIGHT * 0.5)
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
+    """What is blurred, and by how much."""
+    calls: list[tuple[str, float]] = []
+
+    def streak(light: torch.Tensor, extent: float) -> torch.Tensor:
+        calls.append(("streak", extent))
+        return motion_blur(light, extent)
+
+    def disc(light: torch.Tensor, diameter: float) -> torch.Tensor:
+        if diameter:
+            calls.append(("disc", diameter))
+        return disc_blur(light.clamp(-LATENT_LIMIT, LATENT_LIMIT), diameter)
+
+    monkeypatch.setattr(optics_module, "motion_blur", streak)
+    monkeypatch.setattr(optics_module, "defocused_light", disc)
+    return calls
+
+
+def test_what_needs_no_blur_is_not_copied() -> None:
+    optics = Optics(LIGHT, CLEAN, None)
+    assert optics.blurred(STILL) is LIGHT
+    assert optics.blurred(replace(STILL, denoised=True)) is CLEAN.light
+
+
+@pytest.mark.parametrize("denoised", [False, True])
+def test_disc_then_streak(denoised: bool) -> None:
+    exposure = replace(STILL, defocus_px=2.0, motion_px=3.0, denoised=denoised)
+    expected = motion_blur(disc_blur(CLEAN.light if denoised else LIGHT, 2.0), 3.0)
+    assert torch.equal(Optics(LIGHT, CLEAN, None).blurred(exposure), expected)
+
+
+def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
+    """Two apertures, two exposure times, many ISO speeds: two discs and four streaks."""
+    optics = Optics(LIGHT, None, None)
+    for ratio in (1.0, 2.0, 4.0):
+        for disc in (2.0, 1.0):
+            for streak in (3.0, 0.0, 6.0):
+                optics.blurred(Exposure(ratio, ZERO, ZERO, streak, disc))
+    assert sorted(made) == [("disc", 1.0), ("disc", 2.0)] + 2 * [("streak", 3.0)] + 2 * [
+        ("streak", 6.0)
+    ]
+
+
+def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(
+    made: list[tuple[str, float]],
+) -> None:
+    optics = Optics(LIGHT, None, None, kept_bytes=2 * LIGHT.nbytes)
+    for disc in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0):
+        found = optics.blurred(replace(STILL, defocus_px=disc))
+        assert torch.equal(found, disc_blur(LIGHT, disc))
+    assert [d for _, d in made] == [1.0, 2.0, 3.0, 2.0]
+    none = Optics(LIGHT, None, None, kept_bytes=0)
+    for _ in range(2):
+        none.blurred(replace(STILL, defocus_px=7.0))
+    assert [d for _, d in made][-2:] == [7.0, 7.0]
+
+
+def test_the_opened_aperture_comes_first() -> None:
+    opening = MapOpening(LIGHT, CLEAN, torch.full((24, 20), 2.0), 8.0)
+    optics = Optics(LIGHT, CLEAN, opening)
+    exposure = replace(STILL, opened_to=4.0, denoised=True, motion_px=2.0)
+    expected = motion_blur(opening.opened(4.0, denoised=True), 2.0)
+    assert torch.equal(optics.blurred(exposure), expected)
+    assert not torch.equal(expected, motion_blur(CLEAN.light, 2.0))
+
+
+def test_blur_that_opening_adds() -> None:
+    """Squared diameters add: 2 pixels at f/8 take sqrt(16 - 4) more at f/4."""
+    optics = Optics(LIGHT, None, MapOpening(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0))
+    assert optics.added_blur(4.0) == pytest.approx(12**0.5)
+    assert optics.added_blur(8.0) == optics.added_blur(16.0) == 0.0
+    assert Optics(LIGHT, None, None).added_blur(1.4) == 0.0
+
+
+def test_noise_that_opening_leaves() -> None:
+    opening = MapOpening(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
+    optics = Optics(LIGHT, None, opening)
+    alone = opening.remaining(4.0)
+    assert torch.equal(optics.remaining(4.0, 1.0), alone)
+    torch.testing.assert_close(optics.remaining(4.0, 0.5), (2 * alone).clamp(max=1.0))
+    assert optics.remaining(4.0, 0.5) is optics.remaining(4.0, 0.5)
+    assert Optics(LIGHT, None, None).remaining(4.0, 1.0) is None
+
+
+def test_keys_tell_blurs_apart_and_nothing_else() -> None:
+    changes = [{}, {"denoised": True}, {"opened_to": 4.0}, {"defocus_px": 1.0}, {"motion_px": 1.0}]
+    keys = {blur_key(replace(STILL, **change)) for change in changes}
+    assert len(keys) == 5
+    assert blur_key(replace(STILL, ratio=9.0)) == blur_key(STILL)
+
+
+def test_only_the_very_same_light_is_its_own() -> None:
+    optics = Optics(LIGHT, CLEAN, None)
+    assert optics.is_of(LIGHT, CLEAN, None)
+    assert not optics.is_of(LIGHT.clone(), CLEAN, None)
+    assert not optics.is_of(LIGHT, None, None)
+
+
+def test_a_copy_in_another_process_keeps_nothing(made: list[tuple[str, float]]) -> None:
+    optics = Optics(LIGHT, None, None)
+    exposure = replace(STILL, defocus_px=2.0)
+    first = optics.blurred(exposure)
+    copy = pickle.loads(pickle.dumps(optics))
+    assert torch.equal(copy.blurred(exposure), first)
+    assert len(made) == 2

@@ -1,0 +1,164 @@
+"""The fused capture against the steps of `simulator.capture.record`, and against hand-made numbers."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from ae_env.observation import encode_observation
+from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera, list_cameras
+from simulator.capture.exposure import Exposure
+from simulator.capture.kernels import exposure_table, record_capture, record_frames, sensor_table
+from simulator.capture.record import clip_and_quantise
+from simulator.noise.generator import FrameNoise, Noise, noise_keys
+
+Z6 = get_camera("nikon_z6")
+CLEAN = NoiseLevelFunction.zero()
+
+
+def random_light(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 1.5 - 0.01
+
+
+def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) -> torch.Tensor:
+    """The capture in float64, from the formulas of the noise top-up: numbers before rounding."""
+    x = (light.double() * exposure.ratio).clamp(-1e6, 1e6)
+    source, target = exposure.source_noise, exposure.target
+
+    def variance(nlf: NoiseLevelFunction) -> torch.Tensor:
+        shot, read = (torch.tensor(v, dtype=torch.float64) for v in (nlf.shot, nlf.read))
+        return read[:, None, None] + shot[:, None, None] * x.clamp(min=0.0)
+
+    left = 1.0 if exposure.remaining is None else exposure.remaining.double()
+    missing = (variance(target) - left * variance(source)).clamp(min=0.0)
+    return in_numbers(x + missing.sqrt() * normals.double()).clamp(0.0, Z6.white_level)
+
+
+def in_numbers(signal: torch.Tensor) -> torch.Tensor:
+    """Digital numbers of `signal` (4, H, W), in float64 and not rounded."""
+    span, black = (torch.tensor(v, dtype=torch.float64) for v in (Z6.span, Z6.black_level))
+    return signal.double() * span[:, None, None] + black[:, None, None]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 3), (37, 53), (16, 16), (128, 128), (300, 500)])
+@pytest.mark.parametrize("noisy_source", [False, True])
+@pytest.mark.parametrize("blurred", [False, True])
+@pytest.mark.parametrize("kind", ["exact", "bank"])
+def test_captures_are_those_of_the_reference(
+    size: tuple[int, int], noisy_source: bool, blurred: bool, kind: Noise
+) -> None:
+    light = random_light(4, *size)
+    exposure = Exposure(
+        ratio=0.4,
+        source=Z6.nlf(1600) if noisy_source else CLEAN,
+        target=Z6.nlf(400),
+        remaining=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
+    )
+    noise = FrameNoise(int(noise_keys(5, 3)[0]), kind)
+    normals = torch.from_numpy(noise.normals((4, *size)))
+    numbers = in_numbers(record_capture(light, exposure, Z6, noise=noise))
+    assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 holds 14 bits to 0.001
+    # The nearest number, where float32 may be off by a hundredth of one before it rounds.
+    rounding = (numbers.round() - reference(light, exposure, normals)).abs()
+    assert float(rounding.max()) <= 0.51
+
+
+@pytest.mark.parametrize("camera", list_cameras())
+def test_every_digital_number_is_written_exactly(camera: str) -> None:
+    body = get_camera(camera)
+    numbers = np.arange(int(body.white_level) + 1)
+    black, span = np.array(body.black_level)[:, None], np.array(body.span)[:, None]
+    light = torch.from_numpy(((numbers - black) / span).astype(np.float32)).contiguous()
+    outputs = {
+        "codes": np.empty((1, 4, len(numbers)), np.uint8),
+        "numbers": np.empty((1, 4, len(numbers)), np.uint16),
+        "signals": np.empty((1, 4, len(numbers)), np.float32),
+    }
+    counts = record_frames(
+        np.array([light.data_ptr()], np.uintp),
+        len(numbers),
+        exposure_table([Exposure(1.0, CLEAN, CLEAN)]),
+        body,
+        **outputs,
+    )
+    quantised = clip_and_quantise(light[:, None], body)[:, 0]
+    np.testing.assert_array_equal(outputs["numbers"][0], np.tile(numbers, (4, 1)))
+    np.testing.assert_array_equal(outputs["signals"][0], quantised.numpy())
+    np.testing.assert_array_equal(outputs["codes"][0], encode_observation(quantised).numpy())
+    low, high = (quantised <= 2.0**-10).sum(), (quantised >= 1.0 - 1e-6).sum()
+    assert counts.tolist() == [[int(low), int(high)]]
+
+
+def test_clipping_and_extreme_light() -> None:
+    light = torch.tensor([3e38, 1e9, 2.0, 1.0, 0.5, 0.0, -0.01, -3e38]).repeat(4, 1)[:, None]
+    exposure = Exposure(1e3, CLEAN, Z6.nlf(6400))
+    found = record_capture(light.contiguous(), exposure, Z6, noise=FrameNoise(1))
+    assert bool(torch.isfinite(found).all())
+    assert (found[:, 0, :5] == 1.0).all()
+    pedestal = -1008.0 / 14512.0
+    assert found[:, 0, 6:].numpy() == pytest.approx(pedestal, rel=1e-6)
+    dark = record_capture(torch.full((4, 8, 8), 0.3), Exposure(1e-30, CLEAN, CLEAN), Z6)
+    assert (dark == 0.0).all()
+
+
+@pytest.mark.parametrize("kind", ["exact", "bank"])
+def test_noise_has_the_variance_of_the_camera(kind: Noise) -> None:
+    """Mean and variance of a flat patch, 5 standard errors; quantisation adds 1 / 12."""
+    nlf, n = Z6.nlf(6400), 4 * 512 * 512
+    flat, exposure = torch.full((4, 512, 512), 0.2), Exposure(1.0, CLEAN, nlf)
+    signal = record_capture(flat, exposure, Z6, noise=FrameNoise(3, kind))
+    for plane in range(4):
+        variance = nlf.read[plane] + 0.2 * nlf.shot[plane] + 1.0 / 12.0 / 14512.0**2
+        values = signal[plane].double()
+        assert float(values.mean()) == pytest.approx(0.2, abs=5.0 * (variance / (n / 4)) ** 0.5)
+        assert float(values.var()) == pytest.approx(variance, rel=5.0 * (2.0 / (n / 4)) ** 0.5)
+
+
+@pytest.mark.parametrize("kind", ["exact", "bank"])
+def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind: Noise) -> None:
+    lights = [random_light(4, 70, 90, seed=i) for i in range(5)]
+    isos = (100, 400, 1600, 6400, 400)
+    exposures = [Exposure(0.1 * (i + 1), CLEAN, Z6.nlf(iso)) for i, iso in enumerate(isos)]
+    addresses = np.array([light.data_ptr() for light in lights], np.uintp)
+    keys, frames = noise_keys(np.arange(5), 2), []
+    for threads in (1, 2, 3):
+        codes = np.empty((5, 4, 6300), np.uint8)
+        table = exposure_table(exposures)
+        drawn = {"keys": keys, "noise": kind}
+        record_frames(addresses, 6300, table, Z6, **drawn, codes=codes, threads=threads)
+        frames.append(codes)
+    for i, (light, exposure) in enumerate(zip(lights, exposures, strict=True)):
+        frame = record_capture(light, exposure, Z6, noise=FrameNoise(int(keys[i]), kind))
+        alone = encode_observation(frame)
+        for codes in frames:
+            np.testing.assert_array_equal(codes[i], alone.reshape(4, -1).numpy())
+
+
+def test_tables_hold_what_is_missing() -> None:
+    source, target = Z6.nlf(800), Z6.nlf(1600)
+    (table,) = exposure_table([Exposure(2.0, source, target)])
+    assert table[0].tolist() == [2.0] * 4
+    np.testing.assert_allclose(table[1], np.subtract(target.shot, np.multiply(source.shot, 2)))
+    np.testing.assert_allclose(table[2], np.subtract(target.read, np.multiply(source.read, 4)))
+    np.testing.assert_allclose(table[4], np.multiply(source.read, 4), rtol=1e-6)
+    span, black, low, high, white = sensor_table(Z6)[:, 0].tolist()
+    assert (span, black, low, high, white) == (14512.0, 1008.0, 1022.0, 15520.0, 15520.0)
+
+
+def test_black_level_may_be_zero_or_odd() -> None:
+    for black, white in itertools.product((0.0, 64.5), (255.0, 65535.0)):
+        body = CameraProfile("x", "RGGB", (black,) * 4, white, 16)  # type: ignore[arg-type]
+        light = random_light(4, 9, 9)
+        found = record_capture(light, Exposure(1.0, CLEAN, CLEAN), body)
+        assert torch.equal(found, clip_and_quantise(light, body))
+
+
+def test_packages_import_neither_torch_nor_numba() -> None:
+    code = "import sys, ae_env, simulator; print({'torch', 'numba'} & set(sys.modules))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "set()"

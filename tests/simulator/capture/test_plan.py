@@ -1,0 +1,207 @@
+"""The plan: which steps run, why the others do not, and what is said about error and cost."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from simulator import CameraSettings, Latent, NoiseLevelFunction, get_camera
+from simulator.capture.aperture_blur import MapOpening
+from simulator.capture.denoised import Denoised
+from simulator.capture.plan import BIAS, GAMMA
+
+Z6 = get_camera("nikon_z6")
+SOURCE = CameraSettings(1600, 1 / 64, 8)
+CLEANER = CameraSettings(100, 1 / 4, 8)
+BRIGHTER = CameraSettings(100, 4, 8)
+OPENER = CameraSettings(1600, 1 / 256, 4)
+STEPS = {
+    "exposure",
+    "noise_reduction",
+    "aperture",
+    "defocus",
+    "motion_blur",
+    "noise",
+    "clip_and_quantise",
+}
+
+
+def latent(*, networks: bool = True, **changes: object) -> Latent:
+    light = torch.rand(4, 16, 20, generator=torch.Generator().manual_seed(0)) * 0.3
+    made = Latent(light, SOURCE, Z6, Z6.nlf(1600))
+    if networks:
+        made = replace(made, denoised=Denoised(light))
+        made = replace(
+            made, opening=MapOpening(light, made.denoised, torch.full((16, 20), 2.0), 8.0)
+        )
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
+@pytest.mark.parametrize("networks", [True, False])
+def test_every_step_runs_or_has_a_reason(settings: CameraSettings, networks: bool) -> None:
+    plan = latent(networks=networks).plan(settings)
+    assert set(plan.modules) | set(plan.left_out) == STEPS
+    assert not set(plan.modules) & set(plan.left_out)
+    assert all(plan.left_out.values())
+
+
+def test_the_networks_run_where_they_are_needed() -> None:
+    """In the order of the pipeline."""
+    cleaner, opener = latent().plan(CLEANER), latent().plan(OPENER)
+    assert cleaner.modules == ("exposure", "noise_reduction", "noise", "clip_and_quantise")
+    assert opener.modules == ("exposure", "aperture", "noise", "clip_and_quantise")
+    both = latent().plan(CameraSettings(100, 1 / 16, 4))
+    assert both.modules[:3] == ("exposure", "noise_reduction", "aperture")
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "step", "reason"),
+    [
+        ({"networks": False}, CLEANER, "noise_reduction", "no noise module"),
+        ({"nlf": NoiseLevelFunction.zero()}, CLEANER, "noise_reduction", "carries no noise"),
+        ({}, OPENER, "noise_reduction", "at least as noisy"),
+        ({"networks": False}, OPENER, "aperture", "`depth` is not 'unknown'"),
+        ({}, CLEANER, "aperture", "does not open"),
+        ({"opening": None}, CLEANER, "defocus", "far or in focus"),
+        ({}, CLEANER, "defocus", "each pixel's was estimated"),
+        ({"nlf": Z6.nlf(100).scaled(0.1)}, BRIGHTER, "noise_reduction", "err as much"),
+        ({"defocus": 1e-4}, CLEANER, "defocus", "pixel wide, which would hardly show"),
+        ({}, CLEANER, "motion_blur", "does not move"),
+        ({"image_speed": 1e-6}, CLEANER, "motion_blur", "which would hardly show"),
+        ({}, SOURCE, "noise", "has the target's already"),
+    ],
+)
+def test_reasons(changes: dict, settings: CameraSettings, step: str, reason: str) -> None:
+    plan = latent(**changes).plan(settings)
+    assert reason in plan.left_out[step]
+    assert f"left out  {step}: {plan.left_out[step]}" in str(plan)
+
+
+def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
+    with_module, without = latent().plan(CLEANER), latent(networks=False).plan(CLEANER)
+    assert (with_module.excess_noise, with_module.predicted_rmse) == (0.0, 0.0)
+    light = latent().light.double()
+    read, shot = (
+        [torch.tensor(getattr(Z6.nlf(iso), name)).double()[:, None, None] for iso in (1600, 100)]
+        for name in ("read", "shot")
+    )
+    given, wanted = (r + s * light for r, s in zip(read, shot, strict=True))
+    assert without.excess_noise == pytest.approx(float(((given - wanted) / wanted).mean()))
+    assert without.predicted_rmse == pytest.approx(float((given - wanted).mean()) ** 0.5)
+
+
+def test_blur_of_the_aperture_lowers_the_predicted_excess() -> None:
+    """f/8 to f/4 at a fifth of a stop more light: blur removes more noise than that is too much."""
+    settings = replace(OPENER, exposure_time=OPENER.exposure_time * 2**0.2)
+    opened = latent(denoised=None).plan(settings)
+    assert latent(networks=False).plan(settings).excess_noise > 0.1
+    assert opened.excess_noise == 0.0
+    assert "noise" in opened.modules
+
+
+def test_operations_add_up() -> None:
+    """A step more costs more, and a frame of four times the pixels four times as much."""
+    assert latent().plan(OPENER).operations > latent(networks=False).plan(OPENER).operations
+    large = Latent(torch.full((4, 32, 40), 0.1), SOURCE, Z6, Z6.nlf(1600))
+    small = Latent(torch.full((4, 16, 20), 0.1), SOURCE, Z6, Z6.nlf(1600))
+    target = CameraSettings(6400, 1 / 256, 8)
+    assert large.plan(target).operations == 4 * small.plan(target).operations
+
+
+# Steps and errors
+
+
+@pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
+@pytest.mark.parametrize("tolerance", [0.0, 0.1, 5.0])
+def test_old_fields_follow_from_the_steps(settings: CameraSettings, tolerance: float) -> None:
+    plan = latent(tolerance=tolerance, image_speed=1e-3).plan(settings)
+    assert plan.tolerance == tolerance
+    assert plan.modules == tuple(s.name for s in plan.steps if s.runs)
+    assert plan.left_out == {s.name: s.reason for s in plan.steps if not s.runs}
+    assert plan.operations == sum(s.operations for s in plan.steps)
+    assert plan.predicted_error == pytest.approx(math.sqrt(sum(s.error**2 for s in plan.steps)))
+    assert plan.predicted_error <= plan.tolerance
+    assert plan.predicted_difference >= plan.predicted_error
+    assert all(s.error == 0 for s in plan.steps if s.runs)
+    assert all(s.operations == 0 for s in plan.steps if not s.runs)
+
+
+def test_tolerance_nought_predicts_rounding_alone() -> None:
+    for settings in (SOURCE, CLEANER, OPENER):
+        plan = latent(tolerance=0.0, image_speed=1e-3, defocus=0.1).plan(settings)
+        assert {"noise_reduction", "defocus", "motion_blur"} <= set(plan.modules)
+        assert plan.predicted_error == 0.0
+        assert plan.predicted_difference < 1e-3
+
+
+def test_each_decision_says_what_it_costs() -> None:
+    """Standard deviation 5e-3 where 4e-3 is wanted: 0.25 if it stays."""
+    camera = replace(Z6, nlf_by_iso={100.0: NoiseLevelFunction((0.0,) * 4, (16e-6,) * 4)})
+    nlf = NoiseLevelFunction((0.0,) * 4, (25e-6,) * 4)
+    light, settings = torch.full((4, 8, 8), 0.2), CameraSettings(100, 1, 8)
+    made = Latent(light, settings, replace(camera, segments=()), nlf, denoised=Denoised(light))
+    strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.2, 0.3))
+    assert "noise_reduction" in strict.modules
+    assert "leaving it out would err by 0.25" in strict.steps[1].reason
+    assert (strict.predicted_error, loose.predicted_error) == (0.0, pytest.approx(0.25))
+    assert "hardly noisier" in loose.left_out["noise_reduction"]
+    assert "(error 0.25)" in loose.explain()
+    assert (
+        "0.25 of the target's noise is due to what is left out (tolerance 0.3)" in loose.explain()
+    )
+    # The network that did not run would itself have erred: by BIAS of 5e-3, and GAMMA of 0.2.
+    own = math.hypot(BIAS * 5e-3, GAMMA * 0.2) / 4e-3
+    assert loose.predicted_difference == pytest.approx(math.hypot(0.25, own), rel=1e-3)
+    assert replace(made, denoised=None).plan(settings).predicted_error == pytest.approx(0.25)
+
+
+def test_blur_that_hardly_shows_is_left_out_with_its_error() -> None:
+    made = latent(opening=None, denoised=None, nlf=NoiseLevelFunction.zero())
+    moving = replace(made, image_speed=0.02, tolerance=1.0).plan(SOURCE)
+    error = moving.steps[4].error
+    assert 0.0 < error == moving.predicted_error < 1.0
+    assert "which would hardly show" in moving.left_out["motion_blur"]
+    strict = replace(made, image_speed=0.02, tolerance=error * 0.99).plan(SOURCE)
+    assert "motion_blur" in strict.modules
+    assert f"would err by {error:.2g}" in strict.steps[4].reason
+
+
+def test_the_light_alone_takes_neither_noise_nor_clip() -> None:
+    plan = latent().plan(CLEANER, noise=False)
+    assert plan.modules == ("exposure", "noise_reduction")
+    for step in ("noise", "clip_and_quantise"):
+        assert plan.left_out[step] == "only the light is asked for"
+    assert plan.operations < latent().plan(CLEANER).operations
+
+
+def test_the_text_names_every_step() -> None:
+    plan = latent(tolerance=0.0, image_speed=1e-3).plan(OPENER)
+    text = plan.explain()
+    assert text == str(plan)
+    assert "needed    noise_reduction: tolerance 0" in text
+    assert "needed    aperture: the aperture opens and adds blur (up to 3.5 pixel)" in text
+    assert all(step in text for step in STEPS)
+    assert max(len(line) for line in text.splitlines()) < 140
+
+
+def test_regions_that_needed_no_network_count_against_the_full_run() -> None:
+    """A quarter of the frame is saturated and was left as it is: the full run errs by GAMMA of it,
+    and BIAS of the noise that it takes it to have."""
+    light = 0.2 + 0.01 * torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0))
+    light[:, :16, :16] = 1.0
+    denoised = torch.where(light == 1.0, 1.0, 0.19)
+    made = Latent(light, SOURCE, Z6, Z6.nlf(1600), denoised=Denoised(denoised))
+    plan = made.plan(CLEANER)
+    assert "noise_reduction" in plan.modules
+    assert plan.predicted_error == 0.0
+    given, wanted = (
+        torch.tensor(n.read) + torch.tensor(n.shot) for n in (Z6.nlf(1600), Z6.nlf(100))
+    )
+    square = (BIAS**2 * given + GAMMA**2) / wanted
+    expected = math.sqrt(float(square.mean()) / 4)
+    assert plan.predicted_difference == pytest.approx(expected, rel=1e-3)
+    assert replace(made, tolerance=0.0).plan(CLEANER).predicted_difference < 1e-3

@@ -1,0 +1,423 @@
+"""Which light a capture starts from, and that its noise is the target's in every case."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from simulator import CameraSettings, Latent, NoiseLevelFunction, get_camera
+from simulator.camera import CameraProfile
+from simulator.capture.aperture_blur import MapOpening, NetworkOpening
+from simulator.capture.denoised import Denoised
+from simulator.networks.aperture_module import ApertureModule
+
+Z6 = get_camera("nikon_z6")
+LOW, HIGH = CameraSettings(100, 1 / 64, 8), CameraSettings(6400, 1 / 64, 8)
+SIDE = 128
+
+
+def flat(level: float) -> Tensor:
+    return torch.full((4, SIDE, SIDE), level)
+
+
+def recorded(level: float, nlf: NoiseLevelFunction, seed: int = 0) -> Tensor:
+    """A flat field with the noise of `nlf`, drawn by NumPy."""
+    rng = np.random.default_rng(seed)
+    deviation = [math.sqrt(r + s * level) for r, s in zip(nlf.read, nlf.shot, strict=True)]
+    planes = [rng.normal(level, d, (SIDE, SIDE)) for d in deviation]
+    return torch.from_numpy(np.stack(planes).astype(np.float32))
+
+
+def expected_variance(level: float, nlf: NoiseLevelFunction) -> np.ndarray:
+    return np.array(nlf.read) + np.array(nlf.shot) * level
+
+
+def variance(frame: Tensor) -> np.ndarray:
+    """Per plane; of 16,384 pixels, so within 4 * sqrt(2 / 16384) = 4.4 %."""
+    return frame.double().flatten(1).var(dim=1).numpy()
+
+
+TOLERANCE = 4 * math.sqrt(2) / SIDE
+
+
+def latent(level: float = 0.2, reference: CameraSettings = HIGH, **changes: object) -> Latent:
+    nlf = Z6.nlf(reference.iso)
+    made = Latent(recorded(level, nlf), reference, Z6, nlf, denoised=Denoised(flat(level)))
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+# The noise-reduced light
+
+
+def test_denoised_light_is_used_where_the_source_is_noisier() -> None:
+    """ISO 6400 to 100 at the same exposure: 64 times the noise. The output has the target's."""
+    target = CameraSettings(100, 1.0, 8)
+    source = latent()
+    exposure = source.exposure(target)
+    assert exposure.denoised
+    assert exposure.source.is_zero
+    assert torch.equal(source.expected(target), flat(0.2))
+    frame, excess = source.capture(target, 3)
+    assert excess == 0.0
+    np.testing.assert_allclose(
+        variance(frame), expected_variance(0.2, Z6.nlf(100)), rtol=TOLERANCE, atol=1 / 12 / 14512**2
+    )
+    assert source.plan(target).excess_noise == 0.0
+    assert source.output_noise(target) == Z6.nlf(100)
+
+
+def test_light_as_recorded_is_used_where_noise_is_only_to_be_added() -> None:
+    target = CameraSettings(6400, 1 / 64, 8)
+    source = latent(reference=CameraSettings(100, 1.0, 8))
+    exposure = source.exposure(target)
+    assert not exposure.denoised
+    frame, excess = source.capture(target, 3)
+    assert excess == 0.0
+    np.testing.assert_allclose(
+        variance(frame), expected_variance(0.2, Z6.nlf(6400)), rtol=TOLERANCE
+    )
+
+
+def test_the_same_settings_give_the_recorded_light_back() -> None:
+    """No excess at ratio 1: a network must not touch what is exact already."""
+    source = latent()
+    assert not source.exposure(HIGH).denoised
+    span, white = 14512, 15520  # its DNs as they were, unless they were clipped
+    kept = (source.light * span + 1008).round().clamp(0, white).sub(1008) / span
+    torch.testing.assert_close(source.capture(HIGH, 0)[0], kept, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("tolerance", "denoised"), [(0.13, False), (0.12, True), (0.0, True)])
+def test_light_without_noise_takes_none_of_the_sources(tolerance: float, denoised: bool) -> None:
+    """ISO 100 to 6400, both with the same read-noise-free NLF per gain: 1/8 of its deviation."""
+    body = CameraProfile(
+        name="shot noise only",
+        cfa=Z6.cfa,
+        black_level=Z6.black_level,
+        white_level=Z6.white_level,
+        bit_depth=Z6.bit_depth,
+        nlf_by_iso={iso: NoiseLevelFunction((iso * 1e-6,) * 4, (0.0,) * 4) for iso in (100, 6400)},
+    )
+    low, high = CameraSettings(100, 1.0, 8), CameraSettings(6400, 1 / 64, 8)
+    noisy, clean = flat(0.2) + 1e-3, Denoised(flat(0.2))
+    source = Latent(noisy, low, body, body.nlf(100), denoised=clean, tolerance=tolerance)
+    assert not source.exposure(high).denoised or tolerance == 0.0
+    assert torch.equal(source.expected(high), clean.light if denoised else noisy)
+    plan = source.plan(high, noise=False)
+    assert ("noise_reduction" in plan.modules) is denoised
+    assert plan.predicted_error == pytest.approx(0.0 if denoised else 1 / 8)
+
+
+def test_a_brighter_target_at_the_same_iso_is_denoised() -> None:
+    """Exposing by c multiplies shot noise by c^2, the signal and the target's noise by c."""
+    assert latent(0.05).exposure(CameraSettings(6400, 1 / 16, 8)).denoised
+    assert not latent(0.05).exposure(CameraSettings(6400, 1 / 256, 8)).denoised
+
+
+def test_a_source_with_next_to_no_noise_keeps_it() -> None:
+    """ISO 100 at half of white: sigma is sqrt(7.5e-6 * 0.5) = 0.2 %, 0.4 % of the light."""
+    bright = latent(0.5, LOW).exposure(CameraSettings(100, 1 / 16, 8))
+    dark = latent(0.01, LOW).exposure(CameraSettings(100, 1 / 16, 8))  # 3 % of the light
+    assert (bright.denoised, dark.denoised) == (False, True)
+    assert bright.source_noise.shot == pytest.approx([4 * s for s in Z6.nlf(100).shot])
+
+
+def test_without_a_noise_module_the_excess_is_declared() -> None:
+    target = CameraSettings(100, 1.0, 8)
+    source = latent(denoised=None)
+    assert not source.exposure(target).denoised
+    wanted, given = (expected_variance(0.2, Z6.nlf(iso)) for iso in (100, 6400))
+    stated = source.plan(target).excess_noise
+    assert stated == pytest.approx(float((given / wanted - 1).mean()), rel=0.02)
+    assert source.capture(target, 0)[1] == pytest.approx(stated, rel=1e-4)
+
+
+def test_a_source_without_noise_is_never_denoised() -> None:
+    source = latent(nlf=NoiseLevelFunction.zero())
+    assert not source.exposure(CameraSettings(100, 4.0, 8)).denoised
+
+
+def test_the_denoised_light_has_the_shape_of_the_light() -> None:
+    with pytest.raises(ValueError, match=r"`denoised` \(shape \(4, 8, 8\)\) must have the shape"):
+        latent(denoised=Denoised(torch.zeros(4, 8, 8)))
+
+
+def test_noise_is_compared_with_the_averaged_sensors() -> None:
+    """A box-averaged source has the target's noise divided by k^2 as well: nothing to remove."""
+    nlf = Z6.nlf(6400).scaled(1 / 16)
+    assert not latent(nlf=nlf, box_factor=4).exposure(HIGH).denoised
+    assert latent(nlf=Z6.nlf(6400), box_factor=4).exposure(HIGH).denoised
+
+
+# The wider aperture
+
+
+def with_detail(source: Latent) -> Latent:
+    """A chequered corner of 8 pixels: a blur of flat light would be left out."""
+    board = torch.zeros(SIDE, SIDE)
+    board[:8:2, :8:2] = board[1:8:2, 1:8:2] = 0.1
+    assert source.denoised is not None
+    denoised = Denoised(source.denoised.light + board)
+    return replace(source, light=source.light + board, denoised=denoised)
+
+
+def with_opening(source: Latent, diameter: float) -> Latent:
+    denoised = source.denoised or Denoised(source.light)
+    found = torch.full((SIDE, SIDE), diameter)
+    opening = MapOpening(source.light, denoised, found, source.reference.effective_f_number)
+    return replace(source, opening=opening)
+
+
+@pytest.mark.parametrize("diameter", [0.8, 2.0, 6.0])
+@pytest.mark.parametrize("level", [0.02, 0.2])
+def test_noise_that_the_blur_removed_is_topped_up(diameter: float, level: float) -> None:
+    """f/8 to f/4 at the same exposure and ISO: what blur takes of the noise is added again."""
+    source = with_opening(with_detail(latent(level)), diameter)
+    target = CameraSettings(6400, 1 / 256, 4)
+    exposure = source.exposure(target)
+    assert exposure.ratio == 1.0
+    assert exposure.opened_to == 4.0
+    assert not exposure.denoised
+    blurred = variance(source.expected(target)[:, 16:-16, 16:-16])
+    assert (blurred < 0.75 * expected_variance(level, Z6.nlf(6400))).all()  # it did remove some
+    frame, excess = source.capture(target, 9)
+    assert excess == 0.0
+    wanted = expected_variance(level, Z6.nlf(6400)) + 1 / 12 / 14512**2
+    inner = frame[:, 16:, 16:]
+    np.testing.assert_allclose(variance(inner), wanted, rtol=1.6 * TOLERANCE)
+    assert inner.double().mean() == pytest.approx(level, rel=0.01)
+
+
+def test_the_denoised_light_is_opened_where_the_target_is_cleaner() -> None:
+    source = with_opening(with_detail(latent()), 3.0)
+    target = CameraSettings(100, 1 / 4, 4)
+    exposure = source.exposure(target)
+    assert (exposure.denoised, exposure.opened_to, exposure.remaining) == (True, 4.0, None)
+    torch.testing.assert_close(source.expected(target)[:, 16:, 16:], flat(0.2)[:, 16:, 16:])
+    frame, _ = source.capture(target, 3)
+    np.testing.assert_allclose(
+        variance(frame[:, 16:, 16:]),
+        expected_variance(0.2, Z6.nlf(100)),
+        rtol=TOLERANCE,
+        atol=1 / 12 / 14512**2,
+    )
+
+
+@pytest.mark.parametrize("f_number", [8, 11, 16])
+def test_the_same_and_smaller_apertures_leave_every_bit(f_number: float) -> None:
+    target = CameraSettings(6400, 1 / 64 * 2 ** ((f_number - 8) / 8), f_number)
+    source, plain = with_opening(latent(), 9.0), latent()
+    assert source.exposure(target).opened_to is None
+    assert torch.equal(source.capture(target, 1)[0], plain.capture(target, 1)[0])
+
+
+def test_what_is_in_focus_stays_as_it_is() -> None:
+    target = CameraSettings(6400, 1 / 256, 4)
+    source, plain = with_opening(latent(), 0.0), latent()
+    assert source.exposure(target).opened_to is None
+    assert torch.equal(source.capture(target, 1)[0], plain.capture(target, 1)[0])
+
+
+def test_the_papers_network_always_opens_denoised_light() -> None:
+    torch.manual_seed(0)
+    module = ApertureModule("paper").eval().requires_grad_(False)
+    light = flat(0.2)[:, :16, :16]
+    clean = Denoised(light)
+    small = Latent(light, HIGH, Z6, Z6.nlf(6400), denoised=clean)
+    source = replace(small, opening=NetworkOpening(clean, module, 8.0))
+    exposure = source.exposure(CameraSettings(6400, 1 / 256, 4))
+    assert (exposure.denoised, exposure.opened_to, exposure.remaining) == (True, 4.0, None)
+    assert source.exposure(HIGH).denoised is False
+
+
+# What a tolerance leaves out
+
+
+def patch(source: float, target: float, **changes: object) -> tuple[Latent, CameraSettings]:
+    """Flat light of 0.2 with noise variance `source`, asked for with variance `target`."""
+    camera = replace(Z6, nlf_by_iso={100.0: constant(target)}, segments=())
+    settings = CameraSettings(100, 1 / 64, 8)
+    made = Latent(flat(0.2), settings, camera, constant(source), denoised=Denoised(flat(0.2)))
+    return replace(made, **changes), settings  # type: ignore[arg-type]
+
+
+def constant(variance: float) -> NoiseLevelFunction:
+    return NoiseLevelFunction((0.0,) * 4, (variance,) * 4)
+
+
+@pytest.mark.parametrize(("tolerance", "denoised"), [(0.24, True), (0.26, False), (0.0, True)])
+def test_noise_in_excess_by_a_quarter(tolerance: float, denoised: bool) -> None:
+    """Standard deviations 5e-3 and 4e-3: leaving the noise errs by 5 / 4 - 1."""
+    source, settings = patch(25e-6, 16e-6, tolerance=tolerance)
+    exposure = source.exposure(settings)
+    assert exposure.denoised is denoised
+    assert exposure.errors["noise_reduction"] == pytest.approx(0.25, rel=1e-6)
+
+
+def wave(period: int, amplitude: float) -> Tensor:
+    columns = torch.arange(SIDE, dtype=torch.float64) + 0.5
+    light = 0.3 + amplitude * torch.cos(2 * math.pi / period * columns)
+    return light.float().expand(4, SIDE, SIDE).contiguous()
+
+
+def wave_error(period: int, amplitude: float, moment: float, deviation: float) -> float:
+    """Half the second moment times the Laplacian of a wave, root mean square."""
+    return moment / 2 * (2 - 2 * math.cos(2 * math.pi / period)) * amplitude / 2**0.5 / deviation
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.02])
+@pytest.mark.parametrize("blur", ["disc", "streak"])
+def test_blur_of_a_wave_by_hand(blur: str, factor: float) -> None:
+    """A wave of 16 pixels, blurred by 0.4 pixel, against noise of 1e-3."""
+    moment = 0.4**2 / (16 if blur == "disc" else 12)
+    error = wave_error(16, 0.1, moment, 1e-3)
+    camera = replace(Z6, nlf_by_iso={100.0: constant(1e-6)}, segments=())
+    settings = CameraSettings(100, 1 / 64, 8)
+    scene = {"defocus": 0.8} if blur == "disc" else {"image_speed": 0.4 * 64 / SIDE}
+    made = Latent(wave(16, 0.1), settings, camera, NoiseLevelFunction.zero(), **scene)
+    exposure = replace(made, tolerance=factor * error).exposure(settings)
+    name = "defocus" if blur == "disc" else "motion_blur"
+    assert exposure.errors[name] == pytest.approx(error, rel=1e-4)
+    applied = exposure.defocus_px if blur == "disc" else exposure.motion_px
+    assert applied == (pytest.approx(0.4) if factor < 1 else 0.0)
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 0.01, 0.1, 0.3, 1.0, 10.0])
+def test_what_is_left_out_stays_within_the_tolerance(tolerance: float) -> None:
+    """Over all kinds of transitions of a textured, noisy, moving scene of unknown depth."""
+    rng = np.random.default_rng(2)
+    clean = torch.from_numpy((0.02 + 0.5 * rng.random((4, 32, 48))).astype(np.float32))
+    found = torch.from_numpy(rng.random((32, 48)).astype(np.float32)) * 0.05
+    denoised = Denoised(clean)
+    seen = set()
+    for iso, speed, disc in itertools.product((100, 1600), (0.0, 1e-3, 0.1), (0.0, 0.01, 1.0)):
+        reference = CameraSettings(iso, 1 / 64, 8)
+        made = Latent(clean, reference, Z6, Z6.nlf(iso), denoised=denoised, tolerance=tolerance)
+        made = replace(made, image_speed=speed, defocus=disc)
+        made = replace(made, opening=MapOpening(clean, denoised, found, 8.0))
+        for settings in itertools.starmap(
+            CameraSettings, itertools.product((100, 800, 6400), (1 / 500, 1 / 64, 1 / 4), (4, 8))
+        ):
+            exposure = made.exposure(settings)
+            applied = {
+                "noise_reduction": exposure.denoised,
+                "aperture": exposure.opened_to is not None,
+                "defocus": exposure.defocus_px > 0,
+                "motion_blur": exposure.motion_px > 0,
+            }
+            errors = [e for name, e in exposure.errors.items() if not applied[name]]
+            seen |= {name for name in exposure.errors if not applied[name]}
+            if made.is_noisy:
+                assert math.hypot(*errors) <= tolerance * (1 + 1e-9)
+            if tolerance == 0.0:
+                assert not errors
+    assert tolerance < 0.1 or seen == {"noise_reduction", "aperture", "defocus", "motion_blur"}
+
+
+def test_copies_share_what_is_known_of_the_light() -> None:
+    source = latent()
+    other = replace(source, gain=2.0, tolerance=0.0, image_speed=1.0)
+    assert other.statistics is source.statistics
+    assert other.optics is source.optics
+    assert source.statistics.light is source.light
+    assert source.statistics_of(False) is source.statistics
+    assert other.statistics_of(True) is source.statistics_of(True)
+    assert source.statistics_of(True).light is source.denoised.light  # type: ignore[union-attr]
+    brighter = replace(source, light=source.light * 2, denoised=None)
+    assert brighter.statistics is not source.statistics
+    assert brighter.statistics.light is brighter.light
+    assert brighter.optics is not source.optics
+
+
+@pytest.mark.parametrize("tolerance", [-0.1, float("nan"), None])
+def test_bad_tolerances(tolerance: float) -> None:
+    with pytest.raises(ValueError, match="`tolerance`"):
+        latent(tolerance=tolerance)
+
+
+# Sweeps
+
+
+STATES = [
+    CameraSettings(iso, time, f_number)
+    for iso, time, f_number in itertools.product((100, 6400), (1 / 500, 1 / 8), (4, 8, 16))
+]
+
+
+@pytest.mark.parametrize("noise", ["exact", "bank"])
+@pytest.mark.parametrize("scene", [{}, {"image_speed": 0.2, "defocus": 2.0}])
+def test_frames_are_the_same_alone_and_in_any_sweep(noise: str, scene: dict) -> None:
+    source = with_opening(with_detail(latent(**scene)), 2.0)
+    sweep = source.expose(STATES, seed=4, noise=noise)  # type: ignore[arg-type]
+    backwards = source.expose(STATES[::-1], seed=4, noise=noise)  # type: ignore[arg-type]
+    assert torch.equal(sweep.flip(0), backwards)
+    for frame, streamed, settings in zip(
+        sweep,
+        source.stream(STATES, seed=4, noise=noise),  # type: ignore[arg-type]
+        STATES,
+        strict=True,
+    ):
+        assert torch.equal(frame, streamed)
+        assert torch.equal(frame, source.capture(settings, 4, noise=noise)[0])  # type: ignore[arg-type]
+    assert not torch.equal(sweep, source.expose(STATES, seed=5, noise=noise))  # type: ignore[arg-type]
+
+
+def test_noise_from_the_bank_has_the_right_variance() -> None:
+    source = latent(nlf=NoiseLevelFunction.zero(), light=flat(0.2), denoised=None)
+    frame, _ = source.capture(HIGH, 1, noise="bank")
+    np.testing.assert_allclose(
+        variance(frame), expected_variance(0.2, Z6.nlf(6400)), rtol=TOLERANCE
+    )
+    assert not torch.equal(frame, source.capture(HIGH, 1)[0])
+
+
+def test_unknown_noise() -> None:
+    with pytest.raises(ValueError, match=r"`noise` \(='none'\) must be one of \['exact', 'bank'\]"):
+        latent().capture(HIGH, noise="none")  # type: ignore[arg-type]
+
+
+def test_no_states_no_frames() -> None:
+    assert latent().expose([]).shape == (0, 4, SIDE, SIDE)
+
+
+def test_frames_are_written_where_they_are_wanted() -> None:
+    states = [CameraSettings(100, 1 / 64, 4.0), CameraSettings(800, 1 / 8, 4.0)]
+    place = torch.full((3, 4, SIDE, SIDE), -7.0)
+    frames = latent().expose(states, seed=3, out=place[1:])
+    assert frames.data_ptr() == place[1:].data_ptr()
+    assert torch.equal(frames, latent().expose(states, seed=3))
+    assert bool((place[0] == -7.0).all())
+
+
+@pytest.mark.parametrize(
+    "out",
+    [
+        torch.empty(1, 4, SIDE, SIDE),
+        torch.empty(2, 4, SIDE, SIDE, dtype=torch.float64),
+        torch.empty(2, 4, SIDE, 2 * SIDE)[..., ::2],
+    ],
+)
+def test_frames_do_not_fit_everywhere(out: torch.Tensor) -> None:
+    states = [CameraSettings(100, 1 / 64, 4.0)] * 2
+    with pytest.raises(ValueError, match=r"`out` .*must be contiguous float32 \(2, 4"):
+        latent().expose(states, out=out)
+
+
+def test_only_settings_are_exposed_and_never_into_the_light() -> None:
+    own = latent()
+    with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
+        own.expose([HIGH, 3])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
+        own.expose(HIGH)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"`out` .=list. must be a torch tensor"):
+        own.expose([HIGH], out=[1])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="`out` must not be the memory of the light"):
+        own.expose([HIGH], out=own.light[None])
+    with pytest.raises(ValueError, match="without gradient"):
+        own.expose([HIGH], out=torch.empty(1, 4, SIDE, SIDE, requires_grad=True))

@@ -1,0 +1,370 @@
+"""The statistics of a capture against closed forms, over every state of a 64-state grid.
+
+Tolerances are sampling errors: five standard errors, computed from the exact fourth moments.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
+from simulator.capture.exposure import Exposure
+from simulator.capture.prepared_scene import Latent
+from simulator.capture.record import add_noise, clip_and_quantise, sensor_light
+from simulator.noise.generator import FrameNoise
+from simulator.settings import CameraSettings
+
+STATES = [
+    CameraSettings(iso, exposure_time, f_number)
+    for iso, exposure_time, f_number in itertools.product(
+        (100, 400, 1600, 6400), (1 / 1000, 1 / 125, 1 / 15, 1 / 2), (4, 5.6, 8, 11)
+    )
+]
+AREA = {4: 1 / 16, 5.6: 1 / 32, 8: 1 / 64, 11: 1 / 128}  # exact stops of the marked f-numbers
+Z6 = get_camera("nikon_z6")
+BLACK, WHITE, SPAN = 1008.0, 15520.0, 14512.0
+# Shot and read noise of R, G, B at each ISO, retyped from the published table.
+Z6_NOISE = {
+    100: (
+        (7.88891432059205e-06, 7.47234302281224e-06, 7.31670099946593e-06),
+        (5.71150998895191e-09, 5.73712214136873e-09, 5.59509111432998e-09),
+    ),
+    400: (
+        (3.25795376516365e-05, 3.09620813305867e-05, 2.95490959029526e-05),
+        (5.23908219573611e-08, 5.22487909303224e-08, 4.85513274723299e-08),
+    ),
+    1600: (
+        (0.000138265049210346, 0.00013417868314641, 0.000116127260242618),
+        (5.69427999550786e-08, 5.73036984664066e-08, 5.99138096354303e-08),
+    ),
+    6400: (
+        (0.000536276798657206, 0.000529454489967193, 0.000460526436255436),
+        (6.94797157253651e-07, 7.25184811907467e-07, 7.1397833103636e-07),
+    ),
+}
+ROWS, COLUMNS = 32, 128  # pixels of one flat patch
+
+
+def table(iso: float) -> tuple[np.ndarray, np.ndarray]:
+    """(shot, read), each (4, 1) over R, G1, G2, B."""
+    shot, read = Z6_NOISE[int(iso)]
+    return np.array(shot)[[0, 1, 1, 2], None], np.array(read)[[0, 1, 1, 2], None]
+
+
+def exposure_of(settings: CameraSettings) -> float:
+    return settings.iso * settings.exposure_time * AREA[settings.f_number]
+
+
+def patches(levels: np.ndarray) -> torch.Tensor:
+    """(4, L * ROWS, COLUMNS): one flat patch per level; `levels` is (L,) or (4, L)."""
+    levels = np.broadcast_to(levels, (4, np.shape(levels)[-1]))
+    flat = np.repeat(levels, ROWS, axis=1)[:, :, None].repeat(COLUMNS, axis=2)
+    return torch.from_numpy(flat.astype(np.float32))
+
+
+def numbers_of(capture: torch.Tensor, levels: int) -> np.ndarray:
+    """Digital numbers (4, L, pixels), asserted to lie on the camera's integer lattice."""
+    numbers = capture.double().numpy() * SPAN + BLACK
+    assert np.abs(numbers - np.rint(numbers)).max() < 2e-3  # float32 near 15520
+    assert numbers.min() >= -2e-3
+    assert numbers.max() <= WHITE + 2e-3
+    return np.rint(numbers).reshape(4, levels, ROWS * COLUMNS)
+
+
+def recorded_moments(mean: float, variance: float) -> tuple[float, float, float]:
+    """Mean, variance and fourth central moment [DN] of Gaussian light on an integer sensor.
+
+    Every digital number n collects the probability of [n - 1/2, n + 1/2]; those beyond the ends
+    collect the tails.
+    """
+    centre, sigma = mean * SPAN + BLACK, math.sqrt(variance) * SPAN
+    low = min(max(0.0, math.floor(centre - 9 * sigma)), WHITE)
+    high = max(min(WHITE, math.ceil(centre + 9 * sigma)), 0.0)
+    values = np.arange(low, high + 1)
+    edges = values[:-1] + 0.5
+    probability = np.diff(norm.cdf(edges, centre, sigma), prepend=0.0, append=1.0)
+    average = float(probability @ values)
+    spread = values - average
+    return average, float(probability @ spread**2), float(probability @ spread**4)
+
+
+def assert_moments(samples: np.ndarray, expected: list[tuple[float, float, float]]) -> None:
+    """Means and variances of `samples` (N, pixels) within 5 standard errors, alone and together."""
+    count = samples.shape[1]
+    mean, variance, fourth = np.array(expected).T
+    error_mean = np.sqrt(variance / count)
+    error_variance = np.sqrt(np.maximum(fourth - variance**2, 0.0) / count)
+    for name, off, error in (
+        ("mean", samples.mean(1) - mean, error_mean),
+        ("variance", samples.var(1, ddof=1) - variance, error_variance),
+    ):
+        certain = error < 1e-9  # all pixels at white, or at 0
+        assert np.abs(off[certain]).max(initial=0.0) < 1e-9, name
+        z = off[~certain] / error[~certain]
+        assert np.abs(z).max() < 5.0, (name, np.abs(z).argmax(), z)
+        assert abs(z.mean()) * math.sqrt(len(z)) < 5.0, (name, z.mean())
+
+
+def test_noise_free_source_over_all_states() -> None:
+    """At five signals from black to near white, each state has its camera's mean and variance."""
+    reference = CameraSettings(100, 1 / 125, 8)
+    levels = np.array([0.0, 0.004, 0.119, 0.5, 0.85])
+    samples, expected = [], []
+    for state in STATES:
+        ratio = exposure_of(state) / exposure_of(reference)
+        light = patches(levels / ratio)
+        latent = Latent(light, reference, Z6, NoiseLevelFunction.zero())
+        capture, excess = latent.capture(state, seed=1)
+        assert excess == 0.0
+        samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
+        shot, read = table(state.iso)
+        variance = read + shot * levels
+        expected += [
+            recorded_moments(level, v)
+            for row in variance
+            for level, v in zip(levels, row, strict=True)
+        ]
+        # what the design promises, away from the clips: variance read + shot x (the rounding to
+        # whole digital numbers adds 1/12)
+        middle = variance[:, 2] * SPAN**2 + 1 / 12
+        recorded = np.array([e[1] for e in expected[-20:]]).reshape(4, 5)[:, 2]
+        np.testing.assert_allclose(recorded, middle, rtol=1e-6)
+    assert_moments(np.concatenate(samples), expected)
+
+
+def test_one_light_over_all_states_from_black_to_white() -> None:
+    """The same scene, 16 stops of it: most states clip some of it at one end or the other."""
+    reference = CameraSettings(100, 1 / 15, 5.6)
+    levels = 2.0 ** np.arange(-12, 5, 2)
+    light = patches(levels)
+    latent = Latent(light, reference, Z6, NoiseLevelFunction.zero())
+    samples, expected, white = [], [], 0
+    for state, capture in zip(STATES, latent.stream(STATES, seed=2), strict=True):
+        ratio = exposure_of(state) / exposure_of(reference)
+        shot, read = table(state.iso)
+        samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
+        white += int((samples[-1] == WHITE).all(1).sum())
+        signals = levels * ratio
+        for row in read + shot * signals:
+            expected += [recorded_moments(x, v) for x, v in zip(signals, row, strict=True)]
+    assert_moments(np.concatenate(samples), expected)
+    assert white > 100  # patches without any noise left, every pixel at white
+
+
+def noisy_patches(
+    levels: np.ndarray, iso: int, generator: np.random.Generator
+) -> tuple[torch.Tensor, NoiseLevelFunction]:
+    """Flat light with the Z6's noise at `iso`, drawn by NumPy."""
+    shot, read = table(iso)
+    light = patches(levels).double().numpy()
+    sigma = np.sqrt(read[:, :, None] + shot[:, :, None] * light)
+    noisy = light + sigma * generator.standard_normal(light.shape)
+    return torch.from_numpy(noisy.astype(np.float32)), NoiseLevelFunction(
+        tuple(shot[:, 0]),  # type: ignore[arg-type]
+        tuple(read[:, 0]),  # type: ignore[arg-type]
+    )
+
+
+def test_noisy_source_over_all_states() -> None:
+    """Where the source is cleaner, mean and variance are the target's; elsewhere the declared
+    excess says how much larger the variance is: target * (1 + excess)."""
+    reference, generator = CameraSettings(400, 1 / 125, 5.6), np.random.default_rng(0)
+    levels = np.array([0.15, 0.4])
+    grid = np.linspace(-8.0, 8.0, 4001)
+    density = norm.pdf(grid) / norm.pdf(grid).sum()
+    clean, noisier = ([], []), ([], [])
+    for state in STATES:
+        ratio = exposure_of(state) / exposure_of(reference)
+        light, source = noisy_patches(levels / ratio, 400, generator)
+        latent = Latent(light, reference, Z6, source)
+        capture, declared = latent.capture(state, seed=3)
+        numbers = numbers_of(capture, 2)
+        shot1, read1 = table(400)
+        shot2, read2 = table(state.iso)
+        exposed = ratio**2 * read1 + ratio * shot1 * levels  # (4, 2), as it reaches the sensor
+        target = read2 + shot2 * levels
+        spread = 7 * np.sqrt(exposed)  # the top-up reads the noisy signal, not the true one
+        ends = [np.maximum(levels + sign * spread, 0.0) for sign in (-1, 1)]
+        missing = [read2 - ratio**2 * read1 + (shot2 - ratio * shot1) * x for x in ends]
+        for plane, level in itertools.product(range(4), range(2)):
+            cell = numbers[plane, level]
+            if min(m[plane, level] for m in missing) > 0:
+                clean[0].append(cell)
+                clean[1].append(recorded_moments(levels[level], target[plane, level]))
+            elif max(m[plane, level] for m in missing) < 0:
+                excess = exposed[plane, level] / target[plane, level] - 1
+                noisier[0].append(cell)
+                noisier[1].append(
+                    recorded_moments(levels[level], target[plane, level] * (1 + excess))
+                )
+        # the declared excess: mean over the pixels of the source's share beyond the target's
+        x = np.maximum(levels[None, :, None] + np.sqrt(exposed)[:, :, None] * grid, 0.0)
+        before = ratio**2 * read1[:, :, None] + ratio * shot1[:, :, None] * x
+        relative = np.maximum(before / (read2[:, :, None] + shot2[:, :, None] * x) - 1, 0.0)
+        mean = relative @ density
+        error = np.sqrt(np.maximum(relative**2 @ density - mean**2, 0.0).mean() / light.numel())
+        assert declared == pytest.approx(mean.mean(), abs=5 * error + 1e-6 * mean.mean() + 1e-9)
+        assert latent.plan(state).excess_noise == pytest.approx(declared, rel=1e-4, abs=1e-9)
+    assert len(clean[0]) >= 64  # an eighth of the 512 cells at least, of either kind
+    assert len(noisier[0]) >= 64
+    assert_moments(np.array(clean[0]), clean[1])
+    assert_moments(np.array(noisier[0]), noisier[1])
+
+
+def clipped_gaussian(mean: float, sigma: float, low: float, high: float) -> tuple[float, float]:
+    """Mean and variance of a clipped Gaussian in closed form (after Foi 2009, clipped raw data)."""
+    a, b = (low - mean) / sigma, (high - mean) / sigma
+    inside = norm.cdf(b) - norm.cdf(a)
+    first = mean * inside - sigma * (norm.pdf(b) - norm.pdf(a))
+    second = (mean**2 + sigma**2) * inside - sigma * (
+        (mean + high) * norm.pdf(b) - (mean + low) * norm.pdf(a)
+    )
+    first += low * norm.cdf(a) + high * norm.sf(b)
+    second += low**2 * norm.cdf(a) + high**2 * norm.sf(b)
+    return first, second - first**2
+
+
+@pytest.mark.parametrize("offset", [-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])
+@pytest.mark.parametrize("end", ["pedestal", "white"])
+def test_clipped_gaussian_near_both_ends(end: str, offset: float) -> None:
+    """16 bits and strong noise: the rounding (1/12 DN) is a millionth of the variance."""
+    nlf = NoiseLevelFunction((1e-4,) * 4, (4e-4,) * 4)
+    camera = CameraProfile("deep", "RGGB", 1000.0, 65535.0, 16, nlf_by_iso={100: nlf})  # type: ignore[arg-type]
+    pedestal = 1000 / 64535
+    if end == "pedestal":  # sigma 0.02; light below zero as a noisy source may have it
+        sigma = 0.02
+        mean = -pedestal + offset * sigma
+        if mean > 0:
+            sigma = math.sqrt(4e-4 + 1e-4 * mean)
+    else:
+        sigma = math.sqrt(4e-4 + 1e-4)
+        mean = 1.0 + offset * sigma
+        sigma = math.sqrt(4e-4 + 1e-4 * mean)
+    settings = CameraSettings(100, 1, 4)
+    light = torch.full((4, 128, 128), mean)
+    capture, _ = Latent(light, settings, camera, NoiseLevelFunction.zero()).capture(settings, 5)
+    samples = capture.double().numpy().ravel()
+    assert samples.min() >= -pedestal - 1e-6
+    assert samples.max() <= 1.0
+    expected_mean, expected_variance = clipped_gaussian(mean, sigma, -pedestal, 1.0)
+    count = len(samples)
+    assert samples.mean() == pytest.approx(
+        expected_mean, abs=5 * math.sqrt(expected_variance / count) + 1e-7
+    )
+    fourth = np.mean((samples - samples.mean()) ** 4)
+    error = math.sqrt((fourth - samples.var() ** 2) / count)
+    assert samples.var() == pytest.approx(expected_variance, abs=5 * error + 1e-10)
+
+
+def test_digital_numbers_are_rounded_once() -> None:
+    """Without noise the capture is round(x * span + black), clipped to [0, white level]."""
+    black = (64.0, 60.0, 59.0, 63.0)
+    camera = CameraProfile("bench", "GRBG", black, 4095, 12)  # type: ignore[arg-type]
+    signal = np.random.default_rng(0).uniform(-0.05, 1.1, (4, 64, 64)).astype(np.float32)
+    levels = np.array(black)[:, None, None]
+    exact = signal.astype(np.float64) * (4095 - levels) + levels
+    clear = np.abs(exact - np.floor(exact) - 0.5) > 1e-3  # float32 may decide a tie either way
+    recorded = clip_and_quantise(torch.from_numpy(signal), camera).double().numpy()
+    numbers = recorded * (4095 - levels) + levels
+    assert np.abs(numbers - np.rint(numbers)).max() < 1e-3
+    np.testing.assert_array_equal(np.rint(numbers)[clear], np.clip(np.rint(exact), 0, 4095)[clear])
+    again = clip_and_quantise(torch.from_numpy(recorded.astype(np.float32)), camera)
+    np.testing.assert_array_equal(again.numpy(), recorded.astype(np.float32))
+
+
+def test_white_is_exactly_one_and_black_exactly_the_pedestal() -> None:
+    signal = torch.tensor([-1e30, -1.0, 1.0, 1e30]).expand(4, 1, 4)
+    recorded = clip_and_quantise(signal, Z6)
+    expected = np.float32(-BLACK / SPAN)
+    assert recorded[:, 0].tolist() == [[float(expected)] * 2 + [1.0, 1.0]] * 4
+
+
+def test_motion_blur_comes_before_the_clip() -> None:
+    """A lamp ten times above white, smeared over five pixels, is still at white along the streak:
+    10 / 5 = 2. Clipped first it would come out at 0.2."""
+    light = torch.zeros(4, 5, 31)
+    light[:, 2, 15] = 10.0
+    exposure = Exposure(1.0, NoiseLevelFunction.zero(), NoiseLevelFunction.zero(), motion_px=5.0)
+    smeared = sensor_light(light, exposure)
+    np.testing.assert_allclose(smeared[:, 2, 14:17].numpy(), 2.0, rtol=0.05)
+    recorded = clip_and_quantise(smeared, Z6)
+    assert torch.all(recorded[:, 2, 14:17] == 1.0)
+    assert float(recorded[:, 2, [10, 20]].abs().max()) < 1 / SPAN
+
+
+def test_blur_before_exposure_is_blur_after_it() -> None:
+    light = torch.rand(4, 12, 16, generator=torch.Generator().manual_seed(0)) * 3
+    zero = NoiseLevelFunction.zero()
+    bright = sensor_light(light, Exposure(8.0, zero, zero, motion_px=2.2, defocus_px=3.3))
+    dim = sensor_light(light, Exposure(1.0, zero, zero, motion_px=2.2, defocus_px=3.3))
+    np.testing.assert_allclose(bright.numpy(), 8 * dim.numpy(), rtol=1e-5)
+
+
+def test_noise_is_that_of_the_blurred_light() -> None:
+    """Half the frame at 0, half at 0.8: after a streak as wide as the frame the middle has 0.4, and
+    the shot noise of 0.4."""
+    light = torch.zeros(4, 2048, 9)
+    light[..., 5:] = 0.8
+    light[..., 4] = 0.4
+    target = NoiseLevelFunction((1e-4,) * 4, (0.0,) * 4)
+    exposure = Exposure(1.0, NoiseLevelFunction.zero(), target, motion_px=8.0)
+    blurred = sensor_light(light, exposure)
+    np.testing.assert_allclose(blurred[:, 0, 4].numpy(), 0.4, rtol=1e-5)
+    noisy, _ = add_noise(blurred[None], [exposure], [FrameNoise(0)])
+    middle = noisy[0, :, :, 4].double()
+    count = middle.numel()
+    assert float(middle.var()) == pytest.approx(0.4e-4, rel=5 * math.sqrt(2 / count))
+
+
+def test_blur_averages_the_noise_of_the_source() -> None:
+    """Noise already in the light is blurred with it; the top-up makes up for what the blur took."""
+    noise = NoiseLevelFunction((0.0,) * 4, (1e-4,) * 4)
+    generator = np.random.default_rng(1)
+    light = torch.from_numpy(generator.normal(0.3, 1e-2, (4, 96, 96)).astype(np.float32))
+    settings = CameraSettings(100, 1.0, 4.0)
+    camera = replace(Z6, nlf_by_iso={100.0: noise}, segments=())
+    latent = Latent(light, settings, camera, noise, image_speed=4 / 96, defocus=3.0)
+    blurred = latent.expected(settings)
+    left = latent.exposure(settings).source_noise.read[0]
+    # neighbours are correlated over about 4 * 3 pixels: that many fewer independent samples
+    count = blurred.numel() / 12
+    assert float(blurred.double().var()) == pytest.approx(left, rel=5 * math.sqrt(2 / count))
+    capture, excess = latent.capture(settings, 1)
+    assert excess == 0.0
+    count = capture.numel() / 12
+    expected = 1e-4 + 1 / 12 / SPAN**2
+    assert float(capture.double().var()) == pytest.approx(expected, rel=5 * math.sqrt(2 / count))
+
+
+@pytest.mark.parametrize("noisy_source", [False, True])
+def test_a_capture_is_the_same_alone_and_in_a_batch(noisy_source: bool) -> None:
+    source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
+    generator = torch.Generator().manual_seed(0)
+    latents = [torch.rand(4, 17, 23, generator=generator) for _ in range(5)]
+    exposures = [
+        Exposure(2.0 ** (i - 2), source if i % 2 else NoiseLevelFunction.zero(), Z6.nlf(100 * 4**i))
+        for i in range(4)
+    ] + [Exposure(1.0, source, Z6.nlf(100), motion_px=2.5, defocus_px=1.5)]
+    light = torch.stack([sensor_light(x, e) for x, e in zip(latents, exposures, strict=True)])
+    together, excess = add_noise(light.clone(), exposures, [FrameNoise(i) for i in range(5)])
+    frames = clip_and_quantise(together, Z6)
+    for i, exposure in enumerate(exposures):
+        alone, one = add_noise(light[i : i + 1].clone(), [exposure], [FrameNoise(i)])
+        assert torch.equal(clip_and_quantise(alone[0], Z6), frames[i])
+        assert one[0] == excess[i]
+
+
+def test_the_latent_is_left_alone() -> None:
+    light = torch.rand(4, 8, 8, generator=torch.Generator().manual_seed(0))
+    before = light.clone()
+    for motion, defocus in ((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)):
+        exposure = Exposure(4.0, Z6.nlf(100), Z6.nlf(400), motion, defocus)
+        add_noise(sensor_light(light, exposure)[None], [exposure], [FrameNoise(0)])
+        assert torch.equal(light, before)

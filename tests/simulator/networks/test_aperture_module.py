@@ -1,0 +1,199 @@
+"""The aperture module: it opens and never closes, leaves what is in focus, and obeys the lens."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import torch
+from torch import Tensor
+
+from simulator.networks.aperture_module import (
+    DEAD_ZONE,
+    ApertureModule,
+    added_blur,
+    dead_zone,
+    is_defocused,
+    usable_defocus,
+)
+from simulator.networks.noise_module import Preset
+from simulator.optics.thin_lens import Lens
+
+
+def picture(*size: int) -> Tensor:
+    values = np.random.default_rng(0).random((2, 4, *size), dtype=np.float32)
+    return torch.from_numpy(values) * 5.0
+
+
+def module(preset: Preset = "compact") -> ApertureModule:
+    torch.manual_seed(1)
+    made = ApertureModule(preset).eval().requires_grad_(False)
+    if preset == "paper":
+        made.network.tail.weight.mul_(10)
+    return made
+
+
+def with_map(diameter: float) -> ApertureModule:
+    """A module that finds the same circle of confusion everywhere, before the dead zone."""
+    made = module()
+    made.network.tail.weight.zero_()
+    made.network.tail.bias.fill_(np.log(diameter + 0.3))
+    return made
+
+
+F4, F8, F11 = (torch.full((2,), f) for f in (4.0, 8.0, 8 * 2**0.5))
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+@pytest.mark.parametrize("target", [F11, 2 * F11])
+def test_the_same_or_a_smaller_aperture_leaves_every_bit(preset: Preset, target: Tensor) -> None:
+    image = picture(16, 19)
+    assert torch.equal(module(preset)(image, torch.full_like(image, 0.01), F11, target), image)
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+@pytest.mark.parametrize("size", [(16, 16), (17, 21), (1, 1)])
+def test_every_size(preset: Preset, size: tuple[int, int]) -> None:
+    image = picture(*size)
+    output = module(preset)(image, torch.full_like(image, 0.01), F11, F4)
+    assert output.shape == image.shape
+    assert output.dtype == torch.float32
+    assert bool(output.isfinite().all())
+
+
+def test_each_image_of_a_batch_has_its_own_f_numbers() -> None:
+    image = picture(16, 16)
+    for preset in ("compact", "paper"):
+        made = with_map(4.0) if preset == "compact" else module("paper")
+        target = torch.tensor([4.0, 16.0])
+        output = made(image, torch.zeros_like(image), torch.tensor([8.0, 8.0]), target)
+        assert not torch.allclose(output[0], image[0], atol=1e-3)
+        assert torch.equal(output[1], image[1])
+
+
+def test_constant_images_come_out_unchanged() -> None:
+    for level in (0.0, 1e-5, 0.4, 50.0):
+        image = torch.full((2, 4, 16, 16), level)
+        output = with_map(5.0)(image, torch.full_like(image, 1e-3), F11, F4)
+        torch.testing.assert_close(output, image, rtol=2e-6, atol=0)
+
+
+def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
+    """3 px at f/8, less the dead zone z: 9 - z^2 squared; f/4 adds 2^2 - 1 times that. A point
+    becomes a spot of second moment d^2 / 16 per axis."""
+    image = torch.zeros(2, 4, 41, 41)
+    image[..., 20, 20] = 1.0
+    output = with_map(3.0)(image, torch.zeros_like(image), F8, F4).double().numpy()
+    squared = (9 - DEAD_ZONE**2) * 3
+    offsets = np.arange(41) - 20
+    moments = (output.sum(-1) * offsets**2).sum(-1)
+    np.testing.assert_allclose(output.sum((-2, -1)), 1.0, atol=1e-5)
+    np.testing.assert_allclose(moments, squared / 16, rtol=5e-3)
+
+
+def test_the_paper_preset_commutes_with_exposure() -> None:
+    """Its input is divided, its residual multiplied by one scalar."""
+    image, made = picture(16, 16), module("paper")
+    expected = made(image, torch.zeros_like(image), F11, F4)
+    assert (expected - image).abs().mean() > 1e-2
+    for factor in (2.0**-10, 2.0**10):
+        result = made(image * factor, torch.zeros_like(image), F11, F4)
+        torch.testing.assert_close(result, expected * factor, rtol=1e-4, atol=1e-4 * factor)
+
+
+def test_only_compact_has_a_map() -> None:
+    image = picture(8, 8)
+    assert module().defocus(image, image * 0).shape == (2, 8, 8)
+    with pytest.raises(ValueError, match="must be 'compact' to have a defocus map"):
+        module("paper").defocus(image, image * 0)
+
+
+def test_unknown_preset() -> None:
+    with pytest.raises(ValueError, match=r"`preset` \(='deep'\) must be one of"):
+        ApertureModule("deep")  # type: ignore[arg-type]
+
+
+def test_dead_zone_by_hand() -> None:
+    diameter = torch.tensor([0.0, 0.3, 0.5, 1.3, 5.0])
+    expected = [0.0, 0.0, 0.0, 1.2, np.sqrt(25 - 0.25)]  # 5, 12, 13 over ten
+    assert dead_zone(diameter, 0.5).tolist() == pytest.approx(expected, abs=1e-6)
+    assert float(dead_zone(torch.tensor(DEAD_ZONE))) == 0.0
+    assert 0.4 <= DEAD_ZONE <= 1.0
+
+
+def test_dead_zone_has_a_finite_gradient_at_its_edge() -> None:
+    diameter = torch.tensor([0.0, DEAD_ZONE, DEAD_ZONE + 1e-7, 3.0], requires_grad=True)
+    dead_zone(diameter).sum().backward()
+    assert diameter.grad is not None
+    assert bool(diameter.grad.isfinite().all())
+    assert diameter.grad[0] == 0
+
+
+@pytest.mark.parametrize(("source", "target"), [(11.0, 4.0), (8.0, 5.6), (16.0, 4.0)])
+def test_added_blur_is_the_thin_lens(source: float, target: float) -> None:
+    """Squared diameters add: blur at the source and what is added make the blur at the target."""
+    lens = Lens(focal_length=0.05, focus_distance=2.0)
+    depth = np.array([0.7, 1.5, 2.0, 5.0, np.inf])
+    at_source, at_target = (
+        np.abs(lens.circle_of_confusion(depth, f)) / 11.8e-6 for f in (source, target)
+    )
+    added = added_blur(torch.from_numpy(at_source), source, target).numpy()
+    np.testing.assert_allclose(np.hypot(at_source, added), at_target, rtol=1e-6, atol=1e-12)
+
+
+def test_added_blur_when_closing_or_staying_is_exactly_zero() -> None:
+    diameter = torch.tensor([0.0, 3.0, 12.0])
+    assert added_blur(diameter, 4.0, 4.0).tolist() == [0.0] * 3
+    assert added_blur(diameter, 4.0, 11.0).tolist() == [0.0] * 3
+
+
+def test_a_picture_in_focus_is_not_touched_by_a_stray_estimate() -> None:
+    """A twentieth of the detail must be blurred: 4 % of the pixels do not count, 50 % do."""
+    generator = torch.Generator().manual_seed(0)
+    image = 0.5 + 0.1 * torch.rand(2, 4, 50, 50, generator=generator)
+    diameter = torch.full((2, 50, 50), 0.3)
+    diameter[0, :2] = 6.0  # 4 %
+    diameter[1, :25] = 6.0
+    assert is_defocused(diameter, image).tolist() == [0.0, 1.0]
+    trusted = usable_defocus(diameter, image)
+    assert float(trusted[0].max()) == 0.0
+    assert float(trusted[1].max()) == pytest.approx((6.0**2 - DEAD_ZONE**2) ** 0.5)
+
+
+def test_what_has_no_detail_does_not_count() -> None:
+    """Blur of a smooth surface is unknown, whatever the network says: the textured half decides."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.full((1, 4, 40, 80), 0.5)
+    image[..., 40:] += 0.2 * torch.rand(1, 4, 40, 40, generator=generator)
+    diameter = torch.full((1, 40, 80), 0.2)
+    diameter[..., :34] = 8.0  # the flat half, but for the window around its edge
+    assert float(is_defocused(diameter, image)) == 0.0
+    assert float(is_defocused(8.2 - diameter, image)) == 1.0
+
+
+@pytest.mark.parametrize("spread", [0.2, 1.0, 3.0])
+def test_defocus_is_judged_at_the_weighted_quantile(spread: float) -> None:
+    """Against NumPy's sort of all pixels, weights from SciPy's windows."""
+    random = np.random.default_rng(3)
+    image = torch.from_numpy(random.uniform(0.2, 1.0, (3, 4, 30, 37)).astype(np.float32))
+    image[:, :, :, :20] = 0.5 + 0.05 * (image[:, :, :, :20] - 0.5)
+    centre = np.array([1.6, 1.9, 2.3]).reshape(3, 1, 1) - spread
+    diameter = (centre + spread * random.random((3, 30, 37))).clip(0).astype(np.float32)
+    expected = []
+    for picture, values in zip(image.double().numpy(), diameter, strict=True):
+        grey = picture.mean(axis=0)
+        mean = scipy.ndimage.uniform_filter(grey, 9, mode="nearest")
+        square = scipy.ndimage.uniform_filter((grey - mean) ** 2, 9, mode="nearest")
+        weight = np.minimum(square / mean**2, 0.05).ravel()
+        order = np.argsort(values.ravel())
+        share = np.cumsum(weight[order]) / weight.sum()
+        level = values.ravel()[order][np.searchsorted(share, 0.95)]
+        expected.append(float(np.clip((level - 1.7) / (2.2 - 1.7), 0, 1)))
+    found = is_defocused(torch.from_numpy(diameter), image)
+    np.testing.assert_allclose(found.numpy(), expected, atol=0.01)
+
+
+def test_a_picture_without_any_detail_counts_as_in_focus() -> None:
+    assert (
+        float(is_defocused(torch.full((1, 20, 20), 5.0), torch.full((1, 4, 20, 20), 0.25))) == 0.0
+    )

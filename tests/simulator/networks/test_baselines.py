@@ -1,0 +1,230 @@
+"""The two baselines against their papers' tables and PyTorch's own layers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from simulator.networks.baselines import (
+    AdaptiveNorm,
+    DecoupledNet,
+    GeneratedConvolution,
+    ParameterConcatenation,
+    edge_map,
+    scaled_parameters,
+)
+
+SIZES = [(16, 16), (1, 1), (1, 7), (5, 3), (17, 9)]
+PARAMETERS = torch.tensor(
+    [
+        [0.0, -7.0, 3.5, 6.0, -10.0, 2.0],
+        [7.3, -13.0, 2.0, 0.0, 2.0, 4.5],
+        [2.0, -5.0, 2.5, 3.0, -6.0, 2.5],
+    ]
+)
+
+
+def normal(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def concatenation(seed: int = 0) -> ParameterConcatenation:
+    torch.manual_seed(seed)
+    return ParameterConcatenation(width=12).eval()
+
+
+def decoupled(seed: int = 0) -> DecoupledNet:
+    torch.manual_seed(seed)
+    return DecoupledNet(width=6)
+
+
+def count(net: nn.Module) -> int:
+    return sum(p.numel() for p in net.parameters())
+
+
+def test_parameter_count_of_the_context_aggregation_network() -> None:
+    """CAN32: nine 3 x 3 convolutions with bias and two scalars, a 1 x 1 at the end."""
+    first, further = 9 * (4 + 6) * 32 + 32 + 2, 9 * 32 * 32 + 32 + 2
+    assert count(ParameterConcatenation()) == first + 8 * further + (32 * 4 + 4) == 77_046
+
+
+def test_parameter_count_of_the_decoupled_network() -> None:
+    """Seven numbers (six weights, a bias) for each weight of twenty convolutions; 19 norms."""
+    kernels = 9 * 5 * 64 + 17 * 9 * 64 * 64 + 16 * 64 * 64 + 9 * 64 * 4
+    assert count(DecoupledNet()) == 7 * kernels + 19 * 2 * 64 == 4_884_288
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("make", [concatenation, decoupled])
+def test_any_size(make: type[nn.Module], size: tuple[int, int]) -> None:
+    result = make()(normal(2, 4, *size), PARAMETERS[:2])
+    assert result.shape == (2, 4, *size)
+    assert result.isfinite().all()
+
+
+@pytest.mark.parametrize("make", [concatenation, decoupled])
+def test_batch_of_different_parameters_equals_single_runs(make: type[nn.Module]) -> None:
+    net = make().double()
+    for module in net.modules():  # running statistics that differ from a single image's
+        if isinstance(module, AdaptiveNorm):
+            nn.init.constant_(module.normalised, 0.5)
+            module.norm.running_mean.normal_()
+    images = normal(3, 4, 9, 7).double()
+    together = net(images, PARAMETERS)
+    for i in range(3):
+        alone = net(images[i : i + 1], PARAMETERS[i : i + 1])
+        torch.testing.assert_close(together[i : i + 1], alone)
+
+
+@pytest.mark.parametrize("make", [concatenation, decoupled])
+@pytest.mark.parametrize("index", range(6))
+def test_each_parameter_counts(make: type[nn.Module], index: int) -> None:
+    net, image = make(), normal(1, 4, 8, 8)
+    other = PARAMETERS[:1].clone()
+    other[0, index] += 1.0
+    assert (net(image, other) - net(image, PARAMETERS[:1])).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("make", [concatenation, decoupled])
+@pytest.mark.parametrize("image", [normal(3, 4, 9, 7), torch.zeros(3, 4, 4, 4)])
+def test_gradients_are_finite_and_reach_every_parameter(
+    make: type[nn.Module], image: torch.Tensor
+) -> None:
+    net = make().train()
+    net(image, PARAMETERS).sub(0.1).abs().mean().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+@pytest.mark.parametrize("make", [concatenation, decoupled])
+def test_same_seed_same_network(make: type[nn.Module]) -> None:
+    x = normal(1, 4, 6, 6)
+    assert torch.equal(make(3)(x, PARAMETERS[:1]), make(3)(x, PARAMETERS[:1]))
+    assert not torch.equal(make(3)(x, PARAMETERS[:1]), make(4)(x, PARAMETERS[:1]))
+
+
+@pytest.mark.parametrize("make", [concatenation, decoupled])
+def test_shape_of_the_parameters_is_checked(make: type[nn.Module]) -> None:
+    with pytest.raises(ValueError, match=r"`parameters` \(of shape \(1, 6\)\) .* \(2, 6\)"):
+        make()(normal(2, 4, 4, 4), PARAMETERS[:1])
+
+
+@pytest.mark.parametrize("make", [ParameterConcatenation, DecoupledNet])
+def test_arguments_are_checked(make: type[ParameterConcatenation | DecoupledNet]) -> None:
+    with pytest.raises(ValueError, match=r"`width` \(=0\)"):
+        make(width=0)
+    with pytest.raises(ValueError, match="`dilations`"):
+        make(width=4, dilations=(1, 0))
+
+
+def test_scaled_parameters() -> None:
+    """ISO 100, 1/8000 s is the origin; the paper's whole range is positive and of order one."""
+    extremes = torch.tensor([[0.0, -12.97, 2.0, 7.33, 2.0, 4.46]])
+    expected = [[0.0, 0.00375, 0.25, 0.91625, 1.875, 0.5575]]
+    torch.testing.assert_close(scaled_parameters(extremes, normal(1, 1)), torch.tensor(expected))
+
+
+# Parameter concatenation
+
+
+def test_adaptive_normalisation() -> None:
+    """lambda * x + mu * BN(x): over the batch in training, with running statistics after it."""
+    norm = AdaptiveNorm(3).double()
+    x = normal(2, 3, 4, 5).double() * 2 + 1
+    assert torch.equal(norm(x), x)  # lambda = 1, mu = 0
+    nn.init.constant_(norm.identity, 0.3)
+    nn.init.constant_(norm.normalised, 2.0)
+    mean = x.mean(dim=(0, 2, 3), keepdim=True)
+    deviation = (x.var(dim=(0, 2, 3), keepdim=True, correction=0) + 1e-3).sqrt()
+    torch.testing.assert_close(norm(x), 0.3 * x + 2.0 * (x - mean) / deviation)
+    norm.eval()
+    norm.norm.running_mean.fill_(0.5)
+    norm.norm.running_var.fill_(4.0 - 1e-3)
+    torch.testing.assert_close(norm(x), 0.3 * x + 2.0 * (x - 0.5) / 2.0)
+
+
+def test_context_network_starts_as_the_identity() -> None:
+    net, image = concatenation(), normal(1, 4, 9, 7).abs()
+    last = net.body[-1]
+    assert isinstance(last, nn.Conv2d)
+    nn.init.dirac_(last.weight)
+    nn.init.zeros_(last.bias)  # type: ignore[arg-type]
+    torch.testing.assert_close(net(image, PARAMETERS[:1]), image)
+
+
+def test_receptive_field_of_the_published_table() -> None:
+    """513 pixels (Chen et al. 2017, table 1)."""
+    net = ParameterConcatenation(width=1).eval()
+    for parameter in net.parameters():
+        nn.init.ones_(parameter)  # positive, lest contributions cancel
+    image = torch.ones(1, 4, 1, 701, requires_grad=True)
+    net(image, torch.zeros(1, 6))[0, 0, 0, 350].backward()
+    assert image.grad is not None
+    reached = image.grad[0, 0, 0].nonzero().flatten()
+    assert (int(reached[0]), int(reached[-1])) == (350 - 256, 350 + 256)
+
+
+# Decoupled learning
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"stride": 2}, {"dilation": 4}, {"upsample": True}], ids=str
+)
+def test_generated_convolution_is_each_sample_s_own(options: dict[str, int]) -> None:
+    torch.manual_seed(0)
+    layer = GeneratedConvolution(5, 5, **options).double()  # type: ignore[arg-type]
+    x, parameters = (
+        normal(3, 5, 7, 6).double(),
+        scaled_parameters(PARAMETERS, normal(3, 1).double()),
+    )
+    result = layer(x, parameters)
+    for i in range(3):
+        flat = layer.generator.weight @ parameters[i] + layer.generator.bias
+        if layer.upsample:
+            expected = F.conv_transpose2d(
+                x[i : i + 1], flat.reshape(5, 5, 4, 4), stride=2, padding=1
+            )
+        else:
+            expected = F.conv2d(
+                x[i : i + 1],
+                flat.reshape(5, 5, 3, 3),
+                stride=options.get("stride", 1),
+                padding=options.get("dilation", 1),
+                dilation=options.get("dilation", 1),
+            )
+        torch.testing.assert_close(result[i : i + 1], expected)
+
+
+def test_generated_weights_depend_on_the_parameters() -> None:
+    """They start as He-initialised kernels, varied by some tens of percent but not redrawn."""
+    torch.manual_seed(0)
+    layer = GeneratedConvolution(32, 32)
+    kernels = layer.kernels(scaled_parameters(PARAMETERS, normal(3, 1)))
+    assert kernels.shape == (3, 32, 32, 3, 3)
+    deviation = (2 / (32 * 9)) ** 0.5
+    assert float(kernels.detach().std()) == pytest.approx(deviation, rel=0.1)
+    change = float((kernels[0] - kernels[1]).detach().std()) / deviation
+    assert 0.1 < change < 1.0
+
+
+def test_edge_map() -> None:
+    """A ramp of slope 1 along the rows: two differences of 1 inside, one at the ends, over 4."""
+    ramp = torch.arange(4.0).expand(1, 4, 3, 4)
+    assert edge_map(ramp)[0, 0].tolist() == [[0.25, 0.5, 0.5, 0.25]] * 3
+    assert torch.equal(edge_map(ramp.mT), edge_map(ramp).mT)
+    assert edge_map(torch.ones(1, 4, 1, 1)).item() == 0.0
+
+
+def test_decoupled_network_cannot_see_absolute_brightness() -> None:
+    """As documented: the first instance normalisation divides by it."""
+    net, image = decoupled().double(), normal(1, 4, 8, 8).double() * 1e3
+    torch.testing.assert_close(
+        net(image, PARAMETERS[:1]), net(8 * image, PARAMETERS[:1]), rtol=1e-6, atol=1e-6
+    )
+
+
+def test_decoupled_network_may_predict_negative_values() -> None:
+    assert decoupled()(normal(1, 4, 8, 8), PARAMETERS[:1]).min() < 0

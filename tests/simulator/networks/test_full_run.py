@@ -1,0 +1,161 @@
+"""The full run of one transition, and that tolerance 0 gives the same light and frames."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, get_camera
+from simulator.networks.full_run import Stages
+from simulator.optics.blur import disc_blur, motion_blur
+
+Z6 = get_camera("nikon_z6")
+SOURCE = CameraSettings(1600, 1 / 64, 8)
+#: Cleaner, noisier, closing and opening; ratios that are no powers of two.
+TARGETS = [
+    CameraSettings(100, 1 / 3, 8),
+    CameraSettings(6400, 1 / 50, 8),
+    CameraSettings(100, 1 / 70, 11),
+    CameraSettings(400, 1 / 60, 4),
+    CameraSettings(100, 1 / 4000, 2.8),
+    SOURCE,
+]
+SCENES = [
+    {},
+    {"depth": "unknown"},
+    {"depth": "unknown", "image_speed": 0.6, "defocus": 1.7},
+    {"image_speed": 2e-3, "defocus": 0.02},
+]
+
+
+def raw(noise: bool = True) -> RawImage:
+    rng = np.random.default_rng(0)
+    light = 0.05 + 0.4 * rng.random((4, 26, 31))
+    nlf = Z6.nlf(1600)
+    if noise:
+        shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
+        light = light + rng.normal(size=light.shape) * np.sqrt(read + shot * light)
+    else:
+        nlf = NoiseLevelFunction.zero()
+    return RawImage(torch.from_numpy(light.astype(np.float32)), SOURCE, Z6, nlf=nlf)
+
+
+@pytest.fixture(scope="module")
+def compact() -> CameraSimulator:
+    torch.manual_seed(0)
+    made = CameraSimulator("compact", device="cpu")
+    made.noise.network.tail.weight.mul_(3)
+    made.aperture.network.tail.bias.fill_(1.2)  # about 3 px, well above the dead zone
+    return made
+
+
+@pytest.mark.parametrize("noise", [True, False])
+@pytest.mark.parametrize("scene", SCENES)
+def test_tolerance_nought_equals_the_full_run(
+    compact: CameraSimulator, scene: dict, noise: bool
+) -> None:
+    source = raw(noise)
+    latent = compact.prepare(source, tolerance=0, **scene)
+    for target in TARGETS:
+        stages = compact.stages(source, target, seed=3, **{"depth": "far", **scene})
+        expected = latent.expected(target)
+        scale = float(stages.light.abs().max())
+        torch.testing.assert_close(expected, stages.light, rtol=0, atol=3e-6 * scale)
+        full = compact.simulate(source, target, seed=3, tolerance=None, **scene)
+        assert torch.equal(full.data, stages.capture)
+        frame = compact.simulate(source, target, seed=3, tolerance=0, **scene)
+        numbers = [(f.data.double() * 14512).round() for f in (full, frame)]
+        difference = (numbers[0] - numbers[1]).abs()
+        assert difference.max() <= 1
+        assert difference.mean() < 2e-2  # a number that is nearly halfway
+        assert frame.noise == full.noise
+        assert frame.metadata == full.metadata
+
+
+def test_every_module_runs_for_every_transition(
+    compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the target is noisier and the source was prepared before."""
+    calls = []
+    for name in ("noise", "aperture"):
+        module = getattr(compact, name)
+        forward = module.forward
+        monkeypatch.setattr(
+            module, "forward", lambda *a, _n=name, _f=forward: calls.append(_n) or _f(*a)
+        )
+    latent = compact.prepare(raw(), depth="unknown")
+    calls.clear()
+    for source, scene in ((raw(), {"depth": "unknown"}), (latent, {})):
+        compact.simulate(source, CameraSettings(6400, 1 / 64, 8), tolerance=None, **scene)
+    assert calls == ["noise", "aperture", "noise", "aperture"]
+    calls.clear()
+    compact.simulate(raw(), SOURCE, tolerance=None)
+    assert calls == ["noise"]
+
+
+def test_raws_latents_and_scenes_run_alike(compact: CameraSimulator) -> None:
+    source, target = raw(), TARGETS[3]
+    latent = compact.prepare(source, image_speed=0.5, defocus=2.0)
+    scene = SimpleNamespace(latent=replace(latent, denoised=None))
+    given = {"image_speed": 0.5, "defocus": 2.0}
+    frames = [
+        compact.simulate(source, target, tolerance=None, **given).data,
+        compact.simulate(latent, target, tolerance=None).data,
+        compact.simulate(scene, target, tolerance=None).data,
+    ]
+    assert torch.equal(frames[0], frames[1])
+    assert torch.equal(frames[0], frames[2])
+
+
+def test_known_motion_and_disc_follow_the_networks(compact: CameraSimulator) -> None:
+    target = CameraSettings(400, 1 / 8, 5.6)
+    stages = compact.stages(raw(), target, image_speed=0.4, defocus=3.0)
+    extents = 0.4 / 8 * 26, 3.0 * 4 / 2**2.5
+    expected = motion_blur(disc_blur(stages.opened, extents[1]), extents[0])
+    torch.testing.assert_close(stages.light, expected)
+    still = compact.stages(raw(), target)
+    torch.testing.assert_close(still.light, still.opened)
+    assert isinstance(still, Stages)
+
+
+def test_gain_is_part_of_the_exposure(compact: CameraSimulator) -> None:
+    latent = replace(compact.prepare(raw()), gain=3.0)
+    assert torch.equal(compact.stages(latent, SOURCE).exposed, latent.light * 3.0)
+    prepared = compact.prepare(latent, tolerance=0)
+    stages = compact.stages(latent, SOURCE, depth="far")
+    torch.testing.assert_close(prepared.expected(SOURCE), stages.light, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_without_networks_the_full_run_is_exposure_and_noise(target: CameraSettings) -> None:
+    plain = CameraSimulator(device="cpu")
+    for noise, scene in itertools.product((True, False), ({}, {"image_speed": 0.4, "defocus": 2})):
+        source = raw(noise)
+        full = plain.simulate(source, target, seed=5, tolerance=None, **scene)
+        exact = plain.simulate(source, target, seed=5, tolerance=0, **scene)
+        assert torch.equal(full.data, exact.data)
+        assert full.metadata == exact.metadata
+
+
+def test_what_is_prepared_is_shared(compact: CameraSimulator) -> None:
+    for ask in (compact.prepare, lambda *a, **k: compact.plan(*a, SOURCE, **k)):
+        with pytest.raises(ValueError, match=r"`tolerance` \(=None\) .* ask `simulate`"):
+            ask(raw(), tolerance=None)
+    with pytest.raises(ValueError, match=r"`depth` \(='near'\)"):
+        compact.simulate(raw(), SOURCE, tolerance=None, depth="near")
+
+
+def test_the_tolerance_of_a_latent_is_kept(compact: CameraSimulator) -> None:
+    strict = compact.prepare(raw(), tolerance=0)
+    assert compact.prepare(strict).tolerance == 0.0
+    assert compact.prepare(strict, tolerance=0.5).tolerance == 0.5
+    assert compact.prepare(raw()).tolerance == 0.1
+    noisier = CameraSettings(6400, 1 / 64, 8)
+    frames = [compact.simulate(s, noisier, seed=1).data for s in (strict, raw())]
+    assert not torch.equal(*frames)  # denoised with tolerance 0, topped up without
+    assert torch.equal(compact.simulate(strict, noisier, seed=1, tolerance=0.1).data, frames[1])

@@ -1,0 +1,302 @@
+"""Networks run once for one result, and again for whatever could change it."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from simulator import CameraSettings, CameraSimulator, Latent, RawImage, get_camera
+from simulator.capture.denoised import Denoised
+from simulator.networks.network_cache import NetworkCache
+
+CAMERA = get_camera("nikon_z6")
+SOURCE = CameraSettings(6400, 1 / 1024, 8)
+TARGET = CameraSettings(100, 1 / 64, 8)
+
+
+class Counter:
+    """Counts the runs of a simulator's networks."""
+
+    def __init__(self, simulator: CameraSimulator) -> None:
+        self.runs = {"noise": 0, "aperture": 0}
+        for name in self.runs:
+            module: nn.Module = getattr(simulator, name)
+            module.network.register_forward_hook(self._count(name))  # type: ignore[union-attr]
+
+    def _count(self, name: str) -> Callable[..., None]:
+        def count(*_: Any) -> None:
+            self.runs[name] += 1
+
+        return count
+
+    def new(self) -> int:
+        """Runs since the last call."""
+        total = sum(self.runs.values())
+        self.runs = dict.fromkeys(self.runs, 0)
+        return total
+
+
+def _raw(seed: int = 0, size: int = 24) -> RawImage:
+    light = 0.1 + 0.2 * torch.rand(
+        (4, size, size + 4), generator=torch.Generator().manual_seed(seed)
+    )
+    return RawImage(light, SOURCE, CAMERA)
+
+
+def _simulator(**options: Any) -> CameraSimulator:
+    torch.manual_seed(0)
+    return CameraSimulator("compact", device="cpu", **options)
+
+
+def _denoised(simulator: CameraSimulator, source: RawImage | Latent) -> torch.Tensor:
+    found = simulator.prepare(source).denoised
+    assert found is not None
+    return found.light
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    return tmp_path
+
+
+def test_the_same_source_runs_the_networks_once() -> None:
+    simulator, raw = _simulator(), _raw()
+    counter = Counter(simulator)
+    first = simulator.simulate(raw, TARGET, depth="unknown")
+    assert counter.new() > 0
+    again = replace(raw, data=raw.data.clone())  # another object of the same content
+    second = simulator.simulate(again, TARGET, depth="unknown")
+    latent = simulator.prepare(replace(simulator._latent(raw), image_speed=0.5), depth="unknown")
+    assert counter.new() == 0
+    assert torch.equal(first.data, second.data)
+    assert torch.equal(latent.denoised.light, simulator.denoise(latent))  # type: ignore[arg-type]
+
+
+def test_the_papers_network_runs_once_for_an_f_number(folder: Path) -> None:
+    torch.manual_seed(0)
+    simulator = CameraSimulator("paper", device="cpu", cache="disk")
+    raw, target = _raw(), CameraSettings(6400, 1 / 1024, 4)
+    counter = Counter(simulator)
+    opened = []
+    for settings in (target, target, CameraSettings(6400, 1 / 1024, 5.6)):
+        f_number = settings.effective_f_number
+        opening = simulator.prepare(raw, depth="unknown").opening
+        assert opening is not None
+        opened.append(opening.opened(f_number, denoised=True))
+        opening.opened(f_number, denoised=True)
+        assert (counter.new() > 0) == (len(opened) != 2)
+    assert torch.equal(opened[0], opened[1])
+    assert not torch.equal(opened[0], opened[2])
+    denoised = simulator.prepare(raw).denoised
+    assert denoised is not None
+    assert simulator.aperture is not None
+    f_numbers = (torch.tensor([s.effective_f_number]) for s in (SOURCE, target))
+    with torch.no_grad():
+        image = denoised.light[None]
+        assert torch.equal(
+            opened[0], simulator.aperture(image, torch.zeros_like(image), *f_numbers)[0]
+        )
+    assert len(list((folder / "opened").iterdir())) == 2
+
+
+def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path) -> None:
+    raw = _raw()
+    for depth in ("far", "unknown"):
+        made = _simulator(cache=None).prepare(raw, depth=depth)  # type: ignore[arg-type]
+        keeper = _simulator(cache="disk")
+        latents = [keeper.prepare(raw, depth=depth) for _ in range(2)]  # type: ignore[arg-type]
+        later = _simulator(cache="disk")
+        counter = Counter(later)
+        latents.append(later.prepare(raw, depth=depth))  # type: ignore[arg-type]
+        lights = [latent.denoised.light for latent in (*latents, made)]  # type: ignore[union-attr]
+        assert counter.new() == 0
+        for latent, light in zip(latents, lights, strict=False):
+            assert torch.equal(light, lights[-1])
+            assert light.stride() == lights[0].stride()
+            if depth == "unknown":
+                assert torch.equal(latent.opening.diameter, made.opening.diameter)  # type: ignore[union-attr]
+
+
+def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
+    simulator = _simulator(cache=None)
+    counter = Counter(simulator)
+    _denoised(simulator, _raw())
+    runs = counter.new()
+    _denoised(simulator, _raw())
+    assert counter.new() == runs > 0
+    assert list(folder.iterdir()) == []
+
+
+def test_memory_leaves_nothing_on_disk(folder: Path) -> None:
+    _denoised(_simulator(), _raw())
+    assert list(folder.iterdir()) == []
+
+
+def test_asking_the_network_itself_runs_it() -> None:
+    simulator = _simulator()
+    latent = simulator.prepare(_raw())
+    counter = Counter(simulator)
+    simulator.denoise(latent)
+    simulator.estimate_defocus(latent)
+    simulator.stages(_raw(), TARGET)
+    assert counter.runs["noise"] >= 2
+    assert counter.runs["aperture"] >= 2
+
+
+def test_no_network_no_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("hashed where no network would run")
+
+    monkeypatch.setattr("simulator.networks.network_cache.content_digest", refuse)
+    simulator, raw = _simulator(), _raw()
+    clean = replace(simulator._latent(raw), nlf=CAMERA.nlf(6400).zero())
+    simulator.prepare(clean)
+    simulator.prepare(replace(simulator._latent(raw), denoised=Denoised(raw.data)))
+    CameraSimulator(device="cpu").simulate(raw, TARGET)
+    _simulator(cache=None).prepare(raw)
+
+
+@pytest.mark.parametrize("where", ["memory", "disk"])
+def test_everything_that_changes_the_result_is_seen(where: Any, folder: Path) -> None:
+    simulator, raw = _simulator(cache=where), _raw()
+    counter = Counter(simulator)
+    _denoised(simulator, raw)
+    assert counter.new() > 0
+    brighter = raw.data.clone()
+    brighter[3, 5, 7] += 1e-6
+    twice = replace(raw, nlf=CAMERA.nlf(6400).scaled(2.0))
+    for other in (replace(raw, data=brighter), twice):
+        _denoised(simulator, other)
+        assert counter.new() > 0, other
+    cropped = replace(raw, data=raw.data.reshape(4, 28, 24))
+    _denoised(simulator, cropped)
+    assert counter.new() > 0
+    simulator.precision = "bfloat16"
+    _denoised(simulator, raw)
+    assert counter.new() > 0
+    simulator.precision = "float32"
+    _denoised(simulator, raw)
+    assert counter.new() == 0
+
+
+def test_a_map_depends_on_the_light_that_it_was_found_in() -> None:
+    simulator, raw = _simulator(), _raw()
+    latent = simulator.prepare(raw)
+    assert latent.denoised is not None
+    simulator.prepare(latent, depth="unknown").opening.extent(2.8)
+    counter = Counter(simulator)
+    simulator.prepare(latent, depth="unknown").opening.extent(2.8)
+    assert counter.new() == 0
+    simulator.prepare(
+        replace(latent, denoised=Denoised(latent.denoised.light * 1.5)), depth="unknown"
+    ).opening.extent(2.8)
+    assert counter.new() > 0
+
+
+def _step(simulator: CameraSimulator, change: str) -> None:
+    """One step of training, or whatever else changes weights where they are."""
+    assert simulator.noise is not None
+    module = simulator.noise
+    parameter = next(iter(module.parameters()))
+    if change == "module":
+        module = simulator.noise = copy.deepcopy(module)
+        parameter = next(iter(module.parameters()))
+    if change in ("plain", "foreach", "fused"):
+        options = {} if change == "plain" else {change: True}
+        module.requires_grad_(True)
+        optimiser = torch.optim.Adam(module.parameters(), lr=1e-3, **options)
+        for p in module.parameters():
+            p.grad = torch.ones_like(p)
+        optimiser.step()
+        module.requires_grad_(False)
+    elif change == "loaded":
+        state = {k: v.clone() for k, v in module.state_dict().items()}
+        next(iter(state.values())).mul_(1.01)
+        module.load_state_dict(state)
+    elif change == "data":
+        parameter.data.mul_(1.01)
+    else:
+        with torch.no_grad():
+            parameter.mul_(1.01)
+
+
+@pytest.mark.parametrize(
+    "change", ["plain", "foreach", "fused", "loaded", "data", "in place", "module"]
+)
+def test_other_weights_are_seen(change: str) -> None:
+    simulator, raw = _simulator(), _raw()
+    before = _denoised(simulator, raw)
+    _step(simulator, change)
+    after = _denoised(simulator, raw)
+    assert torch.equal(after, simulator.denoise(simulator._latent(raw)))
+    assert not torch.equal(after, before)
+
+
+def test_a_result_changed_in_place_is_made_again() -> None:
+    simulator, raw = _simulator(), _raw()
+    expected = _denoised(simulator, raw).clone()
+    _denoised(simulator, raw).mul_(2.0)
+    assert torch.equal(_denoised(simulator, raw), expected)
+
+
+def test_results_of_inference_mode_are_kept_too() -> None:
+    simulator, raw = _simulator(), _raw()
+    counter = Counter(simulator)
+    with torch.inference_mode():
+        first = _denoised(simulator, raw)
+        assert counter.new() > 0
+        assert torch.equal(_denoised(simulator, raw), first)
+    assert counter.new() == 0
+
+
+def test_a_damaged_file_is_made_again(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    raw = _raw()
+    expected = _denoised(_simulator(cache="disk"), raw)
+    (file,) = (folder / "denoised").iterdir()
+    file.write_bytes(file.read_bytes()[:-1])
+    simulator = _simulator(cache="disk")
+    counter = Counter(simulator)
+    assert torch.equal(_denoised(simulator, raw), expected)
+    assert counter.new() > 0
+    assert "damaged" in caplog.text
+    counter = Counter(other := _simulator(cache="disk"))
+    assert torch.equal(_denoised(other, raw), expected)
+    assert counter.new() == 0
+
+
+def test_memory_is_bounded_and_the_oldest_goes() -> None:
+    simulator = _simulator()
+    each = _raw().data.nbytes
+    simulator._results = results = NetworkCache("memory", max_bytes=3 * each)
+    counter = Counter(simulator)
+    for seed in range(5):
+        _denoised(simulator, _raw(seed))
+        assert results.memory.nbytes == min(seed + 1, 3) * each
+    counter.new()
+    for seed in (2, 3, 4):
+        _denoised(simulator, _raw(seed))
+    assert counter.new() == 0
+    _denoised(simulator, _raw(1))
+    assert counter.new() > 0
+
+
+def test_a_simulator_can_be_copied_and_pickled() -> None:
+    simulator, raw = _simulator(), _raw()
+    expected = _denoised(simulator, raw)
+    for other in (copy.deepcopy(simulator), pickle.loads(pickle.dumps(simulator))):
+        assert len(other._results.memory) == 0
+        assert torch.equal(_denoised(other, raw), expected)
+
+
+def test_unknown_places_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"`cache` \(='ram'\) must be None or one of"):
+        CameraSimulator(device="cpu", cache="ram")  # type: ignore[arg-type]

@@ -1,0 +1,200 @@
+"""Trained weights on disk: what comes back, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from simulator import CameraSimulator
+from simulator.networks.weights import build_modules, list_pretrained, load_modules, save_modules
+
+
+@pytest.fixture(scope="module")
+def modules() -> nn.ModuleDict:
+    torch.manual_seed(0)
+    return build_modules("compact")
+
+
+@pytest.fixture
+def saved(modules: nn.ModuleDict, tmp_path: Path) -> Path:
+    save_modules(tmp_path / "net-0.5", modules, "compact", {"note": "for a test"})
+    return tmp_path / "net-0.5"
+
+
+def beside(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name + suffix)
+
+
+def rewrite(path: Path, change: Callable[[dict[str, torch.Tensor]], None]) -> None:
+    """Other tensors under a card whose hash is right again."""
+    weights, card = beside(path, ".safetensors"), beside(path, ".json")
+    tensors = load_file(weights)
+    change(tensors)
+    save_file(tensors, weights)
+    head = json.loads(card.read_text())
+    head["sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+    card.write_text(json.dumps(head))
+
+
+@pytest.mark.parametrize("ending", ["", ".safetensors", ".json"])
+def test_round_trip(saved: Path, modules: nn.ModuleDict, ending: str) -> None:
+    loaded, card = load_modules(beside(saved, ending))
+    assert sorted(p.name for p in saved.parent.iterdir()) == ["net-0.5.json", "net-0.5.safetensors"]
+    expected = modules.state_dict()
+    assert list(loaded.state_dict()) == list(expected)
+    assert all(torch.equal(value, expected[name]) for name, value in loaded.state_dict().items())
+    assert not loaded.training
+    assert not any(p.requires_grad for p in loaded.parameters())
+    assert (card["preset"], card["note"]) == ("compact", "for a test")
+    assert card["parameters"] == sum(p.numel() for p in modules.parameters())
+
+
+def test_the_card_has_the_hash_of_the_file(saved: Path) -> None:
+    card = json.loads(beside(saved, ".json").read_text())
+    content = beside(saved, ".safetensors").read_bytes()
+    assert card["sha256"] == hashlib.sha256(content).hexdigest()
+    assert set(load_file(beside(saved, ".safetensors"))) == set(
+        build_modules("compact").state_dict()
+    )
+
+
+@pytest.mark.parametrize("position", [20, -1])
+def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
+    file = beside(saved, ".safetensors")
+    content = bytearray(file.read_bytes())
+    content[position] ^= 1
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"the hash of net-0.5.safetensors .* train or copy"):
+        load_modules(saved)
+
+
+def test_a_cut_file_is_noticed(saved: Path) -> None:
+    file = beside(saved, ".safetensors")
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match="hash"):
+        load_modules(saved)
+
+
+def _wrong_shape(tensors: dict[str, torch.Tensor]) -> None:
+    tensors["exposure.b"] = torch.zeros(3)
+
+
+def _missing(tensors: dict[str, torch.Tensor]) -> None:
+    del tensors["exposure.w"]
+
+
+def _extra(tensors: dict[str, torch.Tensor]) -> None:
+    tensors["surplus"] = torch.zeros(1)
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [(_wrong_shape, "exposure.b"), (_missing, "exposure.w"), (_extra, "surplus")],
+)
+def test_tensors_of_other_networks_are_refused(
+    saved: Path, change: Callable[[dict[str, torch.Tensor]], None], name: str
+) -> None:
+    rewrite(saved, change)
+    with pytest.raises(ValueError, match="do not fit the networks") as caught:
+        load_modules(saved)
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("ending", [".json", ".safetensors"])
+def test_a_missing_file_is_named(saved: Path, ending: str) -> None:
+    beside(saved, ending).unlink()
+    with pytest.raises(ValueError, match=re.escape(f"there is no {beside(saved, ending)}")):
+        load_modules(saved)
+
+
+@pytest.mark.parametrize(
+    ("card", "message"),
+    [
+        ("{", "is damaged"),
+        ("[" * 10**6, "net-0.5.json is damaged"),
+        ("[]", "must hold a JSON object"),
+        ('{"format": [1]}', r"model card of format 1, got \[1\]"),
+        ('{"format": 1}', "must hold the hash, `sha256`"),
+        ('{"format": 0}', "must be a model card of format"),
+    ],
+)
+def test_damaged_cards(saved: Path, card: str, message: str) -> None:
+    beside(saved, ".json").write_text(card)
+    with pytest.raises(ValueError, match=message):
+        load_modules(saved)
+
+
+@pytest.mark.parametrize("preset", ["huge", None, ["compact"], {"compact": 1}])
+def test_an_unknown_preset_in_the_card(saved: Path, preset: Any) -> None:
+    card: dict[str, Any] = json.loads(beside(saved, ".json").read_text())
+    beside(saved, ".json").write_text(json.dumps({**card, "preset": preset}))
+    with pytest.raises(ValueError, match=re.escape(f"unknown preset {preset!r}")):
+        load_modules(saved)
+
+
+def test_modules_that_are_not_finite_are_not_saved(saved: Path) -> None:
+    before = beside(saved, ".safetensors").read_bytes()
+    broken = build_modules("compact")
+    with torch.no_grad():
+        next(broken.parameters()).fill_(torch.inf)
+    with pytest.raises(ValueError, match="must be finite: their training has failed"):
+        save_modules(saved, broken, "compact", {})
+    assert beside(saved, ".safetensors").read_bytes() == before
+
+
+@pytest.fixture
+def package(saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: Any) -> Path:
+    """A package that ships one set of weights, and a folder without any to be in."""
+    root = tmp_path_factory.mktemp("package")
+    (root / "pretrained").mkdir()
+    for ending in (".json", ".safetensors"):
+        beside(saved, ending).rename(root / "pretrained" / f"compact{ending}")
+    monkeypatch.setattr(
+        "simulator.networks.weights.resources", SimpleNamespace(files=lambda _: root)
+    )
+    monkeypatch.chdir(saved.parent)
+    return root
+
+
+def test_shipped_weights_load_by_name(package: Path) -> None:
+    assert list_pretrained() == ["compact"]
+    simulator = CameraSimulator.from_pretrained("compact", device="cpu")
+    assert simulator.noise is not None
+    assert simulator.noise.preset == "compact"
+
+
+def test_an_unknown_name_proposes_the_nearest(package: Path) -> None:
+    with pytest.raises(ValueError, match=r"one of \['compact'\] .* did you mean 'compact'\?"):
+        load_modules("compcat")
+    with pytest.raises(ValueError) as caught:
+        load_modules("zzz")
+    assert "did you mean" not in str(caught.value)
+
+
+def test_a_package_without_weights_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(
+        "simulator.networks.weights.resources", SimpleNamespace(files=lambda _: tmp_path)
+    )
+    monkeypatch.chdir(tmp_path)
+    assert list_pretrained() == []
+    with pytest.raises(ValueError, match=r"must be one of \[\] or the path"):
+        load_modules("compact")
+
+
+def test_a_baseline_is_no_simulator(tmp_path: Path) -> None:
+    save_modules(tmp_path / "pc", build_modules("pc"), "pc", {})
+    loaded, card = load_modules(tmp_path / "pc")
+    assert (list(loaded), card["preset"]) == (["baseline"], "pc")
+    with pytest.raises(ValueError, match=r"holds the baseline 'pc'"):
+        CameraSimulator.from_pretrained(tmp_path / "pc", device="cpu")

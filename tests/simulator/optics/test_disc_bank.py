@@ -1,0 +1,145 @@
+"""Defocus by a bank of discs: energy, second moments, gradient, and what it leaves of noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from simulator.optics.blur import disc_blur
+from simulator.optics.disc_bank import DIAMETERS, DiscBank, remaining_variance
+
+BETWEEN = [0.35, 0.85, 1.2, 1.7, 2.4, 3.3, 5.0, 6.5, 9.7, 14.0, 19.0, 27.0]
+
+
+def point(size: int = 81) -> torch.Tensor:
+    image = torch.zeros(size, size)
+    image[size // 2, size // 2] = 1.0
+    return image
+
+
+def blurred(image: torch.Tensor, diameter: float) -> torch.Tensor:
+    return DiscBank(image).blurred(torch.full(image.shape[-2:], diameter))
+
+
+def noise(*size: int, seed: int = 0) -> torch.Tensor:
+    values = np.random.default_rng(seed).standard_normal(size, dtype=np.float32)
+    return torch.from_numpy(values)
+
+
+@pytest.mark.parametrize("diameter", DIAMETERS)
+def test_at_its_diameters_it_is_the_disc_blur(diameter: float) -> None:
+    image = noise(2, 24, 31)
+    result = blurred(image, diameter)
+    torch.testing.assert_close(result, disc_blur(image, diameter), atol=2e-6, rtol=0)
+
+
+def test_no_blur_is_the_image_bit_for_bit() -> None:
+    image = noise(4, 9, 7) * 1e4
+    assert torch.equal(blurred(image, 0.0), image)
+
+
+@pytest.mark.parametrize("diameter", BETWEEN)
+def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter: float) -> None:
+    """d^2 / 16 per axis: the moment of a uniform disc of diameter d."""
+    spread = blurred(point(), diameter).double().numpy()
+    offsets = np.arange(81) - 40
+    assert spread.sum() == pytest.approx(1.0, abs=1e-5)
+    assert spread.min() > -1e-7
+    for axis in (0, 1):
+        moment = (spread.sum(axis) * offsets**2).sum()
+        assert moment == pytest.approx(diameter**2 / 16, rel=2e-3, abs=2e-4)
+        assert (spread.sum(axis) * offsets).sum() == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("diameter", [0.5, 2.4, 9.7])
+def test_a_blend_is_close_to_the_disc_between(diameter: float) -> None:
+    """Two discs of twice the area and their blend differ by little on a natural 1/f picture."""
+    frequencies = np.hypot(np.fft.fftfreq(64)[:, None], np.fft.fftfreq(64)[None]) + 1 / 64
+    spectrum = np.fft.fft2(np.random.default_rng(0).standard_normal((64, 64))) / frequencies
+    image = torch.from_numpy(np.fft.ifft2(spectrum).real.astype(np.float32))
+    exact = disc_blur(image, diameter)
+    error = (blurred(image, diameter) - exact).square().mean().sqrt()
+    assert error < 0.1 * (exact - image).square().mean().sqrt()
+
+
+def test_beyond_the_largest_disc_it_stays_there() -> None:
+    image = noise(16, 16)
+    assert torch.equal(blurred(image, 100.0), blurred(image, DIAMETERS[-1]))
+    assert float(remaining_variance(torch.tensor(100.0))) == pytest.approx(
+        float(remaining_variance(torch.tensor(DIAMETERS[-1])))
+    )
+
+
+def test_each_pixel_has_its_own_blur() -> None:
+    image = noise(4, 20, 20)
+    diameter = torch.zeros(20, 20)
+    diameter[:, 10:] = 4.0
+    result = DiscBank(image).blurred(diameter)
+    assert torch.equal(result[..., :10], image[..., :10])
+    torch.testing.assert_close(result[..., 10:], disc_blur(image, 4.0)[..., 10:])
+
+
+def test_a_map_for_each_image_of_a_batch() -> None:
+    images = noise(2, 4, 12, 12)
+    diameters = torch.stack([torch.full((12, 12), 1.2), torch.full((12, 12), 5.0)])
+    result = DiscBank(images).blurred(diameters[:, None])
+    for i in range(2):
+        torch.testing.assert_close(result[i], blurred(images[i], float(diameters[i, 0, 0])))
+
+
+def test_constant_images_stay() -> None:
+    diameter = torch.from_numpy(np.random.default_rng(1).uniform(0, 40, (20, 23))).float()
+    result = DiscBank(torch.full((4, 20, 23), 0.37)).blurred(diameter)
+    torch.testing.assert_close(result, torch.full((4, 20, 23), 0.37), rtol=2e-6, atol=0)
+
+
+@pytest.mark.parametrize("diameter", [0.0, 0.5, 1.0, 1.2, 2.8, 4.7, 11.3, 18.0])
+def test_remaining_variance_is_what_blurred_white_noise_has(diameter: float) -> None:
+    size, margin = 400, 12
+    result = blurred(noise(size, size, seed=5), diameter)[margin:-margin, margin:-margin]
+    expected = float(remaining_variance(torch.tensor(diameter)))
+    # Neighbours within the disc are correlated: about size^2 / (disc's area) independent values.
+    independent = size**2 / max(1.0, diameter**2)
+    spread = 4.0 * (2.0 / independent) ** 0.5
+    assert float(result.square().mean()) == pytest.approx(expected, rel=max(spread, 0.01))
+
+
+def test_remaining_variance_of_a_large_disc_is_one_over_its_area() -> None:
+    """A little less: pixels on its edge are covered in part."""
+    for diameter in (16.0, 32.0):
+        area = np.pi * diameter**2 / 4
+        remaining = float(remaining_variance(torch.tensor(diameter)))
+        assert remaining == pytest.approx(1 / area, rel=0.05)
+
+
+def test_remaining_variance_falls_from_one_to_zero() -> None:
+    shares = remaining_variance(torch.linspace(0, 32, 300))
+    assert float(shares[0]) == 1.0
+    assert bool((shares[1:] < shares[:-1]).all())
+    assert float(shares[-1]) > 0
+
+
+def test_gradient_is_finite_everywhere_and_right() -> None:
+    image = noise(1, 16, 16)
+    values = torch.tensor([0.0, 1e-9, 0.7, 1.3, 4.0, 32.0, 50.0])
+    diameter = values.repeat(16, 3)[:, :16].clone().requires_grad_()
+    DiscBank(image).blurred(diameter).square().sum().backward()
+    assert diameter.grad is not None
+    assert bool(diameter.grad.isfinite().all())
+    assert bool((diameter.grad[:, 0] == 0).all())  # d(diameter^2) is 0 there
+
+    exact = torch.full((6, 6), 1.27, dtype=torch.float64, requires_grad=True)
+    bank = DiscBank(noise(6, 6).double())
+    assert torch.autograd.gradcheck(bank.blurred, exact, eps=1e-5)
+
+
+def test_no_gradient_flows_into_the_image() -> None:
+    image = noise(8, 8).requires_grad_()
+    assert not DiscBank(image).blurred(torch.ones(8, 8)).requires_grad
+
+
+def test_only_the_discs_in_use_are_computed() -> None:
+    bank = DiscBank(noise(8, 8))
+    bank.blurred(torch.full((8, 8), 2.3))
+    assert sorted(bank._levels) == [0, DIAMETERS.index(2.0), DIAMETERS.index(2.8)]

@@ -1,0 +1,124 @@
+"""Light integrated in closed form against SciPy's adaptive quadrature and exact fractions."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from simulator.optics.lamps import Flash, Lamp, MainsLamp, PulsedLamp
+
+TIMES = (1 / 8000, 1 / 1000, 1 / 120, 0.01, 1 / 60, 0.35)
+STARTS = (0.0, 0.0013, 0.00499999, 3.7)
+#: An hour and a day on: the phase must be known as well as in the first second.
+LATER = (3600.123, 86_400.7, -1e6 / 3)
+
+
+@pytest.mark.parametrize("time", TIMES)
+@pytest.mark.parametrize("frequency", [100.0, 120.0])
+@pytest.mark.parametrize("depth", [0.3, 1.0])
+def test_mains_light_is_its_integral(time: float, frequency: float, depth: float) -> None:
+    lamp = MainsLamp(frequency, depth, phase=0.2)
+    for start in STARTS:
+
+        def light(t: float) -> float:
+            return 1.0 + depth * math.cos(2 * math.pi * (frequency * t + 0.2))
+
+        integral, _ = quad(light, start, start + time, epsabs=0, epsrel=1e-12, limit=500)
+        assert lamp.mean_light(start, time) == pytest.approx(integral / time, rel=1e-9)
+
+
+def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction) -> Fraction:
+    """Exact mean of a pulsed lamp: what each pulse and the exposure share, pulse by pulse."""
+    on, stop = Fraction(0), start + time
+    first, last = math.floor(start * frequency) - 1, math.ceil(stop * frequency) + 1
+    for pulse in range(first, last + 1):
+        begin = pulse / frequency
+        on += max(Fraction(0), min(stop, begin + duty / frequency) - max(start, begin))
+    return on / (time * duty)
+
+
+@pytest.mark.parametrize("frequency", [1000, 7919, 20_000])
+@pytest.mark.parametrize("duty", [0.01, 0.5, 0.99])
+@pytest.mark.parametrize("time", [1 / 8000, 1 / 1000, 1 / 60])
+def test_pulsed_light_is_the_exact_overlap(frequency: int, duty: float, time: float) -> None:
+    lamp = PulsedLamp(frequency, duty)
+    for start in (*STARTS, *LATER):
+        exact = _pulses(Fraction(start), Fraction(time), Fraction(frequency), Fraction(duty))
+        found = float(lamp.mean_light(start, time))
+        assert found == pytest.approx(float(exact), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])
+@pytest.mark.parametrize("decay", [1e-6, 50e-6, 1e-3])
+def test_a_flash_is_its_integral(time: float, decay: float) -> None:
+    lamp = Flash(at=0.01, decay=decay, energy=0.02)
+    for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
+        begin, stop = max(start, 0.01), start + time
+        integral = 0.0
+        if stop > begin:  # beyond 60 decays there is nothing left
+
+            def light(t: float) -> float:
+                return 0.02 / decay * math.exp(-(t - 0.01) / decay)
+
+            near = min(stop, begin + 60 * decay)
+            integral, _ = quad(light, begin, near, epsabs=0, epsrel=1e-12, limit=500)
+        wanted = 1.0 + integral / time
+        assert lamp.mean_light(start, time) == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize("lamp", [MainsLamp(100.0), PulsedLamp(5000.0, 0.03), PulsedLamp(60, 0.5)])
+def test_whole_periods_have_no_bands(lamp: Lamp) -> None:
+    rows = lamp.row_light(0.123, 0.1, 500, 12e-6)
+    np.testing.assert_allclose(rows, 1.0, rtol=1e-9)
+
+
+def test_rows_are_exposed_one_after_the_other() -> None:
+    lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
+    rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
+    wanted = [
+        np.mean([lamp.mean_light(0.5 + row_time * (4 * row + k), time) for k in range(4)])
+        for row in range(64)
+    ]
+    np.testing.assert_allclose(rows, wanted, rtol=1e-12)
+    # Bands of one period: 10 ms are 500 sensor rows of 20 us, 125 rows of four.
+    repeated = lamp.row_light(0.5, time, 250, row_time, sensor_rows=4)
+    np.testing.assert_allclose(repeated[:125], repeated[125:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("time", [1e-9, 1e-3, 1e6])
+def test_extremes_stay_finite_and_in_range(time: float) -> None:
+    for lamp, most in (
+        (MainsLamp(1e9), 2.0),
+        (MainsLamp(1e-9), 2.0),
+        (PulsedLamp(1e9, 1e-9), 1e9),
+        (PulsedLamp(1e-9, 1.0), 1.0),
+        (Flash(0.0, 1e-12, 1e3), 1.0 + 1e3 / time),
+    ):
+        found = lamp.mean_light(np.array([-1e6, 0.0, 1e-12, 1e6]), time)
+        assert np.isfinite(found).all()
+        assert ((found >= -1e-12) & (found <= most * (1 + 1e-9))).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "rule"),
+    [
+        (lambda: MainsLamp(0.0), "`frequency` \\(=0.0\\) must be in"),
+        (lambda: MainsLamp(depth=1.5), "`depth` \\(=1.5\\) must be in"),
+        (lambda: MainsLamp(phase=math.nan), "`phase` \\(=nan\\) must be a finite number"),
+        (lambda: PulsedLamp(duty=0.0), "`duty` \\(=0.0\\) must be in"),
+        (lambda: PulsedLamp("100"), "`frequency` \\(='100'\\) must be a finite number"),  # type: ignore[arg-type]
+        (lambda: Flash(decay=0.0), "`decay` \\(=0.0\\) must be in"),
+        (lambda: Flash(energy=-1.0), "`energy` \\(=-1.0\\) must be in"),
+        (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` \\(=0.0\\) must be in"),
+        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` \\(=0\\) must be an integer"),
+        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` \\(=-1e-05\\) must be in"),
+        (lambda: Lamp().mean_light(math.inf, 1.0), "`start` must be finite"),
+    ],
+)
+def test_bad_values_are_refused(make: object, rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        make()  # type: ignore[operator]

@@ -1,0 +1,264 @@
+"""Thin-lens defocus against geometry: similar triangles, areas of discs, rays through an aperture.
+
+Nothing here uses the layers that the code under test works with: expected pictures are sums over
+points of the aperture, each of which sees two planes through its own pinhole.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from simulator.optics.thin_lens import Lens, defocus
+
+DOUBLE = torch.float64
+
+
+def constant(value: float, height: int = 41, width: int = 41) -> torch.Tensor:
+    return torch.full((height, width), value, dtype=DOUBLE)
+
+
+def lamp(height: int = 41, width: int = 41, light: float = 1.0) -> torch.Tensor:
+    image = torch.zeros(1, height, width, dtype=DOUBLE)
+    image[0, height // 2, width // 2] = light
+    return image
+
+
+# --- circle of confusion ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
+@pytest.mark.parametrize("depth", [0.3, 1.0, 2.0, 500.0])
+def test_circle_of_confusion_follows_from_similar_triangles(focus: float, depth: float) -> None:
+    # The cone from the aperture (diameter f / N) converges at v, the sensor stands at v_focus.
+    focal_length, f_number = 0.05, 2.8
+    v = 1.0 / (1.0 / focal_length - 1.0 / depth)
+    v_focus = 1.0 / (1.0 / focal_length - 1.0 / focus)
+    expected = (focal_length / f_number) * (v_focus - v) / v
+    found = Lens(focal_length, focus).circle_of_confusion(depth, f_number)
+    assert found == pytest.approx(expected, rel=1e-12, abs=1e-18)
+
+
+def test_circle_of_confusion_of_far_points() -> None:
+    # Focused at infinity: f^2 / (N z). Focused at s, a point at infinity: f^2 / (N (s - f)).
+    assert Lens(0.05, math.inf).circle_of_confusion(10.0, 4.0) == pytest.approx(-0.0025 / 40)
+    assert Lens(0.05, math.inf).circle_of_confusion(math.inf, 4.0) == 0.0
+    assert Lens(0.05, 2.05).circle_of_confusion(math.inf, 4.0) == pytest.approx(0.0025 / 8)
+
+
+def test_circle_of_confusion_keeps_type_and_shape() -> None:
+    lens = Lens(0.05, 2.0)
+    depths = np.array([[1.0, 2.0, math.inf]], np.float64)
+    expected = [[lens.circle_of_confusion(float(z), 4.0) for z in depths[0]]]
+    as_array = lens.circle_of_confusion(depths, 4.0)
+    as_tensor = lens.circle_of_confusion(torch.from_numpy(depths), 4.0)
+    assert isinstance(as_array, np.ndarray)
+    assert isinstance(as_tensor, torch.Tensor)
+    np.testing.assert_allclose(as_array, expected, rtol=1e-14)
+    np.testing.assert_allclose(as_tensor.numpy(), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("focal_length", "focus_distance", "name"),
+    [
+        (0.0, 1.0, "focal_length"),
+        (math.inf, math.inf, "focal_length"),
+        (math.nan, 1.0, "focal_length"),
+        (0.05, 0.05, "focus_distance"),
+        (0.05, -1.0, "focus_distance"),
+        (0.05, math.nan, "focus_distance"),
+    ],
+)
+def test_lens_refuses(focal_length: float, focus_distance: float, name: str) -> None:
+    with pytest.raises(ValueError, match=f"`{name}`.*must be"):
+        Lens(focal_length, focus_distance)
+
+
+# --- one plane --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize("diameter", [0.4, 1.0, 2.7, 6.3, 14.0])
+def test_point_source_becomes_its_disc(diameter: float, sign: int) -> None:
+    spread = defocus(lamp(), constant(sign * diameter))[0].numpy()
+    assert spread.sum() == pytest.approx(1.0, abs=1e-9)
+    offset = np.arange(41) - 20
+    for axis in (0, 1):  # second moment of a uniform disc: d^2 / 16 along each axis
+        moment = (spread.sum(1 - axis) * offset**2).sum()
+        assert moment == pytest.approx(diameter**2 / 16, rel=0.01)
+    radius = np.hypot(offset[:, None], offset[None, :])
+    assert np.abs(spread[radius > diameter / 2 + 1]).max() < 1e-12
+    if diameter > 4:
+        inside = spread[radius < diameter / 2 - 1]
+        np.testing.assert_allclose(inside, 4 / (math.pi * diameter**2), rtol=0.05)
+
+
+def test_blur_too_small_to_see_leaves_every_bit() -> None:
+    light = torch.rand(4, 9, 13, generator=torch.Generator().manual_seed(0))
+    ripple = 0.1 * torch.rand(9, 13, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(defocus(light, ripple - 0.05), light)
+
+
+def test_blur_scale_of_every_diameter_on_one_picture() -> None:
+    # A slow ramp of diameters: each lamp gets the disc of its own place, to half a step of layers.
+    light = torch.zeros(1, 33, 400, dtype=DOUBLE)
+    diameter = torch.linspace(0.5, 12.5, 400, dtype=DOUBLE).expand(33, 400)
+    columns = list(range(30, 400, 40))
+    light[0, 16, columns] = 1.0
+    spread = defocus(light, diameter)[0].numpy()
+    offset = np.arange(33) - 16
+    for column in columns:
+        window = spread[:, column - 16 : column + 17]
+        moment = (window.sum(1) * offset**2).sum() / window.sum()
+        assert 4 * math.sqrt(moment) == pytest.approx(float(diameter[0, column]), rel=0.1)
+
+
+# --- what keeps -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", ["step", "ramp", "through_focus", "stairs", "noise", "islands"])
+def test_equal_light_shows_no_seam(case: str) -> None:
+    rng = np.random.default_rng(3)
+    rows, columns = np.mgrid[:48, :40]
+    diameter = {
+        "step": np.where(columns < 20, -7.0, 5.0),
+        "ramp": 1.0 + columns * 0.2,
+        "through_focus": (columns - 20) * 0.3,
+        "stairs": (columns // 8) * 3.0 - 6.0,
+        "noise": rng.uniform(-8.0, 8.0, (48, 40)),
+        "islands": np.where((rows // 6 + columns // 6) % 2 == 0, 0.0, 9.0),
+    }[case]
+    level = torch.tensor([0.2, 3.0])[:, None, None].expand(2, 48, 40)
+    found = defocus(level, torch.from_numpy(diameter))
+    torch.testing.assert_close(found, level.contiguous(), rtol=2e-6, atol=0.0)
+
+
+@pytest.mark.parametrize("row", range(20, 44, 3))
+def test_lamp_on_a_receding_floor_keeps_its_energy(row: int) -> None:
+    # The floor rises through many layers of blur; none of them stands in the way of its neighbour.
+    diameter = torch.linspace(10, 2, 64, dtype=DOUBLE)[:, None].expand(64, 48)
+    floor = torch.full((1, 64, 48), 0.2, dtype=DOUBLE)
+    lit = floor.clone()
+    lit[0, row, 24] += 100.0
+    gained = float((defocus(lit, diameter) - defocus(floor, diameter)).sum())
+    assert gained == pytest.approx(100.0, rel=0.05)
+
+
+def test_sharp_foreground_is_untouched_by_a_bright_blurred_background() -> None:
+    rng = np.random.default_rng(0)
+    columns = np.arange(60)[None, :].repeat(40, 0)
+    light = torch.from_numpy(rng.uniform(0.01, 0.1, (4, 40, 60)).astype(np.float32))
+    light[:, :, 30:] = torch.from_numpy(rng.uniform(50.0, 900.0, (4, 40, 30)).astype(np.float32))
+    diameter = torch.from_numpy(np.where(columns < 30, 0.0, 13.0))
+    found = defocus(light, diameter)
+    assert torch.equal(found[:, :, :30], light[:, :, :30])
+    assert float(found[:, :, 30:].min()) > 50.0  # nor does the dark foreground spill over
+
+
+def beyond_chord(diameter: np.ndarray | float) -> np.ndarray:
+    """Share of a disc beyond a chord, for columns 0 to 59 and a chord between 29 and 30."""
+    x = np.clip((np.arange(60) - 29.5) / (np.asarray(diameter) / 2), -1, 1)
+    return 1 - (np.arccos(x) - x * np.sqrt(1 - x * x)) / math.pi
+
+
+def test_blurred_foreground_spills_over_a_sharp_background() -> None:
+    # The same picture, the sides of the focus exchanged: a sign error would swap both tests.
+    columns = np.arange(60)[None, :].repeat(40, 0)
+    light = torch.from_numpy(np.where(columns < 30, 0.0, 1.0))[None]
+    found = defocus(light, torch.from_numpy(np.where(columns < 30, -10.0, 0.0)))[0, 20].numpy()
+    np.testing.assert_allclose(found, beyond_chord(10.0), atol=0.005)
+
+
+def test_slanted_foreground_does_not_close_its_own_blurred_border() -> None:
+    # A dark wall in many layers: none of them may continue into the border of its neighbour.
+    columns = np.arange(60)[None, :].repeat(48, 0)
+    blur = np.linspace(12, 6, 48)[:, None]
+    light = torch.from_numpy(np.where(columns < 30, 0.0, 1.0))[None]
+    found = defocus(light, torch.from_numpy(np.where(columns < 30, -blur, 0.0)))[0].numpy()
+    np.testing.assert_allclose(found[8:40], beyond_chord(blur)[8:40], atol=0.04)
+
+
+def test_what_a_blurred_foreground_hides_is_continued() -> None:
+    # Stripes across the edge go on behind the foreground, and show through its blurred border.
+    rows, columns = np.mgrid[:40, :60]
+    stripes = 1.0 + (rows // 4 % 2)
+    light = torch.from_numpy(np.where(columns < 30, 0.0, stripes))[None]
+    found = defocus(light, torch.from_numpy(np.where(columns < 30, -10.0, 0.0)))[0].numpy()
+    np.testing.assert_allclose(found[8:32], (beyond_chord(10.0) * stripes)[8:32], atol=0.01)
+
+
+def test_each_surface_continues_where_it_is_the_nearest_one() -> None:
+    # Beside the foreground: a sharp wall above, a brighter one farther away below.
+    rows, columns = np.mgrid[:48, :60]
+    light = np.where(columns < 30, 0.0, np.where(rows < 24, 1.0, 5.0))
+    diameter = np.where(columns < 30, -10.0, np.where(rows < 24, 0.0, 3.0))
+    found = defocus(torch.from_numpy(light)[None], torch.from_numpy(diameter))[0].numpy()
+    np.testing.assert_allclose(found[10:22], np.tile(beyond_chord(10.0), (12, 1)), atol=0.01)
+    np.testing.assert_allclose(found[27:38], 5 * np.tile(beyond_chord(10.0), (11, 1)), atol=0.25)
+
+
+# --- two planes, ray by ray -------------------------------------------------------------------
+
+
+Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def near_texture(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    return 0.5 + 0.3 * np.sin(rows * 0.9) * np.cos(columns * 0.7)
+
+
+def far_texture(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    return 3.0 + 1.5 * np.sin(rows * 0.25 + 1.0) + 0.5 * np.cos(columns * 0.25)
+
+
+def through_an_aperture(shape: Texture, near_blur: float, far_blur: float) -> np.ndarray:
+    """What the sensor gets of two planes: a mean over aperture points and points of a pixel."""
+    grid = (np.arange(20) + 0.5) / 10 - 1
+    aperture = [(a, b) for a in grid for b in grid if a * a + b * b < 1]
+    rows, columns = np.mgrid[:56, :72].astype(float)
+    total = np.zeros(rows.shape)
+    for number, (a, b) in enumerate(aperture):
+        y, x = rows + (number * 0.618) % 1 - 0.5, columns + (number * 0.755) % 1 - 0.5
+        near, far = ((y - blur / 2 * a, x - blur / 2 * b) for blur in (near_blur, far_blur))
+        hides = shape(np.rint(near[0]), np.rint(near[1]))  # the edge of a mask of whole pixels
+        total += np.where(hides, near_texture(*near), far_texture(*far))
+    return total / len(aperture)
+
+
+SHAPES: dict[str, Texture] = {
+    "half": lambda rows, columns: columns < 36,
+    "pole": lambda rows, columns: abs(columns - 36) < 3,
+    "disc": lambda rows, columns: (columns - 36) ** 2 + (rows - 28) ** 2 < 13**2,
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("blurs", [(0, 8), (-8, 0), (4, 10), (-10, -4), (-8, 8), (-8, 4)])
+def test_two_planes_against_rays(shape: str, blurs: tuple[float, float]) -> None:
+    # What is hidden is not in the picture: it can be right only as far as the texture is smooth.
+    rows, columns = np.mgrid[:56, :72]
+    mask = SHAPES[shape](rows, columns)
+    picture = np.where(mask, near_texture(rows, columns), far_texture(rows, columns))
+    diameter = torch.from_numpy(np.where(mask, *map(float, blurs)))
+    found = defocus(torch.from_numpy(picture)[None], diameter)[0].numpy()
+    expected = through_an_aperture(SHAPES[shape], *blurs)
+    inner = (slice(10, -10), slice(10, -10))
+    error = np.sqrt(((found - expected)[inner] ** 2).mean())
+    change = np.sqrt(((picture - expected)[inner] ** 2).mean())
+    assert error < 0.15 * change
+
+
+def test_planes_and_dtype_are_independent() -> None:
+    generator = torch.Generator().manual_seed(5)
+    light = torch.rand(4, 24, 30, generator=generator)
+    diameter = 6 * torch.rand(24, 30, generator=generator) - 3
+    together = defocus(light, diameter)
+    assert together.dtype == torch.float32
+    for plane in range(4):
+        torch.testing.assert_close(defocus(light[plane : plane + 1], diameter)[0], together[plane])
+    exact = defocus(light.double(), diameter)
+    torch.testing.assert_close(together.double(), exact, rtol=1e-4, atol=1e-5)

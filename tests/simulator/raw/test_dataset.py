@@ -1,0 +1,425 @@
+"""Both layouts of the paper's dataset, on files of the reference camera and on files made by hand
+the way the authors' preprocessing makes them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import logging
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rawpy
+import torch
+
+from simulator import CameraSettings, RawImage, get_camera
+from simulator.networks.exposure_module import LinearFit
+from simulator.noise.noise_level_function import noise_variance
+from simulator.raw.dataset import (
+    RawSequence,
+    packed_camera,
+    read_dataset,
+    read_sequence,
+    write_packed_sequence,
+    write_raw_sequence,
+)
+from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.settings import exposure_ratio
+
+SETTINGS = (
+    CameraSettings(100, 1 / 64, 8),
+    CameraSettings(1600, 1 / 512, 5.6),
+    CameraSettings(400, 2 ** (-5 / 3), 22),
+)
+#: NoiseProfile of a Nikon Z6 raw at ISO 800, as exiftool prints it: (shot, read) of R, G, B.
+PROFILE = "6.4e-05 2.3e-08 6.1e-05 2.2e-08 5.7e-05 1.9e-08"
+NIKON = ("path", "time", "iso", "aperture", "wb", "noiseprofile")
+CANON = ("path", "time", "iso", "aperture", "noiseprofile")
+
+
+def captures(camera_name: str, size: int = 16) -> list[RawImage]:
+    camera = packed_camera(camera_name)
+    rows = torch.linspace(0.02, 0.3, size)
+    light = rows.repeat(size, 1) * torch.tensor([0.5, 1.0, 0.9, 0.6])[:, None, None]
+    scene = ReferenceScene("s", "g", "k", light, SETTINGS[0])
+    body = ReferenceCamera(camera)
+    return [
+        RawImage(body.capture(scene, s, seed=1).sample, s, camera, white_balance=(2.0, 1.0, 1.5))
+        for s in SETTINGS
+    ]
+
+
+def assert_same(back: Sequence[RawImage], raws: Sequence[RawImage]) -> None:
+    assert len(back) == len(raws)
+    for one, other in zip(back, raws, strict=True):
+        torch.testing.assert_close(one.data, other.data, rtol=0, atol=1e-7)
+        np.testing.assert_array_equal(one.to_mosaic(), other.to_mosaic())
+        assert one.settings == other.settings
+        assert one.camera.name == other.camera.name
+        assert one.camera.black_level == other.camera.black_level
+        assert one.camera.white_level == other.camera.white_level
+        greens = (other.noise.shot[1] + other.noise.shot[2]) / 2
+        assert one.noise.shot[1] == pytest.approx(greens)
+        assert one.noise.read[0] == pytest.approx(other.noise.read[0])
+
+
+@pytest.mark.parametrize("write", [write_raw_sequence, write_packed_sequence])
+def test_captures_of_the_reference_camera_come_back(tmp_path: Path, write: Any) -> None:
+    raws = captures("nikon_z6")
+    write(tmp_path / "scene_007", raws)
+    sequence = read_sequence(tmp_path / "scene_007")
+    assert isinstance(sequence, RawSequence)
+    assert sequence.name == "scene_007"
+    assert_same(list(sequence.captures), raws)
+    assert sequence.captures[0].white_balance == pytest.approx((2.0, 1.0, 1.5))
+    # What fitting and evaluation rest on: two captures of a scene differ by the exposure ratio.
+    first, second = sequence.captures[0], sequence.captures[1]
+    measured = float(second.data.mean() / first.data.mean())
+    assert measured == pytest.approx(exposure_ratio(*SETTINGS[:2]), rel=0.02)
+    assert exposure_ratio(*SETTINGS[:2]) == 4.0
+
+
+def test_the_canon_comes_back_from_the_packed_layout(tmp_path: Path) -> None:
+    raws = captures("canon_70d")
+    write_packed_sequence(tmp_path / "a", raws)
+    header = (tmp_path / "a" / "camera_params.csv").read_text().splitlines()[0]
+    assert header == ",".join(CANON)
+    assert_same(list(read_sequence(tmp_path / "a").captures), raws)
+
+
+def test_captures_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
+    for write in (write_raw_sequence, write_packed_sequence):
+        folder = tmp_path / write.__name__
+        write(folder, captures("nikon_z6"))
+        sequence = read_sequence(folder)
+        next(iter(sorted(folder.glob("capture_001.*")))).unlink()
+        assert sequence.captures[0].settings == SETTINGS[0]
+        assert sequence.captures[-1].settings == SETTINGS[2]
+        assert [c.settings for c in sequence.captures[::2]] == [SETTINGS[0], SETTINGS[2]]
+        with pytest.raises(FileNotFoundError):
+            sequence.captures[1]
+        with pytest.raises(IndexError):
+            sequence.captures[3]
+
+
+# --- files as the authors' preprocessing leaves them -------------------------------------------
+
+
+def author_file(path: Path, mosaic: np.ndarray, black: float, white: float) -> None:
+    """Subtract black, divide, pack top-left, top-right, bottom-right, bottom-left, save."""
+    bayer = (mosaic.astype(np.float32) - black) / (white - black)
+    tile = (bayer[0::2, 0::2], bayer[0::2, 1::2], bayer[1::2, 1::2], bayer[1::2, 0::2])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, np.stack(tile).astype(np.float32))
+
+
+def author_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    text = io.StringIO()
+    csv.writer(text).writerows([header, *rows])
+    path.write_text(text.getvalue(), newline="")
+
+
+def nikon_row(path: str, **changes: Any) -> list[Any]:
+    cells = {
+        "path": path,
+        "time": 0.008,
+        "iso": 800,
+        "aperture": 5.6,
+        "wb": [1.9, 1.0, 1.4, 0.0],
+        "noiseprofile": PROFILE,
+    }
+    return [*(cells | changes).values()]
+
+
+@pytest.fixture
+def nikon(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
+    """Two sequences with one table above them, paths beginning where the script ran."""
+    rng = np.random.default_rng(0)
+    root = tmp_path / "Nikon"
+    mosaics, rows = {}, []
+    for scene, names in (("scene_001", ("DSC_0001", "DSC_0002")), ("scene_002", ("DSC_0001",))):
+        for name in names:
+            mosaic = rng.integers(1008, 15520, (6, 10))
+            mosaic[0, :2] = 900, 16383  # what the preprocessing does not clip
+            author_file(root / scene / f"{name}.npy", mosaic, 1008, 15520)
+            mosaics[f"{scene}/{name}"] = mosaic
+            rows.append(nikon_row(f"./ProcessedData/Nikon/{scene}/{name}.jpg"))
+    author_table(root / "camera_params.csv", NIKON, rows)
+    return root, mosaics
+
+
+def test_the_authors_nikon_files(nikon: tuple[Path, dict[str, np.ndarray]]) -> None:
+    root, mosaics = nikon
+    sequences = read_dataset(root)
+    assert [(s.name, len(s.captures)) for s in sequences] == [("scene_001", 2), ("scene_002", 1)]
+    raw = sequences[0].captures[1]
+    # Red at the top left: R, G1 beside it, G2 below it, B across.
+    expected = mosaics["scene_001/DSC_0002"].astype(float)
+    for plane, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        numbers = raw.data[plane].numpy() * (15520 - 1008) + 1008
+        np.testing.assert_allclose(numbers, expected[row::2, column::2], atol=1e-2)
+    # 1/125 s stands for 1/128.
+    assert raw.settings == CameraSettings(800, 1 / 128, 5.6)
+    assert raw.camera.name == "nikon_z6"
+    assert raw.white_balance == (1.9, 1.0, 1.4)
+    # Planes R, G1, G2, B from pairs of R, G, B.
+    assert raw.noise.shot == (6.4e-5, 6.1e-5, 6.1e-5, 5.7e-5)
+    assert raw.noise.read == (2.3e-8, 2.2e-8, 2.2e-8, 1.9e-8)
+    assert raw.box_factor == 1
+    assert raw.metadata["nlf_source"] == "camera_params.csv"
+    assert float(raw.data.max()) > 1
+    assert float(raw.data.min()) < 0
+
+
+def test_one_sequence_below_the_authors_table(nikon: tuple[Path, dict[str, np.ndarray]]) -> None:
+    root, mosaics = nikon
+    raw = read_sequence(root / "scene_002").captures[0]
+    np.testing.assert_array_equal(raw.to_mosaic(), np.minimum(mosaics["scene_002/DSC_0001"], 15520))
+    with pytest.raises(ValueError, match="lists 2; use read_dataset"):
+        read_sequence(root)
+
+
+def test_the_authors_canon_files(tmp_path: Path) -> None:
+    mosaic = np.random.default_rng(1).integers(2000, 16000, (4, 8))
+    author_file(tmp_path / "s1" / "IMG_1.npy", mosaic, 2048, 15000)
+    path = "D:\\data\\Canon\\s1\\IMG_1.jpg"
+    author_table(tmp_path / "camera_params.csv", CANON, [[path, 4, 3200, 22.0, "2e-4 3e-7"]])
+    # The table for developing: white balance as AsShotNeutral, and cells beyond csv's limit.
+    long = " ".join(["0.125"] * 30_000)
+    assert len(long) > csv.field_size_limit()
+    header = ["path", "AnalogBalance", "AsShotNeutral", "ProfileLookTableData"]
+    author_table(tmp_path / "camera_isp_params.csv", header, [[path, "1 1 1", "0.5 1 0.625", long]])
+    raw = read_sequence(tmp_path / "s1").captures[0]
+    assert raw.camera.name == "canon_70d"
+    assert raw.camera.black_level == (2048.0,) * 4
+    assert raw.camera.white_level == 15000
+    np.testing.assert_array_equal(raw.to_mosaic(), np.minimum(mosaic, 15000))
+    assert raw.settings == CameraSettings(3200, 4, 22)
+    assert raw.noise.shot == (2e-4,) * 4
+    assert raw.noise.read == (3e-7,) * 4
+    assert raw.white_balance == pytest.approx((2.0, 1.0, 1.6))
+
+
+def test_the_canons_noise_moves_to_the_levels_of_the_files() -> None:
+    # One electron is the same digital numbers on either scale.
+    built_in, packed = get_camera("canon_70d"), packed_camera("canon_70d")
+    numbers = 500.0
+    variances = [
+        float(noise_variance(torch.full((4, 1, 1), numbers / c.span[0]), c.nlf(400)).mean())
+        * c.span[0] ** 2
+        for c in (built_in, packed)
+    ]
+    assert packed.span[0] == 15000 - 2048
+    assert variances[0] == pytest.approx(variances[1], rel=1e-5)
+    assert packed_camera("nikon_z6").nlf(400).shot == pytest.approx(
+        get_camera("nikon_z6").nlf(400).shot
+    )
+    with pytest.raises(ValueError, match=r"`camera` \(='sony'\) must be one of nikon_z6"):
+        packed_camera("sony")
+
+
+def test_a_camera_given_replaces_the_guess(nikon: tuple[Path, dict[str, np.ndarray]]) -> None:
+    root, _ = nikon
+    assert read_dataset(root, camera="canon_70d")[0].captures[0].camera.name == "canon_70d"
+    mine = get_camera("nikon_z6")
+    assert read_sequence(root / "scene_001", camera=mine).captures[0].camera is mine
+
+
+def test_a_partial_copy_is_read_with_a_warning(
+    nikon: tuple[Path, dict[str, np.ndarray]], caplog: pytest.LogCaptureFixture
+) -> None:
+    root, _ = nikon
+    (root / "scene_002" / "DSC_0001.npy").unlink()
+    with caplog.at_level(logging.WARNING):
+        sequences = read_dataset(root)
+    assert [s.name for s in sequences] == ["scene_001"]
+    assert "1 of 3 files are not there" in caplog.text
+    for path in (root / "scene_001").iterdir():
+        path.unlink()
+    with pytest.raises(ValueError, match=r"\(3 rows\) must list \.npy files that are there"):
+        read_dataset(root)
+
+
+def test_a_table_without_a_column_is_refused_with_what_it_has(tmp_path: Path) -> None:
+    author_table(tmp_path / "camera_params.csv", ("path", "ExposureTime", "iso", "aperture"), [])
+    with pytest.raises(ValueError, match=r"path, ExposureTime, iso, aperture\).*missing: time"):
+        read_dataset(tmp_path)
+    (tmp_path / "camera_params.csv").write_text("")
+    with pytest.raises(ValueError, match="columns: none"):
+        read_dataset(tmp_path)
+
+
+def test_columns_may_stand_in_any_order_and_noise_may_be_missing(tmp_path: Path) -> None:
+    author_file(tmp_path / "a.npy", np.full((4, 4), 3000), 1008, 15520)
+    author_table(
+        tmp_path / "camera_params.csv",
+        ("iso", "path", "wb", "aperture", "time"),
+        [[400, "a.jpg", "[2.0, 1.0, 1.5, 0.0]", "8.0", "1.0"]],
+    )
+    raw = read_sequence(tmp_path).captures[0]
+    assert raw.settings == CameraSettings(400, 1, 8)
+    assert raw.noise == get_camera("nikon_z6").nlf(400)
+    assert raw.metadata["nlf_source"] == "camera calibration (nikon_z6)"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"iso": "auto"}, r"row 2: `iso` \(='auto'\) must be a number"),
+        ({"time": ""}, r"row 2: `time` \(=''\) must be a number"),
+        ({"aperture": "0"}, r"row 2: `f_number`"),
+        ({"noiseprofile": "1e-5 1e-8 1e-5"}, r"row 2: `noiseprofile` .* must be 2 or 6 numbers"),
+    ],
+)
+def test_a_cell_that_is_no_value_is_named(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    author_file(tmp_path / "s" / "a.npy", np.full((4, 4), 3000), 1008, 15520)
+    author_table(tmp_path / "camera_params.csv", NIKON, [nikon_row("s/a.jpg", **changes)])
+    with pytest.raises(ValueError, match=message):
+        read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (np.zeros((4, 6), np.float32), r"must be \(4, H, W\)"),
+        (np.zeros((6, 8, 4), np.float32), r"must be \(4, H, W\)"),
+        (np.full((4, 2, 2), math.nan, np.float32), "finite"),
+        (np.zeros((4, 2, 2), np.uint16), "floating point"),
+        (b"", "whole .npy file"),
+        (b"not an array at all", "whole .npy file"),
+    ],
+)
+def test_files_that_are_no_packed_raw_are_refused(
+    tmp_path: Path, content: np.ndarray | bytes, message: str
+) -> None:
+    file = tmp_path / "a.npy"
+    file.write_bytes(content) if isinstance(content, bytes) else np.save(file, content)
+    author_table(tmp_path / "camera_params.csv", NIKON, [nikon_row("a.jpg")])
+    sequence = read_sequence(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        sequence.captures[0]
+
+
+def test_pickled_objects_are_never_run(tmp_path: Path) -> None:
+    mark = tmp_path / "ran"
+
+    class Harmful:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (Path.touch, (mark,))
+
+    np.save(tmp_path / "a.npy", np.array([Harmful()], dtype=object), allow_pickle=True)
+    author_table(tmp_path / "camera_params.csv", NIKON, [nikon_row("a.jpg")])
+    with pytest.raises(ValueError, match="allow_pickle"):
+        read_sequence(tmp_path).captures[0]
+    assert not mark.exists()
+
+
+# --- folders of raws ---------------------------------------------------------------------------
+
+
+def test_every_folder_of_raws_is_a_sequence(tmp_path: Path) -> None:
+    raws = captures("nikon_z6", size=4)
+    write_raw_sequence(tmp_path / "nikon" / "b", raws)
+    write_raw_sequence(tmp_path / "nikon" / "a", raws[:2])
+    (tmp_path / "nikon" / "readme.txt").write_text("words")
+    found = read_dataset(tmp_path)
+    assert [(s.name, len(s.captures)) for s in found] == [("nikon/a", 2), ("nikon/b", 3)]
+    assert [s.name for s in read_dataset(tmp_path / "nikon" / "a")] == ["a"]
+    assert_same(list(found[1].captures), raws)
+
+
+def test_a_capture_that_is_there_twice_is_read_once_from_the_dng(tmp_path: Path) -> None:
+    raws = captures("nikon_z6", size=4)
+    write_raw_sequence(tmp_path / "a", raws)
+    for stem in ("capture_000", "capture_001"):
+        (tmp_path / "a" / f"{stem}.NEF").write_bytes(b"never read")
+        (tmp_path / "a" / f"{stem}.jpg").write_bytes(b"never read")
+    assert_same(list(read_sequence(tmp_path / "a").captures), raws)
+
+
+def test_a_camera_given_is_used_for_raws(tmp_path: Path) -> None:
+    write_raw_sequence(tmp_path / "a", captures("nikon_z6", size=4))
+    assert read_sequence(tmp_path / "a", camera="canon_70d").captures[0].camera.name == "canon_70d"
+
+
+def test_folders_without_a_sequence_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="`folder`"):
+        read_sequence(tmp_path / "nowhere")
+    with pytest.raises(FileNotFoundError, match="`root`"):
+        read_dataset(tmp_path / "nowhere")
+    (tmp_path / "a.txt").write_text("words")
+    with pytest.raises(ValueError, match=r"files ending in \['\.txt'\]\) must hold raw files"):
+        read_sequence(tmp_path)
+    with pytest.raises(ValueError, match=r"`root` .* must hold a camera_params\.csv"):
+        read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("write", [write_raw_sequence, write_packed_sequence])
+def test_writing_replaces_nothing(tmp_path: Path, write: Any) -> None:
+    raws = captures("nikon_z6", size=4)
+    (tmp_path / "a.txt").write_text("words")
+    with pytest.raises(ValueError, match="must be new or empty"):
+        write(tmp_path, raws)
+    with pytest.raises(ValueError, match="at least one capture"):
+        write(tmp_path / "b", [])
+
+
+def test_packed_files_that_would_come_back_as_another_cameras_are_not_written(
+    tmp_path: Path,
+) -> None:
+    nikon, canon = captures("nikon_z6", size=4), captures("canon_70d", size=4)
+    built_in = get_camera("canon_70d")
+    other_levels = [RawImage(canon[0].data, SETTINGS[0], built_in)]
+    for raws in ([*nikon, canon[0]], other_levels):
+        with pytest.raises(ValueError, match="must all be of packed_camera"):
+            write_packed_sequence(tmp_path / "a", raws)
+    assert not (tmp_path / "a").exists()
+
+
+def test_the_exposure_module_is_fitted_on_a_dataset(tmp_path: Path) -> None:
+    # A body whose black lies 2 digital numbers above what its files say: b takes them off again.
+    camera = packed_camera("nikon_z6")
+    offset = 2.0 / camera.span[0]
+    body = ReferenceCamera(camera, body=BodyError(black_offset=(offset,) * 4))
+    light = torch.linspace(0.0, 0.2, 64).repeat(4, 64, 1)
+    scene = ReferenceScene("s", "g", "k", light, SETTINGS[0])
+    times = (1 / 256, 1 / 64, 1 / 32)
+    raws = []
+    for time in times:
+        settings = CameraSettings(100, time, 8)
+        raws.append(RawImage(body.capture(scene, settings, seed=0).sample, settings, camera))
+    write_packed_sequence(tmp_path / "a", raws)
+
+    fit = LinearFit()
+    for sequence in read_dataset(tmp_path):
+        for source, target in itertools.permutations(sequence.captures, 2):
+            ratio = torch.tensor([exposure_ratio(source.settings, target.settings)])
+            fit.add(source.data[None], target.data[None], ratio)
+    module = fit.solve()
+    assert module.w.item() == pytest.approx(1.0, abs=2e-3)
+    np.testing.assert_allclose(module.b.detach().numpy(), -offset, atol=0.3 * offset)
+
+
+@pytest.mark.real_data
+def test_a_folder_of_camera_raws(data_dir: Path) -> None:
+    folder = data_dir / "canon_crw_cc0"
+    sequence = read_sequence(folder)
+    files = sorted(folder.glob("*.CRW"))
+    assert len(sequence.captures) == len(files)
+    raw = sequence.captures[2]
+    with rawpy.imread(str(files[2])) as same:
+        exif = CameraSettings.from_exif(
+            same.other.iso_speed, same.other.shutter_speed, same.other.aperture
+        )
+        assert raw.data.shape[1] == same.raw_image_visible.shape[0] // 2
+    assert raw.metadata["path"] == files[2].name
+    assert raw.settings.iso == exif.iso
+    assert raw.settings.exposure_time == pytest.approx(exif.exposure_time)
+    assert raw.settings.f_number == pytest.approx(exif.f_number)

@@ -1,0 +1,119 @@
+"""Against colour-demosaicing, an independent implementation, and hand-computed pixels."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from simulator.camera import BayerPattern, CameraProfile
+from simulator.raw.demosaic import demosaic_half, demosaic_malvar
+from simulator.raw.image import pack_mosaic
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # its own imports warn about optional packages
+    from colour_demosaicing import demosaicing_CFA_Bayer_Malvar2004
+
+PATTERNS = [p.value for p in BayerPattern]
+
+
+def pack(mosaic: np.ndarray, pattern: str) -> torch.Tensor:
+    """(2H, 2W) float mosaic to (1, 4, H, W), by the letters of the pattern alone."""
+    red, blue = pattern.index("R"), pattern.index("B")
+    order = [red, red ^ 1, blue ^ 1, blue]
+    tiles = [mosaic[i // 2 :: 2, i % 2 :: 2] for i in order]
+    return torch.from_numpy(np.stack(tiles))[None]
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_packing_is_that_of_raw_images(pattern):
+    mosaic = np.arange(48.0).reshape(6, 8)
+    camera = CameraProfile("c", pattern, 0, 1, 1)
+    torch.testing.assert_close(pack(mosaic, pattern)[0].float(), pack_mosaic(mosaic, camera))
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 5e-7)])
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_malvar_equals_colour_demosaicing_in_the_interior(pattern, dtype, tolerance):
+    mosaic = np.random.default_rng(1).random((22, 34))
+    ours = demosaic_malvar(pack(mosaic, pattern).to(dtype), pattern)
+    assert ours.dtype == dtype
+    theirs = demosaicing_CFA_Bayer_Malvar2004(mosaic, pattern)
+    difference = ours[0].permute(1, 2, 0).double().numpy() - theirs
+    assert np.abs(difference[2:-2, 2:-2]).max() < tolerance
+
+
+@pytest.mark.parametrize("size", [(4, 4), (4, 10), (6, 4), (8, 12)])
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_malvar_border_is_that_of_a_mirrored_mosaic(pattern, size):
+    """The border of ours is the interior of theirs on a mosaic that numpy mirrored."""
+    mosaic = np.random.default_rng(2).random(size)
+    ours = demosaic_malvar(pack(mosaic, pattern), pattern)[0].permute(1, 2, 0).numpy()
+    mirrored = np.pad(mosaic, 4, mode="reflect")
+    theirs = demosaicing_CFA_Bayer_Malvar2004(mirrored, pattern)[4:-4, 4:-4]
+    np.testing.assert_allclose(ours, theirs, atol=1e-14)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_malvar_keeps_a_flat_colour_and_the_measured_pixels(pattern):
+    flat = torch.tensor([0.6, 0.4, 0.4, 0.2]).reshape(1, 4, 1, 1).expand(2, 4, 3, 5)
+    rgb = demosaic_malvar(flat, pattern)
+    assert rgb.shape == (2, 3, 6, 10)
+    expected = torch.tensor([0.6, 0.4, 0.2]).reshape(1, 3, 1, 1).expand_as(rgb)
+    torch.testing.assert_close(rgb, expected)
+
+    packed = torch.rand(1, 4, 3, 5, generator=torch.Generator().manual_seed(0))
+    rgb = demosaic_malvar(packed, pattern)
+    for plane, (row, column) in enumerate(BayerPattern(pattern).offsets):
+        assert torch.equal(rgb[:, (0, 1, 1, 2)[plane], row::2, column::2], packed[:, plane])
+
+
+def test_malvar_reproduces_a_grey_ramp():
+    """The filters' Laplacians vanish on a plane, so a linear ramp comes back exactly."""
+    rows, columns = np.mgrid[0:12, 0:16].astype(np.float64)
+    ramp = 0.1 + 0.02 * rows + 0.03 * columns
+    rgb = demosaic_malvar(pack(ramp, "GRBG"), "GRBG")[0].numpy()
+    expected = np.broadcast_to(ramp, (3, 12, 16))
+    np.testing.assert_allclose(rgb[:, 2:-2, 2:-2], expected[:, 2:-2, 2:-2], atol=1e-14)
+
+
+def test_malvar_is_the_same_alone_and_in_a_batch():
+    packed = torch.rand(5, 4, 7, 9, generator=torch.Generator().manual_seed(0))
+    batch = demosaic_malvar(packed, "BGGR")
+    for image, expected in zip(packed, batch, strict=True):
+        assert torch.equal(demosaic_malvar(image[None], "BGGR")[0], expected)
+
+
+def test_half_is_one_pixel_per_tile():
+    packed = torch.arange(2 * 4 * 2 * 3, dtype=torch.float32).reshape(2, 4, 2, 3)
+    rgb = demosaic_half(packed)
+    assert rgb.shape == (2, 3, 2, 3)
+    # image 1, row 0, column 2: planes 26, 32, 38, 44
+    assert rgb[1, :, 0, 2].tolist() == [26.0, 35.0, 44.0]
+
+
+@pytest.mark.parametrize("shape", [(4, 8, 8), (1, 3, 8, 8), (8, 8)])
+def test_bad_shape(shape):
+    with pytest.raises(ValueError, match=r"`packed` \(shape"):
+        demosaic_half(torch.zeros(shape))
+    with pytest.raises(ValueError, match=r"`packed` \(shape"):
+        demosaic_malvar(torch.zeros(shape), "RGGB")
+
+
+def test_malvar_refuses_what_it_cannot_interpolate():
+    with pytest.raises(ValueError, match="at least 2 x 2"):
+        demosaic_malvar(torch.zeros(1, 4, 1, 8), "RGGB")
+    with pytest.raises(ValueError, match="one of RGGB, BGGR, GRBG, GBRG"):
+        demosaic_malvar(torch.zeros(1, 4, 2, 2), "RGBG")
+    with pytest.raises(ValueError, match="floating point"):
+        demosaic_malvar(torch.zeros(1, 4, 2, 2, dtype=torch.uint8), "RGGB")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_malvar_on_the_gpu_is_not_rounded():
+    packed = torch.rand(2, 4, 9, 8, generator=torch.Generator().manual_seed(0))
+    on_gpu = demosaic_malvar(packed.cuda(), "GBRG").cpu()
+    torch.testing.assert_close(on_gpu, demosaic_malvar(packed, "GBRG"), atol=3e-7, rtol=0)

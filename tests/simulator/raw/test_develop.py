@@ -1,0 +1,219 @@
+"""Against scikit-image, LibRaw's published matrix arithmetic and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import rawpy
+import torch
+from skimage.color import xyz2rgb
+
+from simulator import CameraSettings, RawImage, develop, get_camera, read_raw, render_srgb
+from simulator.camera import CameraProfile
+from simulator.raw.develop import apply_tone, balance, srgb_encode, srgb_from_camera
+
+Z6 = get_camera("nikon_z6")
+
+
+def flat(r: float, g: float, b: float, size: int = 4) -> torch.Tensor:
+    return torch.tensor([r, g, g, b]).reshape(1, 4, 1, 1).repeat(1, 1, size, size)
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, spelled out once more."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_encoding_is_the_standard():
+    linear = np.concatenate([np.linspace(0, 0.01, 1001), np.linspace(0.01, 1, 5001)])
+    ours = srgb_encode(torch.from_numpy(linear).float()).numpy()
+    np.testing.assert_allclose(ours, srgb(linear), atol=5e-7)
+    assert (np.diff(ours) >= 0).all()
+    assert ours[0] == pytest.approx(0, abs=1e-7)
+    assert ours[-1] == pytest.approx(1, abs=2e-7)
+
+
+def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
+    linear = torch.linspace(0, 1, 10_001, dtype=torch.float64)
+    curve = apply_tone(linear, "photographic")
+    assert (curve.diff() > 0).all()
+    assert curve[0] == 0
+    assert curve[-1] == pytest.approx(1, abs=1e-15)
+    assert (curve.diff().diff() < 1e-12).all()  # concave: contrast falls towards the highlights
+    card = apply_tone(torch.tensor([0.18 * 0.6635], dtype=torch.float64), "photographic")
+    assert card.item() == pytest.approx(0.18, abs=1e-12)
+    assert torch.equal(apply_tone(linear, "linear"), linear)
+
+
+def test_develop_follows_the_formula():
+    """R, mean green, B -> gains -> matrix -> sRGB, computed with numpy for one colour."""
+    out = develop(flat(0.1, 0.2, 0.15), (2.0, 1.0, 1.5), Z6.colour_matrix, tone="linear")
+    xyz_from_srgb = np.array(  # IEC 61966-2-1
+        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    )
+    camera_from_srgb = np.array(Z6.colour_matrix) @ xyz_from_srgb
+    camera_from_srgb /= camera_from_srgb.sum(axis=1, keepdims=True)
+    linear = np.linalg.solve(camera_from_srgb, [0.2, 0.2, 0.225])
+    assert out.shape == (1, 3, 4, 4)
+    assert out.dtype == torch.float32
+    np.testing.assert_allclose(out[0, :, 0, 0].numpy(), srgb(linear), atol=1e-6)
+
+
+def test_matrix_agrees_with_xyz_of_scikit_image():
+    """A camera whose channels are X, Y, Z develops XYZ colours as scikit-image does."""
+    white = np.array([0.4124 + 0.3576 + 0.1805, 1.0, 0.0193 + 0.1192 + 0.9505])
+    xyz = np.array([[0.20, 0.21, 0.25], [0.40, 0.35, 0.30], [0.10, 0.12, 0.20]])
+    expected = xyz2rgb(xyz[:, None, :])[:, 0]
+    matrix = srgb_from_camera(torch.eye(3)).numpy()
+    linear = (xyz / white) @ matrix.T
+    np.testing.assert_allclose(srgb(linear), expected, atol=2e-3)  # its matrix has more digits
+
+
+@pytest.mark.parametrize("camera", ["nikon_z6", "canon_70d"])
+def test_white_stays_white(camera):
+    matrix = get_camera(camera).colour_matrix
+    row_sums = srgb_from_camera(matrix).sum(dim=1)
+    torch.testing.assert_close(row_sums, torch.ones(3, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("gains", [(2.1, 1.0, 1.5), (0.8, 1.0, 2.9), (1.0, 1.7, 1.0)])
+@pytest.mark.parametrize("level", [1.0, 1.0001, 7.0, 1e6])
+def test_saturated_areas_are_white(gains, level):
+    out = develop(flat(level, level, level), gains, Z6.colour_matrix)
+    torch.testing.assert_close(out, torch.ones_like(out), atol=1e-6, rtol=0)
+    raw = RawImage(flat(level, level, level)[0], CameraSettings(100, 0.01, 4), Z6, None, gains)
+    for demosaic in ("malvar", "half"):
+        assert (render_srgb(raw, demosaic) == 255).all()
+    dimmed = render_srgb(raw, exposure_ev=-2.0)
+    assert (dimmed == dimmed[0, 0, 0]).all()  # grey, not magenta
+
+
+def test_only_the_ratio_of_gains_matters():
+    images = torch.rand(2, 4, 3, 3, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(
+        develop(images, (1.6, 0.8, 1.2), Z6.colour_matrix),
+        develop(images, (2.0, 1.0, 1.5), Z6.colour_matrix),
+    )
+
+
+@pytest.mark.parametrize("tone", ["linear", "photographic"])
+@pytest.mark.parametrize("matrix", [None, Z6.colour_matrix])
+@pytest.mark.parametrize("value", [-0.07, -1e6, -3e38, 0.0, 1e-30, 1e6, 3e38])
+def test_extreme_values_stay_finite(value, matrix, tone):
+    images = torch.rand(1, 4, 4, 4, generator=torch.Generator().manual_seed(0))
+    images[0, 1] = value
+    images[0, :, 1, 2] = value
+    out = develop(images, (3.0, 1.0, 0.2), matrix, tone=tone)
+    assert torch.isfinite(out).all()
+    assert out.min() >= 0
+    assert out.max() <= 1
+    raw = RawImage(images[0], CameraSettings(100, 0.01, 4), Z6, None, (3.0, 1.0, 0.2))
+    for exposure_ev in (-32, 32):
+        assert render_srgb(raw, exposure_ev=exposure_ev, tone=tone).shape == (3, 8, 8)
+
+
+def test_shadow_noise_keeps_its_mean():
+    """Negative pixels survive up to the last clip: a half-size green averages them in."""
+    packed = balance(torch.tensor([0.0, -0.02, 0.06, 0.0]).reshape(1, 4, 1, 1), (1.0, 1.0, 1.0))
+    assert packed.flatten().tolist() == pytest.approx([0.0, -0.02, 0.06, 0.0])
+    out = develop(torch.tensor([0.0, -0.02, 0.06, 0.0]).reshape(1, 4, 1, 1), tone="linear")
+    assert out[0, 1].item() == pytest.approx(float(srgb(np.array(0.02))), abs=1e-6)
+
+
+@pytest.mark.parametrize("batch", [1, 5, 40])
+def test_per_image_white_balance_and_batching(batch):
+    generator = torch.Generator().manual_seed(3)
+    images = torch.rand(batch, 4, 40, 48, generator=generator) * 1.2 - 0.1
+    gains = 1 + torch.rand(batch, 3, generator=generator)
+    together = develop(images, gains, Z6.colour_matrix)
+    for i in range(batch):
+        alone = develop(images[i : i + 1], tuple(gains[i].tolist()), Z6.colour_matrix)
+        assert torch.equal(together[i], alone[0])
+
+
+def test_inputs_are_left_alone():
+    images = torch.rand(2, 4, 4, 4, generator=torch.Generator().manual_seed(0)) * 2 - 0.5
+    gains = torch.tensor([2.0, 1.0, 1.5])
+    before, gains_before = images.clone(), gains.clone()
+    develop(images, gains, Z6.colour_matrix)
+    render_srgb(RawImage(images[0], CameraSettings(100, 0.01, 4), Z6))
+    assert torch.equal(images, before)
+    assert torch.equal(gains, gains_before)
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (3, 7), (16, 16)])
+def test_render_sizes(size, pattern):
+    camera = CameraProfile("c", pattern, 0, 1023, 10)
+    raw = RawImage(torch.full((4, *size), 0.5), CameraSettings(100, 0.01, 4), camera)
+    full, half = render_srgb(raw), render_srgb(raw, "half")
+    assert full.shape == (3, 2 * size[0], 2 * size[1])
+    assert half.shape == (3, *size)
+    assert full.dtype == half.dtype == torch.uint8
+    # Schlick: 1.618 * .5 / (.618 * .5 + 1) = .618; sRGB .8077; 206
+    assert set(full.unique().tolist()) == set(half.unique().tolist()) == {206}
+
+
+def test_exposure_correction_is_in_stops():
+    raw = RawImage(flat(0.1, 0.1, 0.1)[0], CameraSettings(100, 0.01, 4), Z6)
+    brighter = render_srgb(raw, "half", exposure_ev=1.0, tone="linear")
+    assert brighter.unique().item() == round(255 * float(srgb(np.array(0.2))))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"images": torch.zeros(4, 8, 8)},
+            r"`images` \(shape \(4, 8, 8\)\) must be \(B, 4, H, W\)",
+        ),
+        ({"images": torch.zeros(1, 3, 8, 8)}, r"`images` \(shape"),
+        ({"images": torch.full((1, 4, 2, 2), float("nan"))}, "`images` .* finite"),
+        ({"images": torch.zeros(1, 4, 2, 2, dtype=torch.uint8)}, "`images` .* floating point"),
+        ({"white_balance": (1.0, 1.0)}, r"`white_balance` \(shape \(2,\)\)"),
+        ({"white_balance": torch.ones(3, 3)}, r"`white_balance` \(shape \(3, 3\)\)"),
+        ({"white_balance": (1.0, 0.0, 1.0)}, "`white_balance` .* positive"),
+        ({"white_balance": (1.0, float("nan"), 1.0)}, "`white_balance` .* positive"),
+        ({"colour_matrix": torch.eye(4)}, "`colour_matrix` .* 3 x 3"),
+        ({"colour_matrix": torch.full((3, 3), float("inf"))}, "`colour_matrix` .* finite"),
+        ({"colour_matrix": torch.ones(3, 3)}, "`colour_matrix` .* invertible"),
+        ({"colour_matrix": -torch.eye(3)}, "`colour_matrix` .* white"),
+        ({"tone": "photografic"}, r"`tone` .* \['linear', 'photographic'\]; did you mean 'photo"),
+    ],
+)
+def test_develop_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        develop(**({"images": torch.zeros(2, 4, 2, 2)} | arguments))
+
+
+def test_render_refuses():
+    raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
+    with pytest.raises(ValueError, match=r"`demosaic` .* \['half', 'malvar'\]; did you mean 'malv"):
+        render_srgb(raw, demosaic="malvr")
+    with pytest.raises(ValueError, match="`tone` "):
+        render_srgb(raw, tone="aces")
+    with pytest.raises(ValueError, match="`exposure_ev` "):
+        render_srgb(raw, exposure_ev=float("nan"))
+
+
+@pytest.mark.real_data
+@pytest.mark.parametrize("exposure_ev", [0.0, 2.0])
+def test_a_real_raw_looks_as_libraw_shows_it(data_dir, exposure_ev):
+    path = data_dir / "canon_crw_cc0" / "CRW_0101.CRW"
+    with rawpy.imread(str(path)) as file:
+        theirs = file.postprocess(
+            half_size=True,
+            use_camera_wb=True,
+            no_auto_bright=True,
+            adjust_maximum_thr=0.0,
+            gamma=(2.4, 12.92),
+            user_flip=0,
+            output_bps=16,
+            bright=2.0**exposure_ev,
+        )
+    raw = read_raw(path)
+    ours = render_srgb(raw, "half", exposure_ev, tone="linear").permute(1, 2, 0).numpy()
+    assert ours.shape == theirs.shape
+    difference = ours.astype(np.float64) - theirs / 257.0
+    assert np.abs(difference.mean(axis=(0, 1))).max() < 0.25
+    assert np.quantile(np.abs(difference), 0.999) < 1.5

@@ -1,0 +1,198 @@
+"""Raw images: digital numbers in, digital numbers out, and what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage, get_camera
+from simulator.raw.image import check_packed, pack_mosaic, unpack_mosaic
+
+SETTINGS = CameraSettings(100, 1 / 64, 4.0)
+BLACK = (64.0, 60.25, 59.5, 63.0)  # R, G1, G2, B
+
+
+def camera(cfa: str = "RGGB", black: tuple[float, ...] | float = BLACK) -> CameraProfile:
+    return CameraProfile("bench", cfa, black, 4095, 12)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_round_trip_keeps_every_digital_number(cfa: str) -> None:
+    generator = np.random.default_rng(0)
+    mosaic = generator.integers(0, 4096, (10, 14), dtype=np.uint16)
+    mosaic[0, :4] = [0, 4095, 1, 4094]
+    packed = pack_mosaic(mosaic, camera(cfa))
+    assert packed.shape == (4, 5, 7)
+    assert packed.dtype == torch.float32
+    np.testing.assert_array_equal(unpack_mosaic(packed, camera(cfa)), mosaic)
+    raw = RawImage.from_mosaic(mosaic, SETTINGS, camera(cfa))
+    np.testing.assert_array_equal(raw.to_mosaic(), mosaic)
+
+
+def test_round_trip_of_16_bits() -> None:
+    profile = CameraProfile("deep", "GBRG", (1024, 1025, 1026, 1027), 65535, 16)  # type: ignore[arg-type]
+    mosaic = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    np.testing.assert_array_equal(unpack_mosaic(pack_mosaic(mosaic, profile), profile), mosaic)
+
+
+@pytest.mark.parametrize(
+    ("cfa", "tile"),
+    [
+        ("RGGB", [["R", "G1"], ["G2", "B"]]),
+        ("BGGR", [["B", "G2"], ["G1", "R"]]),
+        ("GRBG", [["G1", "R"], ["B", "G2"]]),
+        ("GBRG", [["G2", "B"], ["R", "G1"]]),
+    ],
+)
+def test_planes_and_levels_of_each_order(cfa: str, tile: list[list[str]]) -> None:
+    """Each filter gets its own number and is scaled with its own black level."""
+    numbers = {"R": 1000, "G1": 2000, "G2": 3000, "B": 4000}
+    mosaic = np.tile([[numbers[name] for name in row] for row in tile], (2, 3))
+    packed = pack_mosaic(mosaic, camera(cfa))
+    for plane, (number, black) in enumerate(zip((1000, 2000, 3000, 4000), BLACK, strict=True)):
+        expected = np.float32((number - black) / (4095 - black))
+        assert torch.all(packed[plane] == float(expected))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (3, 2), (3, 5), (7, 7), (8, 9)])
+def test_an_odd_last_row_or_column_is_dropped(rows: int, columns: int) -> None:
+    mosaic = np.arange(rows * columns).reshape(rows, columns)
+    packed = pack_mosaic(mosaic, camera())
+    assert packed.shape == (4, rows // 2, columns // 2)
+    even = mosaic[: rows // 2 * 2, : columns // 2 * 2]
+    np.testing.assert_array_equal(unpack_mosaic(packed, camera()), even)
+
+
+@pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32, ">u2"])
+def test_any_layout_of_a_mosaic_is_packed_alike(cfa: str, dtype: str) -> None:
+    """LibRaw's visible area is a part of its array: rows do not follow each other in memory."""
+    whole = np.random.default_rng(4).integers(0, 4096, (300, 40)).astype(dtype)
+    visible = whole[3:295, 5:34]  # odd columns, more rows than are converted at a time
+    plain = np.array(visible.tolist(), np.uint16)
+    assert torch.equal(pack_mosaic(visible, camera(cfa)), pack_mosaic(plain, camera(cfa)))
+    turned = np.array(visible.T, order="C").T
+    assert torch.equal(pack_mosaic(turned, camera(cfa)), pack_mosaic(plain, camera(cfa)))
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 7), (3, 5), (250, 300), (0, 300), (7, 7)])
+def test_part_of_the_rows_is_unpacked_as_the_whole(first: int, last: int) -> None:
+    mosaic = np.random.default_rng(5).integers(0, 4096, (600, 6), dtype=np.uint16)
+    packed = pack_mosaic(mosaic, camera("GBRG"))
+    part = unpack_mosaic(packed, camera("GBRG"), first, last)
+    np.testing.assert_array_equal(part, mosaic[2 * first : 2 * last])
+
+
+def test_unpack_clips_to_the_sensor_and_rounds() -> None:
+    data = torch.tensor([-9.0, 9.0, 0.4 / 4031, 0.6 / 4031]).reshape(4, 1, 1)
+    numbers = unpack_mosaic(data, camera(black=64))
+    assert numbers.tolist() == [[0, 4095], [64, 65]]
+
+
+@pytest.mark.parametrize("shape", [(4,), (1, 8), (8, 1), (2, 2, 2), (0, 4)])
+def test_bad_mosaic(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="`mosaic`"):
+        pack_mosaic(np.zeros(shape, np.uint16), camera())
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (torch.zeros(3, 4, 4), r"`data` \(shape \(3, 4, 4\)\) must be \(4, H, W\)"),
+        (torch.zeros(4, 4), r"`data` \(shape \(4, 4\)\)"),
+        (torch.zeros(1, 4, 4, 4), r"must be \(4, H, W\)"),
+        (torch.zeros(4, 0, 4), "`data`"),
+        (torch.zeros(4, 2, 2, dtype=torch.int16), "from_mosaic"),
+        (np.zeros((4, 2, 2), np.uint16), "from_mosaic"),
+        (torch.full((4, 2, 2), math.nan), r"\(16 values NaN or infinite\)"),
+        (torch.tensor([1.0, -math.inf, 0.0, 0.0]).reshape(4, 1, 1), r"\(1 values"),
+        (torch.full((4, 2, 2), 1e300, dtype=torch.float64), "infinite"),  # beyond float32
+        ([[0.0]], "`data` .=list. must be a torch tensor"),
+        (None, "`data`"),
+    ],
+)
+def test_bad_data_is_refused_before_any_work(data: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RawImage(data, SETTINGS, camera())  # type: ignore[arg-type]
+
+
+def test_one_bad_value_among_many_is_found() -> None:
+    data = torch.zeros(4, 33, 65)
+    data[2, 17, 40] = math.nan
+    with pytest.raises(ValueError, match="1 values"):
+        check_packed("data", data)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_other_float_types_become_float32(dtype: torch.dtype) -> None:
+    raw = RawImage(torch.full((4, 2, 2), 0.5, dtype=dtype), SETTINGS, camera())
+    assert raw.data.dtype == torch.float32
+    assert torch.all(raw.data == 0.5)
+
+
+def test_numpy_views_are_accepted() -> None:
+    data = np.arange(32, dtype=np.float32).reshape(4, 2, 4)[:, ::-1, ::-1]
+    np.testing.assert_array_equal(RawImage(data, SETTINGS, camera()).data.numpy(), data)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "gains", [(1.0, 1.0), (1.0, 0.0, 1.0), (1.0, -1.0, 1.0), (1.0, math.nan, 1.0)]
+)
+def test_bad_white_balance(gains: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="`white_balance`"):
+        RawImage(torch.zeros(4, 2, 2), SETTINGS, camera(), white_balance=gains)  # type: ignore[arg-type]
+
+
+def test_noise_is_the_files_own_before_the_cameras() -> None:
+    z6, data = get_camera("nikon_z6"), torch.zeros(4, 2, 2)
+    assert RawImage(data, SETTINGS, z6).noise.shot[1] == pytest.approx(7.47234302281224e-06)
+    own = NoiseLevelFunction((1e-3,) * 4, (1e-6,) * 4)
+    assert RawImage(data, SETTINGS, z6, nlf=own).noise.shot == (1e-3,) * 4
+    averaged = RawImage(data, SETTINGS, z6, nlf=own, box_factor=4)
+    assert averaged.noise.shot == pytest.approx((1e-3 / 16,) * 4)
+    assert averaged.noise.read == pytest.approx((1e-6 / 16,) * 4)
+    with pytest.raises(ValueError, match="no noise calibration"):
+        _ = RawImage(data, SETTINGS, camera()).noise
+
+
+def test_saturated_pixels_are_those_at_white_in_any_plane() -> None:
+    mosaic = np.full((4, 4), 4094)
+    mosaic[0, 0] = 4095  # R of the first pixel
+    mosaic[3, 2] = 4095  # G2 of the last
+    saturated = RawImage.from_mosaic(mosaic, SETTINGS, camera()).saturated
+    assert saturated.tolist() == [[True, False], [False, True]]
+
+
+@pytest.mark.parametrize("rows", [1, 127, 300])
+def test_saturated_pixels_of_frames_in_shares(rows: int) -> None:
+    """Each plane has a limit of its own; NumPy marks the same pixels."""
+    limits = [1 - 0.5 / (4095 - black) for black in BLACK]
+    levels = np.random.default_rng(6).uniform(0.9995, 1.0001, (4, 9, rows)).astype(np.float32)
+    data = levels.transpose(0, 2, 1)  # not in the order of memory
+    expected = np.any(data >= np.array(limits, np.float32)[:, None, None], axis=0)
+    assert expected.any()
+    assert not expected.all()
+    raw = RawImage(torch.from_numpy(data), SETTINGS, camera())
+    np.testing.assert_array_equal(raw.saturated.numpy(), expected)
+
+
+def test_repr_says_what_it_is() -> None:
+    text = repr(RawImage(torch.zeros(4, 6, 8), SETTINGS, camera()))
+    assert text == "RawImage(6 x 8 packed, ISO 100, 1/64 s, f/4, bench)"
+
+
+@pytest.mark.parametrize("rows", [2, 62, 66, 514, 1030])
+def test_any_number_of_rows_is_packed_as_by_hand(rows: int) -> None:
+    """Frames are converted a few rows at a time, on several threads."""
+    mosaic = np.random.default_rng(1).integers(0, 4096, (rows, 6), dtype=np.uint16)
+    packed = pack_mosaic(mosaic, camera("GRBG"))
+    corners = {0: (0, 1), 1: (0, 0), 2: (1, 1), 3: (1, 0)}  # R, G1, G2, B of GRBG
+    for plane, (row, column) in corners.items():
+        expected = (mosaic[row::2, column::2].astype(np.float64) - BLACK[plane]) / (
+            4095 - BLACK[plane]
+        )
+        assert np.array_equal(packed[plane].numpy(), expected.astype(np.float32))
+    np.testing.assert_array_equal(unpack_mosaic(packed, camera("GRBG")), mosaic)

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from simulator.camera import BayerPattern, CameraProfile, NoiseLevelFunction, get_camera
+from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.sequences import (
+    EXPOSURE_TIMES,
+    F_NUMBERS,
+    ISO_SPEEDS,
+    Pair,
+    Sequence,
+    draw_settings,
+    exposure_error,
+    grey_signal,
+    select_pairs,
+)
+from simulator.settings import CameraSettings
+
+Z6 = get_camera("nikon_z6")
+#: What the marked f-numbers stand for: powers of sqrt(2).
+EXACT_F = {4.0: 4.0, 5.6: 2**2.5, 8.0: 8.0, 11.0: 2**3.5, 16.0: 16.0, 22.0: 2**4.5}
+
+
+def scene(
+    illuminance: float | None = 320.0, reference: CameraSettings | None = None, light: float = 0.1
+) -> ReferenceScene:
+    reference = reference or CameraSettings(100, 0.01, 4)
+    return ReferenceScene(
+        "s", "g", "k", torch.full((4, 2, 3), light), reference, illuminance=illuminance
+    )
+
+
+def shot_only() -> CameraProfile:
+    """A sensor whose only noise is that of the photons: shot noise grows with ISO."""
+    table = {
+        iso: NoiseLevelFunction((1e-7 * iso,) * 4, (0.0,) * 4) for iso in (100.0, 400.0, 6400.0)
+    }
+    return CameraProfile("ideal", BayerPattern.RGGB, (0, 0, 0, 0), 1000, 10, nlf_by_iso=table)
+
+
+def drawn(illuminance: float, count: int, camera: CameraProfile = Z6) -> list[CameraSettings]:
+    rng = np.random.default_rng(7)
+    return [s for _ in range(count) for s in draw_settings(illuminance, rng, camera)]
+
+
+@pytest.mark.parametrize("illuminance", [1.0, 300.0, 20_000.0])
+def test_a_sequence_has_20_to_25_different_captures_in_the_papers_ranges(
+    illuminance: float,
+) -> None:
+    rng = np.random.default_rng(1)
+    lengths = set()
+    for _ in range(40):
+        settings = draw_settings(illuminance, rng, Z6)
+        lengths.add(len(settings))
+        assert len(set(settings)) == len(settings)
+        assert settings == sorted(settings)
+        for s in settings:
+            assert 100 <= s.iso <= 16_000
+            # 1/8000 s stands for 2**-13
+            assert 2.0**-13 <= s.exposure_time <= 4.0
+            assert s.f_number in EXACT_F
+    assert lengths <= set(range(20, 26))
+    assert {20, 25} <= lengths
+
+
+def test_levels_are_what_cameras_offer() -> None:
+    assert tuple(EXACT_F) == F_NUMBERS
+    assert (ISO_SPEEDS[0], ISO_SPEEDS[-1]) == (100, 16_000)
+    np.testing.assert_allclose(np.diff(np.log2(ISO_SPEEDS)), 1 / 3, atol=0.04)
+    np.testing.assert_allclose(np.diff(np.log2(EXPOSURE_TIMES)), 1 / 3)
+    # A raw file that states one of these times, rounded or not, brings back the same number.
+    for time in EXPOSURE_TIMES:
+        assert CameraSettings.from_exif(100, time, 4).exposure_time == time
+    marked = (1 / 8000, 1 / 1000, 1 / 125, 1 / 60, 1 / 15, 1.0, 4.0)
+    assert {CameraSettings.from_exif(100, t, 4).exposure_time for t in marked} <= set(
+        EXPOSURE_TIMES
+    )
+
+
+def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures() -> None:
+    means = []
+    for illuminance in (1.0, 20.0, 400.0, 4000.0, 20_000.0):
+        logs = [
+            (math.log2(s.iso), math.log2(s.exposure_time), -math.log2(s.f_number))
+            for s in drawn(illuminance, 40)
+        ]
+        means.append(np.mean(logs, axis=0))
+    assert (np.diff(means, axis=0) < 0).all()
+
+
+@pytest.mark.parametrize("illuminance", [10.0, 320.0, 20_000.0])
+def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance: float) -> None:
+    # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
+    errors = np.array(
+        [
+            math.log2(illuminance / 2.5)
+            - math.log2(EXACT_F[s.f_number] ** 2 / s.exposure_time)
+            + math.log2(s.iso / 100)
+            for s in drawn(illuminance, 40)
+        ]
+    )
+    assert np.abs(errors).max() <= 3 + 1e-9
+    assert abs(np.median(errors)) < 0.5
+    assert np.percentile(errors, 5) < -2
+    assert np.percentile(errors, 95) > 2
+
+
+def test_the_generator_decides_and_nothing_else() -> None:
+    first = draw_settings(100.0, np.random.default_rng(3), Z6)
+    np.random.seed(0)  # noqa: NPY002 - the global state must not matter
+    assert draw_settings(100.0, np.random.default_rng(3), Z6) == first
+    assert draw_settings(100.0, np.random.default_rng(4), Z6) != first
+
+
+def test_isos_stay_near_the_calibrated_ones() -> None:
+    nlf = Z6.nlf(100.0)
+    camera = CameraProfile(
+        "small", BayerPattern.RGGB, (0, 0, 0, 0), 1000, 10, nlf_by_iso={200.0: nlf, 1600.0: nlf}
+    )
+    isos = {s.iso for s in drawn(30.0, 30, camera)}
+    assert min(isos) == 200
+    assert max(isos) == 4000
+
+
+def test_a_camera_of_unknown_noise_and_a_scene_without_light_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    bare = CameraProfile("bare", BayerPattern.RGGB, (0, 0, 0, 0), 1000, 10)
+    with pytest.raises(ValueError, match=r"`camera` \(='bare'\)"):
+        draw_settings(100.0, rng, bare)
+    with pytest.raises(ValueError, match=r"`illuminance` \(=0.001\)"):
+        draw_settings(1e-3, rng, Z6)
+    with pytest.raises(ValueError, match=r"`illuminance` \(=0\)"):
+        draw_settings(0, rng, Z6)
+
+
+def test_exposure_error_is_positive_where_it_is_too_bright() -> None:
+    # 320 lux is EV 7: ISO 100, 1/8 s, f/4 is right.
+    right = CameraSettings(100, 1 / 8, 4)
+    assert exposure_error(320.0, right) == pytest.approx(0.0)
+    assert exposure_error(320.0, CameraSettings(200, 1 / 4, 4)) == pytest.approx(2.0)
+    assert exposure_error(320.0, CameraSettings(100, 1 / 8, 5.6)) == pytest.approx(-1.0)
+
+
+def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter() -> None:
+    # x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
+    card = 0.18 * 250 / (120 * math.pi)
+    assert card == pytest.approx(0.119, abs=5e-4)
+    settings = CameraSettings(100, 1 / 8, 4)
+    assert grey_signal(scene(320.0), settings) == pytest.approx(card)
+    assert grey_signal(scene(640.0), settings) == pytest.approx(2 * card)
+    dark = scene(None, CameraSettings(100, 1 / 4, 4), light=0.3)
+    assert grey_signal(dark, settings) == pytest.approx(0.15)
+
+
+def test_a_sequence_needs_two_captures() -> None:
+    with pytest.raises(ValueError, match="at least 2"):
+        Sequence(scene(), (CameraSettings(100, 1, 4),))
+
+
+@pytest.mark.parametrize("stage", ["exposure", "all"])
+def test_any_two_captures_of_one_sequence_train_the_exposure(stage: str) -> None:
+    settings = tuple(CameraSettings(100, t, 4) for t in (0.1, 0.2, 0.4))
+    pairs = select_pairs([Sequence(scene(), settings), Sequence(scene(), settings[:2])], stage, Z6)  # type: ignore[arg-type]
+    expected = [(0, 0, 1), (0, 0, 2), (0, 1, 0), (0, 1, 2), (0, 2, 0), (0, 2, 1)]
+    expected += [(1, 0, 1), (1, 1, 0)]
+    assert pairs == [Pair(*p) for p in expected]
+
+
+def test_noise_targets_collect_four_times_the_light_at_the_same_aperture() -> None:
+    # With photon noise alone, variance at a common exposure goes as 1 / (light collected): at one
+    # f-number the target's must be at most a quarter, so its exposure time at least fourfold.
+    source = CameraSettings(6400, 1 / 128, 8)
+    candidates = {
+        CameraSettings(100, 1 / 31.9, 8): True,
+        CameraSettings(100, 1 / 32.1, 8): False,  # not yet four times
+        CameraSettings(400, 1 / 16, 8): True,
+        CameraSettings(500, 1 / 16, 8): False,  # ISO above 400
+        CameraSettings(100, 1 / 16, 11): False,  # other defocus
+    }
+    # EV 9: each target is within the range of exposures asked of it.
+    sequence = Sequence(scene(2.5 * 2**9), (source, *candidates))
+    chosen = {p.target for p in select_pairs([sequence], "noise", shot_only()) if p.source == 0}
+    assert chosen == {i for i, good in enumerate(candidates.values(), start=1) if good}
+
+
+def test_noise_targets_are_neither_black_nor_white() -> None:
+    source = CameraSettings(6400, 1 / 8192, 8)  # an eighth of the light of any target
+    # EV 12 is ISO 100, 1/64 s, f/8.
+    times = {
+        2.0**-9 * 0.98: False,
+        2.0**-9 * 1.02: True,
+        2.0**-4 * 0.98: True,
+        2.0**-4 * 1.02: False,
+    }
+    settings = (source, *(CameraSettings(100, t, 8) for t in times))
+    pairs = select_pairs([Sequence(scene(2.5 * 2**12), settings)], "noise", shot_only())
+    chosen = {p.target for p in pairs if p.source == 0}
+    assert chosen == {i for i, good in enumerate(times.values(), start=1) if good}
+
+
+def test_read_noise_counts_in_dim_light() -> None:
+    # Reads: 4e-6 at ISO 100. Source and target differ in exposure by 2 and in gain not at all:
+    # brought to the target's exposure the source's read variance is 4 times as large.
+    nlf = NoiseLevelFunction((1e-12,) * 4, (4e-6,) * 4)
+    camera = CameraProfile(
+        "reads", BayerPattern.RGGB, (0, 0, 0, 0), 1000, 10, nlf_by_iso={100.0: nlf}
+    )
+    settings = (CameraSettings(100, 0.1, 4), CameraSettings(100, 0.2001, 4))
+    dim = scene(2.5 * 2**5)
+    assert select_pairs([Sequence(dim, settings)], "noise", camera) == [Pair(0, 0, 1)]
+
+
+def test_the_aperture_only_opens_and_seldom_stays() -> None:
+    f_numbers = (4.0, 4.0, 5.6, 5.6, 8.0, 8.0, 11.0, 11.0, 16.0, 22.0)
+    settings = tuple(CameraSettings(100, 0.1 + i / 10, n) for i, n in enumerate(f_numbers))
+    pairs = select_pairs([Sequence(scene(), settings)] * 3, "aperture", Z6)
+    opened = [p for p in pairs if f_numbers[p.source] > f_numbers[p.target]]
+    same = [p for p in pairs if f_numbers[p.source] == f_numbers[p.target]]
+    assert len(opened) == 3 * (10 * 9 // 2 - 4)
+    assert len(opened) + len(same) == len(pairs) == len(set(pairs))
+    assert 0 < len(same) <= 0.1 * len(pairs)
+    assert {p.sequence for p in same} == {0, 1, 2}
+    assert pairs == sorted(pairs)
+
+
+def test_one_aperture_leaves_no_pair_for_its_module() -> None:
+    settings = tuple(CameraSettings(100, t, 8) for t in (0.1, 0.2, 0.4))
+    assert select_pairs([Sequence(scene(), settings)], "aperture", Z6) == []
+
+
+def test_most_drawn_sequences_serve_every_stage() -> None:
+    rng = np.random.default_rng(0)
+    sequences = [Sequence(scene(320.0), tuple(draw_settings(320.0, rng, Z6))) for _ in range(10)]
+    for stage in ("exposure", "noise", "aperture", "all"):
+        assert {p.sequence for p in select_pairs(sequences, stage, Z6)} == set(range(10))  # type: ignore[arg-type]
+
+
+def test_an_unknown_stage_proposes_the_nearest() -> None:
+    with pytest.raises(ValueError, match=r"`stage` \(='noises'\).*did you mean 'noise'"):
+        select_pairs([], "noises", Z6)  # type: ignore[arg-type]

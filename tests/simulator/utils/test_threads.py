@@ -1,0 +1,98 @@
+"""Shares of work: each item once, on the threads that were asked for, after a fork as well."""
+
+from __future__ import annotations
+
+import multiprocessing
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from simulator.utils.threads import in_shares, thread_count
+
+
+def test_as_many_threads_as_torch_uses() -> None:
+    assert thread_count() == torch.get_num_threads()
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 8])
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 64])
+def test_every_item_is_done_once(count: int, threads: int) -> None:
+    done = np.zeros(count, int)
+
+    def task(first: int, last: int) -> None:
+        done[first:last] += 1
+
+    in_shares(task, count, threads=threads)
+    assert (done == 1).all()
+
+
+def test_shares_are_contiguous_and_run_at_the_same_time() -> None:
+    barrier, shares = threading.Barrier(3, timeout=30), []
+
+    def task(first: int, last: int) -> None:
+        barrier.wait()  # passes only if all three are under way
+        shares.append((first, last))
+
+    in_shares(task, 9, threads=3)
+    assert sorted(shares) == [(0, 3), (3, 6), (6, 9)]
+
+
+def test_little_work_stays_on_the_callers_thread() -> None:
+    names: list[str] = []
+    in_shares(lambda *_: names.append(threading.current_thread().name), 5, least=3, threads=4)
+    assert names == [threading.current_thread().name]
+
+
+def test_a_task_may_ask_for_shares_itself() -> None:
+    done = np.zeros((4, 10), int)
+
+    def outer(first: int, last: int) -> None:
+        for row in done[first:last]:
+
+            def inner(a: int, b: int, row: np.ndarray = row) -> None:
+                row[a:b] += 1
+
+            in_shares(inner, 10, threads=2)
+
+    in_shares(outer, 4, threads=2)
+    assert (done == 1).all()
+
+
+@pytest.mark.parametrize("bad", [0, 3])
+def test_errors_of_any_share_are_raised_once_all_are_done(bad: int) -> None:
+    done: list[int] = []
+
+    def task(first: int, last: int) -> None:
+        if first == bad:
+            raise ValueError(f"share {first}")
+        done.append(first)
+
+    with pytest.raises(ValueError, match=f"share {bad}"):
+        in_shares(task, 6, threads=2)
+    assert done == [3 - bad]
+    in_shares(lambda *_: done.append(-1), 1)
+    assert done[-1] == -1
+
+
+def _sum_in_child(queue: object) -> None:
+    totals = np.zeros(2)
+
+    def task(first: int, last: int) -> None:
+        totals[first:last] = last
+
+    in_shares(task, 2, threads=2)
+    queue.put(totals.tolist())  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
+def test_child_processes_make_threads_of_their_own(method: str) -> None:
+    in_shares(lambda *_: None, 2, threads=2)  # this process has some already
+    context = multiprocessing.get_context(method)
+    queue = context.Queue()
+    child = context.Process(target=_sum_in_child, args=(queue,))  # type: ignore[attr-defined]
+    child.start()
+    assert queue.get(timeout=60) == [1.0, 2.0]
+    child.join(timeout=60)

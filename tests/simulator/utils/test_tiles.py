@@ -1,0 +1,204 @@
+"""Tiles: what a network gives on the whole frame, on any size, in bounded memory."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from simulator import camera_simulator
+from simulator.networks.aperture_module import DefocusMap
+from simulator.networks.noise_module import CompactDenoiser, NoiseModule
+from simulator.utils.tiles import in_tiles, make_tiles, varying
+
+
+def frame(*size: int, seed: int = 0) -> Tensor:
+    return torch.rand(1, 4, *size, generator=torch.Generator().manual_seed(seed))
+
+
+def mean_of_neighbours(*images: Tensor) -> Tensor:
+    """Sees 2 pixels far, and the position modulo 4."""
+    total = F.avg_pool2d(F.pad(sum(images), (2,) * 4), 5, stride=1)
+    rows = torch.arange(total.shape[-2])[:, None] % 4
+    return total * (1 + rows) + torch.arange(total.shape[-1]) % 4
+
+
+@pytest.mark.parametrize("size", [(1, 1), (12, 16), (16, 17), (17, 16), (40, 41), (5, 93), (93, 5)])
+def test_tiles_of_a_function_of_neighbourhood_and_phase(size: tuple[int, int]) -> None:
+    image, other = frame(*size), frame(*size, seed=1)
+    tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=12)
+    torch.testing.assert_close(tiled, mean_of_neighbours(image, other), rtol=0, atol=1e-6)
+
+
+def test_too_small_a_halo_shows() -> None:
+    """The check above can fail: with a halo of 0 the seams are visible."""
+    image = frame(40, 40)
+    tiled = in_tiles(mean_of_neighbours, image, halo=0, tile=12)
+    assert (tiled - mean_of_neighbours(image)).abs().max() > 0.1
+
+
+def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once() -> None:
+    sizes: list[tuple[int, ...]] = []
+
+    def spy(image: Tensor) -> Tensor:
+        sizes.append(tuple(image.shape[-2:]))
+        return image.double()[:, :2]
+
+    image = frame(50, 130)
+    result = in_tiles(spy, image, halo=8, tile=16)
+    assert result.dtype == torch.float64
+    assert torch.equal(result, image.double()[:, :2])
+    assert max(max(s) for s in sizes) == 16 + 2 * 8
+    assert len(sizes) == 4 * 9
+    sizes.clear()
+    in_tiles(spy, frame(24, 20), halo=8, tile=16)
+    assert sizes == [(24, 20)]
+
+
+def test_maps_without_channels() -> None:
+    image = frame(30, 50)
+    assert torch.equal(in_tiles(lambda x: x.sum(1), image, halo=4, tile=8), image.sum(1))
+
+
+@pytest.mark.parametrize(("halo", "tile"), [(3, 8), (4, 10), (4, 0)])
+def test_steps_that_would_break_the_phase_are_refused(halo: int, tile: int) -> None:
+    with pytest.raises(ValueError, match="multiples of 4"):
+        in_tiles(lambda x: x, frame(8, 8), halo=halo, tile=tile)
+
+
+def test_denoiser_in_tiles_with_the_simulators_halo() -> None:
+    torch.manual_seed(0)
+    module = NoiseModule("compact").eval().requires_grad_(False)
+    module.network = CompactDenoiser((4, 6, 8)).requires_grad_(False)  # depth alone decides
+    module.network.tail.weight.mul_(30)
+    image = frame(150, 133)
+    shot, read = torch.full((1, 4), 1e-2), torch.full((1, 4), 1e-4)
+
+    def network(part: Tensor) -> Tensor:
+        return module(part, shot, read)
+
+    whole = network(image)
+    tiled = in_tiles(network, image, halo=camera_simulator._NOISE_HALO, tile=32)
+    assert (whole - image).abs().mean() > 0.05
+    torch.testing.assert_close(tiled, whole, rtol=0, atol=2e-5 * float(whole.abs().max()))
+
+
+def changed_outside(image: Tensor, halo: int) -> Tensor:
+    """Everything farther than `halo` from the central 4 x 4 block is another picture."""
+    other = frame(*image.shape[-2:], seed=7) * 3
+    first, last = (side // 2 // 4 * 4 for side in image.shape[-2:])
+    keep = (..., slice(first - halo, first + 4 + halo), slice(last - halo, last + 4 + halo))
+    other[keep] = image[keep]
+    return other
+
+
+def test_the_halo_covers_what_the_networks_see() -> None:
+    """What lies beyond the halo changes no bit; what lies within does."""
+    torch.manual_seed(0)
+    noise = NoiseModule("compact").eval().requires_grad_(False)
+    noise.network = CompactDenoiser((4, 6, 8)).requires_grad_(False)
+    noise.network.tail.weight.mul_(30)
+    blur = DefocusMap(width=6).eval().requires_grad_(False)
+    shot, read = torch.full((1, 4), 1e-2), torch.full((1, 4), 1e-4)
+    image = frame(144, 148)
+    networks = [
+        (lambda x: noise(x, shot, read), camera_simulator._NOISE_HALO),
+        (lambda x: blur(x, torch.full_like(x, 0.01)), camera_simulator._MAP_HALO),
+    ]
+    for network, halo in networks:
+        expected = network(image)[..., 72:76, 72:76]
+        assert torch.equal(network(changed_outside(image, halo))[..., 72:76, 72:76], expected)
+        near = network(changed_outside(image, 16))[..., 72:76, 72:76]
+        assert not torch.equal(near, expected)
+
+
+def test_defocus_map_in_tiles_with_the_simulators_halo() -> None:
+    torch.manual_seed(0)
+    network = DefocusMap(width=6).eval().requires_grad_(False)
+    network.tail.weight.mul_(20)
+    image = frame(171, 198)
+    deviation = torch.full_like(image, 0.01)
+    whole = network(image, deviation)
+    tiled = in_tiles(network, image, deviation, halo=camera_simulator._MAP_HALO, tile=48)
+    assert float(whole.std()) > 0.05
+    torch.testing.assert_close(tiled, whole, rtol=0, atol=1e-3 * float(whole.std()))
+
+
+# Where it is needed
+
+
+def patches(height: int, width: int) -> Tensor:
+    """Two corners and a pixel in between."""
+    needed = torch.zeros(height, width, dtype=torch.bool)
+    needed[:9, :21] = needed[-5:, -30:] = True
+    needed[height // 2, width // 3] = True
+    return needed
+
+
+@pytest.mark.parametrize("size", [(16, 16), (1, 90), (90, 1), (61, 203), (200, 130)])
+@pytest.mark.parametrize("tile", [16, 64, 512])
+def test_where_it_is_needed_it_is_what_it_is_without(size: tuple[int, int], tile: int) -> None:
+    image, needed = frame(*size), patches(*size)
+    expected = torch.where(needed, mean_of_neighbours(image), -image)
+    tiled = in_tiles(mean_of_neighbours, image, halo=4, tile=tile, needed=needed, fallback=-image)
+    torch.testing.assert_close(tiled, expected, rtol=0, atol=1e-6)
+
+
+def test_what_is_not_needed_is_not_computed() -> None:
+    seen: list[int] = []
+
+    def spy(image: Tensor) -> Tensor:
+        seen.append(image[0, 0].numel())
+        return image + 1
+
+    image = frame(320, 480)
+    for needed, most in ((patches(320, 480), 0.05), (torch.zeros(320, 480, dtype=torch.bool), 0)):
+        seen.clear()
+        result = in_tiles(spy, image, halo=8, needed=needed, fallback=image)
+        assert sum(seen) <= most * 320 * 480
+        assert torch.equal(result, image + needed)
+    everything = torch.ones(320, 480, dtype=torch.bool)
+    assert len(make_tiles(320, 480, halo=8, needed=everything)) == 1
+
+
+@pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
+def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density: float) -> None:
+    needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
+    tiles = make_tiles(333, 270, halo=12, tile=128, needed=needed)
+    count = torch.zeros(333, 270)
+    for each in tiles:
+        count[each.inner] += 1
+        assert each.top % 4 == each.left % 4 == 0
+        assert count[each.outer][each.core].shape == count[each.inner].shape
+    assert bool((count[needed] == 1).all())
+    assert bool((count <= 1).all())
+    whole = make_tiles(333, 270, halo=12, tile=128)
+    assert sum(t.area for t in tiles) <= sum(t.area for t in whole)
+
+
+def test_bad_needs_are_refused() -> None:
+    image, needed = frame(8, 12), torch.ones(8, 12, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"`fallback` \(=None\)"):
+        in_tiles(mean_of_neighbours, image, halo=4, needed=needed)
+    with pytest.raises(ValueError, match=r"`needed` \(shape \(12, 8\)\) must be that of the frame"):
+        in_tiles(mean_of_neighbours, image, halo=4, needed=needed.T, fallback=image)
+    with pytest.raises(ValueError, match=r"`margin` \(=8\) must be a multiple of 16"):
+        varying(image[0], 8)
+
+
+def test_constant_parts_do_not_vary() -> None:
+    image = frame(75, 100)[0]
+    image[:, 32:, :50] = 1.0  # saturated
+    image[:, :16, 64:] = 0.0  # black, but for one plane's pixel
+    image[2, 3, 70] = 1e-6
+    expected = torch.ones(75, 100, dtype=torch.bool)
+    expected[32:, :48] = expected[:16, 80:] = False
+    assert torch.equal(varying(image), expected)
+    expected[32:48] = expected[:, 48:] = expected[:, 32:48] = True
+    assert torch.equal(varying(image, 16), expected)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (1, 33)])
+def test_a_cell_of_one_pixel_counts_as_varying(size: tuple[int, int]) -> None:
+    assert varying(torch.zeros(4, *size))[-1, -1]
