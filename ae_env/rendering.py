@@ -17,7 +17,7 @@ from ae_env.observation import decode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.registry import make_scorer
-from ae_env.scorers.score_table import ScoreTable, ScoreTables, scene_latent
+from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
 from simulator.camera import CameraProfile
 from simulator.raw.develop import develop
 from simulator.settings import format_exposure_time
@@ -138,8 +138,8 @@ def contact_sheet(
     scene = _averaged(scene, CAPTURE_PIXELS)
     tables = ScoreTables(grid, camera, make_scorer(scorer), use_cache=False)
     table = tables.table(scene, speed=speed, defocus=defocus)
-    latent = scene_latent(scene, camera, speed=speed, defocus=defocus)
-    frames = latent.stream(grid.states, seed=seed)
+    prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
+    frames = prepared.stream(grid.states, seed=seed)
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, speed, defocus, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)

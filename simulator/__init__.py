@@ -10,7 +10,7 @@ _EXPORTS = {
     "CameraProfile": "camera",
     "CameraSettings": "settings",
     "CameraSimulator": "camera_simulator",
-    "Latent": "capture.prepared_scene",
+    "PreparedScene": "capture.prepared_scene",
     "NoiseLevelFunction": "camera",
     "RawImage": "raw.image",
     "SimulationPlan": "capture.plan",
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from simulator.camera import list_cameras as list_cameras
     from simulator.camera_simulator import CameraSimulator as CameraSimulator
     from simulator.capture.plan import SimulationPlan as SimulationPlan
-    from simulator.capture.prepared_scene import Latent as Latent
+    from simulator.capture.prepared_scene import PreparedScene as PreparedScene
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
     from simulator.raw.dng import write_dng as write_dng

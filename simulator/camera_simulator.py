@@ -1,7 +1,7 @@
 """The camera simulator: plans which steps a change of settings needs, and runs those.
 
 A raw or a scene is prepared once (`CameraSimulator.prepare`): everything that does not depend on
-the target settings, the networks included, is in the `Latent`. Exposing it at any settings is then
+the target settings, the networks included, is in the `PreparedScene`. Exposing it at any settings is then
 a few element-wise steps.
 """
 
@@ -16,10 +16,10 @@ from typing import Any, Literal, cast, get_args
 import torch
 from torch import nn
 
-from simulator.capture.aperture_blur import MapOpening, NetworkOpening, Opening
+from simulator.capture.aperture_blur import ApertureBlur, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.capture.plan import SimulationPlan
-from simulator.capture.prepared_scene import HasLatent, Latent, Noise, check_noise
+from simulator.capture.prepared_scene import HasPrepared, Noise, PreparedScene, check_noise
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.full_run import FullRun, Stages
@@ -29,7 +29,7 @@ from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.tiles import in_tiles, varying
 
-# What the simulator photographs: raws, latents and scenes, as light on a device.
+# What the simulator photographs: raws, prepared scenes and scenes, as light on a device.
 #: What is known of a scene's depth: it is far or in focus throughout, or not known.
 Depth = Literal["far", "unknown"]
 
@@ -40,30 +40,34 @@ def check_depth(depth: str) -> None:
         raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
 
 
-def latent_of(source: RawImage | Latent | HasLatent, device: torch.device) -> Latent:
-    """The light of `source` as it was recorded, or a latent as it is, on `device`.
+def prepared_of(
+    source: RawImage | PreparedScene | HasPrepared, device: torch.device
+) -> PreparedScene:
+    """The light of `source` as it was recorded, or a prepared scene as it is, on `device`.
 
     Raises:
-        ValueError: If `source` is neither a raw nor a latent nor a scene.
+        ValueError: If `source` is neither a raw nor a prepared scene nor a scene.
     """
     if isinstance(source, RawImage):
         return _recorded(source, device)
-    if isinstance(source, Latent):
+    if isinstance(source, PreparedScene):
         if source.light.device == device:
             return source
         given = {name: getattr(source, name) for name in ("light", "denoised", "saturated")}
         moved = {name: part.to(device) for name, part in given.items() if part is not None}
         return replace(source, **moved)
-    if hasattr(source, "latent"):
-        return latent_of(source.latent, device)
-    raise ValueError(f"`source` (={type(source).__name__}) must be a RawImage, a Latent or a scene")
+    if hasattr(source, "prepared"):
+        return prepared_of(source.prepared, device)
+    raise ValueError(
+        f"`source` (={type(source).__name__}) must be a RawImage, a PreparedScene or a scene"
+    )
 
 
-def _recorded(raw: RawImage, device: torch.device) -> Latent:
+def _recorded(raw: RawImage, device: torch.device) -> PreparedScene:
     saturated, camera = raw.saturated, raw.camera
     if raw.nlf is not None and not camera.nlf_by_iso:
         camera = camera.with_nlf(raw.settings.iso, raw.nlf)
-    return Latent(
+    return PreparedScene(
         light=raw.data.to(device),
         reference=raw.settings,
         camera=camera,
@@ -167,19 +171,19 @@ class CameraSimulator:
 
     def prepare(
         self,
-        source: RawImage | Latent | HasLatent,
+        source: RawImage | PreparedScene | HasPrepared,
         *,
         image_speed: float | None = None,
         defocus: float | None = None,
         depth: Depth = "far",
         tolerance: float | Literal["source"] = "source",
-    ) -> Latent:
+    ) -> PreparedScene:
         """Everything that does not depend on the target settings, done once, when first needed.
 
         The source's data must not be changed afterwards.
 
         Args:
-            source: A raw, a latent, or a scene.
+            source: A raw, a prepared scene, or a scene.
             image_speed: Speed of the image along the rows [frame heights per second]; by default
                 the source's own, 0 for a raw.
             defocus: Diameter of the defocus disc at f/4 [pixel]; by default the source's own. 0
@@ -203,40 +207,42 @@ class CameraSimulator:
             raise ValueError(
                 "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
             )
-        latent = self._seen(source, image_speed, defocus)
+        prepared = self._seen(source, image_speed, defocus)
         if tolerance != "source":
-            latent = replace(latent, tolerance=tolerance)
-        # A latent may come from here, corrected already; a scene is no recording of this body.
+            prepared = replace(prepared, tolerance=tolerance)
+        # A prepared scene may come from here, corrected already; a scene is no recording of this body.
         if isinstance(source, RawImage) and not self.exposure.is_identity:
-            noise = latent.nlf.exposed(float(self.exposure.w))
-            latent = replace(latent, light=self.exposure(latent.light, 1.0), nlf=noise)
-        whole = latent.tolerance == 0.0  # what was found with another one may leave parts out
-        known, opening = latent.denoised, latent.opening
-        if self.noise is not None and not latent.nlf.is_zero and _lacks(known, whole):
+            noise = prepared.nlf.exposed(float(self.exposure.w))
+            prepared = replace(prepared, light=self.exposure(prepared.light, 1.0), nlf=noise)
+        whole = prepared.tolerance == 0.0  # what was found with another one may leave parts out
+        known, aperture_blur = prepared.denoised, prepared.aperture_blur
+        if self.noise is not None and not prepared.nlf.is_zero and _lacks(known, whole):
             every = whole or self.noise.preset == "paper"
-            light = partial(self._kept_light, replace(latent, denoised=None))
-            latent = replace(latent, denoised=Denoised(light, everywhere=every))
-        if depth == "unknown" or (opening is not None and self.aperture and _lacks(opening, whole)):
-            latent = replace(latent, opening=self._opening(latent))
-        return latent
+            light = partial(self._kept_light, replace(prepared, denoised=None))
+            prepared = replace(prepared, denoised=Denoised(light, everywhere=every))
+        if depth == "unknown" or (
+            aperture_blur is not None and self.aperture and _lacks(aperture_blur, whole)
+        ):
+            prepared = replace(prepared, aperture_blur=self._aperture_blur(prepared))
+        return prepared
 
     def _seen(
         self,
-        source: RawImage | Latent | HasLatent,
+        source: RawImage | PreparedScene | HasPrepared,
         image_speed: float | None,
         defocus: float | None,
-    ) -> Latent:
+    ) -> PreparedScene:
         """The source's light, with its motion and blur where they are given."""
-        latent = self._latent(source)
+        prepared = self._prepared(source)
         given = {"image_speed": image_speed, "defocus": defocus}
-        return replace(latent, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
+        return replace(prepared, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
 
-    def _latent(self, source: RawImage | Latent | HasLatent) -> Latent:
-        return latent_of(source, self.device)
+    def _prepared(self, source: RawImage | PreparedScene | HasPrepared) -> PreparedScene:
+        return prepared_of(source, self.device)
 
     @torch.no_grad()
-    def denoise(self, latent: Latent) -> torch.Tensor:
-        """The latent's light (4, H, W) with little noise.
+    def denoise(self, prepared: PreparedScene) -> torch.Tensor:
+        """The prepared scene's light (4, H, W) with little noise.
 
         The result serves every exposure: the compact network commutes with exposure. The paper's
         does not; it is run at the exposure of the source.
@@ -246,7 +252,7 @@ class CameraSimulator:
         """
         if self.noise is None:
             raise ValueError("there is no noise module: use CameraSimulator.from_pretrained")
-        image, (shot, read) = latent.light[None], self._noise_of(latent)
+        image, (shot, read) = prepared.light[None], self._noise_of(prepared)
         noise = self.noise
 
         def network(part: torch.Tensor) -> torch.Tensor:
@@ -254,13 +260,13 @@ class CameraSimulator:
                 return noise(part, shot, read)
 
         if noise.preset == "compact":
-            needed = varying(latent.light) if latent.tolerance > 0 else None
+            needed = varying(prepared.light) if prepared.tolerance > 0 else None
             return in_tiles(network, image, halo=_NOISE_HALO, needed=needed, fallback=image)[0]
         return network(image)[0]
 
     @torch.no_grad()
-    def estimate_defocus(self, latent: Latent) -> torch.Tensor:
-        """Circle of confusion of each pixel (H, W), at the latent's own aperture [pixel].
+    def estimate_defocus(self, prepared: PreparedScene) -> torch.Tensor:
+        """Circle of confusion of each pixel (H, W), at the prepared scene's own aperture [pixel].
 
         Raises:
             ValueError: If this simulator's aperture module has no such map.
@@ -268,9 +274,9 @@ class CameraSimulator:
         if self.aperture is None:
             raise ValueError("there is no aperture module: use CameraSimulator.from_pretrained")
         aperture = self.aperture
-        shot, read = self._noise_of(latent)
-        light = latent.light[None]
-        image = light if latent.denoised is None else latent.denoised.light[None]
+        shot, read = self._noise_of(prepared)
+        light = prepared.light[None]
+        image = light if prepared.denoised is None else prepared.denoised.light[None]
 
         def network(part: torch.Tensor, noisy: torch.Tensor) -> torch.Tensor:
             deviation = variance_map(smoothed(noisy), shot, read).sqrt()
@@ -278,44 +284,48 @@ class CameraSimulator:
                 return aperture.estimate_defocus(part, deviation)
 
         # No disc changes a pixel that sees a constant neighbourhood.
-        needed = varying(latent.light, _DISC_REACH) if latent.tolerance > 0 else None
+        needed = varying(prepared.light, _DISC_REACH) if prepared.tolerance > 0 else None
         sharp = light.new_zeros(light[:, 0].shape)
         diameter = in_tiles(network, image, light, halo=_MAP_HALO, needed=needed, fallback=sharp)
         return usable_defocus(diameter, image)[0]
 
-    def _opening(self, latent: Latent) -> Opening:
+    def _aperture_blur(self, prepared: PreparedScene) -> ApertureBlur:
         assert self.aperture is not None
-        f_number = latent.reference.effective_f_number
-        denoised = latent.denoised or Denoised(latent.light)
+        f_number = prepared.reference.effective_f_number
+        denoised = prepared.denoised or Denoised(prepared.light)
         if self.aperture.preset == "paper":
             opened = partial(self._results.called, "opened", self.aperture)
-            return NetworkOpening(denoised, opened, f_number)
-        find, every = partial(self._kept_map, latent), latent.tolerance == 0.0
-        return MapOpening(latent.light, denoised, find, f_number, everywhere=every)
+            return NetworkApertureBlur(denoised, opened, f_number)
+        find, every = partial(self._kept_map, prepared), prepared.tolerance == 0.0
+        return MapApertureBlur(prepared.light, denoised, find, f_number, everywhere=every)
 
-    def _kept_light(self, latent: Latent) -> torch.Tensor:
-        return self._kept("denoised", self.noise, latent, partial(self.denoise, latent))
+    def _kept_light(self, prepared: PreparedScene) -> torch.Tensor:
+        return self._kept("denoised", self.noise, prepared, partial(self.denoise, prepared))
 
-    def _kept_map(self, latent: Latent) -> torch.Tensor:
-        estimate = partial(self.estimate_defocus, latent)
-        return self._kept("defocus_maps", self.aperture, latent, estimate)
+    def _kept_map(self, prepared: PreparedScene) -> torch.Tensor:
+        estimate = partial(self.estimate_defocus, prepared)
+        return self._kept("defocus_maps", self.aperture, prepared, estimate)
 
     def _kept(
-        self, kind: str, module: nn.Module | None, latent: Latent, make: Callable[[], torch.Tensor]
+        self,
+        kind: str,
+        module: nn.Module | None,
+        prepared: PreparedScene,
+        make: Callable[[], torch.Tensor],
     ) -> torch.Tensor:
-        """What `make` finds out about the latent, or found when everything was the same."""
-        denoised = None if latent.denoised is None else latent.denoised.light
-        inputs = {"light": latent.light, "denoised": denoised, "saturated": latent.saturated}
-        nlf = [latent.nlf.shot, latent.nlf.read]
+        """What `make` finds out about the prepared scene, or found when everything was the same."""
+        denoised = None if prepared.denoised is None else prepared.denoised.light
+        inputs = {"light": prepared.light, "denoised": denoised, "saturated": prepared.saturated}
+        nlf = [prepared.nlf.shot, prepared.nlf.read]
         return self._results.result(
             *(kind, [] if module is None else [module], inputs, make),
             nlf=nlf,
             precision=self.precision,
-            everywhere=latent.tolerance == 0,
+            everywhere=prepared.tolerance == 0,
         )
 
-    def _noise_of(self, latent: Latent) -> tuple[torch.Tensor, torch.Tensor]:
-        shot, read = (torch.tensor([v]) for v in (latent.nlf.shot, latent.nlf.read))
+    def _noise_of(self, prepared: PreparedScene) -> tuple[torch.Tensor, torch.Tensor]:
+        shot, read = (torch.tensor([v]) for v in (prepared.nlf.shot, prepared.nlf.read))
         return shot.to(self.device), read.to(self.device)
 
     def _autocast(self) -> torch.autocast:
@@ -324,7 +334,7 @@ class CameraSimulator:
 
     def plan(
         self,
-        source: RawImage | Latent | HasLatent,
+        source: RawImage | PreparedScene | HasPrepared,
         settings: CameraSettings,
         *,
         noise: bool = True,
@@ -333,9 +343,9 @@ class CameraSimulator:
         """Which steps the change to `settings` takes, why others are left out, error and cost.
 
         Args:
-            source: A raw, a latent, or a scene.
+            source: A raw, a prepared scene, or a scene.
             settings: Target settings.
-            noise: False plans the light on the sensor alone (`Latent.expected`).
+            noise: False plans the light on the sensor alone (`PreparedScene.expected`).
             scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``,
                 ``tolerance``.
         """
@@ -343,7 +353,7 @@ class CameraSimulator:
 
     def stages(
         self,
-        source: RawImage | Latent | HasLatent,
+        source: RawImage | PreparedScene | HasPrepared,
         settings: CameraSettings,
         *,
         seed: int = 0,
@@ -357,13 +367,13 @@ class CameraSimulator:
         preset ``"paper"`` clips to [0, 1] after the exposure, as the paper does.
 
         Args:
-            source: A raw, a latent, or a scene.
+            source: A raw, a prepared scene, or a scene.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
             image_speed: See `prepare`.
             defocus: See `prepare`.
-            depth: See `prepare`; unknown to a latent that was prepared as such.
+            depth: See `prepare`; unknown to a prepared scene that was prepared as such.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.
@@ -371,18 +381,18 @@ class CameraSimulator:
         if self.noise is None or self.aperture is None:
             raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
         check_depth(depth)
-        latent = self._seen(source, image_speed, defocus)
-        opens = depth == "unknown" or latent.opening is not None
-        # A latent may come from `prepare`, corrected already; a scene is no recording of this body.
+        prepared = self._seen(source, image_speed, defocus)
+        opens = depth == "unknown" or prepared.aperture_blur is not None
+        # A prepared scene may come from `prepare`, corrected already; a scene is no recording of this body.
         exposure = self.exposure
         if not isinstance(source, RawImage):
             exposure = ExposureModule().requires_grad_(False).to(self.device)
         aperture, half = self.aperture if opens else None, self.precision == "bfloat16"
-        return FullRun(exposure, self.noise, aperture, half).run(latent, settings, seed=seed)
+        return FullRun(exposure, self.noise, aperture, half).run(prepared, settings, seed=seed)
 
     def simulate(
         self,
-        source: RawImage | Latent | HasLatent,
+        source: RawImage | PreparedScene | HasPrepared,
         settings: CameraSettings,
         *,
         seed: int = 0,
@@ -393,12 +403,12 @@ class CameraSimulator:
         """The raw that the camera would have recorded at `settings`.
 
         Args:
-            source: A raw, a latent, or a scene.
+            source: A raw, a prepared scene, or a scene.
             settings: Target ISO, exposure time and f-number.
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
             tolerance: See `prepare`; None runs every module for this very transition (`stages`),
                 and shares and leaves out nothing.
-            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster (see `Latent.capture`); the
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster (see `PreparedScene.capture`); the
                 full run draws it.
             scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``.
 
@@ -410,20 +420,20 @@ class CameraSimulator:
         if tolerance is None and self.noise is not None:
             scene = {"depth": "far", **scene}
             data, excess_noise = self.stages(source, settings, seed=seed, **scene).capture, 0.0
-            latent = self._latent(source)
-            clean = replace(latent, nlf=latent.nlf.zero(), denoised=None, opening=None)
+            prepared = self._prepared(source)
+            clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=None, aperture_blur=None)
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
-            latent = self.prepare(
+            prepared = self.prepare(
                 source, tolerance=0.0 if tolerance is None else tolerance, **scene
             )
-            data, excess_noise = latent.capture(settings, seed, noise=noise)
-            output_noise = latent.output_noise(settings)
-        marks = latent.saturated
+            data, excess_noise = prepared.capture(settings, seed, noise=noise)
+            output_noise = prepared.output_noise(settings)
+        marks = prepared.saturated
         clipped = 0.0 if marks is None else int(marks.count_nonzero()) / marks.numel()
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}
         metadata |= {
-            "simulated_from": str(latent.reference),
+            "simulated_from": str(prepared.reference),
             "seed": seed,
             "excess_noise": excess_noise,
             "clipped_source": clipped,
@@ -431,14 +441,14 @@ class CameraSimulator:
         return RawImage(
             data=data,
             settings=settings,
-            camera=latent.camera,
+            camera=prepared.camera,
             nlf=output_noise,
-            white_balance=latent.white_balance,
-            box_factor=latent.box_factor,
+            white_balance=prepared.white_balance,
+            box_factor=prepared.box_factor,
             metadata=metadata,
         )
 
 
-def _lacks(known: Denoised | Opening | None, whole: bool) -> bool:
+def _lacks(known: Denoised | ApertureBlur | None, whole: bool) -> bool:
     """Whether there is none, or one that leaves out parts of the frame where it must not."""
     return known is None or (whole and not known.everywhere)

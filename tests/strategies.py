@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ae_env.grid import ExposureGrid
 from simulator import CameraSettings, NoiseLevelFunction
 from simulator.camera import BayerPattern, CameraProfile
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 
 Mosaic = tuple[CameraProfile, np.ndarray]
 
@@ -87,15 +87,15 @@ def mosaics(draw: st.DrawFn, bodies: st.SearchStrategy[CameraProfile]) -> Mosaic
     return camera, numbers.astype(np.uint16)
 
 
-def latent(
+def prepared(
     light: torch.Tensor,
     reference: CameraSettings,
     camera: CameraProfile,
     nlf: NoiseLevelFunction | None = None,
     **fields: float,
-) -> Latent:
+) -> PreparedScene:
     """`light` ready to be exposed, noise-free by default."""
-    return Latent(light, reference, camera, nlf or NoiseLevelFunction.zero(), **fields)  # type: ignore[arg-type]
+    return PreparedScene(light, reference, camera, nlf or NoiseLevelFunction.zero(), **fields)  # type: ignore[arg-type]
 
 
 @st.composite

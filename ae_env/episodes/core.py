@@ -30,7 +30,7 @@ from simulator.optics.disc_bank import DIAMETERS
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
-OPTICS_BYTES = 256 * 2**20
+LIGHT_CACHE_BYTES = 256 * 2**20
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 _OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
@@ -92,7 +92,7 @@ class EpisodeCore:
         self._part_scores = PartScores(self.tables, self.scenes, self.episodes, static=self._static)
         self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
         frame_bytes = 16 * options.resolution**2
-        keep = num_envs * self._kept_frames() * frame_bytes <= OPTICS_BYTES
+        keep = num_envs * self._kept_frames() * frame_bytes <= LIGHT_CACHE_BYTES
         self.recorder = Recorder(
             options, self.grid, self.camera, self.scenes, self.episodes, keep=keep
         )

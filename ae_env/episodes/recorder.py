@@ -18,12 +18,12 @@ from ae_env.episodes.state import Episodes
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
-from ae_env.scorers.score_table import in_episode, scene_latent
+from ae_env.scorers.score_table import in_episode, prepare_scene
 from simulator.camera import CameraProfile
-from simulator.capture.batch import Buffers, KeptLight, Plans, in_bands, remaining_in_bands
-from simulator.capture.exposure import LATENT_LIMIT, Exposure
+from simulator.capture.batch import Buffers, LightCache, Plans, in_bands, remaining_in_bands
+from simulator.capture.exposure import LIGHT_LIMIT, Exposure
 from simulator.capture.kernels import exposure_table, record_frames
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import noise_balance
 from simulator.noise.generator import noise_keys
 from simulator.optics.blur_kernels import Blur, blur_many
@@ -33,7 +33,7 @@ from simulator.utils.jit import addresses
 from simulator.utils.threads import in_shares
 
 #: Memory for what is known of scenes, and what of it a scene takes, about [byte].
-_LATENTS_BYTES, _LATENT_BYTES = 2**28, 2**16
+_PREPARED_SCENES_BYTES, _PREPARED_BYTES = 2**28, 2**16
 #: Discs wider than this are cheaper in the Fourier domain than as a sum [pixel].
 _WIDE_PX = 40.0
 
@@ -64,10 +64,12 @@ class Recorder:
         self.episodes, self.keep = episodes, keep
         size, places = options.resolution, len(episodes.slot)
         self._samples = size * size
-        self._latents: LruCache[Latent] = LruCache(_LATENTS_BYTES)  # at rest, by scene
+        self._prepared_scenes: LruCache[PreparedScene] = LruCache(
+            _PREPARED_SCENES_BYTES
+        )  # at rest, by scene
         self._plans = Plans(len(scenes) + places, len(grid))
         self._buffers = Buffers((4, size, size))
-        self._kept = [KeptLight(self._buffers, keep) for _ in range(places)]
+        self._kept = [LightCache(self._buffers, keep) for _ in range(places)]
         # Row of the plans whose blurred light each place has.
         self._shown = np.full(places, -1)
 
@@ -104,37 +106,39 @@ class Recorder:
         """Works out `rows` (K,) of the plans, for the next frames of `places` in light `gains`."""
         plans, noisy, exposures = self._plans, self.options.noise is not False, []
         for place, row, gain in zip(places.tolist(), rows.tolist(), gains.tolist(), strict=True):
-            latent = self._latent(place)
-            if gain != latent.gain:
-                latent = replace(latent, gain=gain)
-            exposure = latent.exposure(self.grid[row % len(self.grid)])
+            prepared = self._prepared(place)
+            if gain != prepared.gain:
+                prepared = replace(prepared, gain=gain)
+            exposure = prepared.exposure(self.grid[row % len(self.grid)])
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
             plans.blurs[row], plans.exposure[row] = blurs, exposure if blurs else None
             if not blurs:
-                plans.light[row] = latent.source_light(exposure).contiguous()
-            plans.excess[row] = _excess_noise(latent, exposure) if noisy else 0.0
+                plans.light[row] = prepared.source_light(exposure).contiguous()
+            plans.excess[row] = _excess_noise(prepared, exposure) if noisy else 0.0
             plans.modules[row] = _modules(exposure, noisy)
             exposures.append(exposure)
         plans.table[rows] = exposure_table(exposures)
         plans.gain[rows] = gains  # last: what is interrupted stays unknown
         self._shown[places] = -1
 
-    def _latent(self, place: int) -> Latent:
+    def _prepared(self, place: int) -> PreparedScene:
         """What the camera sees of the scene in its own light."""
         kept, episodes = self._kept[place], self.episodes
-        if kept.latent is not None:
-            return kept.latent
+        if kept.prepared is not None:
+            return kept.prepared
         scene = int(episodes.scene[place])
-        latent = self._latents.get(scene)
-        if latent is None:
-            latent = scene_latent(self.scenes[scene], self.camera)
-            latent = replace(latent, tolerance=self.options.tolerance)
-            if latent.opening is None:  # that keeps too much light to stay longer than an episode
-                self._latents.put(scene, latent, _LATENT_BYTES)
+        prepared = self._prepared_scenes.get(scene)
+        if prepared is None:
+            prepared = prepare_scene(self.scenes[scene], self.camera)
+            prepared = replace(prepared, tolerance=self.options.tolerance)
+            if (
+                prepared.aperture_blur is None
+            ):  # that keeps too much light to stay longer than an episode
+                self._prepared_scenes.put(scene, prepared, _PREPARED_BYTES)
         if episodes.slot[place] != scene:
             speed, defocus = float(episodes.speed[place]), float(episodes.defocus[place])
-            kept.latent = latent = in_episode(latent, speed=speed, defocus=defocus)
-        return latent
+            kept.prepared = prepared = in_episode(prepared, speed=speed, defocus=defocus)
+        return prepared
 
     def _blur(self, places: np.ndarray, rows: np.ndarray) -> None:
         """Makes the light of `rows`, on as many threads as torch may use."""
@@ -144,7 +148,7 @@ class Recorder:
             _in_shares(self._open, opened)
             begun = [self._begin_blur(*pair) for pair in planned]
             blurs = [blur for blur in begun if blur is not None]
-            blur_many(_without_wide_discs(blurs), limit=LATENT_LIMIT)
+            blur_many(_without_wide_discs(blurs), limit=LIGHT_LIMIT)
             _in_shares(self._balance, opened)
         except BaseException:  # what the episodes keep is not all made
             self.end(places)
@@ -153,11 +157,11 @@ class Recorder:
 
     def _open(self, place: int, row: int) -> None:
         """Opens the aperture, which keeps its result."""
-        self._latent(place).source_light(self._plans.exposure[row])
+        self._prepared(place).source_light(self._plans.exposure[row])
 
     def _begin_blur(self, place: int, row: int) -> Blur | None:
         exposure = self._plans.exposure[row]
-        self._latent(place)  # it may have been let go of since this was planned
+        self._prepared(place)  # it may have been let go of since this was planned
         self._plans.light[row], blur = self._kept[place].blurred(exposure)
         remaining = exposure.remaining
         if remaining is not None:
@@ -171,7 +175,7 @@ class Recorder:
             balance = noise_balance(self._plans.light[row], self._plans.exposure[row])
             self._plans.excess[row] = balance.relative_excess
         if not self.keep:  # an opening keeps the light of each f-number
-            self._kept[place].latent = None
+            self._kept[place].prepared = None
 
     # -- frames ---------------------------------------------------------------------------------
 
@@ -261,7 +265,7 @@ def _wide_disc(blur: Blur) -> None:
     assert blur.defocused is not None
     weights = disc_kernel(blur.diameter_px)
     radius = len(weights) // 2
-    light = np.clip(blur.light.numpy(), -LATENT_LIMIT, LATENT_LIMIT).astype(np.float64)
+    light = np.clip(blur.light.numpy(), -LIGHT_LIMIT, LIGHT_LIMIT).astype(np.float64)
     padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
     size = padded.shape[-2:]
     spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
@@ -277,7 +281,7 @@ def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, in
     in_shares(run, len(planned))
 
 
-def _excess_noise(latent: Latent, exposure: Exposure) -> float:
+def _excess_noise(prepared: PreparedScene, exposure: Exposure) -> float:
     """Mean variance that the source brings beyond the target's; NaN where pixels must tell."""
     if exposure.source.is_zero:
         return 0.0
@@ -287,7 +291,7 @@ def _excess_noise(latent: Latent, exposure: Exposure) -> float:
         return 0.0
     if exposure.remaining is not None:
         return math.nan
-    return latent.statistics.relative_excess(exposure.ratio, source, target)
+    return prepared.statistics.relative_excess(exposure.ratio, source, target)
 
 
 def _modules(exposure: Exposure, noise: bool) -> str:

@@ -77,7 +77,7 @@ class SceneNetworks:
             return scene
 
         def make() -> torch.Tensor:  # leaving nothing out: it serves every tolerance
-            return self._simulator.denoise(replace(scene.latent, tolerance=0.0))
+            return self._simulator.denoise(replace(scene.prepared, tolerance=0.0))
 
         return replace(
             scene,
@@ -112,8 +112,8 @@ class SceneNetworks:
         if used is not None and used + 2 * _MARGIN < shorter:
             scene = scene.resized(used + 2 * _MARGIN, "native")
         # Denoises where there is noise; leaves nothing out, as scorers ask for the blur of it all.
-        latent = self._simulator.prepare(scene.latent, tolerance=0.0)
-        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(latent))
+        prepared = self._simulator.prepare(scene.prepared, tolerance=0.0)
+        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(prepared))
         found = fine.resized(used, "native").resized(resolution, crop).defocus_map
         assert found is not None
         return found

@@ -13,10 +13,10 @@ import torch
 
 from ae_env.scenes.colour import camera_from_srgb, check_rgb
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture.aperture_blur import MapOpening
+from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.raw.image import RawImage, check_packed
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
@@ -80,7 +80,7 @@ class Scene:
         scene_id: Unique and stable, such as ``"snow-012"``.
         group: Source group: the photograph, panorama or physical subject. All scenes of a group
             stay in one split and are resampled together.
-        light: (4, H, W) float32 packed latent at `reference`, planes R, G1, G2, B, 1.0 at sensor
+        light: (4, H, W) float32 packed light at `reference`, planes R, G1, G2, B, 1.0 at sensor
             white; not clipped, so lamps exceed 1. At least 0 where noise-free.
         reference: Settings at which `light` is. With `illuminance` known, an 18 % grey card under
             it has 0.119 of white in green there.
@@ -180,13 +180,13 @@ class Scene:
         return self.light if self.denoised is None else self.denoised
 
     @property
-    def latent(self) -> Latent:
+    def prepared(self) -> PreparedScene:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        denoised, opening = None if self.denoised is None else Denoised(self.denoised), None
+        denoised, aperture_blur = None if self.denoised is None else Denoised(self.denoised), None
         if self.defocus_map is not None:
             clean, f_number = denoised or Denoised(self.light), self.reference.effective_f_number
-            opening = MapOpening(self.light, clean, self.defocus_map, f_number)
-        return Latent(
+            aperture_blur = MapApertureBlur(self.light, clean, self.defocus_map, f_number)
+        return PreparedScene(
             light=self.light,
             reference=self.reference,
             camera=self.camera,
@@ -195,7 +195,7 @@ class Scene:
             white_balance=self.white_balance,
             box_factor=self.box_factor,
             denoised=denoised,
-            opening=opening,
+            aperture_blur=aperture_blur,
             statistics=self._statistics,
         )
 

@@ -44,8 +44,8 @@ def describe_captures(
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
-    openings = np.array([4.0 / s.effective_f_number for s in settings])
-    blur = np.hypot(speed * times * height, defocus * openings * height / 64.0)
+    aperture_blurs = np.array([4.0 / s.effective_f_number for s in settings])
+    blur = np.hypot(speed * times * height, defocus * aperture_blurs * height / 64.0)
     own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
     blur = np.hypot(blur, own)  # exactly `blur` where they are 0
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
@@ -70,7 +70,7 @@ class _AtRest:
     scene: weakref.ref[Scene]
     captures: Captures
     times: np.ndarray
-    openings: np.ndarray
+    aperture_blurs: np.ndarray
 
 
 class SceneCaptures:
@@ -108,7 +108,9 @@ class SceneCaptures:
         """
         known = self._known(scene, states)
         height = scene.light.shape[-2]
-        blur = np.hypot(speed * known.times * height, defocus * known.openings * height / 64.0)
+        blur = np.hypot(
+            speed * known.times * height, defocus * known.aperture_blurs * height / 64.0
+        )
         captures = replace(
             known.captures,
             scene_light=self._light(scene, len(states)),

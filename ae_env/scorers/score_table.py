@@ -26,7 +26,7 @@ from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
 from simulator.capture.batch import expected_in_bands, expose_in_bands
 from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import clip_and_quantise
 from simulator.utils.cache import DiskCache, LruCache, cache_key
 
@@ -68,14 +68,14 @@ class ScoreTable:
         return int(np.argmax(self.mean >= self.mean.max() - TIE))
 
 
-def scene_latent(
+def prepare_scene(
     scene: Scene,
     camera: CameraProfile,
     *,
     speed: float = 0.0,
     defocus: float = 0.0,
     gain: float = 1.0,
-) -> Latent:
+) -> PreparedScene:
     """What `camera` sees of `scene` in an episode.
 
     Args:
@@ -85,16 +85,16 @@ def scene_latent(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
         gain: Light relative to the scene's own.
     """
-    latent = replace(scene.latent, camera=camera)
-    return in_episode(latent, speed=speed, defocus=defocus, gain=gain)
+    prepared = replace(scene.prepared, camera=camera)
+    return in_episode(prepared, speed=speed, defocus=defocus, gain=gain)
 
 
 def in_episode(
-    latent: Latent, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
-) -> Latent:
-    """A scene's `latent` in an episode; the arguments are those of `scene_latent`."""
-    pixels = defocus * latent.light.shape[-2] / 64.0
-    return replace(latent, image_speed=speed, defocus=pixels, gain=gain)
+    prepared: PreparedScene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+) -> PreparedScene:
+    """A scene's `prepared` in an episode; the arguments are those of `prepare_scene`."""
+    pixels = defocus * prepared.light.shape[-2] / 64.0
+    return replace(prepared, image_speed=speed, defocus=pixels, gain=gain)
 
 
 class ScoreTables:
@@ -106,7 +106,7 @@ class ScoreTables:
         scorer: What rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
-        tolerance: How far the captures that are scored may be off, see `Latent.tolerance`.
+        tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.
         use_cache: Whether to keep the per-scene parts on disk; in memory they are in any case.
     """
 
@@ -149,8 +149,8 @@ class ScoreTables:
 
         Args:
             scene: The scene.
-            speed: See `scene_latent`.
-            defocus: See `scene_latent`.
+            speed: See `prepare_scene`.
+            defocus: See `prepare_scene`.
             gain: Light relative to the scene's own; (S,) where it depends on the state, as in
                 flickering light.
             row_gain: (S, H) light of each row relative to that, see `Captures`.
@@ -277,8 +277,8 @@ class ScoreTables:
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
         changes = isinstance(gain, np.ndarray) or row_gain is not None
-        latent = replace(
-            scene_latent(scene, self.camera, speed=speed, defocus=defocus),
+        prepared = replace(
+            prepare_scene(scene, self.camera, speed=speed, defocus=defocus),
             tolerance=self.tolerance,
             gain=1.0 if isinstance(gain, np.ndarray) else gain,
         )
@@ -291,18 +291,18 @@ class ScoreTables:
             captures = self._captures.describe(
                 scene, states, speed=speed, defocus=defocus, gain=gains, row_gain=rows
             )
-            latents = [latent] * len(states)
+            prepared_scenes = [prepared] * len(states)
             if isinstance(gains, np.ndarray):
-                latents = [replace(latent, gain=value) for value in gains.tolist()]
+                prepared_scenes = [replace(prepared, gain=value) for value in gains.tolist()]
             for seed in range(self.noise_seeds):
                 if not self.noise:
                     images = clip_and_quantise(
-                        expected_in_bands(latents, states, rows), self.camera
+                        expected_in_bands(prepared_scenes, states, rows), self.camera
                     )
                 elif changes:
-                    images = expose_in_bands(latents, states, rows, seed=seed)
+                    images = expose_in_bands(prepared_scenes, states, rows, seed=seed)
                 else:
-                    images = latent.expose(states, seed=seed)
+                    images = prepared.expose(states, seed=seed)
                 images = images.clamp_(0.0, 1.0)
                 for name, values in self.scorer.score_parts(images, captures, ("image",)).items():
                     samples[name][seed, part] = values.numpy()

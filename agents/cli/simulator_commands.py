@@ -93,10 +93,10 @@ def simulate(
         if path is not None:
             make_folder(path.parent, name=name, file=path)
     simulator = _simulator(weights, device, cache)
-    latent = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
+    prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
-    console.print(str(latent.plan(settings)), highlight=False, soft_wrap=True)
-    result = simulator.simulate(latent, settings, seed=seed, noise=noise)  # type: ignore[arg-type]
+    console.print(str(prepared.plan(settings)), highlight=False, soft_wrap=True)
+    result = simulator.simulate(prepared, settings, seed=seed, noise=noise)  # type: ignore[arg-type]
     result = replace(result, metadata={**source.metadata, **result.metadata})
     write_dng(out, result)
     files = {"DNG": out}
@@ -138,11 +138,11 @@ def sweep(
     files = {"contact sheet": sheet}
     if dngs:
         grid, simulator = ExposureGrid.default(), _simulator(weights, device, cache)
-        latent = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
+        prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
         with progress_bars() as progress, progress("DNGs") as task:
             for i, settings in enumerate(grid):
                 path = out / f"{raw.stem}-{i:02d}.dng"
-                write_dng(path, simulator.simulate(latent, settings, seed=seed))
+                write_dng(path, simulator.simulate(prepared, settings, seed=seed))
                 task(i + 1, len(grid))
         files["DNGs"] = out
     print_files(files)

@@ -44,12 +44,12 @@ def state_scores(
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
     """
     from ae_env.scorers.captures import describe_captures
-    from ae_env.scorers.score_table import scene_latent
+    from ae_env.scorers.score_table import prepare_scene
 
     options = run.plan.options()
     camera = options.make_camera()
-    latent = scene_latent(scene, camera, speed=speed, defocus=defocus)
-    latent = replace(latent, tolerance=options.tolerance)
+    prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
+    prepared = replace(prepared, tolerance=options.tolerance)
     found = []
     for first in range(0, len(states), _CHUNK):
         settings = [run.grid[int(state)] for state in states[first : first + _CHUNK]]
@@ -67,7 +67,7 @@ def state_scores(
         totals = []
         for seed in range(1 if scorer.closed_form else NOISE_SEEDS):
             if not scorer.closed_form:
-                images = latent.expose(settings, seed=seed).clamp_(0.0, 1.0)
+                images = prepared.expose(settings, seed=seed).clamp_(0.0, 1.0)
                 drawn = scorer.score_parts(images, captures, ("image",))
                 sums |= {name: values.numpy() for name, values in drawn.items()}
             totals.append(scorer.totals(sums))

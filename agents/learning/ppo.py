@@ -61,9 +61,9 @@ class _StateLogits(nn.Module):
         nn.init.orthogonal_(self.head.values.weight, 0.01)  # begin with all states alike
         nn.init.zeros_(self.head.values.bias)
 
-    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+    def forward(self, prepared: torch.Tensor) -> torch.Tensor:
         """Logits (B, S)."""
-        features, sensors = latent[:, : self.width], latent[:, self.width :]
+        features, sensors = prepared[:, : self.width], prepared[:, self.width :]
         return self.head(features, sensors if sensors.shape[1] else None)[..., 0]
 
 

@@ -18,7 +18,7 @@ from skimage.metrics import structural_similarity
 from ae_env.episodes.core import EpisodeCore
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
-from ae_env.scorers.score_table import scene_latent
+from ae_env.scorers.score_table import prepare_scene
 from benchmarks.markdown import table
 from simulator import CameraProfile, develop
 from simulator.capture.record import clip_and_quantise
@@ -65,8 +65,8 @@ def _closeness(
     """Closeness (64,) of every state's capture to the reference, by measure; higher is better."""
     camera, states = core.camera, core.grid.states
     native = replace(scene, box_factor=1)  # as if each pixel were one of the sensor's
-    sharp = scene_latent(native, camera)
-    blurred = scene_latent(native, camera, speed=speed, defocus=defocus)
+    sharp = prepare_scene(native, camera)
+    blurred = prepare_scene(native, camera, speed=speed, defocus=defocus)
     proper = reference_settings(scene.ev100)
     reference = _developed(sharp.expected(proper)[None], scene, camera)[0]
     captures = blurred.expose(states, seed=seed)
@@ -101,10 +101,10 @@ def _closeness(
     return {"rmse": rmse, "ssim": np.array(ssim), "exposed": exposed_rmse, **aspects}
 
 
-def _at(latent: Any, state: Any, proper: Any) -> torch.Tensor:
+def _at(prepared: Any, state: Any, proper: Any) -> torch.Tensor:
     """Light with the blur of `state` and the exposure of `proper`."""
     ratio = 2.0 ** (proper.log2_exposure - state.log2_exposure)
-    return latent.expected(state) * ratio
+    return prepared.expected(state) * ratio
 
 
 def _developed(signal: torch.Tensor, scene: Scene, camera: CameraProfile) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import scene_latent
+from ae_env.scorers.score_table import prepare_scene
 from benchmarks.markdown import table
 from simulator import CameraProfile
 from simulator.settings import CameraSettings
@@ -110,7 +110,7 @@ def _scores(
     captures = describe_captures(
         [scene] * len(states), states, camera, speed=zeros, defocus=zeros, gain=zeros + 1.0
     )
-    images = scene_latent(scene, camera).expose(states, seed=seed).clamp_(0.0, 1.0)
+    images = prepare_scene(scene, camera).expose(states, seed=seed).clamp_(0.0, 1.0)
     return {name: scorer(images, captures).numpy() for name, scorer in scorers.items()}
 
 

@@ -14,7 +14,7 @@ import torch
 from ae_env.options import EnvOptions
 from ae_env.scorers import Captures, CompositeScorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import scene_latent
+from ae_env.scorers.score_table import prepare_scene
 from benchmarks.markdown import table
 from simulator import develop
 
@@ -60,7 +60,7 @@ def _batch(size: int) -> tuple[torch.Tensor, Captures]:
     captures = describe_captures(
         [scene] * len(states), states, camera, speed=zeros, defocus=zeros, gain=zeros + 1.0
     )
-    return scene_latent(scene, camera).expose(states, seed=0).clamp_(0.0, 1.0), captures
+    return prepare_scene(scene, camera).expose(states, seed=0).clamp_(0.0, 1.0), captures
 
 
 def _row(name: str, size: int, task: Callable[[], Any], repeats: int) -> dict[str, Any]:

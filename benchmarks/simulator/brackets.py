@@ -31,7 +31,7 @@ from benchmarks.brackets import (
     variance,
 )
 from benchmarks.simulator.scenes import Progress, data_root
-from simulator import CameraSimulator, Latent, RawImage, exposure_ratio
+from simulator import CameraSimulator, PreparedScene, RawImage, exposure_ratio
 from simulator.networks.exposure_module import ExposureModule, LinearFit
 
 if TYPE_CHECKING:
@@ -78,15 +78,15 @@ def measure(
         static = [p for p in chosen if p.scene == next(iter(SCENES))]
         steps = [p for p in static if (p.source_ms, p.target_ms) in QUICK_STEPS]
         chosen = [_middle(pair) for pair in steps]
-    latents: dict[tuple[str, int], list[tuple[Latent, float]]] = {}
+    prepared_scenes: dict[tuple[str, int], list[tuple[PreparedScene, float]]] = {}
     for done, pair in enumerate(chosen):
         if progress is not None:
             progress(f"{pair.source_ms} to {pair.target_ms} ms", done / len(chosen))
         other = next(module for scene, module in fits.items() if scene != pair.scene)
         methods, key = _methods(models, other), (pair.scene, pair.source_ms)
-        if key not in latents:
-            latents[key] = [_prepared(method.simulator, pair.source) for method in methods]
-        rows += transition_rows(pair, methods, latents[key], seed)
+        if key not in prepared_scenes:
+            prepared_scenes[key] = [_prepared(method.simulator, pair.source) for method in methods]
+        rows += transition_rows(pair, methods, prepared_scenes[key], seed)
     return rows
 
 
@@ -99,11 +99,11 @@ def _middle(pair: Pair) -> Pair:
     return replace(pair, source=cut(pair.source), target=cut(pair.target))
 
 
-def _prepared(simulator: CameraSimulator, source: RawImage) -> tuple[Latent, float]:
+def _prepared(simulator: CameraSimulator, source: RawImage) -> tuple[PreparedScene, float]:
     """What serves every exposure, and the time that it took [ms]."""
     start = time.perf_counter()
-    latent = simulator.prepare(source)
-    return latent, round(1e3 * (time.perf_counter() - start), 1)
+    prepared = simulator.prepare(source)
+    return prepared, round(1e3 * (time.perf_counter() - start), 1)
 
 
 def fitted(pairs: Sequence[Pair]) -> ExposureModule:
@@ -154,7 +154,7 @@ def _methods(models: Models, other: ExposureModule) -> list[_Method]:
 def transition_rows(
     pair: Pair,
     methods: Sequence[_Method],
-    latents: Sequence[tuple[Latent, float]],
+    prepared_scenes: Sequence[tuple[PreparedScene, float]],
     seed: int,
 ) -> list[dict[str, Any]]:
     """Error of every method before and after the output's noise, registered to whole pixels."""
@@ -164,11 +164,11 @@ def transition_rows(
     limits = {"EXP": own_noise + exposed_variance(pair.source, ratio), "NS": own_noise}
     linear = np.broadcast_to(~pair.masked, real.shape) & (pair.brighter < LINEAR_BELOW)
     # By one method's shift, so that all are compared on the same pixels.
-    moved = _shift(pair, latents[0][0].expected(target).clamp(0.0, 1.0))
+    moved = _shift(pair, prepared_scenes[0][0].expected(target).clamp(0.0, 1.0))
     rows = []
-    for method, (latent, prepare_ms) in zip(methods, latents, strict=True):
-        clean, ms = timed(lambda x=latent: x.expected(target).clamp(0.0, 1.0), REPEATS)
-        capture, _ = latent.capture(target, seed)
+    for method, (prepared, prepare_ms) in zip(methods, prepared_scenes, strict=True):
+        clean, ms = timed(lambda x=prepared: x.expected(target).clamp(0.0, 1.0), REPEATS)
+        capture, _ = prepared.capture(target, seed)
         before = compare(clean.numpy(), real, pair, moved)
         after = compare(capture.numpy(), real, pair, moved)
         rows.append(
@@ -180,7 +180,7 @@ def transition_rows(
                 "target_ms": pair.target_ms,
                 "stage": method.stage,
                 "correction": method.correction,
-                "denoised": latent.exposure(target).denoised,
+                "denoised": prepared.exposure(target).denoised,
                 **before,
                 "limit_linear_range_db": decibel(float(limits[method.stage][linear].mean())),
                 "with_noise": {k: after[k] for k in ("psnr_db", "ssim", "texture_ratio")},

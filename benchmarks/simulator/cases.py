@@ -115,8 +115,8 @@ def pairs_of(mix: str, sequences: Sequence[CaptureSequence], camera: ReferenceCa
     if mix == "all":
         return select_pairs(sequences, "all", camera.camera)
     with_depth = {i for i, s in enumerate(sequences) if s.scene.depth is not None}
-    opening = select_pairs(sequences, "aperture", camera.camera)
-    pairs = [p for p in opening if p.sequence in with_depth]
+    aperture_blur = select_pairs(sequences, "aperture", camera.camera)
+    pairs = [p for p in aperture_blur if p.sequence in with_depth]
     if mix == "opening":
         return pairs
     wanted = tuple(CameraSettings(100, 1.0, n).aperture_stop for n in (11, 4))
@@ -144,22 +144,22 @@ def photographed(
     seed: int,
 ) -> Iterator[Case]:
     """The captures of every pair, of the same crop, each with noise of its own."""
-    optics: dict[tuple[int, int], Tensor] = {}
+    blurred_light: dict[tuple[int, int], Tensor] = {}
     for number, pair in enumerate(pairs):
         sequence = sequences[pair.sequence]
         scene = sequence.scene
-        for old in [key for key in optics if key[0] != pair.sequence]:
-            del optics[old]  # pairs come in order of their sequence
+        for old in [key for key in blurred_light if key[0] != pair.sequence]:
+            del blurred_light[old]  # pairs come in order of their sequence
         rng = np.random.default_rng([seed, number, pair.sequence, pair.source, pair.target])
         top, left = (int(rng.integers(n - crop + 1)) for n in scene.light.shape[1:])
         window = (..., slice(top, top + crop), slice(left, left + crop))
         captures = []
         for settings in (sequence.settings[pair.source], sequence.settings[pair.target]):
             key = (pair.sequence, settings.aperture_stop)
-            if key not in optics:
-                optics[key] = camera.optics(scene, settings.f_number)
+            if key not in blurred_light:
+                blurred_light[key] = camera.blurred_light(scene, settings.f_number)
             noise = int(rng.integers(2**31))
-            light = optics[key][window]
+            light = blurred_light[key][window]
             captures.append(camera.capture(scene, settings, noise, light=light))
         source, target = captures
         blur = camera.blur_diameter(scene, source.settings.effective_f_number)[window]

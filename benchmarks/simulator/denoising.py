@@ -25,8 +25,8 @@ from benchmarks.simulator.scenes import Progress, clipped, held_out_scenes, psnr
 from simulator import (
     CameraSettings,
     CameraSimulator,
-    Latent,
     NoiseLevelFunction,
+    PreparedScene,
     RawImage,
     get_camera,
 )
@@ -42,8 +42,8 @@ STOPS = (-12, -9, -6, -3, -0.5, 0, 0.5, 3, 6, 9, 12)
 #: Non-local means' strength in units of the noise and patch size, and the wavelet: the best of a
 #: few on the validation maps, halved as the test maps are.
 NLM_STRENGTH, NLM_PATCH, WAVELET = 0.6, 3, "db2"
-#: What denoises a raw: takes it and its latent, returns (4, H, W).
-Denoiser = Callable[[Latent], Tensor]
+#: What denoises a raw: takes it and its prepared scene, returns (4, H, W).
+Denoiser = Callable[[PreparedScene], Tensor]
 
 
 def measure(
@@ -99,11 +99,11 @@ def _captures(camera: str, seed: int, quick: bool) -> Iterator[tuple[RawImage, R
 
 def _gain(denoise: Denoiser, raw: RawImage, mean: Tensor) -> tuple[float, float]:
     """By how much `denoise` raises the PSNR [dB], and how long it takes [ms]."""
-    latent = CameraSimulator(device="cpu").prepare(raw)
+    prepared = CameraSimulator(device="cpu").prepare(raw)
     began = time.perf_counter()
-    image = denoise(latent)
+    image = denoise(prepared)
     milliseconds = 1e3 * (time.perf_counter() - began)
-    before = psnr(clipped(latent.light, raw.camera), mean)
+    before = psnr(clipped(prepared.light, raw.camera), mean)
     return psnr(clipped(image, raw.camera), mean) - before, milliseconds
 
 
@@ -142,8 +142,10 @@ def _ratio_rows(
         ratio = 2.0**stops
         gains = []
         for raw, target in captures:
-            latent = CameraSimulator(device="cpu").prepare(raw)
-            exposed = replace(latent, light=latent.light * ratio, nlf=latent.nlf.exposed(ratio))
+            prepared = CameraSimulator(device="cpu").prepare(raw)
+            exposed = replace(
+                prepared, light=prepared.light * ratio, nlf=prepared.nlf.exposed(ratio)
+            )
             images = (exposed.light, simulator.denoise(exposed))
             before, after = (psnr(image, target.mean * ratio, peak=ratio) for image in images)
             gains.append(after - before)
@@ -163,10 +165,10 @@ def _ratio_rows(
 def behind_anscombe(denoise: Callable[[np.ndarray], np.ndarray]) -> Denoiser:
     """`denoise`, which removes noise of standard deviation 1, as a denoiser of raws."""
 
-    def denoiser(latent: Latent) -> Tensor:
-        stable = anscombe(latent.light, latent.nlf)
+    def denoiser(prepared: PreparedScene) -> Tensor:
+        stable = anscombe(prepared.light, prepared.nlf)
         smooth = denoise(stable.double().numpy())
-        return inverse_anscombe(torch.from_numpy(smooth), latent.nlf).float()
+        return inverse_anscombe(torch.from_numpy(smooth), prepared.nlf).float()
 
     return denoiser
 

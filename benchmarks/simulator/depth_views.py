@@ -78,7 +78,7 @@ def make_views(
 
 def make_view(scene: ReferenceScene, camera: ReferenceCamera, *, seed: int) -> View:
     """Photographs `scene`, exposed for its incident light as its reference settings are."""
-    light = {n: camera.optics(scene, n) for n in (F_SOURCE, F_TARGET)}
+    light = {n: camera.blurred_light(scene, n) for n in (F_SOURCE, F_TARGET)}
     captures = {
         iso: camera.capture(
             scene, equal_exposure(scene.reference, iso, F_SOURCE), seed, light=light[F_SOURCE]

@@ -24,8 +24,8 @@ from simulator import (
     CameraProfile,
     CameraSettings,
     CameraSimulator,
-    Latent,
     NoiseLevelFunction,
+    PreparedScene,
     RawImage,
     get_camera,
 )
@@ -156,20 +156,20 @@ class _Photographer:
             target = self._target(scene)
             own = []
             for repeat in range(self.repeats):
-                latent = self._latent(simulator, scene, route, index, repeat)
+                prepared = self._prepared(simulator, scene, route, index, repeat)
                 began = time.perf_counter()
-                own.append(latent.capture(target, self.seed + repeat)[0])
+                own.append(prepared.capture(target, self.seed + repeat)[0])
                 times.append(1e3 * (time.perf_counter() - began))
             images.append(torch.stack(own))
         return images, float(np.median(times))
 
-    def _latent(
+    def _prepared(
         self, simulator: CameraSimulator, scene: ReferenceScene, route: str, index: int, repeat: int
-    ) -> Latent:
+    ) -> PreparedScene:
         profile = self.camera.camera
         if route == NOISE_FREE:
             clean = NoiseLevelFunction.zero()
-            return simulator.prepare(Latent(scene.light, scene.reference, profile, clean))
+            return simulator.prepare(PreparedScene(scene.light, scene.reference, profile, clean))
         target = self._target(scene)
         source = {
             CLEANER: _at(scene, 100),
@@ -184,7 +184,7 @@ class _Photographer:
         return _at(scene, self.iso)
 
     def _signal(self, scene: ReferenceScene, settings: CameraSettings) -> Tensor:
-        light = _optics(self.camera, scene, settings.f_number)
+        light = _blurred_light(self.camera, scene, settings.f_number)
         return self.camera.expose(light, scene.reference, settings)
 
     def _recorded(self, signal: Tensor, iso: float, index: int, repeat: int, draw: int) -> Tensor:
@@ -194,8 +194,8 @@ class _Photographer:
 
 
 @functools.lru_cache(maxsize=32)
-def _optics(camera: ReferenceCamera, scene: ReferenceScene, f_number: float) -> Tensor:
-    return camera.optics(scene, f_number)
+def _blurred_light(camera: ReferenceCamera, scene: ReferenceScene, f_number: float) -> Tensor:
+    return camera.blurred_light(scene, f_number)
 
 
 def _at(scene: ReferenceScene, iso: float) -> CameraSettings:

@@ -11,7 +11,7 @@ import torch
 from scipy import stats
 
 from benchmarks.stability.case import Row, time_ratio
-from simulator import CameraProfile, CameraSettings, Latent, NoiseLevelFunction, get_camera
+from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.noise.generator import Noise
 from simulator.reference.reference_camera import ReferenceCamera
 
@@ -93,13 +93,13 @@ def _few(electrons: float, read: float, size: int, seed: int) -> Iterator[Row]:
     grid = (numbers + 0.5 - black) / span * well
     sigma = math.sqrt(electrons + read**2)
     gaussian = stats.norm.cdf((grid - electrons) / sigma)
-    latent = Latent(light, _STATE, camera, NoiseLevelFunction.zero())
+    prepared = PreparedScene(light, _STATE, camera, NoiseLevelFunction.zero())
     captures = {
         "reference camera against photons": (
             ReferenceCamera(camera).record(light, 100.0, torch.Generator().manual_seed(seed)),
             _poisson_cdf(grid, electrons, read),
         ),
-        "simulator against its Gaussian": (latent.expose([_STATE], seed=seed)[0], gaussian),
+        "simulator against its Gaussian": (prepared.expose([_STATE], seed=seed)[0], gaussian),
     }
     for name, (frame, wanted) in captures.items():
         counts = np.bincount((frame * span + black).round().long().flatten(), minlength=2**16)
@@ -135,8 +135,8 @@ def _clipped(end: str, sigmas: float, noise: Noise, size: int, seed: int) -> Row
     )
     level = 1.0 - sigmas * sigma if end == "white" else sigmas * sigma
     light = torch.full((4, size, size), level)
-    latent = Latent(light, _STATE, camera, NoiseLevelFunction.zero())
-    frame = latent.expose([_STATE], seed=seed, noise=noise)[0].double()
+    prepared = PreparedScene(light, _STATE, camera, NoiseLevelFunction.zero())
+    frame = prepared.expose([_STATE], seed=seed, noise=noise)[0].double()
     # The distance from the end is a Gaussian clipped at 0.
     away = 1.0 - frame if end == "white" else frame
     mean, variance, kurtosis = _clipped_gaussian(sigmas * sigma, sigma)
@@ -144,7 +144,7 @@ def _clipped(end: str, sigmas: float, noise: Noise, size: int, seed: int) -> Row
     mean_error = (float(away.mean()) - mean) / math.sqrt(variance / count)
     spread = variance * math.sqrt((kurtosis - 1.0) / count)
     variance_error = (float(away.var()) - variance) / spread
-    ordinary = Latent(torch.full_like(light, 0.5), _STATE, camera, NoiseLevelFunction.zero())
+    ordinary = PreparedScene(torch.full_like(light, 0.5), _STATE, camera, NoiseLevelFunction.zero())
     return Row(
         GROUP,
         f"{sigmas:+g} standard deviations from {end}, {noise}",
@@ -154,7 +154,7 @@ def _clipped(end: str, sigmas: float, noise: Noise, size: int, seed: int) -> Row
         finite=bool(torch.isfinite(frame).all()),
         unbiased=abs(mean_error) < _SIGMAS,
         time_ratio=time_ratio(
-            lambda: latent.expose([_STATE], noise=noise),
+            lambda: prepared.expose([_STATE], noise=noise),
             lambda: ordinary.expose([_STATE], noise=noise),
             repeats=3,
         ),

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from benchmarks.stability.case import Row, time_ratio
-from simulator import CameraSettings, Latent, NoiseLevelFunction, exposure_ratio, get_camera
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 
 GROUP = "exposure ratios"
 #: Rounding of a float32 and of a float64.
@@ -49,8 +49,8 @@ def _settings(stops: float) -> CameraSettings:
     return CameraSettings(iso, 2.0**stops * 100.0 / iso, 4.0)
 
 
-def _latent(light: torch.Tensor, reference: CameraSettings) -> Latent:
-    return Latent(light, reference, get_camera("nikon_z6"), NoiseLevelFunction.zero())
+def _prepared(light: torch.Tensor, reference: CameraSettings) -> PreparedScene:
+    return PreparedScene(light, reference, get_camera("nikon_z6"), NoiseLevelFunction.zero())
 
 
 def _ratios() -> Row:
@@ -70,12 +70,12 @@ def _there_and_back(seed: int) -> Row:
     previous = None
     for stops in range(-30, 31):
         settings = _settings(stops)
-        there = _latent(light, _START).expected(settings)
-        back = _latent(there, settings).expected(_START)
+        there = _prepared(light, _START).expected(settings)
+        back = _prepared(there, settings).expected(_START)
         worst = max(worst, float((back.double() / light.double() - 1.0).abs().max()))
         monotone &= previous is None or bool((there >= previous).all())
         previous = there
-    latent = _latent(light, _START)
+    prepared = _prepared(light, _START)
     return Row(
         GROUP,
         "light there and back, 2^-30 to 2^30",
@@ -83,7 +83,7 @@ def _there_and_back(seed: int) -> Row:
         limit=8 * EPS32,
         monotone=monotone,
         time_ratio=time_ratio(
-            lambda: latent.expected(_settings(-30)), lambda: latent.expected(_settings(0))
+            lambda: prepared.expected(_settings(-30)), lambda: prepared.expected(_settings(0))
         ),
     )
 
@@ -100,7 +100,7 @@ def _chains(seed: int, count: int) -> Iterator[Row]:
         numbers = max(numbers, abs(float(math.prod(map(Fraction, ratios)) - 1)))
         image = light
         for before, after in itertools.pairwise(steps):
-            image = _latent(image, before).expected(after)
+            image = _prepared(image, before).expected(after)
         images = max(images, float((image.double() / light.double() - 1.0).abs().max()))
     name = "100 random transitions that return"
     # Each ratio is 2 to the power of a difference of logarithms of up to 2^5.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from benchmarks.stability.case import Row, time_ratio
-from simulator import CameraProfile, CameraSettings, Latent, NoiseLevelFunction, get_camera
+from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture.exposure import Exposure
 from simulator.capture.record import add_noise
 from simulator.noise.generator import FrameNoise
@@ -68,7 +68,7 @@ def extreme_signals(seed: int) -> dict[str, torch.Tensor]:
         "one hot pixel of 1e6": hot,
         "checkerboard of 0 and 1": board.float().expand(4, _SIZE, _SIZE).contiguous(),
         "30 stops in one frame": (2.0**stops).float(),
-        "latent of 1e6": 1e6 * flat,
+        "light of 1e6": 1e6 * flat,
     }
 
 
@@ -83,8 +83,8 @@ def _exposed(stops: float) -> CameraSettings:
 def _recorded(name: str, light: torch.Tensor, ordinary: torch.Tensor, camera: CameraProfile) -> Row:
     """Without noise, against float64: the recorded number less the exact one before rounding."""
     clean = replace(camera, nlf_by_iso={100.0: NoiseLevelFunction.zero()}, segments=())
-    latent = Latent(light, _REFERENCE, clean, NoiseLevelFunction.zero())
-    frames = latent.expose([_exposed(stops) for stops in STOPS]).cpu().numpy().astype(np.float64)
+    prepared = PreparedScene(light, _REFERENCE, clean, NoiseLevelFunction.zero())
+    frames = prepared.expose([_exposed(stops) for stops in STOPS]).cpu().numpy().astype(np.float64)
     exact_light = light.cpu().numpy().astype(np.float64)
     span, black = (np.array(v)[:, None, None] for v in (camera.span, camera.black_level))
     worst = 0.0
@@ -93,7 +93,7 @@ def _recorded(name: str, light: torch.Tensor, ordinary: torch.Tensor, camera: Ca
         exact = np.minimum(exact, camera.white_level)
         worst = max(worst, float(np.abs(frame * span + black - exact).max()))
     states = [_exposed(stops) for stops in STOPS]
-    usual = Latent(ordinary, _REFERENCE, clean, NoiseLevelFunction.zero())
+    usual = PreparedScene(ordinary, _REFERENCE, clean, NoiseLevelFunction.zero())
     clipped = bool((light >= 1.0).any())
     return Row(
         GROUP,
@@ -104,8 +104,8 @@ def _recorded(name: str, light: torch.Tensor, ordinary: torch.Tensor, camera: Ca
         limit=0.5 + 4 * EPS32 * 2**14,
         dtype="float32" if light.device.type == "cpu" else f"float32, {light.device.type}",
         finite=bool(np.isfinite(frames).all()),
-        time_ratio=time_ratio(lambda: latent.expose(states), lambda: usual.expose(states)),
-        declared="clipped highlights: `info['clipped_high']`, `Latent.saturated`" * clipped,
+        time_ratio=time_ratio(lambda: prepared.expose(states), lambda: usual.expose(states)),
+        declared="clipped highlights: `info['clipped_high']`, `PreparedScene.saturated`" * clipped,
     )
 
 
@@ -167,8 +167,8 @@ def _monotone(camera: CameraProfile) -> Row:
     levels = torch.cat([levels, 2.0 ** torch.linspace(-30, 30, 1803)])
     light = levels.reshape(1, 48, 48).expand(4, 48, 48).contiguous()
     clean = replace(camera, nlf_by_iso={100.0: NoiseLevelFunction.zero()}, segments=())
-    latent = Latent(light, _REFERENCE, clean, NoiseLevelFunction.zero())
-    frames = latent.expose([_exposed(stops) for stops in STOPS]).flatten(2)
+    prepared = PreparedScene(light, _REFERENCE, clean, NoiseLevelFunction.zero())
+    frames = prepared.expose([_exposed(stops) for stops in STOPS]).flatten(2)
     monotone = bool((frames.diff(dim=-1) >= 0).all())
     finite = bool(torch.isfinite(frames).all())
     name = "a ramp from -2^-4 to 2^30, at -30 to +30 stops"

@@ -160,12 +160,12 @@ def by_stage(path: str, case: str, passes: int) -> dict[str, Any]:
             with stage("read"):
                 raw = read_raw(path)
             with stage("prepare"):
-                latent = simulator.prepare(raw, depth=depth)
+                prepared = simulator.prepare(raw, depth=depth)
             del raw
             with stage("simulate"):
-                result = simulator.simulate(latent, settings, noise=noise)
-            modules = list(latent.plan(settings).modules)
-            del latent
+                result = simulator.simulate(prepared, settings, noise=noise)
+            modules = list(prepared.plan(settings).modules)
+            del prepared
             with stage("write"):
                 write_dng(Path(folder) / "out.dng", result)
             del result

@@ -10,8 +10,8 @@ from typing import Any, get_args
 
 import torch
 
-from benchmarks.throughput.growth import clean_latent, many_states
-from simulator.capture.prepared_scene import Latent
+from benchmarks.throughput.growth import clean_prepared, many_states
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.generator import Noise
 
 SIZES = ((128, 128), (512, 768), (2000, 3000))
@@ -26,16 +26,16 @@ def measure_gpu(quick: bool) -> dict[str, Any]:
     bandwidth, states = _copy_bandwidth(), many_states(16)
     rows = []
     for height, width in SIZES[:2] if quick else SIZES:
-        latent = clean_latent(height, width)
-        latent = replace(latent, light=latent.light.cuda())
+        prepared = clean_prepared(height, width)
+        prepared = replace(prepared, light=prepared.light.cuda())
         for noise in get_args(Noise):
 
-            def sweep(latent: Latent = latent, noise: Noise = noise) -> None:
-                for _ in latent.stream(states, noise=noise):
+            def sweep(prepared: PreparedScene = prepared, noise: Noise = noise) -> None:
+                for _ in prepared.stream(states, noise=noise):
                     pass
 
             seconds = _timed(sweep) / len(states)
-            least = latent.light.numel() * _BYTES_PER_SAMPLE / bandwidth
+            least = prepared.light.numel() * _BYTES_PER_SAMPLE / bandwidth
             rows.append(
                 {
                     "height": height,

@@ -22,7 +22,7 @@ from benchmarks.keeping import Kept
 from benchmarks.throughput.frames import noisy_raw
 from benchmarks.throughput.kernel_limit import KernelLimit
 from simulator import CameraSettings, CameraSimulator, get_camera
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.generator import Noise
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.
@@ -137,12 +137,12 @@ def measure_pixels(
 
 
 def measure_states(count: int, noise: Noise, *, quick: bool) -> dict[str, float]:
-    """`Latent.expose` of a 128 x 128 scene at `count` states: time, and memory of the frames."""
-    latent, states = clean_latent(128, 128), many_states(512)
-    latent.expose(states[:1], noise=noise)
+    """`PreparedScene.expose` of a 128 x 128 scene at `count` states: time, and memory of the frames."""
+    prepared, states = clean_prepared(128, 128), many_states(512)
+    prepared.expose(states[:1], noise=noise)
     before = _held()
     seconds = median_seconds(
-        lambda: latent.expose(states[:count], noise=noise), least=_LEAST[not quick]
+        lambda: prepared.expose(states[:count], noise=noise), least=_LEAST[not quick]
     )
     return {"x": float(count), "seconds": seconds, "mib": peak_memory() - before}
 
@@ -203,13 +203,13 @@ def measure_marginal(height: int, width: int, noise: Noise, *, quick: bool) -> d
     Both write to memory that is there, one frame behind the other. Sweeps of several lengths and
     the bare loop take turns; the cost is the slope of time against the number of states.
     """
-    latent, states = clean_latent(height, width), many_states(64)
+    prepared, states = clean_prepared(height, width), many_states(64)
     lengths = (1, 8, 16, 32, 64) if height < 512 and not quick else (1, 4, 8)
-    bare = KernelLimit(latent.light.numpy()[None], max(lengths), noise=noise, result="raw")
-    frames = torch.zeros(max(lengths), *latent.light.shape)
+    bare = KernelLimit(prepared.light.numpy()[None], max(lengths), noise=noise, result="raw")
+    frames = torch.zeros(max(lengths), *prepared.light.shape)
 
     def sweep(length: int) -> None:
-        latent.expose(states[:length], noise=noise, out=frames[:length])
+        prepared.expose(states[:length], noise=noise, out=frames[:length])
 
     slopes, limits = [], []
     for turn in range(4 if quick else 10):
@@ -235,11 +235,11 @@ def _held() -> float:
     return peak_memory()
 
 
-def clean_latent(height: int, width: int) -> Latent:
+def clean_prepared(height: int, width: int) -> PreparedScene:
     """A scene without noise of its own: its states cost exposure, noise and clip, nothing else."""
     raw, camera = noisy_raw(height, width), get_camera("nikon_z6")
     nothing = replace(camera.nlf(100), shot=(0.0,) * 4, read=(0.0,) * 4)
-    return Latent(raw.data.clamp(min=0.0), raw.settings, camera, nothing)
+    return PreparedScene(raw.data.clamp(min=0.0), raw.settings, camera, nothing)
 
 
 def many_states(count: int) -> list[CameraSettings]:

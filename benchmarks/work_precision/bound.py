@@ -26,7 +26,7 @@ from benchmarks.simulator.scenes import Progress
 from benchmarks.work_precision.methods import TOLERANCES
 from benchmarks.work_precision.trials import GRID, Trial, test_trials
 from simulator import CameraSettings, CameraSimulator, RawImage
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import exposed_light
 from simulator.noise.noise_level_function import noise_variance, top_up_variance
 
@@ -60,13 +60,13 @@ def measure(
         if progress is not None:
             progress(trial.scene.scene_id, number / len(chosen))
         raws = [trial.raw(seed + 100 * number + i) for i in range(DRAWS)]
-        latents = {t: _prepared(own, raws, t) for t in TOLERANCES}
+        prepared_scenes = {t: _prepared(own, raws, t) for t in TOLERANCES}
         for settings in _states(trial, number, quick):
             truth = trial.mean(settings)
             full = Draws.of_full(own, raws, settings)
             for tolerance in TOLERANCES:
-                plan = latents[tolerance][0].plan(settings)
-                planned = Draws.of_plan(latents[tolerance], settings)
+                plan = prepared_scenes[tolerance][0].plan(settings)
+                planned = Draws.of_plan(prepared_scenes[tolerance], settings)
                 # White in both captures, whatever its light: no difference of theirs can show.
                 shows = torch.where(truth < WHITE, noise_variance(truth, full.target), torch.inf)
                 distance, error = planned.distance(full, shows)
@@ -91,7 +91,9 @@ def measure(
     return rows
 
 
-def _prepared(own: CameraSimulator, raws: Sequence[RawImage], tolerance: float) -> list[Latent]:
+def _prepared(
+    own: CameraSimulator, raws: Sequence[RawImage], tolerance: float
+) -> list[PreparedScene]:
     return [own.prepare(raw, depth="unknown", tolerance=tolerance) for raw in raws]
 
 
@@ -127,12 +129,12 @@ class Draws:
         return cls(light, noise_variance(light, target), target)
 
     @classmethod
-    def of_plan(cls, latents: Sequence[Latent], settings: CameraSettings) -> Draws:
+    def of_plan(cls, prepared_scenes: Sequence[PreparedScene], settings: CameraSettings) -> Draws:
         """Of what is planned for each of the photographs."""
         light, added = [], []
-        for latent in latents:
-            exposure = latent.exposure(settings)
-            image = exposed_light(latent.optics.blurred(exposure), exposure)
+        for prepared in prepared_scenes:
+            exposure = prepared.exposure(settings)
+            image = exposed_light(prepared.blurred_light.blurred(exposure), exposure)
             missing, _ = top_up_variance(
                 image, exposure.source_noise, exposure.target, exposure.remaining
             )

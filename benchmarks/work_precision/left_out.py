@@ -15,7 +15,7 @@ from benchmarks.work_precision.measures import quartiles, timed
 from benchmarks.work_precision.methods import DEFAULT, simulator
 from benchmarks.work_precision.trials import GRID, Trial, source_settings, test_trials
 from simulator import CameraSimulator, NoiseLevelFunction, RawImage, read_raw
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.reference.reference_camera import DRAPED
 
 #: Height and width of every scene, how many there are of a kind, and runs of each sweep.
@@ -37,7 +37,7 @@ _BLURRED = 2.5
 class Example:
     """One scene of a kind: the source, and what the simulator is told about it."""
 
-    source: RawImage | Latent
+    source: RawImage | PreparedScene
     told: dict[str, Any] = field(default_factory=dict)
 
 
@@ -66,9 +66,9 @@ def _row(own: CameraSimulator, kind: str, examples: list[Example], repeats: int)
     names: dict[str, int] = {}
     predicted, times, every = [], [], []
     for example in examples:
-        latent = own.prepare(example.source, tolerance=DEFAULT, **example.told)
+        prepared = own.prepare(example.source, tolerance=DEFAULT, **example.told)
         for settings in GRID:
-            plan = latent.plan(settings)
+            plan = prepared.plan(settings)
             for step in plan.steps:
                 names[step.name] = names.get(step.name, 0) + int(step.runs)
             predicted.append(float(plan.predicted_difference))
@@ -125,7 +125,7 @@ def _retaken(trial: Trial, iso: float, error: float) -> Trial:
 
 def _radiance(seed: int) -> Iterable[Example]:
     for trial in _of_kind("radiance"):
-        light = Latent(
+        light = PreparedScene(
             light=trial.scene.light,
             reference=trial.scene.reference,
             camera=trial.camera.camera,

@@ -17,7 +17,7 @@ from benchmarks.simulator.denoising import behind_anscombe, non_local_means
 from benchmarks.simulator.models import FOLDER, Models
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, exposure_ratio
 from simulator.capture.exposure import Exposure
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import add_noise, clip_and_quantise
 from simulator.noise.generator import FrameNoise, sweep_keys
 from simulator.training.data import settings_parameters
@@ -151,23 +151,23 @@ def with_non_local_means() -> Method:
     bare, denoise = CameraSimulator(device="cpu"), behind_anscombe(non_local_means)
 
     def prepare(raw: RawImage) -> Prepared:
-        latent = bare.prepare(raw)
-        return replace(latent, light=denoise(latent), nlf=NoiseLevelFunction.zero())
+        prepared = bare.prepare(raw)
+        return replace(prepared, light=denoise(prepared), nlf=NoiseLevelFunction.zero())
 
     return Method("non-local means", prepare=prepare)
 
 
 class _Banked:
-    """A latent whose sweeps read their noise from the bank of drawn normals."""
+    """A prepared scene whose sweeps read their noise from the bank of drawn normals."""
 
-    def __init__(self, latent: Latent) -> None:
-        self._latent = latent
-        self.expected = latent.expected
+    def __init__(self, prepared: PreparedScene) -> None:
+        self._prepared = prepared
+        self.expected = prepared.expected
 
     def expose(
         self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
     ) -> Tensor:
-        return self._latent.expose(states, seed=seed, noise="bank", out=out)
+        return self._prepared.expose(states, seed=seed, noise="bank", out=out)
 
 
 def planned(
@@ -183,8 +183,8 @@ def planned(
     """
 
     def prepare(raw: RawImage) -> Prepared:
-        latent = own.prepare(raw, depth="unknown", tolerance=tolerance)
-        return _Banked(latent) if bank else latent
+        prepared = own.prepare(raw, depth="unknown", tolerance=tolerance)
+        return _Banked(prepared) if bank else prepared
 
     name = f"compact {tolerance:g}{', bank' * bank}"
     return Method(name, dtype, tolerance, prepare=prepare)

@@ -73,27 +73,27 @@ class Trial:
     def raw(self, seed: int) -> RawImage:
         """A noisy capture of the scene with the source's settings."""
         capture = self.camera.capture(
-            self.scene, self.source, seed, light=self._optics(self.source.f_number)
+            self.scene, self.source, seed, light=self._blurred_light(self.source.f_number)
         )
         return RawImage(capture.sample, self.source, self.camera.camera)
 
     def mean(self, settings: CameraSettings) -> Tensor:
         """(4, H, W) what the camera would record at `settings` without noise, clipped."""
-        light = self._optics(settings.f_number)
+        light = self._blurred_light(settings.f_number)
         signal = self.camera.expose(light, self.scene.reference, settings)
         return self.camera.clip(signal, settings.iso)
 
     def sample(self, settings: CameraSettings, seed: int) -> Tensor:
         """(4, H, W) what it would record."""
-        light = self._optics(settings.f_number)
+        light = self._blurred_light(settings.f_number)
         return self.camera.capture(self.scene, settings, seed, light=light).sample
 
-    def _optics(self, f_number: float) -> Tensor:
+    def _blurred_light(self, f_number: float) -> Tensor:
         return self._kept(f_number)
 
     @functools.cached_property
     def _kept(self) -> functools._lru_cache_wrapper[Tensor]:
-        return functools.cache(lambda f_number: self.camera.optics(self.scene, f_number))
+        return functools.cache(lambda f_number: self.camera.blurred_light(self.scene, f_number))
 
     def states(self, number: int | None = None) -> tuple[CameraSettings, ...]:
         """States of the grid within `FAIR_EXPOSURE`: `number` of them evenly spread, or all.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import LATENT_LIMIT
+from simulator.capture.exposure import LIGHT_LIMIT
 from simulator.networks.aperture_module import added_blur
 from simulator.optics.disc_bank import HALO, DiscBank, remaining_variance
 from simulator.utils.cache import LruCache
@@ -20,7 +20,7 @@ from simulator.utils.tiles import TILE, Tile, make_tiles
 KEPT_BYTES = 256 * 2**20
 
 
-class Opening(Protocol):
+class ApertureBlur(Protocol):
     """Opens the aperture of one scene's light; results are kept, as f-numbers are few."""
 
     f_number: float
@@ -47,7 +47,7 @@ class Opening(Protocol):
         """(H, W) share of the recorded noise's variance that the blur leaves."""
 
 
-class MapOpening:
+class MapApertureBlur:
     """Blurs by the estimated circle of confusion of each pixel (preset ``"compact"``).
 
     Only the parts of the frame that are out of focus are blurred, tile by tile; the rest is copied.
@@ -58,7 +58,7 @@ class MapOpening:
         diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or what estimates it,
             called when an aperture first opens.
         f_number: Effective f-number of the light.
-        everywhere: See `Opening`.
+        everywhere: See `ApertureBlur`.
     """
 
     needs_denoised = False
@@ -83,13 +83,13 @@ class MapOpening:
         return self._diameter if isinstance(self._diameter, Tensor) else self._diameter()
 
     def extent(self, f_number: float) -> float:
-        """See `Opening`."""
+        """See `ApertureBlur`."""
         if f_number >= self.f_number:
             return 0.0
         return float(added_blur(self._largest, self.f_number, f_number))
 
     def opened(self, f_number: float, *, denoised: bool) -> Tensor:
-        """See `Opening`."""
+        """See `ApertureBlur`."""
         key = (f_number, denoised)
         result = self._kept.get(key)
         if result is None:
@@ -99,7 +99,7 @@ class MapOpening:
         return result
 
     def remaining(self, f_number: float) -> Tensor:
-        """See `Opening`."""
+        """See `ApertureBlur`."""
         return remaining_variance(added_blur(self.diameter, self.f_number, f_number))
 
     @cached_property
@@ -119,7 +119,7 @@ class MapOpening:
         tiles = self._tiles
         if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
             return blurred(tiles[0])
-        result = light.clamp(-LATENT_LIMIT, LATENT_LIMIT)
+        result = light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT)
         for tile in tiles:
             result[tile.inner] = blurred(tile)
         return result
@@ -129,13 +129,13 @@ class MapOpening:
         bank = self._banks.get((tile, denoised))
         if bank is None:
             # Beyond the limit sums would no longer resolve the shadows.
-            bank = DiscBank(light[tile.outer].clamp(-LATENT_LIMIT, LATENT_LIMIT))
+            bank = DiscBank(light[tile.outer].clamp(-LIGHT_LIMIT, LIGHT_LIMIT))
             if self.diameter.numel() <= TILE**2:
                 self._banks[tile, denoised] = bank
         return bank
 
 
-class NetworkOpening:
+class NetworkApertureBlur:
     """Runs the paper's attention U-Net for every f-number (preset ``"paper"``).
 
     Args:
@@ -162,7 +162,7 @@ class NetworkOpening:
 
     @torch.no_grad()
     def opened(self, f_number: float, *, denoised: bool = True) -> Tensor:
-        """See `Opening`."""
+        """See `ApertureBlur`."""
         result = self._kept.get(f_number)
         if result is None:
             image = self._denoised.light[None]

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from simulator.capture.exposure import Exposure
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import record_batch
 from simulator.noise.generator import sweep_keys
 from simulator.optics.blur_kernels import Blur
@@ -38,35 +38,37 @@ def remaining_in_bands(
 
 
 def expected_in_bands(
-    latents: Sequence[Latent], states: Sequence[CameraSettings], row_gain: np.ndarray | None
+    prepared_scenes: Sequence[PreparedScene],
+    states: Sequence[CameraSettings],
+    row_gain: np.ndarray | None,
 ) -> torch.Tensor:
     """Noise-free light (S, 4, H, W) at each state, not clipped; arguments of `expose_in_bands`."""
-    light = torch.stack([x.expected(s) for x, s in zip(latents, states, strict=True)])
+    light = torch.stack([x.expected(s) for x, s in zip(prepared_scenes, states, strict=True)])
     if row_gain is None:
         return light
     return light * torch.from_numpy(row_gain).float()[:, None, :, None]
 
 
 def expose_in_bands(
-    latents: Sequence[Latent],
+    prepared_scenes: Sequence[PreparedScene],
     states: Sequence[CameraSettings],
     row_gain: np.ndarray | None,
     *,
     seed: int,
 ) -> torch.Tensor:
-    """A sweep in which each state has light of its own, with the noise of `Latent.expose`.
+    """A sweep in which each state has light of its own, with the noise of `PreparedScene.expose`.
 
     Args:
-        latents: The scene in the light of each state, S long; they share their `Latent.optics`.
+        prepared_scenes: The scene in the light of each state, S long; they share their `PreparedScene.blurred_light`.
         states: S settings.
         row_gain: (S, H) light of each row relative to that; None where all rows have the same.
-        seed: See `Latent.capture`.
+        seed: See `PreparedScene.capture`.
 
     Returns:
         (S, 4, H, W) float32 in [-pedestal, 1].
     """
-    exposures = [x.exposure(s) for x, s in zip(latents, states, strict=True)]
-    lights = [x.optics.blurred(e) for x, e in zip(latents, exposures, strict=True)]
+    exposures = [x.exposure(s) for x, s in zip(prepared_scenes, states, strict=True)]
+    lights = [x.blurred_light.blurred(e) for x, e in zip(prepared_scenes, exposures, strict=True)]
     if row_gain is not None:
         width = lights[0].shape[-1]
         exposures = [
@@ -78,7 +80,7 @@ def expose_in_bands(
         lights = [in_bands(x, g) for x, g in zip(lights, row_gain, strict=True)]
     out = torch.empty((len(lights), *lights[0].shape))
     keys = sweep_keys(seed, states)
-    record_batch(lights, exposures, latents[0].camera, keys, "exact", out=out)
+    record_batch(lights, exposures, prepared_scenes[0].camera, keys, "exact", out=out)
     return out
 
 
@@ -154,7 +156,7 @@ class Buffers:
         return type(self), (self.shape,)
 
 
-class KeptLight:
+class LightCache:
     """The light that the episode at one place has blurred. A pickled copy has none.
 
     The latest one is kept, because an agent that has settled repeats it.
@@ -164,18 +166,18 @@ class KeptLight:
         keep: Whether the defocused light of every f-number is kept while an episode lasts.
 
     Attributes:
-        latent: What the camera sees of the scene in its own light; None until it is asked for.
+        prepared: What the camera sees of the scene in its own light; None until it is asked for.
     """
 
     def __init__(self, buffers: Buffers, keep: bool) -> None:
         self.buffers, self.keep = buffers, keep
-        self.latent: Latent | None = None
+        self.prepared: PreparedScene | None = None
         self._defocused: dict[tuple[Any, ...], torch.Tensor] = {}  # by aperture
         self._blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
         self._streak: torch.Tensor | None = None
 
     def blurred(self, exposure: Exposure) -> tuple[torch.Tensor, Blur | None]:
-        """The light (4, H, W) of `latent` with the blur of `exposure`, valid until the next call.
+        """The light (4, H, W) of `prepared` with the blur of `exposure`, valid until the next call.
 
         Returns:
             The light, and what must be done (`simulator.optics.blur_kernels.blur_many`) to fill it; None
@@ -188,8 +190,8 @@ class KeptLight:
         light = self._defocused.get(lens)
         source = defocused = moved = None
         if light is None:
-            assert self.latent is not None
-            light = source = self.latent.source_light(exposure).contiguous()
+            assert self.prepared is not None
+            light = source = self.prepared.source_light(exposure).contiguous()
             if exposure.defocus_px:
                 if not self.keep:
                     self._drop_defocused()
@@ -215,7 +217,7 @@ class KeptLight:
         self._drop_defocused()
         if self._streak is not None:
             self.buffers.give_back(self._streak)
-        self.latent = self._streak = self._blurred = None
+        self.prepared = self._streak = self._blurred = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.buffers, self.keep)

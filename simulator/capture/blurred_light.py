@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from simulator.capture.aperture_blur import Opening
+from simulator.capture.aperture_blur import ApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import Exposure
 from simulator.capture.record import defocused_light
@@ -17,7 +17,7 @@ from simulator.utils.cache import LruCache
 KEPT_BYTES = 512 * 2**20
 
 
-class Optics:
+class BlurredLight:
     """Blurs a scene's light, each blur when it is first asked for, and keeps the latest.
 
     Blur and exposure are linear: one light per f-number, and one per f-number and length of the
@@ -34,35 +34,39 @@ class Optics:
         self,
         light: torch.Tensor,
         denoised: Denoised | None,
-        opening: Opening | None,
+        aperture_blur: ApertureBlur | None,
         kept_bytes: int = KEPT_BYTES,
     ) -> None:
-        self.light, self.denoised, self.opening = light, denoised, opening
+        self.light, self.denoised, self.aperture_blur = light, denoised, aperture_blur
         self._added: dict[float, float] = {}
         self._kept: LruCache[torch.Tensor] = LruCache(kept_bytes)
 
     def is_of(
-        self, light: torch.Tensor, denoised: Denoised | None, opening: Opening | None
+        self, light: torch.Tensor, denoised: Denoised | None, aperture_blur: ApertureBlur | None
     ) -> bool:
         """Whether it was made for these very objects."""
-        return self.light is light and self.denoised is denoised and self.opening is opening
+        return (
+            self.light is light
+            and self.denoised is denoised
+            and self.aperture_blur is aperture_blur
+        )
 
     def added_blur(self, f_number: float) -> float:
         """Largest diameter of the blur that opening to `f_number` adds [pixel]; 0 for none."""
-        if self.opening is None or f_number >= self.opening.f_number:
+        if self.aperture_blur is None or f_number >= self.aperture_blur.f_number:
             return 0.0
         if f_number not in self._added:
-            self._added[f_number] = self.opening.extent(f_number)
+            self._added[f_number] = self.aperture_blur.extent(f_number)
         return self._added[f_number]
 
     def remaining(self, f_number: float, energy: float) -> torch.Tensor | None:
         """(H, W) `Exposure.remaining` where other blurs left `energy` of the noise's variance."""
-        if self.opening is None:
+        if self.aperture_blur is None:
             return None
         key = ("remaining", f_number, energy)
         left = self._kept.get(key)
         if left is None:
-            share = self.opening.remaining(f_number)
+            share = self.aperture_blur.remaining(f_number)
             if share is None:
                 return None
             left = (share / energy).clamp(max=1.0)
@@ -71,8 +75,8 @@ class Optics:
 
     def source(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from: as recorded, denoised or opened."""
-        if exposure.opened_to is not None and self.opening is not None:
-            return self.opening.opened(exposure.opened_to, denoised=exposure.denoised)
+        if exposure.opened_to is not None and self.aperture_blur is not None:
+            return self.aperture_blur.opened(exposure.opened_to, denoised=exposure.denoised)
         return self.denoised.light if exposure.denoised and self.denoised else self.light
 
     def blurred(self, exposure: Exposure) -> torch.Tensor:

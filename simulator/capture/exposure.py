@@ -78,7 +78,7 @@ class Budget:
 SIGNAL_LIMIT = 1e6
 #: Light beyond this many times the reference's white is clipped before it is blurred: it is white
 #: at every exposure, and sums of larger numbers would no longer resolve the shadows.
-LATENT_LIMIT = 1e9
+LIGHT_LIMIT = 1e9
 #: Exposure ratios beyond it are limited: float32 must hold them, and any two settings keep below.
 RATIO_LIMIT = 2.0**107
 
@@ -88,8 +88,8 @@ class Exposure:
     """What happens to the light of a scene during one capture.
 
     Args:
-        ratio: Exposure ratio from the latent's reference to the capture.
-        source: Noise in the latent at its reference settings.
+        ratio: Exposure ratio from the prepared scene's reference to the capture.
+        source: Noise in the prepared scene at its reference settings.
         target: Noise of the camera at the capture's settings.
         motion_px: How far the image moves while the shutter is open [pixel].
         defocus_px: Diameter of the defocus disc [pixel].
@@ -114,7 +114,7 @@ class Exposure:
 
     @cached_property
     def source_noise(self) -> NoiseLevelFunction:
-        """Noise that reaches the sensor from the latent: exposed, and averaged by the blur."""
+        """Noise that reaches the sensor from the prepared scene: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
         return self.source.exposed(self.ratio).scaled(

@@ -328,7 +328,7 @@ def record_capture(
     """One capture of `light`: exposed, noisy, clipped and quantised, blurred by the caller.
 
     Args:
-        light: (4, H, W) float32 on the CPU, at the exposure of the latent.
+        light: (4, H, W) float32 on the CPU, at the exposure of the prepared scene.
         exposure: What happens to it; its blur is not applied here.
         camera: The body.
         noise: The noise; None for none.

@@ -13,7 +13,7 @@ from simulator.settings import CameraSettings
 from simulator.utils.tiles import varying
 
 if TYPE_CHECKING:
-    from simulator.capture.prepared_scene import Latent
+    from simulator.capture.prepared_scene import PreparedScene
 
 #: What the compact noise module errs by itself: a share of the standard deviation of the noise that
 #: it removes, and a share of the light. Calibrated on 41 scenes of the validation split
@@ -144,25 +144,27 @@ class SimulationPlan:
         return self.explain()
 
 
-def make_plan(latent: Latent, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
-    """Steps, reasons, predicted error and cost of a capture of `latent` at `settings`.
+def make_plan(
+    prepared: PreparedScene, settings: CameraSettings, *, noise: bool = True
+) -> SimulationPlan:
+    """Steps, reasons, predicted error and cost of a capture of `prepared` at `settings`.
 
     Args:
-        latent: The scene's light.
+        prepared: The scene's light.
         settings: Settings to simulate.
         noise: Whether a capture is wanted, or the light on the sensor without noise.
     """
-    exposure = latent.exposure(settings, noise=noise)
+    exposure = prepared.exposure(settings, noise=noise)
     # A clean source lacks all of the noise: its light need not be made to see that.
-    light = latent.light if exposure.source.is_zero else latent.source_light(exposure)
+    light = prepared.light if exposure.source.is_zero else prepared.source_light(exposure)
     balance = noise_balance(light, exposure)
-    pixels = latent.light.numel()
+    pixels = prepared.light.numel()
     steps = (
         PlannedStep("exposure", True, "", 0.0, _EXPOSE_OPERATIONS * pixels),
-        _noise_reduction(latent, exposure, noise, pixels),
-        _aperture(latent, settings, exposure, pixels),
-        _defocus(latent, settings, exposure, pixels),
-        _motion_blur(latent, settings, exposure, pixels),
+        _noise_reduction(prepared, exposure, noise, pixels),
+        _aperture(prepared, settings, exposure, pixels),
+        _defocus(prepared, settings, exposure, pixels),
+        _motion_blur(prepared, settings, exposure, pixels),
         _noise(noise, balance.is_short, pixels),
         _clip(noise, pixels),
     )
@@ -170,48 +172,50 @@ def make_plan(latent: Latent, settings: CameraSettings, *, noise: bool = True) -
         settings=settings,
         exposure_ratio=exposure.ratio,
         steps=steps,
-        tolerance=latent.tolerance,
+        tolerance=prepared.tolerance,
         excess_noise=balance.relative_excess,
         clipped_source=0.0
-        if latent.saturated is None
-        else int(latent.saturated.count_nonzero()) / latent.saturated.numel(),
+        if prepared.saturated is None
+        else int(prepared.saturated.count_nonzero()) / prepared.saturated.numel(),
         extrapolated_noise=exposure.target.extrapolated,
         predicted_rmse=balance.excess**0.5,
-        predicted_difference=_difference(latent, exposure, steps),
+        predicted_difference=_difference(prepared, exposure, steps),
     )
 
 
-def _difference(latent: Latent, exposure: Exposure, steps: tuple[PlannedStep, ...]) -> float:
+def _difference(
+    prepared: PreparedScene, exposure: Exposure, steps: tuple[PlannedStep, ...]
+) -> float:
     """See `SimulationPlan.predicted_difference`."""
     ratio, target = exposure.ratio, exposure.target
-    found = latent.statistics  # of the light as recorded: a plan need not run the network
+    found = prepared.statistics  # of the light as recorded: a plan need not run the network
     errors = {step.name: step.error for step in steps}
     excess = errors.pop("noise_reduction")
     level = found.relative_level(ratio, target)
     moved = math.hypot(*errors.values()) + ROUNDING * level
-    if latent.denoised is None:  # the full run does not reduce the noise either
+    if prepared.denoised is None:  # the full run does not reduce the noise either
         return moved
     if exposure.denoised:
-        noise, level = _untouched(latent, exposure)
+        noise, level = _untouched(prepared, exposure)
     else:
-        noise = found.relative_noise(ratio, latent.nlf, target)
-    if not latent.nlf.is_zero:
+        noise = found.relative_noise(ratio, prepared.nlf, target)
+    if not prepared.nlf.is_zero:
         moved += math.hypot(BIAS * noise, GAMMA * level)
     return math.hypot(0.0 if exposure.denoised else excess, moved)
 
 
-def _untouched(latent: Latent, exposure: Exposure) -> tuple[float, float]:
+def _untouched(prepared: PreparedScene, exposure: Exposure) -> tuple[float, float]:
     """Noise and level, in units of the target's noise, of the regions that needed no network."""
-    if latent.tolerance == 0.0 or latent.denoised is None:
+    if prepared.tolerance == 0.0 or prepared.denoised is None:
         return 0.0, 0.0
     noise, level = 0.0, 0.0
-    brought = latent.nlf.exposed(exposure.ratio)
-    constant = ~varying(latent.light)
+    brought = prepared.nlf.exposed(exposure.ratio)
+    constant = ~varying(prepared.light)
     for plane in range(4):
-        signal = (latent.light[plane][constant] * exposure.ratio).clamp_(min=0.0).double()
+        signal = (prepared.light[plane][constant] * exposure.ratio).clamp_(min=0.0).double()
         target = exposure.target
         wanted = (signal * target.shot[plane] + target.read[plane]).clamp_(min=1e-30)
-        share = 1.0 / latent.light.numel()
+        share = 1.0 / prepared.light.numel()
         level += share * float((signal**2 / wanted).sum())
         given = signal * brought.shot[plane] + brought.read[plane]
         noise += share * float((given / wanted).sum())
@@ -233,15 +237,17 @@ def _unneeded(name: str, reason: str, error: float = 0.0) -> PlannedStep:
     return PlannedStep(name, False, reason, error, 0)
 
 
-def _noise_reduction(latent: Latent, exposure: Exposure, noise: bool, pixels: int) -> PlannedStep:
+def _noise_reduction(
+    prepared: PreparedScene, exposure: Exposure, noise: bool, pixels: int
+) -> PlannedStep:
     name = "noise_reduction"
-    if latent.nlf.is_zero:
+    if prepared.nlf.is_zero:
         return _unneeded(name, "the source carries no noise")
-    left = latent.statistics.excess if noise else latent.statistics.relative_noise
-    error = left(exposure.ratio, latent.nlf, exposure.target)
-    if latent.denoised is None:
+    left = prepared.statistics.excess if noise else prepared.statistics.relative_noise
+    error = left(exposure.ratio, prepared.nlf, exposure.target)
+    if prepared.denoised is None:
         return _unneeded(name, "the simulator has no noise module", error)
-    if error > latent.tolerance:
+    if error > prepared.tolerance:
         left_out = "the source has so little noise that the network would err as much"
     elif not noise:
         left_out = "the source's noise is small against the target's"
@@ -254,20 +260,24 @@ def _noise_reduction(latent: Latent, exposure: Exposure, noise: bool, pixels: in
         needed = "no noise of the target's is there to take the source's up"
     elif error == 0.0:
         needed = "tolerance 0 takes no noisy pixel for its mean"
-    if latent.opening is not None and latent.opening.needs_denoised and exposure.opened_to:
+    if (
+        prepared.aperture_blur is not None
+        and prepared.aperture_blur.needs_denoised
+        and exposure.opened_to
+    ):
         needed = "the aperture module works on the noise-reduced light only"
     return _step(exposure, name, exposure.denoised, (left_out, needed), pixels)
 
 
 def _aperture(
-    latent: Latent, settings: CameraSettings, exposure: Exposure, pixels: int
+    prepared: PreparedScene, settings: CameraSettings, exposure: Exposure, pixels: int
 ) -> PlannedStep:
-    name, opening = "aperture", latent.opening
-    if opening is None:
+    name, aperture_blur = "aperture", prepared.aperture_blur
+    if aperture_blur is None:
         return _unneeded(name, "no defocus was estimated: `depth` is not 'unknown'")
-    if settings.effective_f_number >= opening.f_number:
+    if settings.effective_f_number >= aperture_blur.f_number:
         return _unneeded(name, "the aperture does not open; what is blurred in the source stays so")
-    added = latent.optics.added_blur(settings.effective_f_number)
+    added = prepared.blurred_light.added_blur(settings.effective_f_number)
     if not added:
         return _unneeded(name, "the picture was found to be in focus throughout")
     largest = f" (up to {added:.2g} pixel)" if added < math.inf else ""
@@ -280,29 +290,29 @@ def _aperture(
 
 
 def _defocus(
-    latent: Latent, settings: CameraSettings, exposure: Exposure, pixels: int
+    prepared: PreparedScene, settings: CameraSettings, exposure: Exposure, pixels: int
 ) -> PlannedStep:
     name = "defocus"
-    if latent.defocus:
-        disc = latent.defocus * 4.0 / settings.effective_f_number
+    if prepared.defocus:
+        disc = prepared.defocus * 4.0 / settings.effective_f_number
         taps = 1 + int(disc) ** 2
         reasons = (
             f"the defocus disc is {disc:.2g} pixel wide, which would hardly show",
             f"the defocus disc is {disc:.3g} pixel wide",
         )
         return _step(exposure, name, exposure.defocus_px > 0, reasons, taps * 2 * pixels)
-    if latent.opening is not None:
+    if prepared.aperture_blur is not None:
         return _unneeded(name, "none is given for the whole frame: each pixel's was estimated")
     return _unneeded(name, "the scene is taken as far or in focus throughout")
 
 
 def _motion_blur(
-    latent: Latent, settings: CameraSettings, exposure: Exposure, pixels: int
+    prepared: PreparedScene, settings: CameraSettings, exposure: Exposure, pixels: int
 ) -> PlannedStep:
     name = "motion_blur"
-    if latent.image_speed == 0:
+    if prepared.image_speed == 0:
         return _unneeded(name, "the image does not move")
-    streak = latent.image_speed * settings.exposure_time * latent.light.shape[-2]
+    streak = prepared.image_speed * settings.exposure_time * prepared.light.shape[-2]
     reasons = (
         f"the image moves by {streak:.2g} pixel during the exposure, which would hardly show",
         f"the image moves by {streak:.3g} pixel during the exposure",

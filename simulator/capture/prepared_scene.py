@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture.aperture_blur import Opening
-from simulator.capture.blurred_light import Optics, blur_key
+from simulator.capture.aperture_blur import ApertureBlur
+from simulator.capture.blurred_light import BlurredLight, blur_key
 from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import (
     DEFAULT_TOLERANCE,
@@ -38,16 +38,16 @@ WORTH_DENOISING = 0.006
 _TOGETHER_BYTES = 2**26
 
 
-class HasLatent(Protocol):
+class HasPrepared(Protocol):
     """Anything that can be photographed, such as a scene of the environment."""
 
     @property
-    def latent(self) -> Latent:
+    def prepared(self) -> PreparedScene:
         """Its light."""
 
 
 @dataclass(frozen=True, eq=False)
-class Latent:
+class PreparedScene:
     """Light of a scene at reference settings, ready to be exposed at any others.
 
     Args:
@@ -83,14 +83,14 @@ class Latent:
     defocus: float = 0.0
     gain: float = 1.0
     denoised: Denoised | None = None
-    opening: Opening | None = None
+    aperture_blur: ApertureBlur | None = None
     tolerance: float = DEFAULT_TOLERANCE
     statistics: LightStatistics = None  # type: ignore[assignment]
-    optics: Optics = None  # type: ignore[assignment]
+    blurred_light: BlurredLight = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        known = self.optics is not None and self.optics.is_of(
-            self.light, self.denoised, self.opening
+        known = self.blurred_light is not None and self.blurred_light.is_of(
+            self.light, self.denoised, self.aperture_blur
         )
         if not known:  # a copy's light was checked before
             object.__setattr__(self, "light", check_packed("light", self.light))
@@ -110,7 +110,9 @@ class Latent:
         if self.statistics is None or self.statistics.light is not self.light:
             object.__setattr__(self, "statistics", LightStatistics(self.light))
         if not known:
-            object.__setattr__(self, "optics", Optics(self.light, self.denoised, self.opening))
+            object.__setattr__(
+                self, "optics", BlurredLight(self.light, self.denoised, self.aperture_blur)
+            )
 
     def exposure(self, settings: CameraSettings, *, noise: bool = True) -> Exposure:
         """What a capture at `settings` does to this light, and what `tolerance` leaves out of it.
@@ -128,7 +130,7 @@ class Latent:
         ratio = min(self.gain * exposure_ratio(self.reference, settings), RATIO_LIMIT)
         target = _averaged_nlf(self.camera, settings.iso, self.box_factor)
         budget = Budget(self.tolerance)
-        added_px = self.optics.added_blur(f_number)
+        added_px = self.blurred_light.added_blur(f_number)
         denoised = self._denoises(ratio, target, added_px, budget, noise=noise)
 
         def kept(name: str, extent: float) -> float:
@@ -148,7 +150,9 @@ class Latent:
         if opened_to is not None and not known:
             # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
             # it further. Both together leave about what the larger leaves alone.
-            remaining = self.optics.remaining(opened_to, kernel_energy(motion_px, defocus_px))
+            remaining = self.blurred_light.remaining(
+                opened_to, kernel_energy(motion_px, defocus_px)
+            )
         return Exposure(
             ratio=ratio,
             source=NoiseLevelFunction.zero() if denoised else self.nlf,
@@ -176,7 +180,7 @@ class Latent:
         left = self.statistics.excess if noise else self.statistics.relative_noise
         error = left(ratio, self.nlf, target)
         # Blur averages noise, too. That is not counted on: it may be left out itself.
-        if self.opening is not None and self.opening.needs_denoised and added_px:
+        if self.aperture_blur is not None and self.aperture_blur.needs_denoised and added_px:
             budget.errors["noise_reduction"] = error
             return True
         return not budget.leaves_out_noise_reduction(error, pointless=not self.is_noisy)
@@ -206,7 +210,7 @@ class Latent:
 
     def source_light(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
-        return self.optics.source(exposure)
+        return self.blurred_light.source(exposure)
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
@@ -230,7 +234,7 @@ class Latent:
     def expected(self, settings: CameraSettings) -> torch.Tensor:
         """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped."""
         exposure = self.exposure(settings, noise=False)
-        return exposed_light(self.optics.blurred(exposure), exposure)
+        return exposed_light(self.blurred_light.blurred(exposure), exposure)
 
     def capture(
         self, settings: CameraSettings, seed: int = 0, *, noise: Noise = "exact"
@@ -250,7 +254,7 @@ class Latent:
         """
         exposure = self.exposure(settings)
         (frame,) = self.expose([settings], seed=seed, noise=noise)
-        return frame, noise_balance(self.optics.blurred(exposure), exposure).relative_excess
+        return frame, noise_balance(self.blurred_light.blurred(exposure), exposure).relative_excess
 
     def expose(
         self,
@@ -282,11 +286,11 @@ class Latent:
         for index, exposure in enumerate(exposures):
             groups.setdefault(blur_key(exposure), []).append(index)
         if len(groups) * self.light.nbytes <= _TOGETHER_BYTES and self.light.device.type == "cpu":
-            lights = [self.optics.blurred(exposure) for exposure in exposures]
+            lights = [self.blurred_light.blurred(exposure) for exposure in exposures]
             record_batch(lights, exposures, self.camera, keys, noise, out=frames)
             return frames
         for i in itertools.chain.from_iterable(groups.values()):
-            light, drawn = self.optics.blurred(exposures[i]), FrameNoise(int(keys[i]), noise)
+            light, drawn = self.blurred_light.blurred(exposures[i]), FrameNoise(int(keys[i]), noise)
             record(light, exposures[i], self.camera, drawn, out=frames[i])
         return frames
 

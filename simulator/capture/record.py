@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from simulator.camera import VARIANCE_LIMIT, CameraProfile
-from simulator.capture.exposure import LATENT_LIMIT, SIGNAL_LIMIT, Exposure
+from simulator.capture.exposure import LIGHT_LIMIT, SIGNAL_LIMIT, Exposure
 from simulator.noise.generator import FrameNoise, Noise
 from simulator.noise.noise_level_function import noise_variance
 from simulator.optics.blur import disc_blur, motion_blur
@@ -25,11 +25,11 @@ _TINY = torch.finfo(torch.float32).tiny
 _BALANCED = 2**15
 
 
-def sensor_light(latent: torch.Tensor, exposure: Exposure) -> torch.Tensor:
+def sensor_light(prepared: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     """Light on the sensor, (4, H, W): exposed and blurred, neither noisy nor clipped."""
-    light = latent
+    light = prepared
     if exposure.defocus_px or exposure.motion_px:  # else even the brightest light stays exact
-        light = motion_blur(defocused_light(latent, exposure.defocus_px), exposure.motion_px)
+        light = motion_blur(defocused_light(prepared, exposure.defocus_px), exposure.motion_px)
     return exposed_light(light, exposure)
 
 
@@ -38,13 +38,13 @@ def exposed_light(light: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     return (light * exposure.ratio).clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
 
-def defocused_light(latent: torch.Tensor, defocus_px: float) -> torch.Tensor:
-    """Light (4, H, W) of a scene behind an aperture, still at the latent's exposure.
+def defocused_light(prepared: torch.Tensor, defocus_px: float) -> torch.Tensor:
+    """Light (4, H, W) of a scene behind an aperture, still at the prepared scene's exposure.
 
     Blur and exposure are linear, so the blur may come first: it then serves every exposure time
     and ISO.
     """
-    return disc_blur(latent.clamp(-LATENT_LIMIT, LATENT_LIMIT), defocus_px)
+    return disc_blur(prepared.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), defocus_px)
 
 
 def add_noise(
@@ -101,7 +101,7 @@ def record(
     A fused kernel on the CPU; elsewhere the same steps one by one.
 
     Args:
-        light: (4, H, W) with the blur of `exposure`, at the exposure of the latent.
+        light: (4, H, W) with the blur of `exposure`, at the exposure of the prepared scene.
         exposure: What happens to it.
         camera: The body.
         noise: The noise; None for none.
@@ -184,7 +184,7 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
     """What the noise top-up of one image finds.
 
     Args:
-        light: (4, H, W) at the exposure of the latent.
+        light: (4, H, W) at the exposure of the prepared scene.
         exposure: What happens to it; neither its ratio nor its noise are in `light` yet.
     """
     source, target = exposure.source_noise, exposure.target

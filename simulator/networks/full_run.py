@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from simulator.camera import NoiseLevelFunction
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import record, sensor_light
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
@@ -55,22 +55,22 @@ class FullRun:
     half: bool = False
 
     @torch.no_grad()
-    def run(self, latent: Latent, settings: CameraSettings, *, seed: int = 0) -> Stages:
+    def run(self, prepared: PreparedScene, settings: CameraSettings, *, seed: int = 0) -> Stages:
         """One transition.
 
         Args:
-            latent: The light as it was recorded; what networks found out about it is not used.
+            prepared: The light as it was recorded; what networks found out about it is not used.
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
         """
         key = int(sweep_keys(seed, [settings])[0])  # a bad seed is told before any work
-        bare = replace(latent, denoised=None, opening=None, tolerance=0.0)
+        bare = replace(prepared, denoised=None, aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
-        exposed = self.exposure(latent.light[None], exposure.ratio)
+        exposed = self.exposure(prepared.light[None], exposure.ratio)
         if self.noise.preset == "paper":
             exposed = exposed.clamp(0.0, 1.0)
-        brought = latent.nlf.exposed(float(self.exposure.w) * exposure.ratio)
+        brought = prepared.nlf.exposed(float(self.exposure.w) * exposure.ratio)
         shot, read = (torch.tensor([v]).to(exposed) for v in (brought.shot, brought.read))
         with torch.autocast(exposed.device.type, dtype=torch.bfloat16, enabled=self.half):
             denoised = self.noise(exposed, shot, read)
@@ -79,11 +79,11 @@ class FullRun:
                 deviation = variance_map(smoothed(exposed), shot, read).sqrt()
                 f_numbers = (
                     torch.tensor([s.effective_f_number], device=exposed.device)
-                    for s in (latent.reference, settings)
+                    for s in (prepared.reference, settings)
                 )
                 opened = self.aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
         light = sensor_light(opened[0], at_target)
         capture = torch.empty_like(light)
-        record(light, at_target, latent.camera, FrameNoise(key), out=capture)
+        record(light, at_target, prepared.camera, FrameNoise(key), out=capture)
         return Stages(exposed[0], denoised[0], opened[0], light, capture)

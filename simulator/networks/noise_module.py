@@ -32,7 +32,7 @@ class CompactDenoiser(nn.Module):
 
     Convolutions without biases, ReLU, additive skips and no normalisation: every layer satisfies
     ``f(c x) = c f(x)`` for c > 0, so the whole network does. "Expose, denoise" then equals
-    "denoise, expose", no exposure ratio lies outside the training range, and one denoised latent
+    "denoise, expose", no exposure ratio lies outside the training range, and one denoised prepared scene
     serves every target. (Mohan et al. 2020, Robust and interpretable blind image denoising via
     bias-free convolutional neural networks.)
 

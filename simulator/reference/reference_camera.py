@@ -206,7 +206,7 @@ class ReferenceCamera:
         pitch = 2e-6 * self.camera.pixel_pitch_um * self.box_factor  # two sensor pixels a plane's
         return scene.lens.circle_of_confusion(scene.depth.double(), exact) / pitch
 
-    def optics(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+    def blurred_light(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
         """Light on the sensor behind the aperture `f_number`, (4, H, W): defocus and nothing else.
 
         Still at the exposure of ``scene.reference``, unclipped and without noise: one result serves
@@ -313,7 +313,7 @@ class ReferenceCamera:
             start: See `expose`.
         """
         if light is None:
-            light = self.optics(scene, settings.f_number)
+            light = self.blurred_light(scene, settings.f_number)
         signal = self.expose(light, scene.reference, settings, lamp=lamp, start=start)
         generator = noise_generator(seed, settings.iso, settings.exposure_time, settings.f_number)
         sample = self.record(signal, settings.iso, generator)

@@ -94,14 +94,14 @@ class ReferencePairs:
         stage: Stage,
         *,
         seed: int = 0,
-        optics: dict[tuple[str, int], Tensor] | None = None,
+        blurred_light: dict[tuple[str, int], Tensor] | None = None,
         progress: Progress | None = None,
     ) -> None:
         self.sequences, self.camera, self.stage, self.seed = sequences, camera, stage, seed
         self.pairs: list[Pair] = select_pairs(list(sequences), stage, camera.camera)
         if not self.pairs:
             raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
-        self._optics = {} if optics is None else optics
+        self._blurred_light = {} if blurred_light is None else blurred_light
         self._defocus: dict[tuple[str, int], Tensor] = {}
         self._render(progress)
 
@@ -138,9 +138,9 @@ class ReferencePairs:
                 progress(done, len(wanted))
             scene = self.sequences[index].scene
             for stop, chosen in by_stop.items():
-                if (scene.scene_id, stop) not in self._optics:
-                    light = self.camera.optics(scene, chosen.f_number)
-                    self._optics[scene.scene_id, stop] = light
+                if (scene.scene_id, stop) not in self._blurred_light:
+                    light = self.camera.blurred_light(scene, chosen.f_number)
+                    self._blurred_light[scene.scene_id, stop] = light
         if progress is not None:
             progress(len(wanted), len(wanted))
 
@@ -166,7 +166,7 @@ class ReferencePairs:
             return (part.transpose(-2, -1) if transposed else part).contiguous()
 
         def record(settings: CameraSettings) -> tuple[Tensor, Tensor]:
-            light = cut(self._optics[scene.scene_id, settings.aperture_stop])
+            light = cut(self._blurred_light[scene.scene_id, settings.aperture_stop])
             signal = self.camera.expose(light, scene.reference, settings)
             return signal, self.camera.record(signal, settings.iso, generator)
 

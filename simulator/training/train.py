@@ -146,7 +146,7 @@ class _Source:
         self.camera = ReferenceCamera(camera, body=BodyError.draw(camera, config.body))
         self.seed = config.seed
         self.sequences = draw_sequences(make_scenes(config, split), camera, config.seed)
-        self._optics: dict[tuple[str, int], torch.Tensor] = {}
+        self._blurred_light: dict[tuple[str, int], torch.Tensor] = {}
 
     def pairs(self, stage: str, progress: Callable[[int, int], None] | None) -> ReferencePairs:
         """The pairs that `stage` is trained or validated on."""
@@ -156,7 +156,7 @@ class _Source:
             self.camera,
             _PAIRS[stage],
             seed=self.seed,
-            optics=self._optics,
+            blurred_light=self._blurred_light,
             progress=progress,
         )
 

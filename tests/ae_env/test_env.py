@@ -369,21 +369,21 @@ def test_every_lighting_works_on_every_scene(lighting: str) -> None:
 def test_kept_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blurred light is kept where memory allows; frames must not depend on it."""
     kept = _rollout(5, depth=3.0, motion=0.5)
-    monkeypatch.setattr("ae_env.episodes.core.OPTICS_BYTES", 0)
+    monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
     _assert_equal(_rollout(5, depth=3.0, motion=0.5), kept)
 
 
 def test_frames_are_the_simulators_own() -> None:
     """The batched path and `CameraSimulator` give the same digital numbers for the same light."""
-    from ae_env.scorers.score_table import scene_latent
+    from ae_env.scorers.score_table import prepare_scene
 
     env = _make(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
     for state in (0, 21, 42, 63):
         observation, _ = env.reset(seed=1, options={"state": state})
         episode = env.core.episode(0)
         scene = env.scenes[episode.scene]
-        latent = scene_latent(scene, env.camera, speed=episode.speed, defocus=episode.defocus)
-        light = latent.expected(env.grid[state]).numpy().astype(np.float64)
+        prepared = prepare_scene(scene, env.camera, speed=episode.speed, defocus=episode.defocus)
+        light = prepared.expected(env.grid[state]).numpy().astype(np.float64)
         span, black = env.camera.span[0], env.camera.black_level[0]
         numbers = np.clip(np.rint(light * span + black), 0, env.camera.white_level)
         assert np.abs(observation["raw"] - numbers).max() <= 1  # float32 against float64

@@ -24,7 +24,7 @@ from ae_env.scenes.loading import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import ScoreTables
-from simulator import CameraSettings, CameraSimulator, Latent, get_camera
+from simulator import CameraSettings, CameraSimulator, PreparedScene, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 
@@ -283,7 +283,7 @@ def test_memory_spared_changes_nothing(
     narrow, wide = 15, 12  # slow: the narrow one is blurred by motion alone
     actions = [narrow, wide, narrow, wide - 4, wide, narrow - 4, narrow, narrow]
     kept = _rollout(lambda: _make(**arguments), actions=actions)
-    monkeypatch.setattr("ae_env.episodes.core.OPTICS_BYTES", 0)
+    monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
     _assert_equal(_rollout(lambda: _make(**arguments), actions=actions), kept)
 
 
@@ -389,9 +389,9 @@ def test_denoised_light_is_kept_between_runs(
     scene, runs = NOISY_SCENES[0], []
     denoise = CameraSimulator.denoise
 
-    def counted(self: CameraSimulator, latent: Latent) -> torch.Tensor:
-        runs.append(latent)
-        return denoise(self, latent)
+    def counted(self: CameraSimulator, prepared: PreparedScene) -> torch.Tensor:
+        runs.append(prepared)
+        return denoise(self, prepared)
 
     monkeypatch.setattr(CameraSimulator, "denoise", counted)
     made = SceneNetworks(weights, cache=False).denoised(scene).denoised

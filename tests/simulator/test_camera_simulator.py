@@ -16,8 +16,8 @@ from simulator import (
     CameraProfile,
     CameraSettings,
     CameraSimulator,
-    Latent,
     NoiseLevelFunction,
+    PreparedScene,
     RawImage,
     get_camera,
 )
@@ -55,31 +55,33 @@ def test_the_same_seed_gives_the_same_frame_alone_in_a_sweep_and_in_simulate(
     simulator: CameraSimulator,
 ) -> None:
     raw = RawImage(picture(), BASE, Z6)
-    latent = simulator.prepare(raw, image_speed=0.5, defocus=1.5)
-    sweep = latent.expose(STATES, seed=11)
+    prepared = simulator.prepare(raw, image_speed=0.5, defocus=1.5)
+    sweep = prepared.expose(STATES, seed=11)
     assert sweep.shape == (64, 4, 16, 20)
     assert sweep.dtype == torch.float32
     for index in (0, 17, 42, 63):
-        assert torch.equal(latent.capture(STATES[index], 11)[0], sweep[index])
+        assert torch.equal(prepared.capture(STATES[index], 11)[0], sweep[index])
         alone = simulator.simulate(raw, STATES[index], seed=11, image_speed=0.5, defocus=1.5)
         assert torch.equal(alone.data, sweep[index])
-    assert torch.equal(latent.expose(STATES[::-1], seed=11), sweep.flip(0))
-    assert torch.equal(torch.stack(list(latent.stream(STATES, seed=11))), sweep)
+    assert torch.equal(prepared.expose(STATES[::-1], seed=11), sweep.flip(0))
+    assert torch.equal(torch.stack(list(prepared.stream(STATES, seed=11))), sweep)
 
 
 def test_other_seeds_and_settings_draw_independent_noise() -> None:
     """Standardised noise of every pair of frames is uncorrelated, within 5 / sqrt(n)."""
-    latent = Latent(torch.full((4, 64, 64), 0.3), BASE, Z6, ZERO)
+    prepared = PreparedScene(torch.full((4, 64, 64), 0.3), BASE, Z6, ZERO)
     same_light = [CameraSettings(100, 1 / 64, 4), CameraSettings(200, 1 / 128, 4)]
     same_light += [CameraSettings(100, 1 / 32, 5.6), CameraSettings(400, 1 / 64, 8)]
-    frames = [latent.capture(BASE, seed)[0] for seed in range(6)]
-    frames += [latent.capture(settings, 0)[0] for settings in same_light[1:]]
+    frames = [prepared.capture(BASE, seed)[0] for seed in range(6)]
+    frames += [prepared.capture(settings, 0)[0] for settings in same_light[1:]]
     correlation = np.corrcoef([frame.flatten().numpy() for frame in frames])
     assert np.abs(correlation - np.eye(len(frames))).max() < 5 / math.sqrt(frames[0].numel())
 
 
 def test_planes_and_pixels_are_independent() -> None:
-    frame = Latent(torch.full((4, 128, 128), 0.3), BASE, Z6, ZERO).capture(BASE, 0)[0].double()
+    frame = (
+        PreparedScene(torch.full((4, 128, 128), 0.3), BASE, Z6, ZERO).capture(BASE, 0)[0].double()
+    )
     frame = frame - frame.mean((1, 2), keepdim=True)
     frame = frame / frame.std((1, 2), keepdim=True)
     bound = 5 / math.sqrt(128 * 128)
@@ -163,10 +165,10 @@ def test_saturated_source_is_declared(simulator: CameraSimulator) -> None:
     darker = CameraSettings(100, 1 / 256, 4)
     assert simulator.plan(raw, darker).clipped_source == pytest.approx(0.3)
     assert simulator.simulate(raw, darker).metadata["clipped_source"] == pytest.approx(0.3)
-    latent = simulator.prepare(raw)
-    assert latent.saturated is not None
-    assert latent.saturated[:3].all()
-    assert not latent.saturated[3:].any()
+    prepared = simulator.prepare(raw)
+    assert prepared.saturated is not None
+    assert prepared.saturated[:3].all()
+    assert not prepared.saturated[3:].any()
 
 
 def test_extrapolated_noise_is_declared(simulator: CameraSimulator) -> None:
@@ -210,27 +212,27 @@ def test_simulate_keeps_what_is_known(simulator: CameraSimulator) -> None:
 
 
 def test_box_averaged_pixels_carry_less_noise(simulator: CameraSimulator) -> None:
-    latent = Latent(torch.full((4, 128, 128), 0.5), BASE, Z6, ZERO, box_factor=4)
-    capture, _ = latent.capture(CameraSettings(6400, 1 / 4096, 4), 0)
+    prepared = PreparedScene(torch.full((4, 128, 128), 0.5), BASE, Z6, ZERO, box_factor=4)
+    capture, _ = prepared.capture(CameraSettings(6400, 1 / 4096, 4), 0)
     expected = (7.25184811907467e-07 + 0.5 * 0.000529454489967193) / 16 + 1 / 12 / 14512**2
     relative = 5 * math.sqrt(2 / 128**2)
     assert float(capture[1].double().var()) == pytest.approx(expected, rel=relative)
 
 
 def test_scene_arguments_replace_only_themselves(simulator: CameraSimulator) -> None:
-    latent = Latent(picture(), BASE, Z6, ZERO, image_speed=0.5, defocus=2.0)
-    assert simulator.prepare(latent).image_speed == 0.5
-    assert simulator.prepare(latent, image_speed=0.0).image_speed == 0.0
-    assert simulator.prepare(latent, image_speed=0.0).defocus == 2.0
-    assert simulator.prepare(latent, defocus=1.0).image_speed == 0.5
+    prepared = PreparedScene(picture(), BASE, Z6, ZERO, image_speed=0.5, defocus=2.0)
+    assert simulator.prepare(prepared).image_speed == 0.5
+    assert simulator.prepare(prepared, image_speed=0.0).image_speed == 0.0
+    assert simulator.prepare(prepared, image_speed=0.0).defocus == 2.0
+    assert simulator.prepare(prepared, defocus=1.0).image_speed == 0.5
 
 
-def test_anything_with_a_latent_is_a_source(simulator: CameraSimulator) -> None:
-    latent = Latent(picture(), BASE, Z6, ZERO)
-    scene = SimpleNamespace(latent=latent)
+def test_anything_with_a_prepared_scene_is_a_source(simulator: CameraSimulator) -> None:
+    prepared = PreparedScene(picture(), BASE, Z6, ZERO)
+    scene = SimpleNamespace(prepared=prepared)
     assert torch.equal(
         simulator.simulate(scene, STATES[9], seed=1).data,
-        simulator.simulate(latent, STATES[9], seed=1).data,
+        simulator.simulate(prepared, STATES[9], seed=1).data,
     )
 
 
@@ -248,12 +250,12 @@ def test_an_uncalibrated_camera_uses_the_raws_own_noise(simulator: CameraSimulat
 
 def test_expected_is_the_light_without_noise_or_clip(simulator: CameraSimulator) -> None:
     light = picture(scale=3.0)
-    latent = Latent(light, BASE, Z6, ZERO)
-    brighter = latent.expected(CameraSettings(800, 1 / 128, 4))
+    prepared = PreparedScene(light, BASE, Z6, ZERO)
+    brighter = prepared.expected(CameraSettings(800, 1 / 128, 4))
     np.testing.assert_allclose(brighter.numpy(), 4 * light.numpy(), rtol=1e-6)
-    moving = Latent(light, BASE, Z6, ZERO, image_speed=0.5)
+    moving = PreparedScene(light, BASE, Z6, ZERO, image_speed=0.5)
     assert moving.exposure(CameraSettings(100, 0.25, 4)).motion_px == pytest.approx(0.5 * 0.25 * 16)
-    near = Latent(light, BASE, Z6, ZERO, defocus=2.0)
+    near = PreparedScene(light, BASE, Z6, ZERO, defocus=2.0)
     assert near.exposure(CameraSettings(100, 0.25, 8)).defocus_px == pytest.approx(1.0)
     assert near.exposure(CameraSettings(100, 0.25, 2.8)).defocus_px == pytest.approx(2 * 2**0.5)
 
@@ -293,13 +295,15 @@ def test_extreme_light_and_ratios_stay_finite(
     light[:, 2] = -PEDESTAL
     light[:, 3] = -1e30
     light[:, 4] = 3e38
-    latent = Latent(light, reference, Z6, source, image_speed=0.1 * blur, defocus=2.0 * blur)
-    capture, excess = latent.capture(target, 0)
-    plan = latent.plan(target)
+    prepared = PreparedScene(
+        light, reference, Z6, source, image_speed=0.1 * blur, defocus=2.0 * blur
+    )
+    capture, excess = prepared.capture(target, 0)
+    plan = prepared.plan(target)
     assert torch.isfinite(capture).all()
     assert float(capture.min()) >= -PEDESTAL * (1 + 1e-6)
     assert float(capture.max()) <= 1.0
-    assert torch.isfinite(latent.expected(target)).all()
+    assert torch.isfinite(prepared.expected(target)).all()
     assert math.isfinite(excess)
     assert excess >= 0
     for value in (plan.excess_noise, plan.predicted_rmse, plan.exposure_ratio):
@@ -316,15 +320,15 @@ def test_the_mean_is_right_at_extreme_ratios(exponent: int) -> None:
     dark, bright = dark_and_bright(abs(exponent))
     reference, target = (dark, bright) if exponent >= 0 else (bright, dark)
     quiet = CameraProfile("quiet", "RGGB", 1008.0, 15520.0, 14, nlf_by_iso={100: ZERO})  # type: ignore[arg-type]
-    latent = Latent(torch.full((4, 2, 2), 0.3 * 2.0**-exponent), reference, quiet, ZERO)
-    capture, _ = latent.capture(target, 0)
+    prepared = PreparedScene(torch.full((4, 2, 2), 0.3 * 2.0**-exponent), reference, quiet, ZERO)
+    capture, _ = prepared.capture(target, 0)
     assert np.unique(np.rint(numbers(capture))).tolist() == [round(0.3 * 14512 + 1008)]
 
 
 @pytest.mark.parametrize("iso", [25, 50, 25_600, 409_600])
 def test_isos_far_outside_the_table(iso: float) -> None:
-    latent = Latent(torch.full((4, 64, 64), 0.2), CameraSettings(iso, 1 / 64, 4), Z6, ZERO)
-    capture, _ = latent.capture(CameraSettings(iso, 1 / 64, 4), 0)
+    prepared = PreparedScene(torch.full((4, 64, 64), 0.2), CameraSettings(iso, 1 / 64, 4), Z6, ZERO)
+    capture, _ = prepared.capture(CameraSettings(iso, 1 / 64, 4), 0)
     assert torch.isfinite(capture).all()
     if iso < 100:
         variance = 5.73712214136873e-09 * (iso / 100) ** 2 + 0.2 * 7.47234302281224e-06 * iso / 100
@@ -333,8 +337,8 @@ def test_isos_far_outside_the_table(iso: float) -> None:
 
 
 def test_a_streak_longer_than_the_frame_by_far() -> None:
-    latent = Latent(picture(8, 8), BASE, Z6, ZERO, image_speed=8.0)
-    capture, _ = latent.capture(CameraSettings(100, 1000.0, 1024.0), 0)
+    prepared = PreparedScene(picture(8, 8), BASE, Z6, ZERO, image_speed=8.0)
+    capture, _ = prepared.capture(CameraSettings(100, 1000.0, 1024.0), 0)
     assert torch.isfinite(capture).all()
 
 
@@ -347,8 +351,8 @@ def test_a_large_sweep_streams_one_frame_at_a_time() -> None:
             taken.append(state)
             yield state
 
-    latent = Latent(torch.full((4, 1500, 2000), 0.01), BASE, Z6, ZERO)
-    frames = latent.stream(states(), seed=0)
+    prepared = PreparedScene(torch.full((4, 1500, 2000), 0.01), BASE, Z6, ZERO)
+    frames = prepared.stream(states(), seed=0)
     assert not taken
     frame = next(frames)
     assert len(taken) == 1
@@ -373,8 +377,8 @@ def test_a_large_sweep_streams_one_frame_at_a_time() -> None:
         (lambda s, raw: s.simulate(raw, BASE, image_speed=-1.0), "`image_speed`"),
         (lambda s, raw: s.simulate(raw, BASE, image_speed=math.nan), "`image_speed`"),
         (lambda s, raw: s.simulate(raw, BASE, defocus=math.inf), "`defocus`"),
-        (lambda s, raw: Latent(raw.data[:3], BASE, Z6, ZERO), "`light`"),
-        (lambda s, raw: Latent(raw.data * math.nan, BASE, Z6, ZERO), "`light`"),
+        (lambda s, raw: PreparedScene(raw.data[:3], BASE, Z6, ZERO), "`light`"),
+        (lambda s, raw: PreparedScene(raw.data * math.nan, BASE, Z6, ZERO), "`light`"),
         (lambda s, raw: CameraSimulator(device="abacus"), "`device`"),
     ],
 )

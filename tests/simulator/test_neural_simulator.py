@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from simulator import CameraSettings, CameraSimulator, RawImage, camera_simulator, get_camera
-from simulator.capture.aperture_blur import MapOpening, NetworkOpening
+from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.weights import save_modules
 from simulator.utils.tiles import in_tiles
@@ -53,13 +53,13 @@ def paper() -> CameraSimulator:
 def test_preparing_denoises_once(compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     denoise = compact.denoise
-    monkeypatch.setattr(compact, "denoise", lambda latent: calls.append(1) or denoise(latent))
-    latent = compact.prepare(raw())
+    monkeypatch.setattr(compact, "denoise", lambda prepared: calls.append(1) or denoise(prepared))
+    prepared = compact.prepare(raw())
     for settings in (CLEANER, SOURCE, OPENER):
-        compact.simulate(latent, settings)
+        compact.simulate(prepared, settings)
     assert len(calls) == 1
-    assert latent.denoised is not None
-    assert not torch.equal(latent.denoised.light, latent.light)
+    assert prepared.denoised is not None
+    assert not torch.equal(prepared.denoised.light, prepared.light)
 
 
 def test_a_source_without_noise_needs_no_network(compact: CameraSimulator) -> None:
@@ -87,31 +87,37 @@ def test_depth_must_be_known(compact: CameraSimulator) -> None:
         compact.prepare(raw(), depth="near")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("preset", "kind"), [("compact", MapOpening), ("paper", NetworkOpening)])
+@pytest.mark.parametrize(
+    ("preset", "kind"), [("compact", MapApertureBlur), ("paper", NetworkApertureBlur)]
+)
 def test_unknown_depth_prepares_an_opening(preset, kind, request) -> None:
     made = request.getfixturevalue(preset)
-    assert made.prepare(raw()).opening is None
-    latent = made.prepare(raw(), depth="unknown")
-    assert isinstance(latent.opening, kind)
-    assert latent.opening.f_number == 8.0
-    assert made.prepare(latent).opening is latent.opening  # simulate() prepares again
-    assert made.simulate(latent, OPENER).data.isfinite().all()
+    assert made.prepare(raw()).aperture_blur is None
+    prepared = made.prepare(raw(), depth="unknown")
+    assert isinstance(prepared.aperture_blur, kind)
+    assert prepared.aperture_blur.f_number == 8.0
+    assert (
+        made.prepare(prepared).aperture_blur is prepared.aperture_blur
+    )  # simulate() prepares again
+    assert made.simulate(prepared, OPENER).data.isfinite().all()
 
 
 def test_frames_are_denoised_and_mapped_in_tiles(
     compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More than one tile gives what one gives, whatever the tile."""
-    latent = compact.prepare(raw(170, 131))
-    defocus = compact.estimate_defocus(latent)
+    prepared = compact.prepare(raw(170, 131))
+    defocus = compact.estimate_defocus(prepared)
     assert defocus.shape == (170, 131)
 
     small = partial(in_tiles, tile=64)
 
     monkeypatch.setattr(camera_simulator, "in_tiles", small)
-    assert latent.denoised is not None
-    torch.testing.assert_close(compact.denoise(latent), latent.denoised.light, atol=1e-4, rtol=0)
-    torch.testing.assert_close(compact.estimate_defocus(latent), defocus, atol=1e-3, rtol=0)
+    assert prepared.denoised is not None
+    torch.testing.assert_close(
+        compact.denoise(prepared), prepared.denoised.light, atol=1e-4, rtol=0
+    )
+    torch.testing.assert_close(compact.estimate_defocus(prepared), defocus, atol=1e-3, rtol=0)
 
 
 def test_saturated_and_black_parts_need_no_network(
@@ -138,7 +144,7 @@ def test_saturated_and_black_parts_need_no_network(
     torch.testing.assert_close(result[:, ~clipped], expected[:, ~clipped], rtol=0, atol=1e-4)
     assert not torch.equal(expected[:, clipped], data[:, clipped])
     tolerant = replace(tolerant, denoised=everywhere.denoised)
-    found = [compact.estimate_defocus(latent) for latent in (everywhere, tolerant)]
+    found = [compact.estimate_defocus(prepared) for prepared in (everywhere, tolerant)]
     assert float(found[1][:176, :240].max()) == 0.0  # no disc of 32 px reaches anything from here
     near = ~clipped
     torch.testing.assert_close(found[1][near], found[0][near], rtol=0, atol=1e-3)
@@ -192,13 +198,13 @@ def test_stages_follow_one_another(compact: CameraSimulator) -> None:
     assert not torch.equal(stages.capture, compact.stages(source, target, seed=6).capture)
 
 
-def test_compact_stages_agree_with_the_prepared_latent(compact: CameraSimulator) -> None:
+def test_compact_stages_agree_with_the_prepared_prepared_scene(compact: CameraSimulator) -> None:
     """Denoise, expose = expose, denoise: one preparation serves every target."""
     source = raw()
-    latent = compact.prepare(source, depth="unknown")
+    prepared = compact.prepare(source, depth="unknown")
     for target in (CLEANER, CameraSettings(100, 1 / 16, 8), CameraSettings(100, 1 / 4, 4)):
         stages = compact.stages(source, target)
-        expected = latent.expected(target)
+        expected = prepared.expected(target)
         scale = float(expected.abs().max())
         torch.testing.assert_close(stages.opened, expected, rtol=0, atol=1e-4 * scale)
 
@@ -232,14 +238,14 @@ def corrected() -> CameraSimulator:
 
 def test_the_correction_reaches_light_and_noise_once() -> None:
     made, source = corrected(), raw()
-    latent = made.prepare(source)
-    torch.testing.assert_close(latent.light, 1.25 * (source.data + 0.01))
-    again = made.prepare(latent)
-    assert torch.equal(again.light, latent.light)
+    prepared = made.prepare(source)
+    torch.testing.assert_close(prepared.light, 1.25 * (source.data + 0.01))
+    again = made.prepare(prepared)
+    assert torch.equal(again.light, prepared.light)
     nlf = Z6.nlf(6400)
-    assert latent.nlf.shot == pytest.approx([1.25 * s for s in nlf.shot])
-    assert latent.nlf.read == pytest.approx([1.25**2 * r for r in nlf.read])
-    frames = [made.simulate(s, CLEANER, seed=1).data for s in (source, latent)]
+    assert prepared.nlf.shot == pytest.approx([1.25 * s for s in nlf.shot])
+    assert prepared.nlf.read == pytest.approx([1.25**2 * r for r in nlf.read])
+    frames = [made.simulate(s, CLEANER, seed=1).data for s in (source, prepared)]
     assert torch.equal(*frames)
 
 
@@ -271,8 +277,8 @@ def test_tolerance_nought_forgets_what_another_one_left_out(
     data = raw(96, 96).data.clone()
     data[:, :48, :48] = 1.0
     source = RawImage(data, SOURCE, Z6)
-    latent = compact.prepare(source, depth=depth)  # type: ignore[arg-type]
-    latent.capture(CLEANER)
-    shared = compact.simulate(latent, CLEANER, tolerance=0.0)
+    prepared = compact.prepare(source, depth=depth)  # type: ignore[arg-type]
+    prepared.capture(CLEANER)
+    shared = compact.simulate(prepared, CLEANER, tolerance=0.0)
     full = compact.simulate(source, CLEANER, tolerance=None, depth=depth)
     torch.testing.assert_close(shared.data, full.data, rtol=0, atol=1.01 / 14512)

@@ -36,10 +36,10 @@ def gain_db(simulator: CameraSimulator, scene: ReferenceScene, camera_name: str)
     target = CameraSettings(100, source.exposure_time * 64, 8)
     capture = body.capture(scene, source, seed=1)
     truth = body.capture(scene, target, seed=2).mean
-    latent = simulator.prepare(RawImage(capture.sample, source, camera))
+    prepared = simulator.prepare(RawImage(capture.sample, source, camera))
     used = (truth < 0.99) & (capture.sample < 0.99)
     before = (capture.sample - truth)[used].square().mean()
-    after = (latent.expected(target) - truth)[used].square().mean()
+    after = (prepared.expected(target) - truth)[used].square().mean()
     return 10.0 * math.log10(float(before / after))
 
 
@@ -99,6 +99,6 @@ def test_a_sharp_picture_stays_sharp(simulator: CameraSimulator) -> None:
     generator = torch.Generator().manual_seed(0)
     data = 0.2 + 0.04 * torch.randn(4, 64, 64, generator=generator)
     raw = RawImage(data, CameraSettings(100, 1 / 64, 11), get_camera("nikon_z6"))
-    latent = simulator.prepare(raw, depth="unknown")
-    diameter = simulator.estimate_defocus(latent)
+    prepared = simulator.prepare(raw, depth="unknown")
+    diameter = simulator.estimate_defocus(prepared)
     assert float(added_blur(diameter, 11.0, 4.0).median()) == 0.0

@@ -33,10 +33,10 @@ from tests.strategies import (
     USUAL_SETTINGS,
     Mosaic,
     cameras,
-    latent,
     lights,
     log_uniform,
     mosaics,
+    prepared,
     settings_within,
 )
 
@@ -70,7 +70,7 @@ def test_more_light_never_lowers_the_raw(
 ) -> None:
     second = torch.from_numpy(np.resize(second.numpy(), first.shape))
     darker, brighter = (
-        latent(f(first, second), reference, camera).expose([settings])
+        prepared(f(first, second), reference, camera).expose([settings])
         for f in (torch.minimum, torch.maximum)
     )
     assert bool((darker <= brighter).all())
@@ -93,7 +93,7 @@ def test_more_exposure_never_lowers_the_raw(
         max(a.iso, b.iso), max(a.exposure_time, b.exposure_time), min(a.f_number, b.f_number)
     )
     assume(exposure_ratio(less, more) >= 1.0)
-    darker, brighter = latent(light, reference, camera).expose([less, more])
+    darker, brighter = prepared(light, reference, camera).expose([less, more])
     assert bool((darker <= brighter).all())
 
 
@@ -106,7 +106,7 @@ def test_simulating_the_own_settings_changes_nothing(
     raw = RawImage.from_mosaic(numbers, settings, camera)
     again = CameraSimulator(device="cpu").simulate(raw, settings, seed=seed, noise=noise)
     np.testing.assert_array_equal(again.to_mosaic(), numbers)
-    assert torch.equal(latent(raw.data, settings, camera).expected(settings), raw.data)
+    assert torch.equal(prepared(raw.data, settings, camera).expected(settings), raw.data)
 
 
 @given(SETTINGS)
@@ -166,7 +166,7 @@ def test_a_frame_is_the_same_alone_in_a_sweep_and_in_any_order(
     random: Any,
 ) -> None:
     nlf = camera.nlf(reference.iso) if is_noisy else None
-    source = latent(light, reference, camera, nlf, **fields)
+    source = prepared(light, reference, camera, nlf, **fields)
     sweep = source.expose(states, seed=seed, noise=noise)
     span = torch.tensor(camera.pedestal)[:, None, None]
     assert bool(((sweep >= -span * (1 + 1e-6) - 1e-6) & (sweep <= 1)).all())
@@ -174,7 +174,7 @@ def test_a_frame_is_the_same_alone_in_a_sweep_and_in_any_order(
     permuted = source.expose([states[i] for i in order], seed=seed, noise=noise)
     assert torch.equal(permuted, sweep[order])
     streamed = list(source.stream(states, seed=seed, noise=noise))
-    fresh = latent(light, reference, camera, nlf, **fields)
+    fresh = prepared(light, reference, camera, nlf, **fields)
     for state, frame, in_stream in zip(states, sweep, streamed, strict=True):
         again, excess = fresh.capture(state, seed, noise=noise)
         assert torch.equal(again, frame)
@@ -187,7 +187,7 @@ def test_other_seeds_give_other_frames(
     shape: tuple[int, int], seeds: list[int], noise: Any
 ) -> None:
     state = CameraSettings(6400, 0.01, 4)
-    source = latent(torch.full((4, *shape), 0.3), state, get_camera("nikon_z6"))
+    source = prepared(torch.full((4, *shape), 0.3), state, get_camera("nikon_z6"))
     first, second = (source.expose([state], seed=seed, noise=noise) for seed in seeds)
     assert not torch.equal(first, second)
 
@@ -219,7 +219,7 @@ def test_two_hops_have_the_noise_of_one(
     middle = CameraSettings(100 * gain, first / gain, 4)
     last = CameraSettings(100 * gain * more, first * second / (gain * more), 4)
     simulator = CameraSimulator(device="cpu")
-    clean = latent(torch.full((4, 64, 64), level), start, camera, box_factor=box_factor)
+    clean = prepared(torch.full((4, 64, 64), level), start, camera, box_factor=box_factor)
     source = simulator.simulate(clean, start, seed=seed)
     one = simulator.simulate(source, last, seed=seed + 1)
     two = simulator.simulate(simulator.simulate(source, middle, seed=seed + 2), last, seed=seed + 3)
@@ -297,7 +297,7 @@ def test_tolerance_0_leaves_out_only_what_changes_no_pixel(
     """Against every step run one by one; the numbers of a plan are finite at any tolerance."""
     nlf = camera.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
     fields = {"image_speed": image_speed, "defocus": defocus}
-    source = latent(light, reference, camera, nlf, **fields, tolerance=0.0)
+    source = prepared(light, reference, camera, nlf, **fields, tolerance=0.0)
     for tolerance in (0.0, 0.1):
         plan = replace(source, tolerance=tolerance).plan(settings)
         assert math.isfinite(plan.predicted_error)

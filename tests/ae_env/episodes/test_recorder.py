@@ -18,7 +18,7 @@ from ae_env.episodes import core as core_module
 from ae_env.episodes import recorder as recorder_module
 from ae_env.observation import encode_observation
 from ae_env.options import EnvOptions
-from ae_env.scorers.score_table import scene_latent
+from ae_env.scorers.score_table import prepare_scene
 from simulator import get_camera
 from simulator.capture.record import exposed_light
 from simulator.noise.generator import FrameNoise, noise_keys
@@ -50,7 +50,7 @@ def _assert_equal(first: list[np.ndarray], second: list[np.ndarray]) -> None:
 @pytest.mark.parametrize("tolerance", [0.0, 0.1])
 @pytest.mark.parametrize("lighting", ["static", "sine"])
 def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lighting: str) -> None:
-    """Light of `Latent`, noise from the bank or drawn, step by step in float64."""
+    """Light of `PreparedScene`, noise from the bank or drawn, step by step in float64."""
     envs = _vector(noise=noise, tolerance=tolerance, lighting=lighting, observation="dn")
     core = envs.core
     span = np.array(core.camera.span)[:, None, None]
@@ -63,16 +63,18 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
         for i in range(5):
             episode, raw = core.episode(i), observation["raw"][i]
             state = core.grid[episode.state]
-            latent = scene_latent(
+            prepared = prepare_scene(
                 core.scenes[episode.scene],
                 core.camera,
                 speed=episode.speed,
                 defocus=episode.defocus,
                 gain=core.lighting.gain(episode.frame, state.exposure_time, episode.phase),
             )
-            latent = replace(latent, tolerance=tolerance)
-            exposure = latent.exposure(state)
-            light = exposed_light(latent.optics.blurred(exposure), exposure).double().numpy()
+            prepared = replace(prepared, tolerance=tolerance)
+            exposure = prepared.exposure(state)
+            light = (
+                exposed_light(prepared.blurred_light.blurred(exposure), exposure).double().numpy()
+            )
             key = int(noise_keys(episode.noise_seed, episode.frame)[0])
             kind = "exact" if noise == "exact" else "bank"
             normals = FrameNoise(key, kind).normals((4, 40, 40))

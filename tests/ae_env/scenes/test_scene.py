@@ -159,13 +159,13 @@ def test_a_scene_can_be_photographed_by_the_simulator() -> None:
     nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
     fields = {"denoised": torch.full((4, 8, 8), 0.2), "defocus_map": torch.ones(8, 8)}
     scene = array_scene(torch.full((4, 8, 8), 0.1), nlf=nlf, box_factor=3, **fields)
-    latent = CameraSimulator(device="cpu").prepare(scene)
-    assert (latent.camera, latent.nlf, latent.box_factor) == (PLAIN, nlf, 3)
-    assert latent.denoised is not None
-    assert latent.denoised.light is scene.denoised
-    assert latent.opening is not None
-    assert latent.opening.f_number == 4.0
-    assert array_scene(torch.ones(4, 8, 8)).latent.opening is None
+    prepared = CameraSimulator(device="cpu").prepare(scene)
+    assert (prepared.camera, prepared.nlf, prepared.box_factor) == (PLAIN, nlf, 3)
+    assert prepared.denoised is not None
+    assert prepared.denoised.light is scene.denoised
+    assert prepared.aperture_blur is not None
+    assert prepared.aperture_blur.f_number == 4.0
+    assert array_scene(torch.ones(4, 8, 8)).prepared.aperture_blur is None
 
 
 def test_noise_free() -> None:

@@ -20,10 +20,10 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.fused import FusedScores
 from ae_env.scorers.protocol import Captures
-from ae_env.scorers.score_table import ScoreTables, scene_latent
+from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from ae_env.scorers.terms import Highlights
 from simulator import get_camera
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 
 CAMERA = get_camera("nikon_z6")
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
@@ -75,10 +75,10 @@ def test_average_over_noise_is_the_noise_free_signal() -> None:
     scene = replace(_scene(), light=torch.full((4, 40, 40), 0.2))
     grid = ExposureGrid((100, 200), (1 / 500,), (4, 5.6))
     table = _tables(MeanSignal(), grid=grid, noise_seeds=64).table(scene)
-    latent = scene_latent(scene, CAMERA)
+    prepared = prepare_scene(scene, CAMERA)
     for state, mean, error in zip(grid, table.mean, table.standard_error, strict=True):
         light = 0.2 * 2.0 ** (state.log2_exposure - scene.reference.log2_exposure)
-        assert float(latent.expected(state).mean()) == pytest.approx(light, rel=1e-6)
+        assert float(prepared.expected(state).mean()) == pytest.approx(light, rel=1e-6)
         assert abs(mean - light) < 5 * error + 1 / 15_520  # quantised to digital numbers
 
 
@@ -361,13 +361,13 @@ def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     seen = set()
-    expose = Latent.expose
+    expose = PreparedScene.expose
 
-    def exposed(latent: Latent, *args: Any, **kwargs: Any) -> torch.Tensor:
-        seen.add(latent.tolerance)
-        return expose(latent, *args, **kwargs)
+    def exposed(prepared: PreparedScene, *args: Any, **kwargs: Any) -> torch.Tensor:
+        seen.add(prepared.tolerance)
+        return expose(prepared, *args, **kwargs)
 
-    monkeypatch.setattr(Latent, "expose", exposed)
+    monkeypatch.setattr(PreparedScene, "expose", exposed)
     _tables(MeanSignal(), tolerance=0.025).table(_scene(), speed=0.2)
     assert seen == {0.025}
     with pytest.raises(ValueError, match="`tolerance`"):

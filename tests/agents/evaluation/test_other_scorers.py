@@ -50,7 +50,7 @@ def test_scorers_of_images_see_noisy_captures(run):
     plan, _ = run
     scene, states = plan.scenes[0], list(range(0, 64, 3))
     found = state_scores(make_scorer(MeanSignal()), plan, scene, states)
-    signal = [scene.latent.expected(plan.grid[s]).clamp(0, 1).mean().item() for s in states]
+    signal = [scene.prepared.expected(plan.grid[s]).clamp(0, 1).mean().item() for s in states]
     # Noise clipped at black lifts a dark frame's mean by less than its own deviation.
     np.testing.assert_allclose(found, signal, atol=0.02)
     assert found.max() - found.min() > 0.3

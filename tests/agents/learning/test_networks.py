@@ -122,8 +122,8 @@ def test_foretold_blur_is_that_of_the_scorer() -> None:
     sensors = torch.from_numpy(encode_sensors(speed, defocus, np.zeros((2, 2))))
     foretold = head._blur(sensors.float())
     times = np.array([s.exposure_time for s in grid])
-    openings = np.array([4.0 / s.effective_f_number for s in grid])
+    aperture_blurs = np.array([4.0 / s.effective_f_number for s in grid])
     # Blur of the `sharpness` term in 64 pixels: sqrt((v t)^2 + (4 D / N)^2); marked N here.
-    blur = np.hypot(64.0 * speed[:, None] * times, defocus[:, None] * openings)
+    blur = np.hypot(64.0 * speed[:, None] * times, defocus[:, None] * aperture_blurs)
     np.testing.assert_allclose(foretold[..., 0].numpy() * 4.0, np.log2(blur), atol=0.05)
     np.testing.assert_allclose(foretold[..., 1].numpy() * 2.0, np.log1p(blur**2), atol=0.05)

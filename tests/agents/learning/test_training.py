@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import agents.learning.regression_training
 import pytest
 import torch
 import yaml
 from safetensors.torch import load_file
 
+import agents.learning.regression_training
 from agents.learning.ppo import PPOTraining
 from agents.learning.regression import RegressionTraining
 from agents.learning.training import AgentConfig, is_trained, load_config, train_agent

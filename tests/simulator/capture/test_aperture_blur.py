@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from simulator.capture.aperture_blur import MapOpening, NetworkOpening
+from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.networks.aperture_module import ApertureModule, added_blur
 from simulator.optics.blur import disc_blur
@@ -23,22 +23,22 @@ def light(seed: int = 0) -> Tensor:
     return torch.from_numpy(values)
 
 
-def opening(diameter: float = 2.0 / math.sqrt(3)) -> MapOpening:
+def aperture_blur(diameter: float = 2.0 / math.sqrt(3)) -> MapApertureBlur:
     """At f/4 the default adds exactly 2 px, a disc of the bank, to a picture at f/8."""
     assert 2.0 in DIAMETERS
-    return MapOpening(light(0), Denoised(light(1)), torch.full((24, 24), diameter), 8.0)
+    return MapApertureBlur(light(0), Denoised(light(1)), torch.full((24, 24), diameter), 8.0)
 
 
 def test_extent_is_the_largest_added_blur() -> None:
     diameter = torch.zeros(24, 24)
     diameter[3, 5] = 3.0
-    made = MapOpening(light(), Denoised(light()), diameter, 8.0)
+    made = MapApertureBlur(light(), Denoised(light()), diameter, 8.0)
     assert made.extent(4.0) == pytest.approx(3 * math.sqrt(2**2 - 1))
     assert made.extent(8.0) == made.extent(11.0) == 0.0
 
 
 def test_each_light_is_blurred_by_its_own_bank() -> None:
-    made = opening()
+    made = aperture_blur()
     for denoised in (False, True):
         result = made.opened(4.0, denoised=denoised)
         expected = disc_blur(light(int(denoised)), 2.0)
@@ -46,7 +46,7 @@ def test_each_light_is_blurred_by_its_own_bank() -> None:
 
 
 def test_results_are_kept_by_f_number_and_light() -> None:
-    made = opening()
+    made = aperture_blur()
     first = made.opened(4.0, denoised=False)
     assert made.opened(4.0, denoised=False) is first
     assert not torch.equal(made.opened(4.0, denoised=True), first)
@@ -57,7 +57,7 @@ def test_remaining_is_the_energy_of_the_added_blur() -> None:
     kernel = torch.zeros(9, 9)
     kernel[4, 4] = 1.0
     energy = float(disc_blur(kernel, 2.0).square().sum())
-    remaining = opening().remaining(4.0)
+    remaining = aperture_blur().remaining(4.0)
     assert remaining.shape == (24, 24)
     torch.testing.assert_close(remaining, torch.full((24, 24), energy), rtol=1e-5, atol=0)
 
@@ -65,13 +65,13 @@ def test_remaining_is_the_energy_of_the_added_blur() -> None:
 def test_a_lamp_of_any_brightness_stays_finite() -> None:
     bright = light()
     bright[:, 12, 12] = 1e30
-    made = MapOpening(bright, Denoised(bright), torch.full((24, 24), 3.0), 8.0)
+    made = MapApertureBlur(bright, Denoised(bright), torch.full((24, 24), 3.0), 8.0)
     result = made.opened(4.0, denoised=False)
     assert bool(result.isfinite().all())
     # A disc's 6 px away nothing of the lamp arrives, and nothing of the shadows is lost.
     torch.testing.assert_close(
         result[:, 3, 3],
-        MapOpening(light(), Denoised(light()), torch.full((24, 24), 3.0), 8.0).opened(
+        MapApertureBlur(light(), Denoised(light()), torch.full((24, 24), 3.0), 8.0).opened(
             4.0, denoised=False
         )[:, 3, 3],
     )
@@ -81,7 +81,7 @@ def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> No
     torch.manual_seed(0)
     module = ApertureModule("paper").eval().requires_grad_(False)
     module.network.tail.weight.mul_(10)
-    made = NetworkOpening(Denoised(light()), module, 8.0)
+    made = NetworkApertureBlur(Denoised(light()), module, 8.0)
     assert made.needs_denoised
     assert made.extent(4.0) == math.inf
     assert made.extent(8.0) == made.extent(11.0) == 0.0
@@ -112,7 +112,7 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
     monkeypatch.setattr(
         "simulator.capture.aperture_blur.make_tiles", functools.partial(make_tiles, tile=tile)
     )
-    made = MapOpening(image, Denoised(image), diameter, 8.0)
+    made = MapApertureBlur(image, Denoised(image), diameter, 8.0)
     for f_number in (5.6, 2.8):
         result = made.opened(f_number, denoised=True)
         torch.testing.assert_close(result, whole(image, diameter, f_number), rtol=0, atol=3e-6)
@@ -131,11 +131,11 @@ def test_only_what_is_out_of_focus_is_blurred(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("simulator.capture.aperture_blur.DiscBank", Spy)
     image, diameter = torch.rand(4, 300, 400), torch.zeros(300, 400)
     assert torch.equal(
-        MapOpening(image, Denoised(image), diameter, 8.0).opened(4.0, denoised=True), image
+        MapApertureBlur(image, Denoised(image), diameter, 8.0).opened(4.0, denoised=True), image
     )
     assert not pixels
     diameter[-32:, -32:] = 5.0
-    MapOpening(image, Denoised(image), diameter, 8.0).opened(4.0, denoised=True)
+    MapApertureBlur(image, Denoised(image), diameter, 8.0).opened(4.0, denoised=True)
     assert (32 + HALO) ** 2 <= sum(pixels) <= (48 + HALO) ** 2  # in cells of 16 pixels
 
 
@@ -146,7 +146,7 @@ def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
         calls.append(1)
         return torch.full((24, 24), 2.0)
 
-    made = MapOpening(light(), Denoised(light()), estimate, 8.0)
+    made = MapApertureBlur(light(), Denoised(light()), estimate, 8.0)
     assert made.extent(8.0) == made.extent(16.0) == 0.0
     assert not calls
     assert made.extent(4.0) == pytest.approx(2 * math.sqrt(3))

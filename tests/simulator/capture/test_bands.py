@@ -16,10 +16,10 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import ScoreTables, scene_latent
+from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from simulator import CameraSettings, get_camera
 from simulator.capture.batch import expose_in_bands
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.generator import noise_keys
 from simulator.optics.lamps import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
@@ -92,8 +92,8 @@ def test_noise_is_that_of_the_banded_signal(source_iso: float | None) -> None:
         normals = torch.randn(light.shape, generator=torch.Generator().manual_seed(0))
         light = light + normals * (shot * 0.3 + read).sqrt()
     rows = np.array([[0.4, 1.0, 1.6]])
-    latent = Latent(light, reference, CAMERA, nlf if source_iso else nlf.zero())
-    frame = expose_in_bands([latent], [target], rows, seed=1)[0].double()
+    prepared = PreparedScene(light, reference, CAMERA, nlf if source_iso else nlf.zero())
+    frame = expose_in_bands([prepared], [target], rows, seed=1)[0].double()
     goal = CAMERA.nlf(800)
     for row, gain in enumerate(rows[0]):
         mean, variance = frame[1, row].mean(), frame[1, row].var()
@@ -121,9 +121,9 @@ def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr("simulator.capture.batch.sweep_keys", lambda *_, keys=keys: keys)
         lamp = MainsLamp(100.0, 0.8, episode.phase)
         rows = lamp.row_light(episode.frame / 30, settings.exposure_time, 40, CAMERA.row_time, 8)
-        latent = scene_latent(scene, CAMERA, gain=float(rows.mean()))
-        latent = replace(latent, tolerance=0.0)
-        wanted = expose_in_bands([latent], [settings], rows[None] / rows.mean(), seed=0)[0]
+        prepared = prepare_scene(scene, CAMERA, gain=float(rows.mean()))
+        prepared = replace(prepared, tolerance=0.0)
+        wanted = expose_in_bands([prepared], [settings], rows[None] / rows.mean(), seed=0)[0]
         wanted = wanted.clamp(-1 / 1024, 1.0).numpy()
         different = observation["raw"] != wanted  # the rounding of the lamp's light
         assert different.mean() < 1e-3

@@ -10,10 +10,10 @@ import torch
 
 from simulator.camera import NoiseLevelFunction
 from simulator.capture import blurred_light as optics_module
-from simulator.capture.aperture_blur import MapOpening
-from simulator.capture.blurred_light import Optics, blur_key
+from simulator.capture.aperture_blur import MapApertureBlur
+from simulator.capture.blurred_light import BlurredLight, blur_key
 from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import LATENT_LIMIT, Exposure
+from simulator.capture.exposure import LIGHT_LIMIT, Exposure
 from simulator.optics.blur import disc_blur, motion_blur
 
 ZERO = NoiseLevelFunction.zero()
@@ -34,7 +34,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
     def disc(light: torch.Tensor, diameter: float) -> torch.Tensor:
         if diameter:
             calls.append(("disc", diameter))
-        return disc_blur(light.clamp(-LATENT_LIMIT, LATENT_LIMIT), diameter)
+        return disc_blur(light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), diameter)
 
     monkeypatch.setattr(optics_module, "motion_blur", streak)
     monkeypatch.setattr(optics_module, "defocused_light", disc)
@@ -42,25 +42,25 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
 
 
 def test_what_needs_no_blur_is_not_copied() -> None:
-    optics = Optics(LIGHT, CLEAN, None)
-    assert optics.blurred(STILL) is LIGHT
-    assert optics.blurred(replace(STILL, denoised=True)) is CLEAN.light
+    blurred_light = BlurredLight(LIGHT, CLEAN, None)
+    assert blurred_light.blurred(STILL) is LIGHT
+    assert blurred_light.blurred(replace(STILL, denoised=True)) is CLEAN.light
 
 
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
     exposure = replace(STILL, defocus_px=2.0, motion_px=3.0, denoised=denoised)
     expected = motion_blur(disc_blur(CLEAN.light if denoised else LIGHT, 2.0), 3.0)
-    assert torch.equal(Optics(LIGHT, CLEAN, None).blurred(exposure), expected)
+    assert torch.equal(BlurredLight(LIGHT, CLEAN, None).blurred(exposure), expected)
 
 
 def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
     """Two apertures, two exposure times, many ISO speeds: two discs and four streaks."""
-    optics = Optics(LIGHT, None, None)
+    blurred_light = BlurredLight(LIGHT, None, None)
     for ratio in (1.0, 2.0, 4.0):
         for disc in (2.0, 1.0):
             for streak in (3.0, 0.0, 6.0):
-                optics.blurred(Exposure(ratio, ZERO, ZERO, streak, disc))
+                blurred_light.blurred(Exposure(ratio, ZERO, ZERO, streak, disc))
     assert sorted(made) == [("disc", 1.0), ("disc", 2.0)] + 2 * [("streak", 3.0)] + 2 * [
         ("streak", 6.0)
     ]
@@ -69,42 +69,44 @@ def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
 def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(
     made: list[tuple[str, float]],
 ) -> None:
-    optics = Optics(LIGHT, None, None, kept_bytes=2 * LIGHT.nbytes)
+    blurred_light = BlurredLight(LIGHT, None, None, kept_bytes=2 * LIGHT.nbytes)
     for disc in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0):
-        found = optics.blurred(replace(STILL, defocus_px=disc))
+        found = blurred_light.blurred(replace(STILL, defocus_px=disc))
         assert torch.equal(found, disc_blur(LIGHT, disc))
     assert [d for _, d in made] == [1.0, 2.0, 3.0, 2.0]
-    none = Optics(LIGHT, None, None, kept_bytes=0)
+    none = BlurredLight(LIGHT, None, None, kept_bytes=0)
     for _ in range(2):
         none.blurred(replace(STILL, defocus_px=7.0))
     assert [d for _, d in made][-2:] == [7.0, 7.0]
 
 
 def test_the_opened_aperture_comes_first() -> None:
-    opening = MapOpening(LIGHT, CLEAN, torch.full((24, 20), 2.0), 8.0)
-    optics = Optics(LIGHT, CLEAN, opening)
+    aperture_blur = MapApertureBlur(LIGHT, CLEAN, torch.full((24, 20), 2.0), 8.0)
+    blurred_light = BlurredLight(LIGHT, CLEAN, aperture_blur)
     exposure = replace(STILL, opened_to=4.0, denoised=True, motion_px=2.0)
-    expected = motion_blur(opening.opened(4.0, denoised=True), 2.0)
-    assert torch.equal(optics.blurred(exposure), expected)
+    expected = motion_blur(aperture_blur.opened(4.0, denoised=True), 2.0)
+    assert torch.equal(blurred_light.blurred(exposure), expected)
     assert not torch.equal(expected, motion_blur(CLEAN.light, 2.0))
 
 
 def test_blur_that_opening_adds() -> None:
     """Squared diameters add: 2 pixels at f/8 take sqrt(16 - 4) more at f/4."""
-    optics = Optics(LIGHT, None, MapOpening(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0))
-    assert optics.added_blur(4.0) == pytest.approx(12**0.5)
-    assert optics.added_blur(8.0) == optics.added_blur(16.0) == 0.0
-    assert Optics(LIGHT, None, None).added_blur(1.4) == 0.0
+    blurred_light = BlurredLight(
+        LIGHT, None, MapApertureBlur(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
+    )
+    assert blurred_light.added_blur(4.0) == pytest.approx(12**0.5)
+    assert blurred_light.added_blur(8.0) == blurred_light.added_blur(16.0) == 0.0
+    assert BlurredLight(LIGHT, None, None).added_blur(1.4) == 0.0
 
 
 def test_noise_that_opening_leaves() -> None:
-    opening = MapOpening(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
-    optics = Optics(LIGHT, None, opening)
-    alone = opening.remaining(4.0)
-    assert torch.equal(optics.remaining(4.0, 1.0), alone)
-    torch.testing.assert_close(optics.remaining(4.0, 0.5), (2 * alone).clamp(max=1.0))
-    assert optics.remaining(4.0, 0.5) is optics.remaining(4.0, 0.5)
-    assert Optics(LIGHT, None, None).remaining(4.0, 1.0) is None
+    aperture_blur = MapApertureBlur(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
+    blurred_light = BlurredLight(LIGHT, None, aperture_blur)
+    alone = aperture_blur.remaining(4.0)
+    assert torch.equal(blurred_light.remaining(4.0, 1.0), alone)
+    torch.testing.assert_close(blurred_light.remaining(4.0, 0.5), (2 * alone).clamp(max=1.0))
+    assert blurred_light.remaining(4.0, 0.5) is blurred_light.remaining(4.0, 0.5)
+    assert BlurredLight(LIGHT, None, None).remaining(4.0, 1.0) is None
 
 
 def test_keys_tell_blurs_apart_and_nothing_else() -> None:
@@ -115,16 +117,16 @@ def test_keys_tell_blurs_apart_and_nothing_else() -> None:
 
 
 def test_only_the_very_same_light_is_its_own() -> None:
-    optics = Optics(LIGHT, CLEAN, None)
-    assert optics.is_of(LIGHT, CLEAN, None)
-    assert not optics.is_of(LIGHT.clone(), CLEAN, None)
-    assert not optics.is_of(LIGHT, None, None)
+    blurred_light = BlurredLight(LIGHT, CLEAN, None)
+    assert blurred_light.is_of(LIGHT, CLEAN, None)
+    assert not blurred_light.is_of(LIGHT.clone(), CLEAN, None)
+    assert not blurred_light.is_of(LIGHT, None, None)
 
 
 def test_a_copy_in_another_process_keeps_nothing(made: list[tuple[str, float]]) -> None:
-    optics = Optics(LIGHT, None, None)
+    blurred_light = BlurredLight(LIGHT, None, None)
     exposure = replace(STILL, defocus_px=2.0)
-    first = optics.blurred(exposure)
-    copy = pickle.loads(pickle.dumps(optics))
+    first = blurred_light.blurred(exposure)
+    copy = pickle.loads(pickle.dumps(blurred_light))
     assert torch.equal(copy.blurred(exposure), first)
     assert len(made) == 2

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from simulator import CameraSettings, Latent, NoiseLevelFunction, get_camera
-from simulator.capture.aperture_blur import MapOpening
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
+from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.capture.plan import BIAS, GAMMA
 
@@ -29,13 +29,14 @@ STEPS = {
 }
 
 
-def latent(*, networks: bool = True, **changes: object) -> Latent:
+def prepared(*, networks: bool = True, **changes: object) -> PreparedScene:
     light = torch.rand(4, 16, 20, generator=torch.Generator().manual_seed(0)) * 0.3
-    made = Latent(light, SOURCE, Z6, Z6.nlf(1600))
+    made = PreparedScene(light, SOURCE, Z6, Z6.nlf(1600))
     if networks:
         made = replace(made, denoised=Denoised(light))
         made = replace(
-            made, opening=MapOpening(light, made.denoised, torch.full((16, 20), 2.0), 8.0)
+            made,
+            aperture_blur=MapApertureBlur(light, made.denoised, torch.full((16, 20), 2.0), 8.0),
         )
     return replace(made, **changes)  # type: ignore[arg-type]
 
@@ -43,7 +44,7 @@ def latent(*, networks: bool = True, **changes: object) -> Latent:
 @pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
 @pytest.mark.parametrize("networks", [True, False])
 def test_every_step_runs_or_has_a_reason(settings: CameraSettings, networks: bool) -> None:
-    plan = latent(networks=networks).plan(settings)
+    plan = prepared(networks=networks).plan(settings)
     assert set(plan.modules) | set(plan.left_out) == STEPS
     assert not set(plan.modules) & set(plan.left_out)
     assert all(plan.left_out.values())
@@ -51,10 +52,10 @@ def test_every_step_runs_or_has_a_reason(settings: CameraSettings, networks: boo
 
 def test_the_networks_run_where_they_are_needed() -> None:
     """In the order of the pipeline."""
-    cleaner, opener = latent().plan(CLEANER), latent().plan(OPENER)
+    cleaner, opener = prepared().plan(CLEANER), prepared().plan(OPENER)
     assert cleaner.modules == ("exposure", "noise_reduction", "noise", "clip_and_quantise")
     assert opener.modules == ("exposure", "aperture", "noise", "clip_and_quantise")
-    both = latent().plan(CameraSettings(100, 1 / 16, 4))
+    both = prepared().plan(CameraSettings(100, 1 / 16, 4))
     assert both.modules[:3] == ("exposure", "noise_reduction", "aperture")
 
 
@@ -76,15 +77,15 @@ def test_the_networks_run_where_they_are_needed() -> None:
     ],
 )
 def test_reasons(changes: dict, settings: CameraSettings, step: str, reason: str) -> None:
-    plan = latent(**changes).plan(settings)
+    plan = prepared(**changes).plan(settings)
     assert reason in plan.left_out[step]
     assert f"left out  {step}: {plan.left_out[step]}" in str(plan)
 
 
 def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
-    with_module, without = latent().plan(CLEANER), latent(networks=False).plan(CLEANER)
+    with_module, without = prepared().plan(CLEANER), prepared(networks=False).plan(CLEANER)
     assert (with_module.excess_noise, with_module.predicted_rmse) == (0.0, 0.0)
-    light = latent().light.double()
+    light = prepared().light.double()
     read, shot = (
         [torch.tensor(getattr(Z6.nlf(iso), name)).double()[:, None, None] for iso in (1600, 100)]
         for name in ("read", "shot")
@@ -97,17 +98,17 @@ def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
 def test_blur_of_the_aperture_lowers_the_predicted_excess() -> None:
     """f/8 to f/4 at a fifth of a stop more light: blur removes more noise than that is too much."""
     settings = replace(OPENER, exposure_time=OPENER.exposure_time * 2**0.2)
-    opened = latent(denoised=None).plan(settings)
-    assert latent(networks=False).plan(settings).excess_noise > 0.1
+    opened = prepared(denoised=None).plan(settings)
+    assert prepared(networks=False).plan(settings).excess_noise > 0.1
     assert opened.excess_noise == 0.0
     assert "noise" in opened.modules
 
 
 def test_operations_add_up() -> None:
     """A step more costs more, and a frame of four times the pixels four times as much."""
-    assert latent().plan(OPENER).operations > latent(networks=False).plan(OPENER).operations
-    large = Latent(torch.full((4, 32, 40), 0.1), SOURCE, Z6, Z6.nlf(1600))
-    small = Latent(torch.full((4, 16, 20), 0.1), SOURCE, Z6, Z6.nlf(1600))
+    assert prepared().plan(OPENER).operations > prepared(networks=False).plan(OPENER).operations
+    large = PreparedScene(torch.full((4, 32, 40), 0.1), SOURCE, Z6, Z6.nlf(1600))
+    small = PreparedScene(torch.full((4, 16, 20), 0.1), SOURCE, Z6, Z6.nlf(1600))
     target = CameraSettings(6400, 1 / 256, 8)
     assert large.plan(target).operations == 4 * small.plan(target).operations
 
@@ -118,7 +119,7 @@ def test_operations_add_up() -> None:
 @pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
 @pytest.mark.parametrize("tolerance", [0.0, 0.1, 5.0])
 def test_old_fields_follow_from_the_steps(settings: CameraSettings, tolerance: float) -> None:
-    plan = latent(tolerance=tolerance, image_speed=1e-3).plan(settings)
+    plan = prepared(tolerance=tolerance, image_speed=1e-3).plan(settings)
     assert plan.tolerance == tolerance
     assert plan.modules == tuple(s.name for s in plan.steps if s.runs)
     assert plan.left_out == {s.name: s.reason for s in plan.steps if not s.runs}
@@ -132,7 +133,7 @@ def test_old_fields_follow_from_the_steps(settings: CameraSettings, tolerance: f
 
 def test_tolerance_nought_predicts_rounding_alone() -> None:
     for settings in (SOURCE, CLEANER, OPENER):
-        plan = latent(tolerance=0.0, image_speed=1e-3, defocus=0.1).plan(settings)
+        plan = prepared(tolerance=0.0, image_speed=1e-3, defocus=0.1).plan(settings)
         assert {"noise_reduction", "defocus", "motion_blur"} <= set(plan.modules)
         assert plan.predicted_error == 0.0
         assert plan.predicted_difference < 1e-3
@@ -143,7 +144,9 @@ def test_each_decision_says_what_it_costs() -> None:
     camera = replace(Z6, nlf_by_iso={100.0: NoiseLevelFunction((0.0,) * 4, (16e-6,) * 4)})
     nlf = NoiseLevelFunction((0.0,) * 4, (25e-6,) * 4)
     light, settings = torch.full((4, 8, 8), 0.2), CameraSettings(100, 1, 8)
-    made = Latent(light, settings, replace(camera, segments=()), nlf, denoised=Denoised(light))
+    made = PreparedScene(
+        light, settings, replace(camera, segments=()), nlf, denoised=Denoised(light)
+    )
     strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.2, 0.3))
     assert "noise_reduction" in strict.modules
     assert "leaving it out would err by 0.25" in strict.steps[1].reason
@@ -160,7 +163,7 @@ def test_each_decision_says_what_it_costs() -> None:
 
 
 def test_blur_that_hardly_shows_is_left_out_with_its_error() -> None:
-    made = latent(opening=None, denoised=None, nlf=NoiseLevelFunction.zero())
+    made = prepared(aperture_blur=None, denoised=None, nlf=NoiseLevelFunction.zero())
     moving = replace(made, image_speed=0.02, tolerance=1.0).plan(SOURCE)
     error = moving.steps[4].error
     assert 0.0 < error == moving.predicted_error < 1.0
@@ -171,15 +174,15 @@ def test_blur_that_hardly_shows_is_left_out_with_its_error() -> None:
 
 
 def test_the_light_alone_takes_neither_noise_nor_clip() -> None:
-    plan = latent().plan(CLEANER, noise=False)
+    plan = prepared().plan(CLEANER, noise=False)
     assert plan.modules == ("exposure", "noise_reduction")
     for step in ("noise", "clip_and_quantise"):
         assert plan.left_out[step] == "only the light is asked for"
-    assert plan.operations < latent().plan(CLEANER).operations
+    assert plan.operations < prepared().plan(CLEANER).operations
 
 
 def test_the_text_names_every_step() -> None:
-    plan = latent(tolerance=0.0, image_speed=1e-3).plan(OPENER)
+    plan = prepared(tolerance=0.0, image_speed=1e-3).plan(OPENER)
     text = plan.explain()
     assert text == str(plan)
     assert "needed    noise_reduction: tolerance 0" in text
@@ -194,7 +197,7 @@ def test_regions_that_needed_no_network_count_against_the_full_run() -> None:
     light = 0.2 + 0.01 * torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0))
     light[:, :16, :16] = 1.0
     denoised = torch.where(light == 1.0, 1.0, 0.19)
-    made = Latent(light, SOURCE, Z6, Z6.nlf(1600), denoised=Denoised(denoised))
+    made = PreparedScene(light, SOURCE, Z6, Z6.nlf(1600), denoised=Denoised(denoised))
     plan = made.plan(CLEANER)
     assert "noise_reduction" in plan.modules
     assert plan.predicted_error == 0.0

@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from simulator import CameraSettings, Latent, NoiseLevelFunction, get_camera
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.camera import CameraProfile
-from simulator.capture.aperture_blur import MapOpening, NetworkOpening
+from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.networks.aperture_module import ApertureModule
 
@@ -46,9 +46,11 @@ def variance(frame: Tensor) -> np.ndarray:
 TOLERANCE = 4 * math.sqrt(2) / SIDE
 
 
-def latent(level: float = 0.2, reference: CameraSettings = HIGH, **changes: object) -> Latent:
+def prepared(
+    level: float = 0.2, reference: CameraSettings = HIGH, **changes: object
+) -> PreparedScene:
     nlf = Z6.nlf(reference.iso)
-    made = Latent(recorded(level, nlf), reference, Z6, nlf, denoised=Denoised(flat(level)))
+    made = PreparedScene(recorded(level, nlf), reference, Z6, nlf, denoised=Denoised(flat(level)))
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
@@ -58,7 +60,7 @@ def latent(level: float = 0.2, reference: CameraSettings = HIGH, **changes: obje
 def test_denoised_light_is_used_where_the_source_is_noisier() -> None:
     """ISO 6400 to 100 at the same exposure: 64 times the noise. The output has the target's."""
     target = CameraSettings(100, 1.0, 8)
-    source = latent()
+    source = prepared()
     exposure = source.exposure(target)
     assert exposure.denoised
     assert exposure.source.is_zero
@@ -74,7 +76,7 @@ def test_denoised_light_is_used_where_the_source_is_noisier() -> None:
 
 def test_light_as_recorded_is_used_where_noise_is_only_to_be_added() -> None:
     target = CameraSettings(6400, 1 / 64, 8)
-    source = latent(reference=CameraSettings(100, 1.0, 8))
+    source = prepared(reference=CameraSettings(100, 1.0, 8))
     exposure = source.exposure(target)
     assert not exposure.denoised
     frame, excess = source.capture(target, 3)
@@ -86,7 +88,7 @@ def test_light_as_recorded_is_used_where_noise_is_only_to_be_added() -> None:
 
 def test_the_same_settings_give_the_recorded_light_back() -> None:
     """No excess at ratio 1: a network must not touch what is exact already."""
-    source = latent()
+    source = prepared()
     assert not source.exposure(HIGH).denoised
     span, white = 14512, 15520  # its DNs as they were, unless they were clipped
     kept = (source.light * span + 1008).round().clamp(0, white).sub(1008) / span
@@ -106,7 +108,7 @@ def test_light_without_noise_takes_none_of_the_sources(tolerance: float, denoise
     )
     low, high = CameraSettings(100, 1.0, 8), CameraSettings(6400, 1 / 64, 8)
     noisy, clean = flat(0.2) + 1e-3, Denoised(flat(0.2))
-    source = Latent(noisy, low, body, body.nlf(100), denoised=clean, tolerance=tolerance)
+    source = PreparedScene(noisy, low, body, body.nlf(100), denoised=clean, tolerance=tolerance)
     assert not source.exposure(high).denoised or tolerance == 0.0
     assert torch.equal(source.expected(high), clean.light if denoised else noisy)
     plan = source.plan(high, noise=False)
@@ -116,21 +118,21 @@ def test_light_without_noise_takes_none_of_the_sources(tolerance: float, denoise
 
 def test_a_brighter_target_at_the_same_iso_is_denoised() -> None:
     """Exposing by c multiplies shot noise by c^2, the signal and the target's noise by c."""
-    assert latent(0.05).exposure(CameraSettings(6400, 1 / 16, 8)).denoised
-    assert not latent(0.05).exposure(CameraSettings(6400, 1 / 256, 8)).denoised
+    assert prepared(0.05).exposure(CameraSettings(6400, 1 / 16, 8)).denoised
+    assert not prepared(0.05).exposure(CameraSettings(6400, 1 / 256, 8)).denoised
 
 
 def test_a_source_with_next_to_no_noise_keeps_it() -> None:
     """ISO 100 at half of white: sigma is sqrt(7.5e-6 * 0.5) = 0.2 %, 0.4 % of the light."""
-    bright = latent(0.5, LOW).exposure(CameraSettings(100, 1 / 16, 8))
-    dark = latent(0.01, LOW).exposure(CameraSettings(100, 1 / 16, 8))  # 3 % of the light
+    bright = prepared(0.5, LOW).exposure(CameraSettings(100, 1 / 16, 8))
+    dark = prepared(0.01, LOW).exposure(CameraSettings(100, 1 / 16, 8))  # 3 % of the light
     assert (bright.denoised, dark.denoised) == (False, True)
     assert bright.source_noise.shot == pytest.approx([4 * s for s in Z6.nlf(100).shot])
 
 
 def test_without_a_noise_module_the_excess_is_declared() -> None:
     target = CameraSettings(100, 1.0, 8)
-    source = latent(denoised=None)
+    source = prepared(denoised=None)
     assert not source.exposure(target).denoised
     wanted, given = (expected_variance(0.2, Z6.nlf(iso)) for iso in (100, 6400))
     stated = source.plan(target).excess_noise
@@ -139,26 +141,26 @@ def test_without_a_noise_module_the_excess_is_declared() -> None:
 
 
 def test_a_source_without_noise_is_never_denoised() -> None:
-    source = latent(nlf=NoiseLevelFunction.zero())
+    source = prepared(nlf=NoiseLevelFunction.zero())
     assert not source.exposure(CameraSettings(100, 4.0, 8)).denoised
 
 
 def test_the_denoised_light_has_the_shape_of_the_light() -> None:
     with pytest.raises(ValueError, match=r"`denoised` \(shape \(4, 8, 8\)\) must have the shape"):
-        latent(denoised=Denoised(torch.zeros(4, 8, 8)))
+        prepared(denoised=Denoised(torch.zeros(4, 8, 8)))
 
 
 def test_noise_is_compared_with_the_averaged_sensors() -> None:
     """A box-averaged source has the target's noise divided by k^2 as well: nothing to remove."""
     nlf = Z6.nlf(6400).scaled(1 / 16)
-    assert not latent(nlf=nlf, box_factor=4).exposure(HIGH).denoised
-    assert latent(nlf=Z6.nlf(6400), box_factor=4).exposure(HIGH).denoised
+    assert not prepared(nlf=nlf, box_factor=4).exposure(HIGH).denoised
+    assert prepared(nlf=Z6.nlf(6400), box_factor=4).exposure(HIGH).denoised
 
 
 # The wider aperture
 
 
-def with_detail(source: Latent) -> Latent:
+def with_detail(source: PreparedScene) -> PreparedScene:
     """A chequered corner of 8 pixels: a blur of flat light would be left out."""
     board = torch.zeros(SIDE, SIDE)
     board[:8:2, :8:2] = board[1:8:2, 1:8:2] = 0.1
@@ -167,18 +169,20 @@ def with_detail(source: Latent) -> Latent:
     return replace(source, light=source.light + board, denoised=denoised)
 
 
-def with_opening(source: Latent, diameter: float) -> Latent:
+def with_aperture_blur(source: PreparedScene, diameter: float) -> PreparedScene:
     denoised = source.denoised or Denoised(source.light)
     found = torch.full((SIDE, SIDE), diameter)
-    opening = MapOpening(source.light, denoised, found, source.reference.effective_f_number)
-    return replace(source, opening=opening)
+    aperture_blur = MapApertureBlur(
+        source.light, denoised, found, source.reference.effective_f_number
+    )
+    return replace(source, aperture_blur=aperture_blur)
 
 
 @pytest.mark.parametrize("diameter", [0.8, 2.0, 6.0])
 @pytest.mark.parametrize("level", [0.02, 0.2])
 def test_noise_that_the_blur_removed_is_topped_up(diameter: float, level: float) -> None:
     """f/8 to f/4 at the same exposure and ISO: what blur takes of the noise is added again."""
-    source = with_opening(with_detail(latent(level)), diameter)
+    source = with_aperture_blur(with_detail(prepared(level)), diameter)
     target = CameraSettings(6400, 1 / 256, 4)
     exposure = source.exposure(target)
     assert exposure.ratio == 1.0
@@ -195,7 +199,7 @@ def test_noise_that_the_blur_removed_is_topped_up(diameter: float, level: float)
 
 
 def test_the_denoised_light_is_opened_where_the_target_is_cleaner() -> None:
-    source = with_opening(with_detail(latent()), 3.0)
+    source = with_aperture_blur(with_detail(prepared()), 3.0)
     target = CameraSettings(100, 1 / 4, 4)
     exposure = source.exposure(target)
     assert (exposure.denoised, exposure.opened_to, exposure.remaining) == (True, 4.0, None)
@@ -212,14 +216,14 @@ def test_the_denoised_light_is_opened_where_the_target_is_cleaner() -> None:
 @pytest.mark.parametrize("f_number", [8, 11, 16])
 def test_the_same_and_smaller_apertures_leave_every_bit(f_number: float) -> None:
     target = CameraSettings(6400, 1 / 64 * 2 ** ((f_number - 8) / 8), f_number)
-    source, plain = with_opening(latent(), 9.0), latent()
+    source, plain = with_aperture_blur(prepared(), 9.0), prepared()
     assert source.exposure(target).opened_to is None
     assert torch.equal(source.capture(target, 1)[0], plain.capture(target, 1)[0])
 
 
 def test_what_is_in_focus_stays_as_it_is() -> None:
     target = CameraSettings(6400, 1 / 256, 4)
-    source, plain = with_opening(latent(), 0.0), latent()
+    source, plain = with_aperture_blur(prepared(), 0.0), prepared()
     assert source.exposure(target).opened_to is None
     assert torch.equal(source.capture(target, 1)[0], plain.capture(target, 1)[0])
 
@@ -229,8 +233,8 @@ def test_the_papers_network_always_opens_denoised_light() -> None:
     module = ApertureModule("paper").eval().requires_grad_(False)
     light = flat(0.2)[:, :16, :16]
     clean = Denoised(light)
-    small = Latent(light, HIGH, Z6, Z6.nlf(6400), denoised=clean)
-    source = replace(small, opening=NetworkOpening(clean, module, 8.0))
+    small = PreparedScene(light, HIGH, Z6, Z6.nlf(6400), denoised=clean)
+    source = replace(small, aperture_blur=NetworkApertureBlur(clean, module, 8.0))
     exposure = source.exposure(CameraSettings(6400, 1 / 256, 4))
     assert (exposure.denoised, exposure.opened_to, exposure.remaining) == (True, 4.0, None)
     assert source.exposure(HIGH).denoised is False
@@ -239,11 +243,13 @@ def test_the_papers_network_always_opens_denoised_light() -> None:
 # What a tolerance leaves out
 
 
-def patch(source: float, target: float, **changes: object) -> tuple[Latent, CameraSettings]:
+def patch(source: float, target: float, **changes: object) -> tuple[PreparedScene, CameraSettings]:
     """Flat light of 0.2 with noise variance `source`, asked for with variance `target`."""
     camera = replace(Z6, nlf_by_iso={100.0: constant(target)}, segments=())
     settings = CameraSettings(100, 1 / 64, 8)
-    made = Latent(flat(0.2), settings, camera, constant(source), denoised=Denoised(flat(0.2)))
+    made = PreparedScene(
+        flat(0.2), settings, camera, constant(source), denoised=Denoised(flat(0.2))
+    )
     return replace(made, **changes), settings  # type: ignore[arg-type]
 
 
@@ -280,7 +286,7 @@ def test_blur_of_a_wave_by_hand(blur: str, factor: float) -> None:
     camera = replace(Z6, nlf_by_iso={100.0: constant(1e-6)}, segments=())
     settings = CameraSettings(100, 1 / 64, 8)
     scene = {"defocus": 0.8} if blur == "disc" else {"image_speed": 0.4 * 64 / SIDE}
-    made = Latent(wave(16, 0.1), settings, camera, NoiseLevelFunction.zero(), **scene)
+    made = PreparedScene(wave(16, 0.1), settings, camera, NoiseLevelFunction.zero(), **scene)
     exposure = replace(made, tolerance=factor * error).exposure(settings)
     name = "defocus" if blur == "disc" else "motion_blur"
     assert exposure.errors[name] == pytest.approx(error, rel=1e-4)
@@ -298,9 +304,11 @@ def test_what_is_left_out_stays_within_the_tolerance(tolerance: float) -> None:
     seen = set()
     for iso, speed, disc in itertools.product((100, 1600), (0.0, 1e-3, 0.1), (0.0, 0.01, 1.0)):
         reference = CameraSettings(iso, 1 / 64, 8)
-        made = Latent(clean, reference, Z6, Z6.nlf(iso), denoised=denoised, tolerance=tolerance)
+        made = PreparedScene(
+            clean, reference, Z6, Z6.nlf(iso), denoised=denoised, tolerance=tolerance
+        )
         made = replace(made, image_speed=speed, defocus=disc)
-        made = replace(made, opening=MapOpening(clean, denoised, found, 8.0))
+        made = replace(made, aperture_blur=MapApertureBlur(clean, denoised, found, 8.0))
         for settings in itertools.starmap(
             CameraSettings, itertools.product((100, 800, 6400), (1 / 500, 1 / 64, 1 / 4), (4, 8))
         ):
@@ -321,10 +329,10 @@ def test_what_is_left_out_stays_within_the_tolerance(tolerance: float) -> None:
 
 
 def test_copies_share_what_is_known_of_the_light() -> None:
-    source = latent()
+    source = prepared()
     other = replace(source, gain=2.0, tolerance=0.0, image_speed=1.0)
     assert other.statistics is source.statistics
-    assert other.optics is source.optics
+    assert other.blurred_light is source.blurred_light
     assert source.statistics.light is source.light
     assert source.statistics_of(False) is source.statistics
     assert other.statistics_of(True) is source.statistics_of(True)
@@ -332,13 +340,13 @@ def test_copies_share_what_is_known_of_the_light() -> None:
     brighter = replace(source, light=source.light * 2, denoised=None)
     assert brighter.statistics is not source.statistics
     assert brighter.statistics.light is brighter.light
-    assert brighter.optics is not source.optics
+    assert brighter.blurred_light is not source.blurred_light
 
 
 @pytest.mark.parametrize("tolerance", [-0.1, float("nan"), None])
 def test_bad_tolerances(tolerance: float) -> None:
     with pytest.raises(ValueError, match="`tolerance`"):
-        latent(tolerance=tolerance)
+        prepared(tolerance=tolerance)
 
 
 # Sweeps
@@ -353,7 +361,7 @@ STATES = [
 @pytest.mark.parametrize("noise", ["exact", "bank"])
 @pytest.mark.parametrize("scene", [{}, {"image_speed": 0.2, "defocus": 2.0}])
 def test_frames_are_the_same_alone_and_in_any_sweep(noise: str, scene: dict) -> None:
-    source = with_opening(with_detail(latent(**scene)), 2.0)
+    source = with_aperture_blur(with_detail(prepared(**scene)), 2.0)
     sweep = source.expose(STATES, seed=4, noise=noise)  # type: ignore[arg-type]
     backwards = source.expose(STATES[::-1], seed=4, noise=noise)  # type: ignore[arg-type]
     assert torch.equal(sweep.flip(0), backwards)
@@ -369,7 +377,7 @@ def test_frames_are_the_same_alone_and_in_any_sweep(noise: str, scene: dict) -> 
 
 
 def test_noise_from_the_bank_has_the_right_variance() -> None:
-    source = latent(nlf=NoiseLevelFunction.zero(), light=flat(0.2), denoised=None)
+    source = prepared(nlf=NoiseLevelFunction.zero(), light=flat(0.2), denoised=None)
     frame, _ = source.capture(HIGH, 1, noise="bank")
     np.testing.assert_allclose(
         variance(frame), expected_variance(0.2, Z6.nlf(6400)), rtol=TOLERANCE
@@ -379,19 +387,19 @@ def test_noise_from_the_bank_has_the_right_variance() -> None:
 
 def test_unknown_noise() -> None:
     with pytest.raises(ValueError, match=r"`noise` \(='none'\) must be one of \['exact', 'bank'\]"):
-        latent().capture(HIGH, noise="none")  # type: ignore[arg-type]
+        prepared().capture(HIGH, noise="none")  # type: ignore[arg-type]
 
 
 def test_no_states_no_frames() -> None:
-    assert latent().expose([]).shape == (0, 4, SIDE, SIDE)
+    assert prepared().expose([]).shape == (0, 4, SIDE, SIDE)
 
 
 def test_frames_are_written_where_they_are_wanted() -> None:
     states = [CameraSettings(100, 1 / 64, 4.0), CameraSettings(800, 1 / 8, 4.0)]
     place = torch.full((3, 4, SIDE, SIDE), -7.0)
-    frames = latent().expose(states, seed=3, out=place[1:])
+    frames = prepared().expose(states, seed=3, out=place[1:])
     assert frames.data_ptr() == place[1:].data_ptr()
-    assert torch.equal(frames, latent().expose(states, seed=3))
+    assert torch.equal(frames, prepared().expose(states, seed=3))
     assert bool((place[0] == -7.0).all())
 
 
@@ -406,11 +414,11 @@ def test_frames_are_written_where_they_are_wanted() -> None:
 def test_frames_do_not_fit_everywhere(out: torch.Tensor) -> None:
     states = [CameraSettings(100, 1 / 64, 4.0)] * 2
     with pytest.raises(ValueError, match=r"`out` .*must be contiguous float32 \(2, 4"):
-        latent().expose(states, out=out)
+        prepared().expose(states, out=out)
 
 
 def test_only_settings_are_exposed_and_never_into_the_light() -> None:
-    own = latent()
+    own = prepared()
     with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
         own.expose([HIGH, 3])  # type: ignore[list-item]
     with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):

@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
 from simulator.capture.exposure import Exposure
-from simulator.capture.prepared_scene import Latent
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.record import add_noise, clip_and_quantise, sensor_light
 from simulator.noise.generator import FrameNoise
 from simulator.settings import CameraSettings
@@ -120,8 +120,8 @@ def test_noise_free_source_over_all_states() -> None:
     for state in STATES:
         ratio = exposure_of(state) / exposure_of(reference)
         light = patches(levels / ratio)
-        latent = Latent(light, reference, Z6, NoiseLevelFunction.zero())
-        capture, excess = latent.capture(state, seed=1)
+        prepared = PreparedScene(light, reference, Z6, NoiseLevelFunction.zero())
+        capture, excess = prepared.capture(state, seed=1)
         assert excess == 0.0
         samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
         shot, read = table(state.iso)
@@ -144,9 +144,9 @@ def test_one_light_over_all_states_from_black_to_white() -> None:
     reference = CameraSettings(100, 1 / 15, 5.6)
     levels = 2.0 ** np.arange(-12, 5, 2)
     light = patches(levels)
-    latent = Latent(light, reference, Z6, NoiseLevelFunction.zero())
+    prepared = PreparedScene(light, reference, Z6, NoiseLevelFunction.zero())
     samples, expected, white = [], [], 0
-    for state, capture in zip(STATES, latent.stream(STATES, seed=2), strict=True):
+    for state, capture in zip(STATES, prepared.stream(STATES, seed=2), strict=True):
         ratio = exposure_of(state) / exposure_of(reference)
         shot, read = table(state.iso)
         samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
@@ -183,8 +183,8 @@ def test_noisy_source_over_all_states() -> None:
     for state in STATES:
         ratio = exposure_of(state) / exposure_of(reference)
         light, source = noisy_patches(levels / ratio, 400, generator)
-        latent = Latent(light, reference, Z6, source)
-        capture, declared = latent.capture(state, seed=3)
+        prepared = PreparedScene(light, reference, Z6, source)
+        capture, declared = prepared.capture(state, seed=3)
         numbers = numbers_of(capture, 2)
         shot1, read1 = table(400)
         shot2, read2 = table(state.iso)
@@ -211,7 +211,7 @@ def test_noisy_source_over_all_states() -> None:
         mean = relative @ density
         error = np.sqrt(np.maximum(relative**2 @ density - mean**2, 0.0).mean() / light.numel())
         assert declared == pytest.approx(mean.mean(), abs=5 * error + 1e-6 * mean.mean() + 1e-9)
-        assert latent.plan(state).excess_noise == pytest.approx(declared, rel=1e-4, abs=1e-9)
+        assert prepared.plan(state).excess_noise == pytest.approx(declared, rel=1e-4, abs=1e-9)
     assert len(clean[0]) >= 64  # an eighth of the 512 cells at least, of either kind
     assert len(noisier[0]) >= 64
     assert_moments(np.array(clean[0]), clean[1])
@@ -249,7 +249,9 @@ def test_clipped_gaussian_near_both_ends(end: str, offset: float) -> None:
         sigma = math.sqrt(4e-4 + 1e-4 * mean)
     settings = CameraSettings(100, 1, 4)
     light = torch.full((4, 128, 128), mean)
-    capture, _ = Latent(light, settings, camera, NoiseLevelFunction.zero()).capture(settings, 5)
+    capture, _ = PreparedScene(light, settings, camera, NoiseLevelFunction.zero()).capture(
+        settings, 5
+    )
     samples = capture.double().numpy().ravel()
     assert samples.min() >= -pedestal - 1e-6
     assert samples.max() <= 1.0
@@ -330,13 +332,13 @@ def test_blur_averages_the_noise_of_the_source() -> None:
     light = torch.from_numpy(generator.normal(0.3, 1e-2, (4, 96, 96)).astype(np.float32))
     settings = CameraSettings(100, 1.0, 4.0)
     camera = replace(Z6, nlf_by_iso={100.0: noise}, segments=())
-    latent = Latent(light, settings, camera, noise, image_speed=4 / 96, defocus=3.0)
-    blurred = latent.expected(settings)
-    left = latent.exposure(settings).source_noise.read[0]
+    prepared = PreparedScene(light, settings, camera, noise, image_speed=4 / 96, defocus=3.0)
+    blurred = prepared.expected(settings)
+    left = prepared.exposure(settings).source_noise.read[0]
     # neighbours are correlated over about 4 * 3 pixels: that many fewer independent samples
     count = blurred.numel() / 12
     assert float(blurred.double().var()) == pytest.approx(left, rel=5 * math.sqrt(2 / count))
-    capture, excess = latent.capture(settings, 1)
+    capture, excess = prepared.capture(settings, 1)
     assert excess == 0.0
     count = capture.numel() / 12
     expected = 1e-4 + 1 / 12 / SPAN**2
@@ -347,12 +349,14 @@ def test_blur_averages_the_noise_of_the_source() -> None:
 def test_a_capture_is_the_same_alone_and_in_a_batch(noisy_source: bool) -> None:
     source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
     generator = torch.Generator().manual_seed(0)
-    latents = [torch.rand(4, 17, 23, generator=generator) for _ in range(5)]
+    prepared_scenes = [torch.rand(4, 17, 23, generator=generator) for _ in range(5)]
     exposures = [
         Exposure(2.0 ** (i - 2), source if i % 2 else NoiseLevelFunction.zero(), Z6.nlf(100 * 4**i))
         for i in range(4)
     ] + [Exposure(1.0, source, Z6.nlf(100), motion_px=2.5, defocus_px=1.5)]
-    light = torch.stack([sensor_light(x, e) for x, e in zip(latents, exposures, strict=True)])
+    light = torch.stack(
+        [sensor_light(x, e) for x, e in zip(prepared_scenes, exposures, strict=True)]
+    )
     together, excess = add_noise(light.clone(), exposures, [FrameNoise(i) for i in range(5)])
     frames = clip_and_quantise(together, Z6)
     for i, exposure in enumerate(exposures):
@@ -361,7 +365,7 @@ def test_a_capture_is_the_same_alone_and_in_a_batch(noisy_source: bool) -> None:
         assert one[0] == excess[i]
 
 
-def test_the_latent_is_left_alone() -> None:
+def test_the_prepared_scene_is_left_alone() -> None:
     light = torch.rand(4, 8, 8, generator=torch.Generator().manual_seed(0))
     before = light.clone()
     for motion, defocus in ((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)):

@@ -60,10 +60,10 @@ def test_tolerance_nought_equals_the_full_run(
     compact: CameraSimulator, scene: dict, noise: bool
 ) -> None:
     source = raw(noise)
-    latent = compact.prepare(source, tolerance=0, **scene)
+    prepared = compact.prepare(source, tolerance=0, **scene)
     for target in TARGETS:
         stages = compact.stages(source, target, seed=3, **{"depth": "far", **scene})
-        expected = latent.expected(target)
+        expected = prepared.expected(target)
         scale = float(stages.light.abs().max())
         torch.testing.assert_close(expected, stages.light, rtol=0, atol=3e-6 * scale)
         full = compact.simulate(source, target, seed=3, tolerance=None, **scene)
@@ -88,9 +88,9 @@ def test_every_module_runs_for_every_transition(
         monkeypatch.setattr(
             module, "forward", lambda *a, _n=name, _f=forward: calls.append(_n) or _f(*a)
         )
-    latent = compact.prepare(raw(), depth="unknown")
+    prepared = compact.prepare(raw(), depth="unknown")
     calls.clear()
-    for source, scene in ((raw(), {"depth": "unknown"}), (latent, {})):
+    for source, scene in ((raw(), {"depth": "unknown"}), (prepared, {})):
         compact.simulate(source, CameraSettings(6400, 1 / 64, 8), tolerance=None, **scene)
     assert calls == ["noise", "aperture", "noise", "aperture"]
     calls.clear()
@@ -98,14 +98,14 @@ def test_every_module_runs_for_every_transition(
     assert calls == ["noise"]
 
 
-def test_raws_latents_and_scenes_run_alike(compact: CameraSimulator) -> None:
+def test_raws_prepared_scenes_and_scenes_run_alike(compact: CameraSimulator) -> None:
     source, target = raw(), TARGETS[3]
-    latent = compact.prepare(source, image_speed=0.5, defocus=2.0)
-    scene = SimpleNamespace(latent=replace(latent, denoised=None))
+    prepared = compact.prepare(source, image_speed=0.5, defocus=2.0)
+    scene = SimpleNamespace(prepared=replace(prepared, denoised=None))
     given = {"image_speed": 0.5, "defocus": 2.0}
     frames = [
         compact.simulate(source, target, tolerance=None, **given).data,
-        compact.simulate(latent, target, tolerance=None).data,
+        compact.simulate(prepared, target, tolerance=None).data,
         compact.simulate(scene, target, tolerance=None).data,
     ]
     assert torch.equal(frames[0], frames[1])
@@ -124,10 +124,10 @@ def test_known_motion_and_disc_follow_the_networks(compact: CameraSimulator) -> 
 
 
 def test_gain_is_part_of_the_exposure(compact: CameraSimulator) -> None:
-    latent = replace(compact.prepare(raw()), gain=3.0)
-    assert torch.equal(compact.stages(latent, SOURCE).exposed, latent.light * 3.0)
-    prepared = compact.prepare(latent, tolerance=0)
-    stages = compact.stages(latent, SOURCE, depth="far")
+    prepared = replace(compact.prepare(raw()), gain=3.0)
+    assert torch.equal(compact.stages(prepared, SOURCE).exposed, prepared.light * 3.0)
+    prepared = compact.prepare(prepared, tolerance=0)
+    stages = compact.stages(prepared, SOURCE, depth="far")
     torch.testing.assert_close(prepared.expected(SOURCE), stages.light, rtol=0, atol=1e-5)
 
 
@@ -150,7 +150,7 @@ def test_what_is_prepared_is_shared(compact: CameraSimulator) -> None:
         compact.simulate(raw(), SOURCE, tolerance=None, depth="near")
 
 
-def test_the_tolerance_of_a_latent_is_kept(compact: CameraSimulator) -> None:
+def test_the_tolerance_of_a_prepared_scene_is_kept(compact: CameraSimulator) -> None:
     strict = compact.prepare(raw(), tolerance=0)
     assert compact.prepare(strict).tolerance == 0.0
     assert compact.prepare(strict, tolerance=0.5).tolerance == 0.5

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import nn
 
-from simulator import CameraSettings, CameraSimulator, Latent, RawImage, get_camera
+from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, get_camera
 from simulator.capture.denoised import Denoised
 from simulator.networks.network_cache import NetworkCache
 
@@ -56,7 +56,7 @@ def _simulator(**options: Any) -> CameraSimulator:
     return CameraSimulator("compact", device="cpu", **options)
 
 
-def _denoised(simulator: CameraSimulator, source: RawImage | Latent) -> torch.Tensor:
+def _denoised(simulator: CameraSimulator, source: RawImage | PreparedScene) -> torch.Tensor:
     found = simulator.prepare(source).denoised
     assert found is not None
     return found.light
@@ -75,10 +75,12 @@ def test_the_same_source_runs_the_networks_once() -> None:
     assert counter.new() > 0
     again = replace(raw, data=raw.data.clone())  # another object of the same content
     second = simulator.simulate(again, TARGET, depth="unknown")
-    latent = simulator.prepare(replace(simulator._latent(raw), image_speed=0.5), depth="unknown")
+    prepared = simulator.prepare(
+        replace(simulator._prepared(raw), image_speed=0.5), depth="unknown"
+    )
     assert counter.new() == 0
     assert torch.equal(first.data, second.data)
-    assert torch.equal(latent.denoised.light, simulator.denoise(latent))  # type: ignore[arg-type]
+    assert torch.equal(prepared.denoised.light, simulator.denoise(prepared))  # type: ignore[arg-type]
 
 
 def test_the_papers_network_runs_once_for_an_f_number(folder: Path) -> None:
@@ -89,10 +91,10 @@ def test_the_papers_network_runs_once_for_an_f_number(folder: Path) -> None:
     opened = []
     for settings in (target, target, CameraSettings(6400, 1 / 1024, 5.6)):
         f_number = settings.effective_f_number
-        opening = simulator.prepare(raw, depth="unknown").opening
-        assert opening is not None
-        opened.append(opening.opened(f_number, denoised=True))
-        opening.opened(f_number, denoised=True)
+        aperture_blur = simulator.prepare(raw, depth="unknown").aperture_blur
+        assert aperture_blur is not None
+        opened.append(aperture_blur.opened(f_number, denoised=True))
+        aperture_blur.opened(f_number, denoised=True)
         assert (counter.new() > 0) == (len(opened) != 2)
     assert torch.equal(opened[0], opened[1])
     assert not torch.equal(opened[0], opened[2])
@@ -113,17 +115,17 @@ def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path) -> None:
     for depth in ("far", "unknown"):
         made = _simulator(cache=None).prepare(raw, depth=depth)  # type: ignore[arg-type]
         keeper = _simulator(cache="disk")
-        latents = [keeper.prepare(raw, depth=depth) for _ in range(2)]  # type: ignore[arg-type]
+        prepared_scenes = [keeper.prepare(raw, depth=depth) for _ in range(2)]  # type: ignore[arg-type]
         later = _simulator(cache="disk")
         counter = Counter(later)
-        latents.append(later.prepare(raw, depth=depth))  # type: ignore[arg-type]
-        lights = [latent.denoised.light for latent in (*latents, made)]  # type: ignore[union-attr]
+        prepared_scenes.append(later.prepare(raw, depth=depth))  # type: ignore[arg-type]
+        lights = [prepared.denoised.light for prepared in (*prepared_scenes, made)]  # type: ignore[union-attr]
         assert counter.new() == 0
-        for latent, light in zip(latents, lights, strict=False):
+        for prepared, light in zip(prepared_scenes, lights, strict=False):
             assert torch.equal(light, lights[-1])
             assert light.stride() == lights[0].stride()
             if depth == "unknown":
-                assert torch.equal(latent.opening.diameter, made.opening.diameter)  # type: ignore[union-attr]
+                assert torch.equal(prepared.aperture_blur.diameter, made.aperture_blur.diameter)  # type: ignore[union-attr]
 
 
 def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
@@ -143,10 +145,10 @@ def test_memory_leaves_nothing_on_disk(folder: Path) -> None:
 
 def test_asking_the_network_itself_runs_it() -> None:
     simulator = _simulator()
-    latent = simulator.prepare(_raw())
+    prepared = simulator.prepare(_raw())
     counter = Counter(simulator)
-    simulator.denoise(latent)
-    simulator.estimate_defocus(latent)
+    simulator.denoise(prepared)
+    simulator.estimate_defocus(prepared)
     simulator.stages(_raw(), TARGET)
     assert counter.runs["noise"] >= 2
     assert counter.runs["aperture"] >= 2
@@ -158,9 +160,9 @@ def test_no_network_no_digest(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr("simulator.networks.network_cache.content_digest", refuse)
     simulator, raw = _simulator(), _raw()
-    clean = replace(simulator._latent(raw), nlf=CAMERA.nlf(6400).zero())
+    clean = replace(simulator._prepared(raw), nlf=CAMERA.nlf(6400).zero())
     simulator.prepare(clean)
-    simulator.prepare(replace(simulator._latent(raw), denoised=Denoised(raw.data)))
+    simulator.prepare(replace(simulator._prepared(raw), denoised=Denoised(raw.data)))
     CameraSimulator(device="cpu").simulate(raw, TARGET)
     _simulator(cache=None).prepare(raw)
 
@@ -190,15 +192,15 @@ def test_everything_that_changes_the_result_is_seen(where: Any, folder: Path) ->
 
 def test_a_map_depends_on_the_light_that_it_was_found_in() -> None:
     simulator, raw = _simulator(), _raw()
-    latent = simulator.prepare(raw)
-    assert latent.denoised is not None
-    simulator.prepare(latent, depth="unknown").opening.extent(2.8)
+    prepared = simulator.prepare(raw)
+    assert prepared.denoised is not None
+    simulator.prepare(prepared, depth="unknown").aperture_blur.extent(2.8)
     counter = Counter(simulator)
-    simulator.prepare(latent, depth="unknown").opening.extent(2.8)
+    simulator.prepare(prepared, depth="unknown").aperture_blur.extent(2.8)
     assert counter.new() == 0
     simulator.prepare(
-        replace(latent, denoised=Denoised(latent.denoised.light * 1.5)), depth="unknown"
-    ).opening.extent(2.8)
+        replace(prepared, denoised=Denoised(prepared.denoised.light * 1.5)), depth="unknown"
+    ).aperture_blur.extent(2.8)
     assert counter.new() > 0
 
 
@@ -237,7 +239,7 @@ def test_other_weights_are_seen(change: str) -> None:
     before = _denoised(simulator, raw)
     _step(simulator, change)
     after = _denoised(simulator, raw)
-    assert torch.equal(after, simulator.denoise(simulator._latent(raw)))
+    assert torch.equal(after, simulator.denoise(simulator._prepared(raw)))
     assert not torch.equal(after, before)
 
 

@@ -75,7 +75,7 @@ def test_point_source_becomes_a_disc_of_the_thin_lens(depth: float) -> None:
     torch.testing.assert_close(
         camera.blur_diameter(shot, 4.0), torch.full((41, 41), expected), rtol=1e-5, atol=0.0
     )
-    spread = camera.optics(shot, 4.0).double().numpy()
+    spread = camera.blurred_light(shot, 4.0).double().numpy()
     np.testing.assert_allclose(spread.sum((1, 2)), 1.0, rtol=1e-5)
     offset = np.arange(41) - 20
     moment = (spread.sum(1) * offset**2).sum(1)  # a uniform disc: d^2 / 16
@@ -99,7 +99,7 @@ def test_two_f_numbers_give_the_area_ratio() -> None:
     shot = scene(lamp(1.0), torch.full((41, 41), 1.2))
     offset = np.arange(41) - 20
     moments = {
-        f: (camera.optics(shot, f)[1].double().numpy().sum(0) * offset**2).sum()
+        f: (camera.blurred_light(shot, f)[1].double().numpy().sum(0) * offset**2).sum()
         for f in (4.0, 5.6, 8.0)
     }
     # Area of the disc ~ second moment ~ 1 / N^2, and so is the light that comes through.
@@ -116,7 +116,7 @@ def test_two_f_numbers_give_the_area_ratio() -> None:
 def test_saturated_lamp_out_of_focus_keeps_its_energy_and_is_a_white_disc() -> None:
     camera = ReferenceCamera(sensor(1e-4, 1e-7))
     shot = scene(lamp(1e4), torch.full((41, 41), 1.2))
-    light = camera.optics(shot, 4.0)
+    light = camera.blurred_light(shot, 4.0)
     np.testing.assert_allclose(light.double().sum((1, 2)).numpy(), 1e4, rtol=1e-5)
     capture = camera.capture(shot, BASE, 0)
     diameter = diameter_px(1.2, 4.0)
@@ -132,25 +132,25 @@ def test_sharp_foreground_keeps_free_of_a_bright_blurred_background() -> None:
     light[:, :, 20:] = 300.0
     depth = torch.full((40, 40), 2.0)
     depth[:, 20:] = 30.0
-    found = ReferenceCamera(sensor(1e-4, 1e-8)).optics(scene(light, depth), 4.0)
+    found = ReferenceCamera(sensor(1e-4, 1e-8)).blurred_light(scene(light, depth), 4.0)
     assert torch.equal(found[:, :, :20], light[:, :, :20])
 
 
 def test_layers_of_equal_light_show_no_seam() -> None:
     depth = torch.linspace(1.0, 9.0, 40).expand(40, 40).clone()
     depth[:15, :15] = 0.8
-    found = ReferenceCamera(sensor(1e-4, 1e-8)).optics(scene(flat(0.3, 40), depth), 4.0)
+    found = ReferenceCamera(sensor(1e-4, 1e-8)).blurred_light(scene(flat(0.3, 40), depth), 4.0)
     torch.testing.assert_close(found, flat(0.3, 40), rtol=2e-6, atol=0.0)
 
 
 def test_scene_without_depth_or_in_focus_is_left_as_it_is() -> None:
     light = torch.rand(4, 7, 5, generator=torch.Generator().manual_seed(0))
     camera = ReferenceCamera(sensor(1e-4, 1e-8))
-    assert torch.equal(camera.optics(scene(light), 4.0), light)
-    assert torch.equal(camera.optics(scene(light, torch.full((7, 5), 2.0)), 4.0), light)
+    assert torch.equal(camera.blurred_light(scene(light), 4.0), light)
+    assert torch.equal(camera.blurred_light(scene(light, torch.full((7, 5), 2.0)), 4.0), light)
     assert float(camera.blur_diameter(scene(light), 4.0).max()) == 0.0
     far = scene(light, torch.full((7, 5), math.inf), lens=Lens(0.05, math.inf))
-    assert torch.equal(camera.optics(far, 4.0), light)
+    assert torch.equal(camera.blurred_light(far, 4.0), light)
 
 
 # --- noise ------------------------------------------------------------------------------------
@@ -320,7 +320,7 @@ def test_same_seed_same_capture() -> None:
     first = camera.capture(shot, BASE, 4)
     state = torch.get_rng_state()
     others = [camera.capture(shot, BASE, 5), camera.capture(shot, replace(BASE, iso=200), 4)]
-    again = camera.capture(shot, BASE, 4, light=camera.optics(shot, 4.0))
+    again = camera.capture(shot, BASE, 4, light=camera.blurred_light(shot, 4.0))
     assert torch.equal(torch.get_rng_state(), state)  # nothing draws from the global generator
     assert torch.equal(first.sample, again.sample)
     for other in others:
@@ -363,9 +363,9 @@ def test_camera_refuses_bad_input() -> None:
     with pytest.raises(ValueError, match="noise calibration"):
         ReferenceCamera(replace(plain, nlf_by_iso={}))
     blind = ReferenceCamera(replace(plain, pixel_pitch_um=None))
-    assert torch.equal(blind.optics(scene(flat(0.1)), 4.0), flat(0.1))  # no depth, no need
+    assert torch.equal(blind.blurred_light(scene(flat(0.1)), 4.0), flat(0.1))  # no depth, no need
     with pytest.raises(ValueError, match="pixel pitch"):
-        blind.optics(scene(flat(0.1), torch.full((8, 8), 3.0)), 4.0)
+        blind.blurred_light(scene(flat(0.1), torch.full((8, 8), 3.0)), 4.0)
     late = ReferenceCamera(plain, body=BodyError(shutter_delay=-0.001))
     with pytest.raises(ValueError, match=r"`exposure_time`.*shutter error"):
         late.capture(scene(flat(0.1)), replace(BASE, exposure_time=1 / 2000), 0)

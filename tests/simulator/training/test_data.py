@@ -140,7 +140,9 @@ def test_everything_of_a_pair_shows_the_same_crop() -> None:
         ReferenceCamera(Z6),
         "exposure",
     )
-    made._optics = dict.fromkeys(made._optics, light)  # sharp: each pixel has its own light
+    made._blurred_light = dict.fromkeys(
+        made._blurred_light, light
+    )  # sharp: each pixel has its own light
     batch = made.batch(0, 6, 24)
     far = batch.target[:, 0] / batch.target.amax((1, 2, 3))[:, None, None] > 0.7
     assert torch.equal(batch.defocus > 0, far)
@@ -195,11 +197,11 @@ def test_light_is_rendered_once_per_aperture_and_shared_between_stages(
 ) -> None:
     camera = ReferenceCamera(Z6)
     rendered: list[float] = []
-    optics = camera.optics
+    blurred_light = camera.blurred_light
 
     def spy(*arguments):
         rendered.append(arguments[1])
-        return optics(*arguments)
+        return blurred_light(*arguments)
 
     object.__setattr__(camera, "optics", spy)
     states = (LIGHT, replace(LIGHT, iso=800), DARK)
@@ -210,7 +212,7 @@ def test_light_is_rendered_once_per_aperture_and_shared_between_stages(
             [Sequence(scene(), states)],
             camera,
             stage,  # type: ignore[arg-type]
-            optics=shared,
+            blurred_light=shared,
             progress=lambda done, total: calls.append((done, total)),
         )
         made.batch(0, 4, 16)
