@@ -111,7 +111,7 @@ class PreparedScene:
             object.__setattr__(self, "statistics", LightStatistics(self.light))
         if not known:
             object.__setattr__(
-                self, "optics", BlurredLight(self.light, self.denoised, self.aperture_blur)
+                self, "blurred_light", BlurredLight(self.light, self.denoised, self.aperture_blur)
             )
 
     def exposure(self, settings: CameraSettings, *, noise: bool = True) -> Exposure:

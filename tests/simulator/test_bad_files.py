@@ -24,7 +24,7 @@ from simulator.raw import read as raw_file_module
 from simulator.raw.metadata import camera_identity, read_directories
 from simulator.raw.read import RawFileError
 from simulator.utils.files import write_atomically
-from tests.simulator.test_raw_file import NLF, SETTINGS, write_sample_dng
+from tests.simulator.raw.test_read import NLF, SETTINGS, write_sample_dng
 
 MOSAIC = np.random.default_rng(0).integers(100, 4000, (64, 96), dtype=np.uint16)
 

@@ -67,7 +67,7 @@ def test_the_networks_run_where_they_are_needed() -> None:
         ({}, OPENER, "noise_reduction", "at least as noisy"),
         ({"networks": False}, OPENER, "aperture", "`depth` is not 'unknown'"),
         ({}, CLEANER, "aperture", "does not open"),
-        ({"opening": None}, CLEANER, "defocus", "far or in focus"),
+        ({"aperture_blur": None}, CLEANER, "defocus", "far or in focus"),
         ({}, CLEANER, "defocus", "each pixel's was estimated"),
         ({"nlf": Z6.nlf(100).scaled(0.1)}, BRIGHTER, "noise_reduction", "err as much"),
         ({"defocus": 1e-4}, CLEANER, "defocus", "pixel wide, which would hardly show"),

@@ -203,7 +203,7 @@ def test_light_is_rendered_once_per_aperture_and_shared_between_stages(
         rendered.append(arguments[1])
         return blurred_light(*arguments)
 
-    object.__setattr__(camera, "optics", spy)
+    object.__setattr__(camera, "blurred_light", spy)
     states = (LIGHT, replace(LIGHT, iso=800), DARK)
     shared: dict = {}
     calls: list[tuple[int, int]] = []
