@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -10,8 +11,8 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import click
 import gymnasium as gym
 import pytest
 import torch
@@ -62,6 +63,15 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in _anchors(target), f"{link} in {_name(page)}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_files_and_modules_are_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|yaml))`", text):
+        assert (ROOT / path).is_file(), path
+    for name in re.findall(r"`((?:simulator|ae_env|agents)(?:\.\w+)+)`", text):
+        pkgutil.resolve_name(name)
+
+
 @pytest.mark.parametrize("page", [*JOBS, SCORER_PAGE], ids=_name)
 def test_pages_for_a_job_are_short(page: Path) -> None:
     limit = 120 if page.name == "README.md" else 150
@@ -78,49 +88,51 @@ def test_printed_examples_are_those_in_the_folder(page: Path) -> None:
             assert block.removeprefix(name[0]) == code.lstrip("\n"), name[1]
 
 
+#: Before a page's code: every environment has few scenes.
+FEW_SCENES = """
+import gymnasium
+
+def _with_few(make):
+    return lambda name, **arguments: make(name, **{**arguments, "scenes": "bundled:snow"})
+
+gymnasium.make, gymnasium.make_vec = _with_few(gymnasium.make), _with_few(gymnasium.make_vec)
+"""
+
+
 @pytest.mark.parametrize("page", JOBS, ids=_name)
 def test_code_runs_as_printed(page: Path, tmp_path: Path) -> None:
-    """In a fresh interpreter, with small frames, few scenes and short trainings."""
-    code = "\n".join(_blocks(page, "python"))
-    code = re.sub(r"STEPS = [\d_]+|\.learn\([\d_]+\)", _shorter, code)
+    """In a fresh interpreter, with few scenes and short trainings."""
+    code = FEW_SCENES + "\n".join(_blocks(page, "python"))
+    code = re.sub(r"STEPS = [\d_]+", "STEPS = 64", re.sub(r"learn\([\d_]+\)", "learn(256)", code))
     code = code.replace('"bundled"', '"bundled:snow"').replace("num_envs=64", "num_envs=4")
-    code = code.replace('split="t', 'scenes="bundled:snow", split="t')
-    code = re.sub(r'(scenes="[\w:]+", )(?=scenes=)', "", code)
     script = tmp_path / "page.py"
     script.write_text(code, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, script]
     done = subprocess.run(
-        [sys.executable, script],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
 
 
-def _shorter(match: re.Match[str]) -> str:
-    return "STEPS = 64" if match[0].startswith("STEPS") else ".learn(256)"
-
-
-def _command_lines(page: Path) -> Iterator[list[str]]:
-    """The words of every `ae-env` command that a page shows, without comments."""
+def _commands(page: Path, pattern: str) -> Iterator[list[str]]:
+    """The words after `ae-env` of every command that the pattern finds, without comments."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
-    lines = re.findall(r"^ *(?:\$ )?(ae-env .+)$", text, re.MULTILINE)
-    for line in lines + re.findall(r"`(ae-env [^`\n]+)`", text):
-        yield shlex.split(line, comments=True)[1:]
+    for line in re.findall(pattern, text, re.MULTILINE):
+        yield shlex.split(line, comments=True)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_commands_parse(page: Path) -> None:
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
-    for words in _command_lines(page):
-        with group.make_context("ae-env", list(words)) as context:
-            name, command, rest = group.resolve_command(context, list(words))
-            if rest:  # a bare name is talked about, not shown
-                command.make_context(name, rest, parent=context)
+    group: Any = typer.main.get_command(app)
+    with group.make_context("ae-env", ["scorers"]) as context:
+        for words in _commands(page, r"^ *ae-env (.+)$"):
+            name, command, rest = group.resolve_command(context, words)
+            command.make_context(name, rest, parent=context)
+        for words in _commands(page, r"`ae-env ([^`\n]+)`"):  # may lack arguments
+            _, command, rest = group.resolve_command(context, words)
+            known = {option for parameter in command.params for option in parameter.opts}
+            assert {word for word in rest if word.startswith("-")} <= {*known, "--help"}
 
 
 @pytest.fixture
@@ -161,7 +173,7 @@ def test_the_scorer_in_the_yaml_of_a_training() -> None:
 
 
 def test_the_scorer_on_the_command_line(ae_env, my_scorer: Path) -> None:
-    (words,) = (words for words in _command_lines(SCORER_PAGE) if words[0] == "evaluate")
+    (words,) = _commands(SCORER_PAGE, r"`ae-env (evaluate [^`]+)`")
     assert words[-2:] == ["--scorer", "my_scorer.py:CentreContrast"]
     small = "--scenes bundled:snow --resolution 36 --frames 2 --episodes 1 --workers 1 --out out"
     code, _, err = ae_env(*words, *small.split())
