@@ -13,7 +13,7 @@ from agents.cli.console import console, make_folder, print_files
 def scorers() -> None:
     """List all known scorers, those of installed packages included.
 
-    Example: `ae-env scorers` lists them; docs/own-scorer.md says how to add one.
+    Example: `ae-env scorers` lists them; docs/plug-in-a-scorer.md says how to add one.
     """
     from rich import box
     from rich.table import Table

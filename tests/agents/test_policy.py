@@ -167,7 +167,7 @@ def test_own_file(context, photograph, tmp_path):
 
 
 def test_the_policy_of_the_page_works_as_it_is_printed(context, photograph, tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "policies.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "judge.md").read_text(encoding="utf-8")
     code = page.partition("```python\n")[2].partition("```")[0]
     file = tmp_path / "my_policy.py"
     file.write_text(code)

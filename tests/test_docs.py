@@ -1,0 +1,202 @@
+"""README and docs: links lead somewhere, code runs as printed, commands parse."""
+
+from __future__ import annotations
+
+import os
+import pkgutil
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import torch
+import typer
+import yaml
+
+from ae_env.scorers import make_scorer
+from ae_env.scorers.registry import describe_scorers
+from agents.cli.main import app
+from agents.learning.training import AgentConfig
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES += [ROOT / "docs" / "results" / "README.md"]
+#: Pages that a user reads to do a job; their code runs.
+JOBS = [ROOT / "README.md", *(ROOT / "docs" / f"{n}.md" for n in ("train", "judge"))]
+SCORER_PAGE = ROOT / "docs" / "plug-in-a-scorer.md"
+SMALL = {"scenes": "bundled:snow", "resolution": 36}
+
+
+def _name(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def _blocks(page: Path, language: str) -> list[str]:
+    """Fenced blocks of a language, but for those marked `<!-- not run: reason -->`."""
+    pattern = rf"^(<!-- not run: .+ -->\n)?```{language}\n(.*?)^```$"
+    found = re.findall(pattern, page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    return [code for mark, code in found if not mark]
+
+
+def _anchors(page: Path) -> set[str]:
+    """Anchors of a page's headings, made as GitHub makes them."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    for link in (link for link in links if "://" not in link):
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.exists(), f"{link} in {_name(page)}"
+        if anchor:
+            assert anchor in _anchors(target), f"{link} in {_name(page)}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_files_and_modules_are_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for path in re.findall(r"`((?:[\w.-]+/)+[\w.-]+\.(?:py|yaml))`", text):
+        assert (ROOT / path).is_file(), path
+    for name in re.findall(r"`((?:simulator|ae_env|agents)(?:\.\w+)+)`", text):
+        pkgutil.resolve_name(name)
+
+
+@pytest.mark.parametrize("page", [*JOBS, SCORER_PAGE], ids=_name)
+def test_pages_for_a_job_are_short(page: Path) -> None:
+    limit = 120 if page.name == "README.md" else 150
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= limit
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_printed_examples_are_those_in_the_folder(page: Path) -> None:
+    for block in _blocks(page, "python"):
+        name = re.match(r"# examples/(\w+\.py)\n", block)
+        if name:
+            file = (ROOT / "examples" / name[1]).read_text(encoding="utf-8")
+            _, _, code = file.partition('"""\n')  # the page explains what the docstring says
+            assert block.removeprefix(name[0]) == code.lstrip("\n"), name[1]
+
+
+#: Before a page's code: every environment has few scenes.
+FEW_SCENES = """
+import gymnasium
+
+def _with_few(make):
+    return lambda name, **arguments: make(name, **{**arguments, "scenes": "bundled:snow"})
+
+gymnasium.make, gymnasium.make_vec = _with_few(gymnasium.make), _with_few(gymnasium.make_vec)
+"""
+
+
+@pytest.mark.parametrize("page", JOBS, ids=_name)
+def test_code_runs_as_printed(page: Path, tmp_path: Path) -> None:
+    """In a fresh interpreter, with few scenes and short trainings."""
+    code = FEW_SCENES + "\n".join(_blocks(page, "python"))
+    code = re.sub(r"STEPS = [\d_]+", "STEPS = 64", re.sub(r"learn\([\d_]+\)", "learn(256)", code))
+    code = code.replace('"bundled"', '"bundled:snow"').replace("num_envs=64", "num_envs=4")
+    script = tmp_path / "page.py"
+    script.write_text(code, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, script]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def _commands(page: Path, pattern: str) -> Iterator[list[str]]:
+    """The words after `ae-env` of every command that the pattern finds, without comments."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    for line in re.findall(pattern, text, re.MULTILINE):
+        yield shlex.split(line, comments=True)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_commands_parse(page: Path) -> None:
+    group: Any = typer.main.get_command(app)
+    with group.make_context("ae-env", ["scorers"]) as context:
+        for words in _commands(page, r"^ *ae-env (.+)$"):
+            name, command, rest = group.resolve_command(context, words)
+            command.make_context(name, rest, parent=context)
+        for words in _commands(page, r"`ae-env ([^`\n]+)`"):  # may lack arguments
+            _, command, rest = group.resolve_command(context, words)
+            known = {option for parameter in command.params for option in parameter.opts}
+            assert {word for word in rest if word.startswith("-")} <= {*known, "--help"}
+
+
+@pytest.fixture
+def my_scorer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current folder, with the page's file in it."""
+    (tmp_path / "my_scorer.py").write_text(_blocks(SCORER_PAGE, "python")[0])
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("my_scorer")
+def test_the_scorer_computes_what_it_says() -> None:
+    pictures = torch.zeros(2, 3, 40, 40)
+    pictures[0, :, 10:30, 10:20] = 0.8  # half of the middle: standard deviation 0.4
+    pictures[1, :, :10] = 1.0  # outside of the middle
+    scorer = make_scorer("my_scorer.py:CentreContrast").parts["CentreContrast"]
+    scores = scorer(pictures, None)  # type: ignore[arg-type]
+    torch.testing.assert_close(scores, torch.tensor([0.8, 0.0]), atol=1e-3, rtol=0.0)
+
+
+@pytest.mark.usefixtures("my_scorer")
+def test_the_scorer_is_used_as_printed(capsys: pytest.CaptureFixture) -> None:
+    use = _blocks(SCORER_PAGE, "python")[1]
+    assert "resolution=64" in use
+    exec(use.replace("resolution=64", 'resolution=36, scenes="bundled:snow"'), {})
+    printed = capsys.readouterr().out
+    assert "CentreContrast" in printed
+    assert "noise" in printed
+
+
+@pytest.mark.usefixtures("my_scorer")
+def test_the_scorer_in_the_yaml_of_a_training() -> None:
+    (text,) = _blocks(SCORER_PAGE, "yaml")
+    config = AgentConfig.model_validate(yaml.safe_load(text))
+    assert config.environment["scorer"] == {"my_scorer.py:CentreContrast": 0.5, "noise": 0.5}
+    with pytest.raises(ValueError, match=r"there is no file 'your_scorer\.py'"):
+        AgentConfig.model_validate(yaml.safe_load(text.replace("my_", "your_")))
+
+
+def test_the_scorer_on_the_command_line(ae_env, my_scorer: Path) -> None:
+    (words,) = _commands(SCORER_PAGE, r"`ae-env (evaluate [^`]+)`")
+    assert words[-2:] == ["--scorer", "my_scorer.py:CentreContrast"]
+    small = "--scenes bundled:snow --resolution 36 --frames 2 --episodes 1 --workers 1 --out out"
+    code, _, err = ae_env(*words, *small.split())
+    assert code == 0, err
+    assert (my_scorer / "out" / "results.json").is_file()
+
+
+def test_the_scorer_in_a_package(my_scorer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its metadata as pip would write it from the page's pyproject.toml."""
+    project = tomllib.loads(_blocks(SCORER_PAGE, "toml")[0])
+    (module,) = project["tool"]["setuptools"]["py-modules"]
+    name, version = project["project"]["name"], project["project"]["version"]
+    info = my_scorer / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    groups = project["project"]["entry-points"]
+    lines = [f"[{g}]\n" + "\n".join(f"{k} = {v}" for k, v in groups[g].items()) for g in groups]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(my_scorer)
+    row = next(row for row in describe_scorers() if row.name == "centre_contrast")
+    assert (row.package, row.domain, row.error) == ("my-scores", "srgb", "")
+    assert row.summary.startswith("Contrast of the middle")
+    env = gym.make("ae_env:ae_env/AutoExposure-v0", scorer="centre_contrast", **SMALL)
+    env.reset(seed=0)
+    assert 0.0 <= env.step(env.action_space.sample())[1] <= 1.0
+    sys.modules.pop(module, None)
