@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from simulator.camera_simulator import CameraSimulator as CameraSimulator
     from simulator.capture.plan import SimulationPlan as SimulationPlan
     from simulator.capture.prepared_scene import PreparedScene as PreparedScene
+    from simulator.raw.decoding import RawFileError as RawFileError
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
     from simulator.raw.dng import write_dng as write_dng
     from simulator.raw.image import RawImage as RawImage
     from simulator.raw.noise_estimation import estimate_nlf as estimate_nlf
-    from simulator.raw.read import RawFileError as RawFileError
     from simulator.raw.read import read_raw as read_raw
     from simulator.settings import CameraSettings as CameraSettings
     from simulator.settings import exposure_ratio as exposure_ratio
@@ -54,11 +54,12 @@ _MODULES = {
     "camera_simulator": ["CameraSimulator"],
     "capture.plan": ["SimulationPlan"],
     "capture.prepared_scene": ["PreparedScene"],
+    "raw.decoding": ["RawFileError"],
     "raw.develop": ["develop", "render_srgb"],
     "raw.dng": ["write_dng"],
     "raw.image": ["RawImage"],
     "raw.noise_estimation": ["estimate_nlf"],
-    "raw.read": ["RawFileError", "read_raw"],
+    "raw.read": ["read_raw"],
     "settings": ["CameraSettings", "exposure_ratio", "incident_ev100", "sensor_signal"],
 }
 

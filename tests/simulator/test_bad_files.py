@@ -22,7 +22,7 @@ from simulator import RawImage, get_camera, read_raw, write_dng
 from simulator.raw import dng as dng_module
 from simulator.raw import read as raw_file_module
 from simulator.raw.metadata import camera_identity, read_directories
-from simulator.raw.read import RawFileError
+from simulator.raw.decoding import RawFileError
 from simulator.utils.files import write_atomically
 from tests.simulator.raw.test_read import NLF, SETTINGS, write_sample_dng
 

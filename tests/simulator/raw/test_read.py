@@ -16,7 +16,7 @@ from skimage.io import imsave
 
 from simulator import CameraSettings, NoiseLevelFunction, RawImage, get_camera, read_raw, write_dng
 from simulator.camera import BayerPattern, CameraProfile
-from simulator.raw.read import RawFileError
+from simulator.raw.decoding import RawFileError
 
 SETTINGS = CameraSettings(iso=100, exposure_time=1 / 60, f_number=4.0)
 NLF = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
