@@ -101,8 +101,10 @@ def render_srgb(
         (3, 2H, 2W) uint8 for ``"malvar"``, (3, H, W) for ``"half"``, sRGB.
 
     Raises:
-        ValueError: If a name is unknown or `exposure_ev` is out of range.
+        ValueError: If `raw` is no `RawImage`, a name is unknown or `exposure_ev` is out of range.
     """
+    if not isinstance(raw, RawImage):
+        raise ValueError(f"`raw` (={type(raw).__name__}) must be a RawImage")
     check_name("demosaic", demosaic, DEMOSAICS)
     check_name("tone", tone, TONES)
     if not (math.isfinite(exposure_ev) and abs(exposure_ev) <= 32.0):
@@ -167,7 +169,8 @@ def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
     camera_from_srgb /= white
     if np.linalg.cond(camera_from_srgb) > 1e6:
         raise ValueError(f"`colour_matrix` (={rows}) must be invertible")
-    return np.linalg.inv(camera_from_srgb).tolist()
+    inverse: list[list[float]] = np.linalg.inv(camera_from_srgb).tolist()
+    return inverse
 
 
 def apply_tone(linear: torch.Tensor, tone: str) -> torch.Tensor:

@@ -20,7 +20,6 @@ from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares
 
 
-# Sums over windows, for `simulator.raw.noise_estimation`; CPU only.
 @kernel()
 def summed_area(image, total):  # type: ignore[no-untyped-def]
     """Sum over everything above and to the left of each corner of a pixel.
@@ -151,7 +150,8 @@ def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.n
         for j in (0, size)
     ]
     first, right, below, last = corners
-    return (last - right - below + first) / (size * size)
+    mean: np.ndarray = (last - right - below + first) / (size * size)
+    return mean
 
 
 def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks:

@@ -37,23 +37,26 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
+        dispatcher: Callable[..., Any]
         try:
             dispatcher = numba.njit(cache=True, **given)(function)
         except RuntimeError as error:
             logger.info("%s; it is compiled again in each process", error)
-            return numba.njit(**given)(function)
-        _adapt(dispatcher._cache, Path(function.__code__.co_filename))
+            dispatcher = numba.njit(**given)(function)
+        else:
+            _adapt_cache(dispatcher, Path(function.__code__.co_filename))
         return dispatcher
 
     return compiled
 
 
-def _adapt(cache: Any, module: Path) -> None:
+def _adapt_cache(dispatcher: Any, module: Path) -> None:
     """Make numba's cache of a kernel stale when any module changes that the kernel depends on.
 
     Numba itself looks at the kernel's own module alone, but the functions and constants that a
     kernel names are compiled into it. Also, a full disk must not be an error.
     """
+    cache = dispatcher._cache
     index, save = cache._cache_file, cache.save_overload
     index._source_stamp = (index._source_stamp, _checksum(module))
 
@@ -83,7 +86,7 @@ def _checksum(module: Path) -> int:
     )
 
 
-class _Announcer(event.Listener):  # type: ignore[misc]
+class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
     """Logs each kernel of this package before it is compiled: its first call takes seconds."""
 
     def on_start(self, event: Any) -> None:
@@ -96,7 +99,7 @@ class _Announcer(event.Listener):  # type: ignore[misc]
         """Numba's base class asks for this method."""
 
 
-event.register("numba:compile", _Announcer())
+event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
 
 
 # Images are given to kernels by their addresses: a batch need not lie in one piece of memory.
@@ -115,4 +118,4 @@ def as_pointer(typing, address):  # type: ignore[no-untyped-def]
     def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
         return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
 
-    return types.CPointer(types.float32)(types.uintp), generate
+    return types.CPointer(types.float32)(types.uintp), generate  # type: ignore[no-untyped-call]
