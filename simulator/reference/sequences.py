@@ -262,5 +262,5 @@ def _more_open(sequences: SequenceOf[Sequence], pairs: list[Pair]) -> list[Pair]
     same = [p for p in pairs if stops(p) == 0]
     room = int(len(opened) * _SAME_APERTURE / (1 - _SAME_APERTURE))
     # Evenly spaced, so that every sequence has its share.
-    kept = [same[i * len(same) // room] for i in range(room)] if room < len(same) else same
-    return sorted(opened + kept)
+    chosen = [same[i * len(same) // room] for i in range(room)] if room < len(same) else same
+    return sorted(opened + chosen)
