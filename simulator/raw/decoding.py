@@ -1,4 +1,4 @@
-"""Decoding raw files, before their camera is known: by LibRaw, or directly where we wrote them."""
+"""Decoding raw files before their camera is known: by LibRaw, or directly for our own DNGs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RawFileError(ValueError):
 
 @dataclass(frozen=True)
 class Decoded:
-    """The mosaic of a file, and what the file says about it."""
+    """The mosaic of a file, and its description by the file."""
 
     mosaic: np.ndarray  # (H, W) uint16, visible area
     cfa: BayerPattern
@@ -67,7 +67,7 @@ def decode_own_dng(path: Path, directories: Sequence[Directory], own: OwnRecord)
     """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes.
 
     Returns:
-        None if another program has laid the pixels out anew.
+        None if another program has changed the layout of its pixels.
 
     Raises:
         RawFileError: If it is damaged.

@@ -71,8 +71,8 @@ def develop(
     check_name("tone", tone, TONES)
     gains = _check_gains(white_balance, images)
     encoded = torch.empty(len(images), 3, *images.shape[2:], device=images.device)
-    # A few images at a time stay in the CPU's cache: twice as fast, and the
-    # same up to the last bits of float32, which depend on a pixel's place in the array.
+    # A few images at a time stay in the CPU's cache: twice as fast, and the same up to the last
+    # bits of float32, which depend on a pixel's position in the array.
     step = max(1, _CHUNK // images[0].numel()) if images.device.type == "cpu" else len(images)
     for start in range(0, len(images), step):
         part = slice(start, start + step)
@@ -125,9 +125,8 @@ def balance(images: torch.Tensor, white_balance: Gains) -> torch.Tensor:
     """White-balance packed raws and clip their highlights to white.
 
     The gains are divided by their smallest, so a saturated pixel reaches at least 1 in every
-    channel; then everything is clipped at 1. Without that clip the gains would turn what saturated
-    the sensor magenta. Negative values are kept: clipping them here would lift the black level of
-    noisy shadows.
+    channel; then everything is clipped at 1. Without that clip the gains would turn saturated areas
+    magenta. Negative values stay: clipping them here would lift the black level of noisy shadows.
 
     Args:
         images: (B, 4, H, W) float32, planes R, G1, G2, B.

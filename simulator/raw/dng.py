@@ -50,7 +50,7 @@ _STRIP_ROWS = 32
 
 @dataclass(frozen=True)
 class OwnRecord:
-    """What `write_dng` notes in the EXIF comment because the standard tags would round it.
+    """A note of `write_dng` in the EXIF comment: values that the standard tags would round.
 
     Args:
         settings: Exact exposure settings.
@@ -256,7 +256,7 @@ def as_rational(value: float, *, signed: bool = False) -> tuple[int, int]:
     exact = Fraction(value)
     if abs(exact) > limit or (exact < 0 and not signed):
         raise ValueError(f"`value` (={value!r}) must fit a {'signed ' * signed}32-bit rational")
-    # The simplest fraction that is the same float64 keeps 1/60 as 1/60.
+    # The simplest fraction that is the same float64: 1/60 stays 1/60.
     bound = limit if abs(exact) <= 1 else max(1, int(limit / abs(exact)))
     for denominator in (1000, 100_000, bound):
         candidate = exact.limit_denominator(min(denominator, bound))

@@ -23,7 +23,7 @@ _SHARE, _ROWS = 128, 32
 
 @dataclass(frozen=True, eq=False)
 class RawImage:
-    """A raw photograph: packed sensor data with the settings and camera that made it.
+    """A raw photograph: packed sensor data with the settings and camera that took it.
 
     Args:
         data: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative

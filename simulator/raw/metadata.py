@@ -1,7 +1,7 @@
-"""What raw files say about themselves: their tags, their camera, their noise and colour.
+"""Metadata of raw files: their tags, their camera, their noise and colour.
 
-The tags of TIFF-structured files (DNG, NEF, CR2, ARW, ...) are read with tifffile. Other containers
-(CRW, CR3, RAF, MRW) are only asked who made them.
+The tags of TIFF-structured files (DNG, NEF, CR2, ARW, ...) are read with tifffile. From other
+containers (CRW, CR3, RAF, MRW) only make and model are read; LibRaw reads their settings.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ _CIFF_MAX_HEAPS, _CIFF_MAX_RECORDS = 64, 1024
 
 
 def describe_file(head: bytes) -> str:
-    """What a file is, in words for an error message, from its first 4096 bytes."""
+    """Kind of a file in words for an error message, from its first 4096 bytes."""
     for signature, words in _SIGNATURES:
         if head.startswith(signature):
             return words
@@ -283,7 +283,7 @@ def normalised_model(make: str, model: str) -> str:
     return maker + "".join(re.findall(r"[a-z0-9]+", model.lower())).removeprefix(maker)
 
 
-# -- what the tags of a DNG mean, beyond what LibRaw hands on -------------------------------------
+# -- the meaning of DNG tags that LibRaw does not pass on -----------------------------------------
 
 #: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
 _LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")

@@ -192,7 +192,7 @@ class ReferenceCamera:
         """Diameter of the circle of confusion, (H, W), in pixels of ``scene.light``, >= 0.
 
         Args:
-            scene: What is photographed.
+            scene: The scene to photograph.
             f_number: As marked on the lens; the blur is that of the stop that it stands for.
         """
         return self._signed_diameter(scene, f_number).abs().to(torch.float32)
@@ -235,7 +235,7 @@ class ReferenceCamera:
             reference: Settings of `light`.
             settings: Nominal settings of the capture.
             image_speed: Speed of the image along the rows [frame heights per second].
-            lamp: What lights the scene, whose long-term mean `light` is; None for steady light.
+            lamp: The scene's lamp, whose long-term mean `light` is; None for steady light.
                 Rows are read one after the other (`CameraProfile.row_time`).
             start: When the first row begins its exposure [s].
         """
@@ -304,7 +304,7 @@ class ReferenceCamera:
         """Photograph a scene that stands still.
 
         Args:
-            scene: What is photographed.
+            scene: The scene to photograph.
             settings: Nominal settings.
             seed: Seed of the noise, >= 0; the noise is a function of it and of the settings.
             light: Result of ``blurred_light(scene, settings.f_number)`` if known: it serves every

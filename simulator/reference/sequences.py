@@ -62,7 +62,7 @@ class Sequence:
     """One scene and the settings it is captured with.
 
     Args:
-        scene: What is photographed.
+        scene: The scene.
         settings: The settings of each capture, at least two.
     """
 
@@ -77,7 +77,7 @@ class Sequence:
 
 @dataclass(frozen=True, order=True)
 class Pair:
-    """Two captures of one sequence: what goes in, and what should come out.
+    """Two captures of one sequence: the input of a module and its target.
 
     Args:
         sequence: Index of the sequence.

@@ -1,6 +1,6 @@
 """Compiling kernels: once per machine, and run without the interpreter's lock.
 
-What numba compiles is cached beside the source, or in the user's cache folder where that cannot be
+Compiled code is cached beside the source, or in the user's cache folder where that cannot be
 written (``NUMBA_CACHE_DIR`` names another); where neither can, each process compiles for itself.
 """
 
@@ -96,7 +96,7 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
             logger.info("compiling %s.%s", function.__module__, function.__name__)
 
     def on_end(self, event: Any) -> None:
-        """Numba's base class asks for this method."""
+        """Nothing to log; numba's base class requires the method."""
 
 
 event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]

@@ -17,7 +17,7 @@ from simulator.utils.files import write_atomically
 
 #: Distribution that the three packages are installed as.
 _PACKAGE = "ae-env"
-#: What numbers depend on, besides the package itself.
+#: Libraries that numbers depend on.
 _LIBRARIES = (
     "torch",
     "numpy",
