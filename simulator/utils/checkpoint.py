@@ -42,7 +42,7 @@ def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
 
 
 def load_checkpoint(path: str | Path) -> dict[str, Any] | None:
-    """The state that `save_checkpoint` wrote, with its tensors on the CPU.
+    """What `save_checkpoint` wrote, with its tensors on the CPU.
 
     Nothing but tensors and plain values is unpickled (``weights_only=True``), so a checkpoint from
     somebody else runs no code.

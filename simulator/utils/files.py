@@ -103,7 +103,7 @@ def write_atomically(
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as stream:
             stream.writelines(pieces)
-        temporary.replace(path)
+        os.replace(temporary, path)
     except OSError as error:
         if error.errno is None:
             raise

@@ -236,7 +236,7 @@ def test_a_full_disk_costs_one_warning(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr("simulator.utils.files.os.replace", full)
     with caplog.at_level(logging.WARNING):
         for key in KEYS[:3]:
             DiskCache(tmp_path).put("denoised", key, {"light": torch.zeros(4)})

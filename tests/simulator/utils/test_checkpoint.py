@@ -1,95 +1,155 @@
-"""Checkpoints: the state that was saved, or none with a warning; nothing in a file is run."""
+"""Training states: restored exactly, or begun anew with a warning."""
 
 from __future__ import annotations
 
-import errno
 import logging
-import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import nn
 
-from simulator.utils.checkpoint import load_checkpoint, save_checkpoint
+from simulator.utils.checkpoint import Checkpoint
 
 
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return tmp_path / "runs" / "a.checkpoint"
+class Run:
+    """A module with AdamW and a one-cycle schedule, on fixed data."""
+
+    def __init__(self, path: Path | None, *, hidden: int = 8, identity: object = "a") -> None:
+        generator = torch.Generator().manual_seed(3)
+        self.inputs = torch.randn(40, 16, 5, generator=generator)
+        self.module = nn.Sequential(nn.Linear(5, hidden), nn.Tanh(), nn.Linear(hidden, 1))
+        with torch.no_grad():
+            for parameter in self.module.parameters():
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.3)
+        self.optimiser = torch.optim.AdamW(self.module.parameters(), lr=1e-2, weight_decay=1e-2)
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimiser, max_lr=1e-2, total_steps=41, pct_start=0.3
+        )
+        parts = {"module": self.module, "optimiser": self.optimiser, "schedule": self.schedule}
+        self.store = Checkpoint(path, parts, identity=identity)
+
+    def steps(self, first: int, last: int) -> list[float]:
+        losses = []
+        for step in range(first, last):
+            loss = (self.module(self.inputs[step]) - 1.0).square().mean()
+            self.optimiser.zero_grad()
+            loss.backward()
+            self.optimiser.step()
+            self.schedule.step()
+            losses.append(loss.item())
+        return losses
+
+    def weights(self) -> list[torch.Tensor]:
+        return [p.detach().clone() for p in self.module.parameters()]
 
 
-def test_states_come_back(path: Path) -> None:
-    module = nn.Linear(3, 2)
-    optimiser = torch.optim.AdamW(module.parameters(), lr=0.5)
-    module(torch.ones(3)).sum().backward()
-    optimiser.step()
-    parts = {"module": module.state_dict(), "optimiser": optimiser.state_dict()}
-    save_checkpoint(path, {"step": 7, "identity": ["a", None, {"seed": 0}], **parts})
-    found = load_checkpoint(path)
-    assert found is not None
-    assert (found["step"], found["identity"]) == (7, ["a", None, {"seed": 0}])
-    other = nn.Linear(3, 2)
-    other.load_state_dict(found["module"])
-    assert torch.equal(other.weight, module.weight)
-    fresh = torch.optim.AdamW(other.parameters())
-    fresh.load_state_dict(found["optimiser"])
-    moments, expected = (o.state_dict()["state"][0]["exp_avg"] for o in (fresh, optimiser))
-    assert torch.equal(moments, expected)
-    assert fresh.param_groups[0]["lr"] == 0.5
+def test_training_goes_on_exactly(tmp_path: Path) -> None:
+    whole = Run(None)
+    expected = whole.steps(0, 40)
+    path = tmp_path / "run.checkpoint"
+    first = Run(path)
+    losses = first.steps(0, 17)
+    first.store.save(17, force=True)
+    second = Run(path)
+    assert second.store.restore() == 17
+    assert second.schedule.last_epoch == 17
+    assert second.optimiser.param_groups[0]["lr"] == first.optimiser.param_groups[0]["lr"]
+    losses += second.steps(17, 40)
+    assert losses == expected
+    assert all(torch.equal(a, b) for a, b in zip(second.weights(), whole.weights(), strict=True))
 
 
-def test_no_file_is_no_state(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert load_checkpoint(path) is None
-    assert not caplog.records
+def test_nothing_to_restore(tmp_path: Path) -> None:
+    assert Run(tmp_path / "none").store.restore() == 0
+    run = Run(None)
+    run.store.save(3, force=True)
+    assert run.store.restore() == 0
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "byte", "no dict"])
-def test_damaged_files_are_no_state(
-    path: Path, damage: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    save_checkpoint(path, {"weights": torch.arange(1000.0)})
-    content = bytearray(path.read_bytes())
-    content[content.index(torch.arange(8.0, 9.0).numpy().tobytes())] ^= 1
-    damaged = {"cut": content[:-50], "empty": b"", "text": b"not a checkpoint", "byte": content}
-    if damage == "no dict":
-        torch.save([1], path)
-    else:
-        path.write_bytes(damaged[damage])
+def test_saves_now_and_then(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    run = Run(path)
+    run.store.save(1)
+    assert not path.exists()
+    run.store.interval = 0.0
+    run.store.save(2)
+    assert path.exists()
+
+
+def damage_cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-50])
+
+
+def damage_text(path: Path) -> None:
+    path.write_text("not a checkpoint at all")
+
+
+def damage_empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def damage_foreign(path: Path) -> None:
+    save_file({"weight": torch.zeros(2)}, path)
+
+
+def damage_structure(path: Path) -> None:
+    save_file({"t0": torch.zeros(2)}, path, metadata={"structure": '{"step": 4, "parts": []}'})
+
+
+def damage_folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [damage_cut, damage_text, damage_empty, damage_foreign, damage_structure, damage_folder],
+)
+def test_damaged_or_foreign(tmp_path: Path, damage, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "run.checkpoint"
+    first = Run(path)
+    first.steps(0, 5)
+    first.store.save(5, force=True)
+    damage(path)
+    second = Run(path)
+    before = second.weights()
     with caplog.at_level(logging.WARNING):
-        assert load_checkpoint(path) is None
-    assert f"checkpoint {path} is damaged, training restarts" in caplog.text
+        assert second.store.restore() == 0
+    assert "training begins anew" in caplog.text
+    assert str(path) in caplog.text
+    assert all(torch.equal(a, b) for a, b in zip(second.weights(), before, strict=True))
+    assert second.steps(0, 3) == Run(None).steps(0, 3)
 
 
-class Harmful:
-    """Makes a folder when it is unpickled."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, ("ran",)
-
-
-def test_nothing_in_a_checkpoint_is_run(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    save_checkpoint(path, {"step": Harmful()})
-    assert load_checkpoint(path) is None
-    assert not (tmp_path / "ran").exists()
+def test_another_network_leaves_no_trace(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "run"
+    wide = Run(path, hidden=9)
+    wide.steps(0, 5)
+    wide.store.save(5, force=True)
+    with caplog.at_level(logging.WARNING):
+        run = Run(path)
+        assert run.store.restore() == 0
+    assert "size mismatch" in caplog.text
+    assert run.steps(0, 3) == Run(None).steps(0, 3)
 
 
-def test_a_full_disk_keeps_the_one_before(
-    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    save_checkpoint(path, {"step": 1})
+def test_one_of_an_earlier_version_says_what_it_lacks(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "run"
+    run = Run(path)
+    Checkpoint(path, {"module": run.module}, identity="a").save(5, force=True)
+    with caplog.at_level(logging.WARNING):
+        assert run.store.restore() == 0
+    assert "it lacks 'optimiser', 'schedule', as those of an earlier version do" in caplog.text
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "replace", full)
-        save_checkpoint(path, {"step": 2})
-    assert "checkpoint not saved, the one before stays" in caplog.text
-    assert "No space left" in caplog.text
-    assert [p.name for p in path.parent.iterdir()] == ["a.checkpoint"]
-    assert load_checkpoint(path) == {"step": 1}
+def test_another_training_is_not_resumed(tmp_path: Path, caplog) -> None:
+    path = tmp_path / "run"
+    one = Run(path, identity={"seed": 0, "rate": (1, 2)})
+    one.steps(0, 5)
+    one.store.save(5, force=True)
+    assert Run(path, identity={"seed": 0, "rate": (1, 2)}).store.restore() == 5
+    with caplog.at_level(logging.WARNING):
+        assert Run(path, identity={"seed": 1, "rate": (1, 2)}).store.restore() == 0
+    assert "other settings" in caplog.text
