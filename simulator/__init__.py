@@ -5,28 +5,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-_EXPORTS = {
-    "BayerPattern": "camera",
-    "CameraProfile": "camera",
-    "CameraSettings": "settings",
-    "CameraSimulator": "camera_simulator",
-    "PreparedScene": "capture.prepared_scene",
-    "NoiseLevelFunction": "camera",
-    "RawImage": "raw.image",
-    "SimulationPlan": "capture.plan",
-    "develop": "raw.develop",
-    "estimate_nlf": "raw.noise_estimation",
-    "exposure_ratio": "settings",
-    "get_camera": "camera",
-    "incident_ev100": "settings",
-    "list_cameras": "camera",
-    "read_raw": "raw.read",
-    "render_srgb": "raw.develop",
-    "sensor_signal": "settings",
-    "write_dng": "raw.dng",
-}
-__all__ = sorted(_EXPORTS)
-
 if TYPE_CHECKING:
     from simulator.camera import BayerPattern as BayerPattern
     from simulator.camera import CameraProfile as CameraProfile
@@ -36,6 +14,7 @@ if TYPE_CHECKING:
     from simulator.camera_simulator import CameraSimulator as CameraSimulator
     from simulator.capture.plan import SimulationPlan as SimulationPlan
     from simulator.capture.prepared_scene import PreparedScene as PreparedScene
+    from simulator.raw.decoding import RawFileError as RawFileError
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
     from simulator.raw.dng import write_dng as write_dng
@@ -47,12 +26,52 @@ if TYPE_CHECKING:
     from simulator.settings import incident_ev100 as incident_ev100
     from simulator.settings import sensor_signal as sensor_signal
 
+__all__ = [
+    "BayerPattern",
+    "CameraProfile",
+    "CameraSettings",
+    "CameraSimulator",
+    "NoiseLevelFunction",
+    "PreparedScene",
+    "RawFileError",
+    "RawImage",
+    "SimulationPlan",
+    "develop",
+    "estimate_nlf",
+    "exposure_ratio",
+    "get_camera",
+    "incident_ev100",
+    "list_cameras",
+    "read_raw",
+    "render_srgb",
+    "sensor_signal",
+    "write_dng",
+]
+
+#: Module of each public name; loaded when the name is first used, so that importing is fast.
+_MODULES = {
+    "camera": ["BayerPattern", "CameraProfile", "NoiseLevelFunction", "get_camera", "list_cameras"],
+    "camera_simulator": ["CameraSimulator"],
+    "capture.plan": ["SimulationPlan"],
+    "capture.prepared_scene": ["PreparedScene"],
+    "raw.decoding": ["RawFileError"],
+    "raw.develop": ["develop", "render_srgb"],
+    "raw.dng": ["write_dng"],
+    "raw.image": ["RawImage"],
+    "raw.noise_estimation": ["estimate_nlf"],
+    "raw.read": ["read_raw"],
+    "settings": ["CameraSettings", "exposure_ratio", "incident_ev100", "sensor_signal"],
+}
+
 
 def __getattr__(name: str) -> Any:
-    if name in _EXPORTS:
-        return getattr(importlib.import_module(f"simulator.{_EXPORTS[name]}"), name)
+    for module, names in _MODULES.items():
+        if name in names:
+            value = getattr(importlib.import_module(f"simulator.{module}"), name)
+            globals()[name] = value  # found directly from now on
+            return value
     raise AttributeError(f"module 'simulator' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return [*__all__, *globals()]
+    return __all__

@@ -11,6 +11,8 @@ import hypothesis
 import pytest
 import torch
 
+from simulator.utils.files import data_folder
+
 # Property tests run the same examples every time, keep none, and may wait for a kernel to compile;
 # HYPOTHESIS_EXAMPLES asks for more of them.
 hypothesis.settings.register_profile(
@@ -33,9 +35,8 @@ torch.set_num_threads(min(2, torch.get_num_threads()))
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """The folder of real files named by AE_ENV_DATA, or a skip that says what is missing."""
-    default = Path(__file__).resolve().parents[2] / "shared" / "data"
-    folder = Path(os.environ.get("AE_ENV_DATA", default))
-    if not folder.is_dir():
+    folder = data_folder()
+    if folder is None:
         pytest.skip("real data not found: set AE_ENV_DATA to its folder")
     return folder
 

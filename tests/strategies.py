@@ -1,4 +1,4 @@
-"""What property tests draw from: settings, camera bodies, grids and images of any shape."""
+"""Strategies of property tests: settings, camera bodies, grids and images of any shape."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SHAPES = st.one_of(
     st.tuples(st.integers(1, 6), st.integers(1, 6)),
     st.sampled_from([(1, 257), (300, 1), (17, 31)]),
 )
-#: Any light at all, and where it is likely to go wrong.
+#: Any light at all, and values where it is likely to go wrong.
 LIGHT = st.one_of(
     st.floats(-2.0, 2.0, width=32),
     st.floats(allow_nan=False, allow_infinity=False, width=32),

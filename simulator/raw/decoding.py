@@ -1,8 +1,9 @@
-"""What raw files hold before a camera is known: by LibRaw, and DNGs of `write_dng` without it."""
+"""Decoding raw files before their camera is known: by LibRaw, or directly for our own DNGs."""
 
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -14,32 +15,38 @@ import numpy as np
 import rawpy
 
 from simulator.camera import BayerPattern
-from simulator.raw.dng import (
-    ORIENTATIONS,
-    OwnRecord,
+from simulator.raw.dng import ORIENTATIONS, OwnRecord
+from simulator.raw.metadata import (
+    Directory,
+    first,
     first_numbers,
+    numbers,
     read_black_level,
     read_colour_matrix,
     read_long_iso,
-    read_plain_mosaic,
 )
-from simulator.raw.metadata import Content, Directory, describe_file, numbers
 from simulator.utils.files import refuse_bomb
 
 logger = logging.getLogger(__name__)
 
-PHOTOMETRIC, COLOUR_FILTER_ARRAY = 262, 32803
-_BITS, _LINEARISATION, _WHITE_LEVEL = 258, 50712, 50717
+#: PhotometricInterpretation of a raw, and of a DNG that is demosaicked already.
+COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
 _LETTERS = {0: "R", 1: "G", 2: "B"}
+_DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
 
 
 class RawFileError(ValueError):
     """A file that is not a Bayer raw, or not a whole one; the message says what it is."""
 
+    @classmethod
+    def of(cls, path: Path, text: str) -> RawFileError:
+        """An error about the file at `path`, which is called by its name alone."""
+        return cls(f"`path` (={path.name!r}) {text}")
+
 
 @dataclass(frozen=True)
 class Decoded:
-    """The mosaic of a file, and what the file says about it."""
+    """The mosaic of a file, and its description by the file."""
 
     mosaic: np.ndarray  # (H, W) uint16, visible area
     cfa: BayerPattern
@@ -53,41 +60,42 @@ class Decoded:
     extra: dict[str, Any]
 
 
-def decode_own_dng(
-    path: Path, data: Content, directories: list[Directory], own: OwnRecord
-) -> Decoded | None:
+# -- DNGs of `write_dng` --------------------------------------------------------------------------
+
+
+def decode_own_dng(path: Path, directories: Sequence[Directory], own: OwnRecord) -> Decoded | None:
     """A DNG of `write_dng` without LibRaw, which misreads very small frames of some makes.
 
     Returns:
-        None if another program has laid the pixels out anew.
+        None if another program has changed the layout of its pixels.
 
     Raises:
         RawFileError: If it is damaged.
     """
-    mosaic = read_plain_mosaic(data, directories)
+    mosaic = _plain_mosaic(path, directories)
     if mosaic is None:
         return None
-    tile = first_numbers(directories, 33422)
+    tile = first_numbers(directories, "CFAPattern")
     letters = "".join(_LETTERS.get(int(colour), "?") for colour in tile)
     if letters not in {p.value for p in BayerPattern}:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must have a Bayer tile of 0 (R), 1 (G), 2 (B), but its "
-            f"CFAPattern is {tile}: damaged"
+        raise RawFileError.of(
+            path,
+            f"must have a Bayer tile of 0 (R), 1 (G), 2 (B), but its CFAPattern is {tile}: damaged",
         )
     black = read_black_level(directories, BayerPattern(letters), (0, 0))
     if black is None:
         return None
-    white = next(iter(first_numbers(directories, _WHITE_LEVEL)), 0.0)
-    neutral = first_numbers(directories, 50728)
+    white = next(iter(first_numbers(directories, "WhiteLevel")), 0.0)
+    neutral = first_numbers(directories, "AsShotNeutral")
     known = len(neutral) == 3 and min(neutral) > 0
     red, green, blue = neutral if known else (1.0, 1.0, 1.0)
     flips = {orientation: flip for flip, orientation in ORIENTATIONS.items()}
-    orientation = next(iter(first_numbers(directories, 274)), 1)
+    orientation = next(iter(first_numbers(directories, "Orientation")), 1)
     extra: dict[str, Any] = {"flip": flips.get(int(orientation), 0)}
-    moment = next((str(d[36867][0]) for d in directories if 36867 in d), "")
+    moment = str((first(directories, "DateTimeOriginal") or ("",))[0])
     with suppress(ValueError):  # blanks where it is not known
         extra["datetime"] = datetime.strptime(moment.strip(), "%Y:%m:%d %H:%M:%S").isoformat()
-    focal_length = next(iter(first_numbers(directories, 37386)), 0.0)
+    focal_length = next(iter(first_numbers(directories, "FocalLength")), 0.0)
     if focal_length > 0:
         extra["focal_length"] = float(focal_length)
     return Decoded(
@@ -98,73 +106,75 @@ def decode_own_dng(
         white_balance=(green / red, 1.0, green / blue),
         white_balance_source="camera" if known else "none",
         colour_matrix=read_colour_matrix(directories),
-        colour_matrix_source="XYZ to camera RGB, ColorMatrix of the file",
+        colour_matrix_source=_DNG_MATRIX,
         exposure=(own.settings.iso, own.settings.exposure_time, own.settings.f_number),
         extra=extra,
     )
 
 
+def _plain_mosaic(path: Path, directories: Sequence[Directory]) -> np.ndarray | None:
+    """The pixels of an uncompressed one-strip Bayer DNG, (H, W) uint16; None in other layouts."""
+    tags = _mosaic_directory(directories)
+    if tags.get("BitsPerSample") != (16,) or tags.get("Compression") != (1,):
+        return None
+    names = ("ImageLength", "ImageWidth", "StripOffsets", "StripByteCounts")
+    layout = [numbers(tags, name) for name in names]
+    if any(len(values) != 1 for values in layout):
+        return None
+    height, width, start, size = (int(values[0]) for values in layout)
+    if min(height, width) < 2 or size != 2 * width * height or start + size > os.stat(path).st_size:
+        return None
+    with path.open("rb") as stream:
+        order = "<u2" if stream.read(2) == b"II" else ">u2"
+        strip = np.fromfile(stream, order, width * height, offset=start - 2)
+    if strip.size < width * height:
+        raise RawFileError.of(path, "became shorter while it was read")
+    return strip.reshape(height, width).astype(np.uint16, copy=False)
+
+
+# -- any raw --------------------------------------------------------------------------------------
+
+
 def decode_with_libraw(
-    path: Path, data: Content, directories: list[Directory], opened: ExitStack
+    path: Path, words: str, directories: Sequence[Directory], opened: ExitStack
 ) -> Decoded:
-    """What LibRaw reads; its mosaic lies in LibRaw's memory, which `opened` lets go of."""
-    words = describe_file(data)
+    """A file as LibRaw reads it.
+
+    Args:
+        path: The file.
+        words: What kind of file it is, for error messages.
+        directories: Its TIFF directories.
+        opened: Closes LibRaw's memory, in which the mosaic lies.
+
+    Raises:
+        RawFileError: If LibRaw cannot read it, or it is no Bayer raw.
+    """
     try:
         raw = opened.enter_context(rawpy.imread(str(path)))
-        bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, len(data))
-        if bomb:  # no pixel is decoded before one is asked for
-            raise RawFileError(f"`path` (={path.name!r}, {words}) {bomb}")
+        # No pixel is decoded before one is asked for.
+        bomb = refuse_bomb(raw.sizes.raw_height, raw.sizes.raw_width, os.stat(path).st_size)
+        if bomb:
+            raise RawFileError.of(path, f"({words}) {bomb}")
         return _from_libraw(path, raw, words, directories)
     except rawpy.LibRawFileUnsupportedError:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a camera raw that LibRaw reads, but is {words}, or "
-            "is truncated"
-        ) from None
+        text = f"must be a camera raw that LibRaw reads, but is {words}, or is truncated"
+        raise RawFileError.of(path, text) from None
     except (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError) as error:
         reason = error.args[0] if error.args else error
         reason = reason.decode() if isinstance(reason, bytes) else reason
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a whole raw file, but LibRaw says {reason!s}: "
-            f"{words}, truncated or damaged"
-        ) from None
+        text = f"must be a whole raw file, but LibRaw says {reason}: {words}, truncated or damaged"
+        raise RawFileError.of(path, text) from None
 
 
-def _white_level(
-    path: Path, white: float, black: Sequence[float], directories: list[Directory]
-) -> float:
-    """`white`, or the largest digital number where the file's WhiteLevel cannot be right.
-
-    That is 0, or beyond what the bits of a sample can hold (but for tables of larger values).
-    """
-    where = next((d for d in directories if d.get(PHOTOMETRIC) == (COLOUR_FILTER_ARRAY,)), {})
-    stated = next(iter(numbers(where, _WHITE_LEVEL)), white)
-    bits = next(iter(numbers(where, _BITS)), 16)
-    fits = 8 <= bits <= 16 and _LINEARISATION not in where
-    largest = 2 ** (int(bits) if fits else 16) - 1
-    if not 0 < stated <= largest:
-        logger.warning(
-            "%s: its white level (=%.10g) must be in [1, %d]; %d is used",
-            *(path.name, stated, largest, largest),
-        )
-        white = float(largest)
-    if white <= max(black):
-        raise RawFileError(
-            f"`path` (={path.name!r}) must have a white level above its black levels, but says "
-            f"white {white:g}, black {tuple(black)}"
-        )
-    return float(white)
-
-
-def _from_libraw(path: Path, raw: rawpy.RawPy, words: str, directories: list[Directory]) -> Decoded:
+def _from_libraw(
+    path: Path, raw: rawpy.RawPy, words: str, directories: Sequence[Directory]
+) -> Decoded:
     sizes = raw.sizes
     if raw.raw_type != rawpy.RawType.Flat:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a Bayer raw, but has every colour at every pixel "
-            f"(linear or Foveon): {words}"
-        )
+        text = "must be a Bayer raw, but has every colour at every pixel (linear or Foveon)"
+        raise RawFileError.of(path, f"{text}: {words}")
     indices = _tile_indices(path, raw, words)
-    letters = "".join(raw.color_desc.decode()[i] for i in indices)
-    cfa = BayerPattern(letters)
+    cfa = BayerPattern("".join(raw.color_desc.decode()[i] for i in indices))
     order = [indices[2 * row + column] for row, column in cfa.offsets]  # R, G1, G2, B
     black = [float(raw.black_level_per_channel[i]) for i in order]
     exact = read_black_level(directories, cfa, (sizes.top_margin, sizes.left_margin))
@@ -173,12 +183,10 @@ def _from_libraw(path: Path, raw: rawpy.RawPy, words: str, directories: list[Dir
         black = list(exact)
     white_balance, source = _white_balance(raw)
     matrix, matrix_source = _colour_matrix(raw, directories)
-    white = _white_level(path, float(raw.white_level), black, directories)
     mosaic = raw.raw_image_visible
     if min(mosaic.shape) < 2:
-        raise RawFileError(f"`path` (={path.name!r}) must hold an image, but is empty: {words}")
-    extra: dict[str, Any] = {"flip": int(sizes.flip)}
-    other = raw.other
+        raise RawFileError.of(path, f"must hold an image, but is empty: {words}")
+    other, extra = raw.other, dict[str, Any](flip=int(sizes.flip))
     iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
     if other.timestamp is not None and other.timestamp.timestamp() > 0:
         extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
@@ -188,7 +196,7 @@ def _from_libraw(path: Path, raw: rawpy.RawPy, words: str, directories: list[Dir
         mosaic=mosaic,
         cfa=cfa,
         black_level=tuple(black),  # type: ignore[arg-type]
-        white_level=white,
+        white_level=_white_level(path, float(raw.white_level), black, directories),
         white_balance=white_balance,
         white_balance_source=source,
         colour_matrix=matrix,
@@ -206,9 +214,7 @@ def _tile_indices(path: Path, raw: rawpy.RawPy, words: str) -> list[int]:
         pattern = None
     shape = None if pattern is None else pattern.shape
     if shape == (6, 6):
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a Bayer raw, but has Fujifilm's X-Trans array"
-        )
+        raise RawFileError.of(path, "must be a Bayer raw, but has Fujifilm's X-Trans array")
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
     description = raw.color_desc.decode()
     if shape == (2, 2):
@@ -218,18 +224,15 @@ def _tile_indices(path: Path, raw: rawpy.RawPy, words: str) -> list[int]:
         if letters in {p.value for p in BayerPattern}:
             return indices
         description = letters
-    raise RawFileError(
-        f"`path` (={path.name!r}) must be a Bayer raw (R, G, B in a 2 x 2 tile), but its colour "
-        f"array is {description or 'monochrome'} in {shape or 'no'} tile: {words}"
-    )
+    array = f"{description or 'monochrome'} in {shape or 'no'} tile"
+    text = f"must be a Bayer raw (R, G, B in a 2 x 2 tile), but its colour array is {array}"
+    raise RawFileError.of(path, f"{text}: {words}")
 
 
 def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
     """Gains of R, G, B with green 1: the camera's, else LibRaw's daylight ones, else neutral."""
-    for gains, source in (
-        (raw.camera_whitebalance, "camera"),
-        (raw.daylight_whitebalance, "daylight"),
-    ):
+    known = {"camera": raw.camera_whitebalance, "daylight": raw.daylight_whitebalance}
+    for source, gains in known.items():
         red, green, blue = gains[:3]
         if all(np.isfinite(g) and g > 0 for g in (red, green, blue)):
             return (red / green, 1.0, blue / green), source
@@ -237,12 +240,12 @@ def _white_balance(raw: rawpy.RawPy) -> tuple[tuple[float, float, float], str]:
 
 
 def _colour_matrix(
-    raw: rawpy.RawPy, directories: list[Directory]
+    raw: rawpy.RawPy, directories: Sequence[Directory]
 ) -> tuple[tuple[tuple[float, float, float], ...] | None, str]:
     """XYZ to camera RGB and its source: a DNG's own, else LibRaw's table."""
     stated = read_colour_matrix(directories)
     if stated is not None:
-        return stated, "XYZ to camera RGB, ColorMatrix of the file"
+        return stated, _DNG_MATRIX
     matrix = np.asarray(raw.rgb_xyz_matrix, np.float64)[:3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-6:
         return None, ""
@@ -250,3 +253,36 @@ def _colour_matrix(
     # float32 to the nearest short decimal: LibRaw's own tables have four digits.
     rows = tuple(tuple(round(float(v), 7) for v in row) for row in matrix)
     return rows, f"XYZ to camera RGB, as LibRaw {version} has it"  # type: ignore[return-value]
+
+
+# -- both -----------------------------------------------------------------------------------------
+
+
+def _mosaic_directory(directories: Sequence[Directory]) -> Directory:
+    """The directory that describes the colour filter array; empty where there is none."""
+    return next(
+        (d for d in directories if d.get("PhotometricInterpretation") == (COLOUR_FILTER_ARRAY,)), {}
+    )
+
+
+def _white_level(
+    path: Path, white: float, black: Sequence[float], directories: Sequence[Directory]
+) -> float:
+    """`white`, or the largest digital number where the file's WhiteLevel cannot be right.
+
+    That is 0, or beyond what the bits of a sample can hold (but for tables of larger values).
+    """
+    tags = _mosaic_directory(directories)
+    stated = next(iter(numbers(tags, "WhiteLevel")), white)
+    bits = next(iter(numbers(tags, "BitsPerSample")), 16)
+    fits = 8 <= bits <= 16 and "LinearizationTable" not in tags
+    largest = 2 ** (int(bits) if fits else 16) - 1
+    if not 0 < stated <= largest:
+        text = f"its white level (={stated:.10g}) must be in [1, {largest}]; {largest} is used"
+        logger.warning("%s: %s", path.name, text)
+        white = float(largest)
+    if white <= max(black):
+        levels = f"white {white:g}, black {tuple(black)}"
+        text = f"must have a white level above its black levels, but says {levels}"
+        raise RawFileError.of(path, text)
+    return float(white)

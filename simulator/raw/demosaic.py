@@ -49,7 +49,7 @@ def demosaic_malvar(packed: torch.Tensor, cfa: BayerPattern | str) -> torch.Tens
 
     A missing colour is its bilinear estimate plus a share of the Laplacian of the colour that is
     there: 1/2 for green, 5/8 at greens, 3/4 for red at blue and blue at red. The border is
-    mirrored about its last pixel, which keeps every colour on its own rows and columns.
+    mirrored about its last pixel, so every colour stays on its own rows and columns.
 
     Source: H. S. Malvar, L. He, R. Cutler, "High-quality linear interpolation for demosaicing of
     Bayer-patterned color images", ICASSP 2004, figure 2.

@@ -71,8 +71,8 @@ def develop(
     check_name("tone", tone, TONES)
     gains = _check_gains(white_balance, images)
     encoded = torch.empty(len(images), 3, *images.shape[2:], device=images.device)
-    # A few images at a time stay in the CPU's cache: twice as fast, and the
-    # same up to the last bits of float32, which depend on a pixel's place in the array.
+    # A few images at a time stay in the CPU's cache: twice as fast, and the same up to the last
+    # bits of float32, which depend on a pixel's position in the array.
     step = max(1, _CHUNK // images[0].numel()) if images.device.type == "cpu" else len(images)
     for start in range(0, len(images), step):
         part = slice(start, start + step)
@@ -101,8 +101,10 @@ def render_srgb(
         (3, 2H, 2W) uint8 for ``"malvar"``, (3, H, W) for ``"half"``, sRGB.
 
     Raises:
-        ValueError: If a name is unknown or `exposure_ev` is out of range.
+        ValueError: If `raw` is no `RawImage`, a name is unknown or `exposure_ev` is out of range.
     """
+    if not isinstance(raw, RawImage):
+        raise ValueError(f"`raw` (={type(raw).__name__}) must be a RawImage")
     check_name("demosaic", demosaic, DEMOSAICS)
     check_name("tone", tone, TONES)
     if not (math.isfinite(exposure_ev) and abs(exposure_ev) <= 32.0):
@@ -123,9 +125,8 @@ def balance(images: torch.Tensor, white_balance: Gains) -> torch.Tensor:
     """White-balance packed raws and clip their highlights to white.
 
     The gains are divided by their smallest, so a saturated pixel reaches at least 1 in every
-    channel; then everything is clipped at 1. Without that clip the gains would turn what saturated
-    the sensor magenta. Negative values are kept: clipping them here would lift the black level of
-    noisy shadows.
+    channel; then everything is clipped at 1. Without that clip the gains would turn saturated areas
+    magenta. Negative values stay: clipping them here would lift the black level of noisy shadows.
 
     Args:
         images: (B, 4, H, W) float32, planes R, G1, G2, B.
@@ -167,7 +168,8 @@ def _srgb_from_camera(rows: tuple[tuple[float, ...], ...]) -> list[list[float]]:
     camera_from_srgb /= white
     if np.linalg.cond(camera_from_srgb) > 1e6:
         raise ValueError(f"`colour_matrix` (={rows}) must be invertible")
-    return np.linalg.inv(camera_from_srgb).tolist()
+    inverse: list[list[float]] = np.linalg.inv(camera_from_srgb).tolist()
+    return inverse
 
 
 def apply_tone(linear: torch.Tensor, tone: str) -> torch.Tensor:

@@ -1,58 +1,56 @@
-"""DNG files: a raw, simulated or not, for any raw developer."""
+"""Writing DNG files: a raw, simulated or not, for any raw developer.
+
+The tags stand here by their names in TIFF 6.0, EXIF 2.3 and the DNG specification 1.4. The file has
+one uncompressed strip: the only layout that every raw developer in use reads.
+"""
 
 from __future__ import annotations
 
 import itertools
 import json
 import os
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, replace
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from importlib import metadata
+from enum import IntEnum
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import tifffile
 
-from simulator.camera import VARIANCE_LIMIT, BayerPattern, NoiseLevelFunction
 from simulator.raw.image import RawImage, unpack_mosaic
-from simulator.raw.metadata import (
-    MAKE,
-    MODEL,
-    SOFTWARE,
-    Content,
-    Directory,
-    Tag,
-    TiffType,
-    numbers,
-    tiff_head,
-)
 from simulator.settings import CameraSettings
 from simulator.utils.files import as_path, write_atomically
+from simulator.utils.results import package_version
 
-# DNG tags that LibRaw does not hand on: noise profile, fractional black level, our own record.
 #: Begins the Software tag of every DNG written here.
 SOFTWARE_NAME = "ae-env"
-USER_COMMENT = 37510
+#: Begins a UserComment in ASCII.
 COMMENT_PREFIX = b"ASCII\0\0\0"
-CFA_PLANE_COLOUR, NOISE_PROFILE = 50710, 51041
-BLACK_REPEAT, BLACK_LEVEL, BLACK_DELTA_H, BLACK_DELTA_V = 50713, 50714, 50715, 50716
-ACTIVE_AREA = 50829
-ANALOG_BALANCE, D65 = 50727, 21
-#: ColorMatrix, CameraCalibration and CalibrationIlluminant, first and second set.
-_COLOUR_SETS = ((50721, 50723, 50778), (50722, 50724, 50779))
-#: ISO speeds above 65534 stand in these; PhotographicSensitivity then says 65535.
-_LONG_ISO_TAGS = (34866, 34867, 34865)
+#: EXIF's code for daylight of 6500 K.
+D65 = 21
 #: EXIF orientation for LibRaw's flip codes.
 ORIENTATIONS = {0: 1, 3: 3, 5: 8, 6: 6}
-#: Beyond these a file is damaged.
-_MAX_BOX_FACTOR, _LARGEST_FACTOR = 4096, 1000.0
-_EXPOSURE_TAGS = {"iso": 34866, "exposure_time": 33434, "f_number": 33437}
+#: Colour matrix of a raw whose camera has none: its R, G, B are taken as linear sRGB primaries
+#: (XYZ to sRGB, D65, IEC 61966-2-1).
+DEFAULT_COLOUR_MATRIX = (
+    (3.2406, -1.5372, -0.4986),
+    (-0.9689, 1.8758, 0.0415),
+    (0.0557, -0.2040, 1.0570),
+)
+#: How EXIF spells a date that is not known.
+_NO_DATE = "    :  :     :  :  "
+_CFA_BYTE = {"R": 0, "G": 1, "B": 2}
+_UNCOMPRESSED, _COLOUR_FILTER_ARRAY, _RECTANGULAR = 1, 32803, 1
+#: Packed rows that are converted and written at a time: few, so that they stay in the CPU's cache.
+_STRIP_ROWS = 32
 
 
 @dataclass(frozen=True)
 class OwnRecord:
-    """What `write_dng` notes in the EXIF comment because the standard tags would round it.
+    """A note of `write_dng` in the EXIF comment: values that the standard tags would round.
 
     Args:
         settings: Exact exposure settings.
@@ -74,165 +72,6 @@ class OwnRecord:
             "colour_matrix_source": self.colour_matrix_source,
         }
         return COMMENT_PREFIX + json.dumps(fields).encode("ascii")
-
-
-def _first(directories: list[Directory], tag: int) -> tuple[Any, ...] | None:
-    return next((d[tag] for d in directories if tag in d), None)
-
-
-def first_numbers(directories: list[Directory], tag: int) -> tuple[float, ...]:
-    """The field's values where it is first; empty if it is nowhere or not made of numbers."""
-    return next((numbers(d, tag) for d in directories if tag in d), ())
-
-
-def read_own_record(directories: list[Directory]) -> OwnRecord | None:
-    """The record of a DNG that `write_dng` wrote, else None.
-
-    A record that no longer agrees with the standard EXIF tags (someone edited them) yields to them
-    where they can be a camera's.
-    """
-    software = _first(directories, SOFTWARE)
-    comment = _first(directories, USER_COMMENT)
-    if software is None or not str(software[0]).startswith(SOFTWARE_NAME) or comment is None:
-        return None
-    try:
-        fields = json.loads(comment[0].removeprefix(COMMENT_PREFIX).rstrip(b"\0 ").decode("ascii"))
-        settings = CameraSettings(**{k: float(fields[k]) for k in _EXPOSURE_TAGS})
-        box_factor, source = int(fields["box_factor"]), str(fields["colour_matrix_source"])
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
-        return None
-    for key, tag in _EXPOSURE_TAGS.items():
-        stated = getattr(settings, key)
-        value = next(iter(first_numbers(directories, tag)), stated)
-        written, rounding = stated, 1e-6 * stated
-        if key == "iso":  # whole, and at least 1
-            written, rounding = max(1.0, stated), 0.5
-        if abs(value - written) > rounding:
-            with suppress(ValueError):
-                settings = replace(settings, **{key: float(value)})
-    return OwnRecord(settings, min(max(1, box_factor), _MAX_BOX_FACTOR), source)
-
-
-def read_long_iso(directories: list[Directory]) -> float | None:
-    """The ISO speed that does not fit EXIF's 16 bits, None where the file has none."""
-    values = (first_numbers(directories, tag) for tag in _LONG_ISO_TAGS)
-    return next((float(v[0]) for v in values if v and v[0] > 0), None)
-
-
-def read_colour_matrix(
-    directories: list[Directory],
-) -> tuple[tuple[float, float, float], ...] | None:
-    """XYZ to camera RGB of a DNG, for D65 or else for its second or only illuminant.
-
-    AnalogBalance and CameraCalibration are multiplied in (DNG specification 1.4, chapter 6).
-    """
-    chosen = None
-    for matrix_tag, calibration_tag, illuminant_tag in _COLOUR_SETS:
-        values = first_numbers(directories, matrix_tag)
-        calibration = first_numbers(directories, calibration_tag)
-        balance = first_numbers(directories, ANALOG_BALANCE)
-        if len(values) != 9 or max(map(abs, (*values, *calibration, *balance))) > _LARGEST_FACTOR:
-            continue
-        matrix = np.array(values, np.float64).reshape(3, 3)
-        if len(calibration) == 9:
-            matrix = np.array(calibration, np.float64).reshape(3, 3) @ matrix
-        if len(balance) == 3:
-            matrix = np.array(balance, np.float64)[:, None] * matrix
-        if abs(np.linalg.det(matrix)) > 1e-6:
-            chosen = tuple(tuple(float(v) for v in row) for row in matrix)
-            if _first(directories, illuminant_tag) == (D65,):
-                break
-    return chosen  # type: ignore[return-value]
-
-
-def read_noise_profile(directories: list[Directory]) -> NoiseLevelFunction | None:
-    """The noise level function of a DNG's NoiseProfile tag (51041), None if it has none.
-
-    The tag holds pairs (S, O), one for all colour planes or one per plane in the order of
-    CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
-    (DNG specification 1.4). Values that cannot be a noise profile are ignored: negative slopes, and
-    variances that no capture has.
-    """
-    values = first_numbers(directories, NOISE_PROFILE)
-    colours = first_numbers(directories, CFA_PLANE_COLOUR) or (0, 1, 2)
-    if len(values) == 2:
-        values = tuple(values) * len(colours)
-    if len(values) != 2 * len(colours) or sorted(colours) != [0, 1, 2]:
-        return None
-    if any(abs(v) > VARIANCE_LIMIT for v in values) or any(v < 0 for v in values[::2]):
-        return None
-    slots = [tuple(colours).index(c) for c in (0, 1, 1, 2)]
-    return NoiseLevelFunction(
-        shot=tuple(float(values[2 * s]) for s in slots),  # type: ignore[arg-type]
-        read=tuple(max(0.0, float(values[2 * s + 1])) for s in slots),  # type: ignore[arg-type]
-        source="DNG NoiseProfile of the file",
-    )
-
-
-def read_black_level(
-    directories: list[Directory], cfa: BayerPattern, origin: tuple[int, int]
-) -> tuple[float, float, float, float] | None:
-    """Black level per plane R, G1, G2, B with its fraction; None for other forms of the tag.
-
-    Args:
-        directories: The file's.
-        cfa: Order of the colour filter array at `origin`.
-        origin: Row and column of the file's array where the mosaic begins. The tag's tile begins
-            at the corner of the ActiveArea (DNG specification 1.4).
-    """
-    where = next((d for d in directories if BLACK_LEVEL in d), None)
-    if where is None or BLACK_DELTA_H in where or BLACK_DELTA_V in where:
-        return None
-    repeat, values = where.get(BLACK_REPEAT, (1, 1)), numbers(where, BLACK_LEVEL)
-    if any(v < 0 for v in values):
-        return None
-    if tuple(repeat) == (1, 1) and len(values) == 1:
-        values = tuple(values) * 4
-    elif tuple(repeat) != (2, 2) or len(values) != 4:
-        return None
-    corner = numbers(where, ACTIVE_AREA)[:2] or (0, 0)
-    if len(corner) != 2:
-        return None
-    down, right = (a - int(b) for a, b in zip(origin, corner, strict=True))
-    return tuple(  # type: ignore[return-value]
-        float(values[2 * ((row + down) % 2) + (column + right) % 2]) for row, column in cfa.offsets
-    )
-
-
-def read_plain_mosaic(data: Content, directories: list[Directory]) -> np.ndarray | None:
-    """The pixels of an uncompressed one-strip Bayer DNG as `write_dng` writes it, (H, W) uint16.
-
-    LibRaw crops and misreads very small frames of some makes; these pixels are plainly there.
-
-    Returns:
-        None if the file is laid out in another way.
-    """
-    where = next((d for d in directories if d.get(262) == (32803,)), {})
-    if where.get(258) != (16,) or where.get(259) != (1,):
-        return None
-    layout = [numbers(where, tag) for tag in (257, 256, 273, 279)]
-    if any(len(values) != 1 for values in layout):
-        return None
-    height, width, start, size = (int(values[0]) for values in layout)
-    if min(height, width) < 2 or size != 2 * width * height or start + size > len(data):
-        return None
-    order = "<u2" if data[:2] == b"II" else ">u2"
-    strip = np.frombuffer(data[start : start + size], order)
-    return strip.reshape(height, width).astype(np.uint16, copy=False)
-
-
-#: Colour matrix of a raw whose camera has none: its R, G, B are taken as linear sRGB primaries
-#: (XYZ to sRGB, D65, IEC 61966-2-1).
-DEFAULT_COLOUR_MATRIX = (
-    (3.2406, -1.5372, -0.4986),
-    (-0.9689, 1.8758, 0.0415),
-    (0.0557, -0.2040, 1.0570),
-)
-#: What EXIF writes for a date that is not known.
-_NO_DATE = "    :  :     :  :  "
-_CFA_BYTE = {"R": 0, "G": 1, "B": 2}
-#: Packed rows that are converted and written at a time: few, so that they stay in the cache.
-_STRIP_ROWS = 32
 
 
 def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
@@ -270,7 +109,7 @@ def _strip(raw: RawImage) -> Iterator[bytes | memoryview]:
         yield rows.astype("<u2", copy=False).data.cast("B")
 
 
-def _image_tags(raw: RawImage) -> dict[int, Tag]:
+def _image_tags(raw: RawImage) -> dict[str, Tag]:
     camera = raw.camera
     height, width = 2 * raw.data.shape[1], 2 * raw.data.shape[2]
     matrix = camera.colour_matrix or DEFAULT_COLOUR_MATRIX
@@ -278,35 +117,36 @@ def _image_tags(raw: RawImage) -> dict[int, Tag]:
     if model == "unknown":
         model = camera.name
     unique = model if model.lower().startswith(make.lower()) else f"{make} {model}"
-    tags = {
-        254: Tag(TiffType.LONG, [0]),  # a full-resolution image
-        256: Tag(TiffType.LONG, [width]),
-        257: Tag(TiffType.LONG, [height]),
-        258: Tag(TiffType.SHORT, [16]),
-        259: Tag(TiffType.SHORT, [1]),  # uncompressed: every reader takes that
-        262: Tag(TiffType.SHORT, [32803]),  # colour filter array
-        MAKE: Tag(TiffType.ASCII, make),
-        MODEL: Tag(TiffType.ASCII, model),
-        274: Tag(TiffType.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
-        277: Tag(TiffType.SHORT, [1]),
-        278: Tag(TiffType.LONG, [height]),  # one strip
-        284: Tag(TiffType.SHORT, [1]),
-        SOFTWARE: Tag(TiffType.ASCII, f"{SOFTWARE_NAME} {_version()}"),
-        306: Tag(TiffType.ASCII, _date(raw)),
-        33421: Tag(TiffType.SHORT, [2, 2]),
-        33422: Tag(TiffType.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),
-        50706: Tag(TiffType.BYTE, [1, 4, 0, 0]),
-        50707: Tag(TiffType.BYTE, [1, 1, 0, 0]),
-        50708: Tag(TiffType.ASCII, unique),
-        CFA_PLANE_COLOUR: Tag(TiffType.BYTE, [0, 1, 2]),
-        50711: Tag(TiffType.SHORT, [1]),  # rectangular layout
-        50717: Tag(TiffType.LONG, [round(camera.white_level)]),
-        50721: Tag(TiffType.SRATIONAL, [v for row in matrix for v in row]),
-        50728: Tag(TiffType.RATIONAL, [_neutral(g) for g in raw.white_balance]),
-        50730: Tag(TiffType.SRATIONAL, [0.0]),
-        50778: Tag(TiffType.SHORT, [D65]),
+    return {
+        "NewSubfileType": Tag(TiffType.LONG, [0]),  # a full-resolution image
+        "ImageWidth": Tag(TiffType.LONG, [width]),
+        "ImageLength": Tag(TiffType.LONG, [height]),
+        "BitsPerSample": Tag(TiffType.SHORT, [16]),
+        "Compression": Tag(TiffType.SHORT, [_UNCOMPRESSED]),
+        "PhotometricInterpretation": Tag(TiffType.SHORT, [_COLOUR_FILTER_ARRAY]),
+        "Make": Tag(TiffType.ASCII, make),
+        "Model": Tag(TiffType.ASCII, model),
+        "Orientation": Tag(TiffType.SHORT, [ORIENTATIONS.get(raw.metadata.get("flip", 0), 1)]),
+        "SamplesPerPixel": Tag(TiffType.SHORT, [1]),
+        "RowsPerStrip": Tag(TiffType.LONG, [height]),
+        "PlanarConfiguration": Tag(TiffType.SHORT, [1]),
+        "Software": Tag(TiffType.ASCII, f"{SOFTWARE_NAME} {package_version()}"),
+        "DateTime": Tag(TiffType.ASCII, _date(raw)),
+        "CFARepeatPatternDim": Tag(TiffType.SHORT, [2, 2]),
+        "CFAPattern": Tag(TiffType.BYTE, [_CFA_BYTE[letter] for letter in camera.cfa.value]),
+        "DNGVersion": Tag(TiffType.BYTE, [1, 4, 0, 0]),
+        "DNGBackwardVersion": Tag(TiffType.BYTE, [1, 1, 0, 0]),
+        "UniqueCameraModel": Tag(TiffType.ASCII, unique),
+        "CFAPlaneColor": Tag(TiffType.BYTE, [0, 1, 2]),
+        "CFALayout": Tag(TiffType.SHORT, [_RECTANGULAR]),
+        "WhiteLevel": Tag(TiffType.LONG, [round(camera.white_level)]),
+        "ColorMatrix1": Tag(TiffType.SRATIONAL, [v for row in matrix for v in row]),
+        "CalibrationIlluminant1": Tag(TiffType.SHORT, [D65]),
+        "AsShotNeutral": Tag(TiffType.RATIONAL, [_neutral(g) for g in raw.white_balance]),
+        "BaselineExposure": Tag(TiffType.SRATIONAL, [0.0]),
+        **_black_tags(raw),
+        **_noise_tags(raw),
     }
-    return tags | _black_tags(raw) | _noise_tags(raw)
 
 
 def _neutral(gain: float) -> float:
@@ -314,49 +154,46 @@ def _neutral(gain: float) -> float:
     return float(f"{1.0 / gain:.12g}")
 
 
-def _black_tags(raw: RawImage) -> dict[int, Tag]:
+def _black_tags(raw: RawImage) -> dict[str, Tag]:
     black = raw.camera.black_level
     whole = all(b == round(b) for b in black)
     kind = TiffType.LONG if whole else TiffType.RATIONAL
     values = [round(b) for b in black] if whole else list(black)
     if len(set(black)) == 1:
-        return {BLACK_LEVEL: Tag(kind, values[:1])}
+        return {"BlackLevel": Tag(kind, values[:1])}
     tile = [values[0]] * 4
     for value, (row, column) in zip(values, raw.camera.cfa.offsets, strict=True):
         tile[2 * row + column] = value
-    return {BLACK_REPEAT: Tag(TiffType.SHORT, [2, 2]), BLACK_LEVEL: Tag(kind, tile)}
+    return {"BlackLevelRepeatDim": Tag(TiffType.SHORT, [2, 2]), "BlackLevel": Tag(kind, tile)}
 
 
-def _noise_tags(raw: RawImage) -> dict[int, Tag]:
+def _noise_tags(raw: RawImage) -> dict[str, Tag]:
     if raw.nlf is None and not raw.camera.nlf_by_iso:
         return {}  # not known; `read_raw` will estimate it
-    noise: NoiseLevelFunction = raw.noise
-    pairs: list[float] = []
+    noise, pairs = raw.noise, list[float]()
     for planes in ((0,), (1, 2), (3,)):
         pairs += [float(np.mean([noise.shot[p] for p in planes]))]
         pairs += [float(np.mean([noise.read[p] for p in planes]))]
-    return {NOISE_PROFILE: Tag(TiffType.DOUBLE, pairs)}
+    return {"NoiseProfile": Tag(TiffType.DOUBLE, pairs)}
 
 
-def _exif_tags(raw: RawImage) -> dict[int, Tag]:
-    settings = raw.settings
+def _exif_tags(raw: RawImage) -> dict[str, Tag]:
+    settings, camera = raw.settings, raw.camera
     iso = max(1, round(settings.iso))
-    record = OwnRecord(
-        settings,
-        raw.box_factor,
-        (raw.camera.colour_matrix_source or "given") if raw.camera.colour_matrix else "",
-    )
+    source = (camera.colour_matrix_source or "given") if camera.colour_matrix else ""
+    record = OwnRecord(settings, raw.box_factor, source)
     return {
-        33434: Tag(TiffType.RATIONAL, [settings.exposure_time]),
-        33437: Tag(TiffType.RATIONAL, [settings.f_number]),
-        34855: Tag(TiffType.SHORT, [min(iso, 65535)]),  # 65535 sends readers to tag 34866
-        34864: Tag(TiffType.SHORT, [2]),  # sensitivity is the recommended exposure index
-        34866: Tag(TiffType.LONG, [iso]),
-        36864: Tag(TiffType.UNDEFINED, b"0230"),
-        36867: Tag(TiffType.ASCII, _date(raw)),
-        36868: Tag(TiffType.ASCII, _date(raw)),
-        37386: Tag(TiffType.RATIONAL, [float(raw.metadata.get("focal_length", 0.0))]),
-        USER_COMMENT: Tag(TiffType.UNDEFINED, record.to_comment()),
+        "ExposureTime": Tag(TiffType.RATIONAL, [settings.exposure_time]),
+        "FNumber": Tag(TiffType.RATIONAL, [settings.f_number]),
+        # 65535 sends readers to RecommendedExposureIndex, which SensitivityType 2 announces.
+        "PhotographicSensitivity": Tag(TiffType.SHORT, [min(iso, 65535)]),
+        "SensitivityType": Tag(TiffType.SHORT, [2]),
+        "RecommendedExposureIndex": Tag(TiffType.LONG, [iso]),
+        "ExifVersion": Tag(TiffType.UNDEFINED, b"0230"),
+        "DateTimeOriginal": Tag(TiffType.ASCII, _date(raw)),
+        "DateTimeDigitized": Tag(TiffType.ASCII, _date(raw)),
+        "FocalLength": Tag(TiffType.RATIONAL, [float(raw.metadata.get("focal_length", 0.0))]),
+        "UserComment": Tag(TiffType.UNDEFINED, record.to_comment()),
     }
 
 
@@ -369,8 +206,98 @@ def _date(raw: RawImage) -> str:
     return moment.strftime("%Y:%m:%d %H:%M:%S")
 
 
-def _version() -> str:
-    try:
-        return metadata.version("ae-env")
-    except metadata.PackageNotFoundError:
-        return "0"
+# -- TIFF -----------------------------------------------------------------------------------------
+
+
+class TiffType(IntEnum):
+    """Field types of TIFF 6.0."""
+
+    BYTE = 1
+    ASCII = 2
+    SHORT = 3
+    LONG = 4
+    RATIONAL = 5
+    UNDEFINED = 7
+    SRATIONAL = 10
+    DOUBLE = 12
+
+
+_FORMATS = {1: "B", 3: "H", 4: "I", 5: "I", 10: "i", 12: "d"}
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A field to write: its type and its values (rationals as numbers, text as ``str``)."""
+
+    type: TiffType
+    values: Sequence[float] | str | bytes
+
+    def encode(self) -> tuple[int, bytes]:
+        """Number of values and their bytes, little endian."""
+        if isinstance(self.values, str):
+            data = self.values.encode("ascii", "replace") + b"\0"
+            return len(data), data
+        if isinstance(self.values, bytes):
+            return len(self.values), self.values
+        flat: list[Any] = list(self.values)
+        if self.type in (TiffType.RATIONAL, TiffType.SRATIONAL):
+            signed = self.type == TiffType.SRATIONAL
+            flat = [part for v in flat for part in as_rational(v, signed=signed)]
+        return len(self.values), struct.pack(f"<{len(flat)}{_FORMATS[self.type]}", *flat)
+
+
+def as_rational(value: float, *, signed: bool = False) -> tuple[int, int]:
+    """Numerator and denominator, each in 32 bits, nearest to `value`.
+
+    >>> as_rational(1 / 60), as_rational(2.8), as_rational(0.0)
+    ((1, 60), (14, 5), (0, 1))
+    """
+    limit = 2**31 - 1 if signed else 2**32 - 1
+    exact = Fraction(value)
+    if abs(exact) > limit or (exact < 0 and not signed):
+        raise ValueError(f"`value` (={value!r}) must fit a {'signed ' * signed}32-bit rational")
+    # The simplest fraction that is the same float64: 1/60 stays 1/60.
+    bound = limit if abs(exact) <= 1 else max(1, int(limit / abs(exact)))
+    for denominator in (1000, 100_000, bound):
+        candidate = exact.limit_denominator(min(denominator, bound))
+        if candidate.numerator / candidate.denominator == value:
+            break
+    return candidate.numerator, candidate.denominator
+
+
+def _pack_directory(tags: Mapping[str, Tag], offset: int) -> bytes:
+    """A directory that begins at `offset` of the file, followed by its out-of-line values."""
+    entries, outside = [], b""
+    values_at = offset + 2 + 12 * len(tags) + 4
+    codes = {int(tifffile.TIFF.EXIF_TAGS[name]): tag for name, tag in tags.items()}
+    for code, tag in sorted(codes.items()):
+        count, data = tag.encode()
+        if len(data) > 4:
+            field = struct.pack("<I", values_at + len(outside))
+            outside += data + b"\0" * (len(data) % 2)
+        else:
+            field = data.ljust(4, b"\0")
+        entries.append(struct.pack("<HHI", code, tag.type, count) + field)
+    return struct.pack("<H", len(tags)) + b"".join(entries) + b"\0\0\0\0" + outside
+
+
+def tiff_head(tags: Mapping[str, Tag], exif: Mapping[str, Tag], size: int) -> bytes:
+    """A little-endian TIFF file of one strip of pixels, up to where the strip begins.
+
+    Args:
+        tags: Its directory. The position and length of the strip and of the EXIF directory are
+            filled in.
+        exif: Its EXIF directory.
+        size: Length of the strip [byte].
+    """
+
+    def directory(strip_at: int, exif_at: int) -> bytes:
+        positions = {"StripOffsets": strip_at, "StripByteCounts": size, "ExifTag": exif_at}
+        own = {name: Tag(TiffType.LONG, [value]) for name, value in positions.items()}
+        return _pack_directory({**tags, **own}, 8)
+
+    exif_at = 8 + len(directory(0, 0))
+    packed_exif = _pack_directory(exif, exif_at)
+    strip_at = -(-(exif_at + len(packed_exif)) // 16) * 16
+    head = struct.pack("<2sHI", b"II", 42, 8) + directory(strip_at, exif_at) + packed_exif
+    return head.ljust(strip_at, b"\0")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,201 +16,14 @@ from simulator.settings import CameraSettings
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares
 
-
-# A Bayer mosaic to planes and back, in one pass; CPU only, for `simulator.raw.image`.
-#
-# The two planes of a mosaic row are taken together: their columns alternate, and only whole rows are
-# vectorised by the compiler.
-@kernel()
-def _split(row, left_black, left_span, right_black, right_span, left, right):  # type: ignore[no-untyped-def]
-    for x in range(len(left)):
-        left[x] = np.float32((np.float64(row[2 * x]) - left_black) / left_span)
-        right[x] = np.float32((np.float64(row[2 * x + 1]) - right_black) / right_span)
-
-
-@kernel()
-def pack_rows(mosaic, tile, black, span, first, planes):  # type: ignore[no-untyped-def]
-    """Rows of the planes (4, H, W) float32 from `first` on: ``(mosaic - black) / span``.
-
-    Args:
-        mosaic: (2R, 2W or more) digital numbers of those rows.
-        tile: (2, 2) plane at each place of the colour filter array.
-        black: (4,) float64.
-        span: (4,) float64, from black to white.
-        first: Row of the planes.
-        planes: Written to.
-    """
-    for y in range(len(mosaic) // 2):
-        for row in range(2):
-            p, q = tile[row]
-            left, right = planes[p, first + y], planes[q, first + y]
-            _split(mosaic[2 * y + row], black[p], span[p], black[q], span[q], left, right)
-
-
-@kernel()
-def _weave(left, left_black, left_span, right, right_black, right_span, white, row):  # type: ignore[no-untyped-def]
-    zero = np.float32(0)
-    for x in range(len(left)):
-        a = np.rint(left[x] * left_span + left_black)
-        b = np.rint(right[x] * right_span + right_black)
-        a, b = a if a > zero else zero, b if b > zero else zero
-        row[2 * x] = np.uint16(np.int32(a if a < white else white))
-        row[2 * x + 1] = np.uint16(np.int32(b if b < white else white))
-
-
-@kernel()
-def unpack_rows(planes, tile, black, span, white, first, last, mosaic):  # type: ignore[no-untyped-def]
-    """The inverse of `pack_rows`, rounded and clipped to [0, white]; in float32, as captures are.
-
-    Args:
-        planes: (4, H, W) float32.
-        tile: (2, 2) plane at each place of the colour filter array.
-        black: (4,) float32.
-        span: (4,) float32.
-        white: Largest number, float32.
-        first: Row of the planes.
-        last: Row of the planes.
-        mosaic: (2 (last - first), 2W) uint16, written to.
-    """
-    for y in range(first, last):
-        for row in range(2):
-            p, q = tile[row]
-            left, right, out = planes[p, y], planes[q, y], mosaic[2 * (y - first) + row]
-            _weave(left, black[p], span[p], right, black[q], span[q], white, out)
-
-
-@kernel()
-def mark_saturated(planes, limits, first, last, marks):  # type: ignore[no-untyped-def]
-    """Rows `first` to `last` of `marks`: whether some plane reaches its limit.
-
-    Args:
-        planes: (4, H, W) float32.
-        limits: (4,) float32.
-        first: Row of the planes.
-        last: Row of the planes.
-        marks: (H, W) bool, written to.
-    """
-    r, g1, g2, b = limits
-    for y in range(first, last):
-        row = marks[y]
-        for x in range(len(row)):
-            upper = (planes[0, y, x] >= r) | (planes[1, y, x] >= g1)
-            row[x] = upper | (planes[2, y, x] >= g2) | (planes[3, y, x] >= b)
-
-
 PLANES = ("R", "G1", "G2", "B")
 #: Packed rows from which a second thread helps, and that are packed at a time.
 _SHARE, _ROWS = 128, 32
 
 
-def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
-    """Bayer mosaic of digital numbers to a packed raw.
-
-    Args:
-        mosaic: (2H, 2W) digital numbers, any integer or float dtype. An odd last row or column is
-            dropped.
-        camera: Gives the CFA order and the black and white levels.
-
-    Returns:
-        (4, H, W) float32, planes R, G1, G2, B; black-subtracted, 1.0 at sensor white.
-
-    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
-
-        R  G1
-        G2 B
-    """
-
-    if mosaic.ndim != 2 or min(mosaic.shape) < 2:
-        raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
-    height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
-    planes = np.empty((4, height, width), np.float32)
-
-    # One kernel for what files hold, and one for all else.
-    dtype = np.uint16 if mosaic.dtype == np.uint16 else np.float64
-    tile = _tile(camera)
-    black, span = (np.array(v, np.float64) for v in (camera.black_level, camera.span))
-
-    def pack(first: int, last: int) -> None:
-        for top in range(first, last, _ROWS):  # what has to be copied stays in the cache
-            rows = mosaic[2 * top : 2 * min(top + _ROWS, last)]
-            pack_rows(np.ascontiguousarray(rows, dtype), tile, black, span, top, planes)
-
-    in_shares(pack, height, least=_SHARE)
-    return torch.from_numpy(planes)
-
-
-def unpack_mosaic(
-    data: torch.Tensor, camera: CameraProfile, first: int = 0, last: int | None = None
-) -> np.ndarray:
-    """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`.
-
-    Args:
-        data: The packed raw.
-        camera: See `pack_mosaic`.
-        first: First packed row of the part that is wanted.
-        last: Where that part ends; by default with the frame.
-    """
-
-    planes = data.detach().float().cpu().contiguous().numpy()
-    _, height, width = planes.shape
-    count = (height if last is None else last) - first
-    mosaic = np.empty((2 * count, 2 * width), np.uint16)
-
-    tile, white = _tile(camera), np.float32(camera.white_level)
-    black, span = (np.array(v, np.float32) for v in (camera.black_level, camera.span))
-
-    def unpack(top: int, bottom: int) -> None:
-        part = mosaic[2 * top : 2 * bottom]
-        unpack_rows(planes, tile, black, span, white, first + top, first + bottom, part)
-
-    in_shares(unpack, count, least=_SHARE)
-    return mosaic
-
-
-def _tile(camera: CameraProfile) -> np.ndarray:
-    """(2, 2) plane at each place of the colour filter array."""
-    tile = np.empty((2, 2), np.int64)
-    for plane, place in enumerate(camera.cfa.offsets):
-        tile[place] = plane
-    return tile
-
-
-def new_frame(like: torch.Tensor) -> torch.Tensor:
-    """Float32 memory for a frame of the shape of `like`, not initialised.
-
-    For large arrays NumPy asks the system for huge pages, which torch does not: the first writing
-    of a full frame then takes a quarter of the time.
-    """
-    if like.device.type != "cpu":
-        return torch.empty(like.shape, device=like.device)
-    return torch.from_numpy(np.empty(tuple(like.shape), np.float32))
-
-
-def check_packed(name: str, data: object, *, ndim: int = 3) -> torch.Tensor:
-    """`data` as a float32 packed raw, or a `ValueError` with name, value and rule."""
-    if isinstance(data, np.ndarray):
-        data = torch.from_numpy(np.ascontiguousarray(data))
-    if not isinstance(data, torch.Tensor):
-        raise ValueError(f"`{name}` (={type(data).__name__}) must be a torch tensor or numpy array")
-    shape = "(4, H, W)" if ndim == 3 else "(B, 4, H, W)"
-    if data.ndim != ndim or data.shape[-3] != 4 or min(data.shape) < 1:
-        raise ValueError(f"`{name}` (shape {tuple(data.shape)}) must be {shape}: R, G1, G2, B")
-    if not data.dtype.is_floating_point:
-        raise ValueError(
-            f"`{name}` (dtype {data.dtype}) must be floating point with white at 1.0; digital "
-            "numbers go through RawImage.from_mosaic"
-        )
-    data = data.float()
-    low, high = torch.aminmax(data.detach())  # passes NaN on; 20 times faster than isfinite().all()
-    if not (math.isfinite(low.item()) and math.isfinite(high.item())):
-        bad = int((~torch.isfinite(data)).sum())
-        raise ValueError(f"`{name}` ({bad} values NaN or infinite) must be finite everywhere")
-    return data
-
-
 @dataclass(frozen=True, eq=False)
 class RawImage:
-    """A raw photograph: packed sensor data with the settings and camera that made it.
+    """A raw photograph: packed sensor data with the settings and camera that took it.
 
     Args:
         data: (4, H, W) float, planes R, G1, G2, B; black-subtracted, 1.0 is sensor white, negative
@@ -225,7 +37,8 @@ class RawImage:
         metadata: Whatever else is known: file name, how the NLF was found, excess noise.
 
     Raises:
-        ValueError: If the data has the wrong shape or dtype, or is not finite.
+        ValueError: If the data has the wrong shape or dtype or is not finite, or another argument
+            is of the wrong type or out of range.
     """
 
     data: torch.Tensor
@@ -238,6 +51,12 @@ class RawImage:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_packed("data", self.data))
+        for name, kind in (("settings", CameraSettings), ("camera", CameraProfile)):
+            value = getattr(self, name)
+            if not isinstance(value, kind):
+                raise ValueError(f"`{name}` (={value!r}) must be a {kind.__name__}")
+        if not isinstance(self.nlf, NoiseLevelFunction | None):
+            raise ValueError(f"`nlf` (={self.nlf!r}) must be a NoiseLevelFunction or None")
         gains = tuple(float(g) for g in self.white_balance)
         if len(gains) != 3 or not all(np.isfinite(g) and g > 0 for g in gains):
             raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
@@ -271,8 +90,7 @@ class RawImage:
         """(H, W) bool: some plane of the pixel is within half a digital number of white."""
         limits = np.array([1.0 - 0.5 / s for s in self.camera.span], np.float32)
         if self.data.device.type != "cpu":
-            planes = zip(self.data.unbind(), limits.tolist(), strict=True)
-            return functools.reduce(torch.Tensor.bitwise_or_, (p >= limit for p, limit in planes))
+            return (self.data >= torch.tensor(limits).to(self.data)[:, None, None]).any(dim=0)
 
         data = self.data.detach().contiguous().numpy()
         marks = np.empty(data.shape[1:], np.bool_)
@@ -286,3 +104,191 @@ class RawImage:
     def __repr__(self) -> str:
         _, height, width = self.data.shape
         return f"RawImage({height} x {width} packed, {self.settings}, {self.camera.name})"
+
+
+def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
+    """Bayer mosaic of digital numbers to a packed raw.
+
+    Args:
+        mosaic: (2H, 2W) digital numbers, any integer or float dtype. An odd last row or column is
+            dropped.
+        camera: Gives the CFA order and the black and white levels.
+
+    Returns:
+        (4, H, W) float32, planes R, G1, G2, B; black-subtracted, 1.0 at sensor white.
+
+    The tile of an RGGB camera, G1 on red's rows and G2 on blue's::
+
+        R  G1
+        G2 B
+    """
+    if mosaic.ndim != 2 or min(mosaic.shape) < 2:
+        raise ValueError(f"`mosaic` (shape {mosaic.shape}) must be (2H, 2W) with H, W >= 1")
+    height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
+    planes = np.empty((4, height, width), np.float32)
+
+    # One kernel for what files hold, and one for all else.
+    dtype = np.uint16 if mosaic.dtype == np.uint16 else np.float64
+    tile = _tile(camera)
+    black, span = (np.array(v, np.float64) for v in (camera.black_level, camera.span))
+
+    def pack(first: int, last: int) -> None:
+        for top in range(first, last, _ROWS):  # what has to be copied stays in the cache
+            rows = mosaic[2 * top : 2 * min(top + _ROWS, last)]
+            pack_rows(np.ascontiguousarray(rows, dtype), tile, black, span, top, planes)
+
+    in_shares(pack, height, least=_SHARE)
+    return torch.from_numpy(planes)
+
+
+def unpack_mosaic(
+    data: torch.Tensor, camera: CameraProfile, first: int = 0, last: int | None = None
+) -> np.ndarray:
+    """Packed raw (4, H, W) to the uint16 mosaic (2H, 2W); inverts `pack_mosaic`.
+
+    Args:
+        data: The packed raw.
+        camera: See `pack_mosaic`.
+        first: First packed row of the part that is wanted.
+        last: Where that part ends; by default with the frame.
+    """
+    planes = data.detach().float().cpu().contiguous().numpy()
+    _, height, width = planes.shape
+    count = (height if last is None else last) - first
+    mosaic = np.empty((2 * count, 2 * width), np.uint16)
+
+    tile, white = _tile(camera), np.float32(camera.white_level)
+    black, span = (np.array(v, np.float32) for v in (camera.black_level, camera.span))
+
+    def unpack(top: int, bottom: int) -> None:
+        part = mosaic[2 * top : 2 * bottom]
+        unpack_rows(planes, tile, black, span, white, first + top, first + bottom, part)
+
+    in_shares(unpack, count, least=_SHARE)
+    return mosaic
+
+
+def _tile(camera: CameraProfile) -> np.ndarray:
+    """(2, 2) plane at each position of the colour filter array."""
+    tile = np.empty((2, 2), np.int64)
+    for plane, position in enumerate(camera.cfa.offsets):
+        tile[position] = plane
+    return tile
+
+
+def new_frame(like: torch.Tensor) -> torch.Tensor:
+    """Uninitialised float32 memory for a frame of the shape of `like`.
+
+    For large arrays NumPy asks the system for huge pages, which torch does not: the first write of
+    a full frame then takes a quarter of the time.
+    """
+    if like.device.type != "cpu":
+        return torch.empty(like.shape, device=like.device)
+    return torch.from_numpy(np.empty(tuple(like.shape), np.float32))
+
+
+def check_packed(name: str, data: object, *, ndim: int = 3) -> torch.Tensor:
+    """`data` as a float32 packed raw, or a `ValueError` with name, value and rule."""
+    if isinstance(data, np.ndarray) and data.dtype.kind in "biuf":
+        data = torch.from_numpy(np.ascontiguousarray(data))
+    if not isinstance(data, torch.Tensor) or data.layout != torch.strided:
+        kind = data.layout if isinstance(data, torch.Tensor) else type(data).__name__
+        raise ValueError(
+            f"`{name}` (={kind}) must be a dense torch tensor or numpy array of numbers"
+        )
+    shape = "(4, H, W)" if ndim == 3 else "(B, 4, H, W)"
+    if data.ndim != ndim or data.shape[-3] != 4 or min(data.shape) < 1:
+        raise ValueError(f"`{name}` (shape {tuple(data.shape)}) must be {shape}: R, G1, G2, B")
+    if not data.dtype.is_floating_point:
+        raise ValueError(
+            f"`{name}` (dtype {data.dtype}) must be floating point with white at 1.0; digital "
+            "numbers go through RawImage.from_mosaic"
+        )
+    data = data.float()
+    low, high = torch.aminmax(data.detach())  # passes NaN on; 20 times faster than isfinite().all()
+    if not (math.isfinite(low.item()) and math.isfinite(high.item())):
+        bad = int((~torch.isfinite(data)).sum())
+        raise ValueError(f"`{name}` ({bad} values NaN or infinite) must be finite everywhere")
+    return data
+
+
+# -- kernels of the CPU: a mosaic to planes and back in one pass --------------------------------
+
+
+# The two planes of a mosaic row are taken together: their columns alternate, and the compiler
+# vectorises whole rows only.
+@kernel()
+def _split(row, left_black, left_span, right_black, right_span, left, right):  # type: ignore[no-untyped-def]
+    for x in range(len(left)):
+        left[x] = np.float32((np.float64(row[2 * x]) - left_black) / left_span)
+        right[x] = np.float32((np.float64(row[2 * x + 1]) - right_black) / right_span)
+
+
+@kernel()
+def pack_rows(mosaic, tile, black, span, first, planes):  # type: ignore[no-untyped-def]
+    """Fill rows of the planes (4, H, W) float32 from `first` on: ``(mosaic - black) / span``.
+
+    Args:
+        mosaic: (2R, 2W or more) digital numbers of those rows.
+        tile: (2, 2) plane at each position of the colour filter array.
+        black: (4,) float64.
+        span: (4,) float64, from black to white.
+        first: Row of the planes.
+        planes: Written to.
+    """
+    for y in range(len(mosaic) // 2):
+        for row in range(2):
+            p, q = tile[row]
+            left, right = planes[p, first + y], planes[q, first + y]
+            _split(mosaic[2 * y + row], black[p], span[p], black[q], span[q], left, right)
+
+
+@kernel()
+def _weave(left, left_black, left_span, right, right_black, right_span, white, row):  # type: ignore[no-untyped-def]
+    zero = np.float32(0)
+    for x in range(len(left)):
+        a = np.rint(left[x] * left_span + left_black)
+        b = np.rint(right[x] * right_span + right_black)
+        a, b = a if a > zero else zero, b if b > zero else zero
+        row[2 * x] = np.uint16(np.int32(a if a < white else white))
+        row[2 * x + 1] = np.uint16(np.int32(b if b < white else white))
+
+
+@kernel()
+def unpack_rows(planes, tile, black, span, white, first, last, mosaic):  # type: ignore[no-untyped-def]
+    """The inverse of `pack_rows`, rounded and clipped to [0, white]; in float32, as captures are.
+
+    Args:
+        planes: (4, H, W) float32.
+        tile: (2, 2) plane at each position of the colour filter array.
+        black: (4,) float32.
+        span: (4,) float32.
+        white: Largest number, float32.
+        first: Row of the planes.
+        last: Row of the planes.
+        mosaic: (2 (last - first), 2W) uint16, written to.
+    """
+    for y in range(first, last):
+        for row in range(2):
+            p, q = tile[row]
+            left, right, out = planes[p, y], planes[q, y], mosaic[2 * (y - first) + row]
+            _weave(left, black[p], span[p], right, black[q], span[q], white, out)
+
+
+@kernel()
+def mark_saturated(planes, limits, first, last, marks):  # type: ignore[no-untyped-def]
+    """Mark the pixels of rows `first` to `last` where some plane reaches its limit.
+
+    Args:
+        planes: (4, H, W) float32.
+        limits: (4,) float32.
+        first: Row of the planes.
+        last: Row of the planes.
+        marks: (H, W) bool, written to.
+    """
+    r, g1, g2, b = limits
+    for y in range(first, last):
+        row = marks[y]
+        for x in range(len(row)):
+            upper = (planes[0, y, x] >= r) | (planes[1, y, x] >= g1)
+            row[x] = upper | (planes[2, y, x] >= g2) | (planes[3, y, x] >= b)

@@ -1,282 +1,179 @@
-"""Who made a raw file: the camera's make and model, whatever the container."""
+"""Metadata of raw files: their tags, their camera, their noise and colour.
+
+The tags of TIFF-structured files (DNG, NEF, CR2, ARW, ...) are read with tifffile. From other
+containers (CRW, CR3, RAF, MRW) only make and model are read; LibRaw reads their settings.
+"""
 
 from __future__ import annotations
 
+import io
+import json
+import logging
 import math
-import os
 import re
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from enum import IntEnum
-from fractions import Fraction
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, BinaryIO
 
-# TIFF directories: the tags of TIFF-based files (DNG, NEF, CR2, ARW ...), read and written.
-#
-# Only what raw files need: tags are read without their pixels, and a file of one uncompressed image
-# with an EXIF directory is written. Numbers follow TIFF 6.0 and EXIF 2.3.
-Directory = dict[int, tuple[Any, ...]]
+import numpy as np
+import tifffile
 
-#: Tags that point to further directories: SubIFDs, EXIF.
-SUB_DIRECTORIES = (330, 34665)
-EXIF_DIRECTORY = 34665
-_STRIPS, _TILES = (273, 279), (324, 325)
-#: Beyond these a file is damaged, or made to take forever; camera files stay far below. Longer
-#: values (maker notes, previews) are passed over, but for the places of strips and tiles.
-_MAX_DIRECTORIES, _MAX_ENTRIES, _MAX_VALUE, _MAX_VALUES = 64, 4096, 2**16, 2**22
+from simulator.camera import VARIANCE_LIMIT, BayerPattern, NoiseLevelFunction
+from simulator.raw.dng import COMMENT_PREFIX, D65, SOFTWARE_NAME, OwnRecord
+from simulator.settings import CameraSettings
+
+#: The tags of one TIFF directory: a tuple of values by name. Rationals are floats, ASCII is one
+#: ``str``, UNDEFINED one ``bytes``.
+Directory = dict[str, tuple[Any, ...]]
+
+# -- TIFF directories -----------------------------------------------------------------------------
+
+_POSITIONS = ("StripOffsets", "StripByteCounts", "TileOffsets", "TileByteCounts")
+#: The tags that are read, by name. Others (maker notes, previews, XMP) are passed over.
+_NAMES = (
+    *("ImageWidth", "ImageLength", "BitsPerSample", "Compression", "PhotometricInterpretation"),
+    *("Make", "Model", "Orientation", "Software", *_POSITIONS),
+    *("CFAPattern", "CFAPlaneColor", "LinearizationTable", "WhiteLevel", "ActiveArea"),
+    *("BlackLevelRepeatDim", "BlackLevel", "BlackLevelDeltaH", "BlackLevelDeltaV"),
+    *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),
+    *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
+    *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
+    *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
+)
+_NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
+_SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
+_WANTED = {*_NAME_OF_CODE, _SUB_DIRECTORIES, _EXIF}
 #: 42 is TIFF; the others are the same structure under Olympus' and Panasonic's own magic.
 _MAGIC = (42, 0x4F52, 0x5352, 0x55)
+#: Beyond these a file is damaged, or made to take forever; camera files stay far below.
+_MAX_DIRECTORIES, _MAX_TAGS, _MAX_VALUES = 64, 4096, 2**18
 
 
-class TiffType(IntEnum):
-    """Field types of TIFF 6.0 that are written here."""
-
-    BYTE = 1
-    ASCII = 2
-    SHORT = 3
-    LONG = 4
-    RATIONAL = 5
-    UNDEFINED = 7
-    SRATIONAL = 10
-    DOUBLE = 12
-
-
-_FORMATS = {1: "B", 2: "c", 3: "H", 4: "I", 5: "II", 6: "b", 7: "c", 8: "h", 9: "i"}
-_FORMATS |= {10: "ii", 11: "f", 12: "d", 13: "I"}
-
-
-@dataclass(frozen=True)
-class Tag:
-    """One field to write: its type and its values (rationals as numbers, text as ``str``)."""
-
-    type: TiffType
-    values: Sequence[Any] | str | bytes
-
-
-def as_rational(value: float, *, signed: bool = False) -> tuple[int, int]:
-    """Numerator and denominator, each in 32 bits, nearest to `value`.
-
-    >>> as_rational(1 / 60), as_rational(2.8), as_rational(0.0)
-    ((1, 60), (14, 5), (0, 1))
-    """
-    limit = 2**31 - 1 if signed else 2**32 - 1
-    exact = Fraction(value)
-    if abs(exact) > limit or (exact < 0 and not signed):
-        raise ValueError(f"`value` (={value!r}) must fit a {'signed ' * signed}32-bit rational")
-    # The simplest fraction that is the same float64 keeps 1/60 as 1/60.
-    bound = limit if abs(exact) <= 1 else max(1, int(limit / abs(exact)))
-    for denominator in (1000, 100_000, bound):
-        candidate = exact.limit_denominator(min(denominator, bound))
-        if candidate.numerator / candidate.denominator == value:
-            break
-    return candidate.numerator, candidate.denominator
-
-
-def _encode(tag: Tag) -> tuple[int, bytes]:
-    """Count and bytes of a field, little endian."""
-    if isinstance(tag.values, str):
-        data = tag.values.encode("ascii", "replace") + b"\0"
-        return len(data), data
-    if isinstance(tag.values, bytes):
-        return len(tag.values), tag.values
-    values = list(tag.values)
-    if tag.type in (TiffType.RATIONAL, TiffType.SRATIONAL):
-        signed = tag.type == TiffType.SRATIONAL
-        flat = [part for v in values for part in as_rational(v, signed=signed)]
-        return len(values), struct.pack(f"<{len(flat)}{_FORMATS[tag.type][0]}", *flat)
-    return len(values), struct.pack(f"<{len(values)}{_FORMATS[tag.type]}", *values)
-
-
-def _pack_directory(tags: Mapping[int, Tag], offset: int) -> bytes:
-    """A directory that begins at `offset` of the file, followed by its out-of-line values."""
-    entries, outside = [], b""
-    values_at = offset + 2 + 12 * len(tags) + 4
-    for number in sorted(tags):
-        count, data = _encode(tags[number])
-        if len(data) > 4:
-            field = struct.pack("<I", values_at + len(outside))
-            outside += data + b"\0" * (len(data) % 2)
-        else:
-            field = data.ljust(4, b"\0")
-        entries.append(struct.pack("<HHI", number, tags[number].type, count) + field)
-    return struct.pack("<H", len(tags)) + b"".join(entries) + b"\0\0\0\0" + outside
-
-
-def tiff_head(tags: Mapping[int, Tag], exif: Mapping[int, Tag], size: int) -> bytes:
-    """A little-endian TIFF file of one strip of pixels, up to where the strip begins.
-
-    The strip's offset and length (tags 273, 279) and the EXIF pointer (34665) are filled in.
+def read_directories(stream: BinaryIO) -> list[Directory]:
+    """The tags of all directories of a TIFF-structured file, SubIFDs and EXIF included.
 
     Args:
-        tags: Its directory.
-        exif: Its EXIF directory.
-        size: Length of the strip [byte].
-    """
-    layout = dict(tags)
-    layout[273] = layout[EXIF_DIRECTORY] = Tag(TiffType.LONG, [0])
-    layout[279] = Tag(TiffType.LONG, [size])
-    exif_at = 8 + len(_pack_directory(layout, 8))
-    packed_exif = _pack_directory(exif, exif_at)
-    strip_at = -(-(exif_at + len(packed_exif)) // 16) * 16
-    layout[273] = Tag(TiffType.LONG, [strip_at])
-    layout[EXIF_DIRECTORY] = Tag(TiffType.LONG, [exif_at])
-    head = struct.pack("<2sHI", b"II", 42, 8) + _pack_directory(layout, 8) + packed_exif
-    return head.ljust(strip_at, b"\0")
-
-
-class FileContent:
-    """The bytes of a file, of which only those are read that are looked at.
-
-    (Memory that is mapped would end the process where a file shrinks or a disk fails meanwhile.)
-
-    Args:
-        path: The file. It stays open until `close`.
-
-    Raises:
-        FileNotFoundError: If there is no such file; also for a folder.
-    """
-
-    def __init__(self, path: Path) -> None:
-        if not path.is_file():
-            missing = "is no ordinary file" if path.exists() else "does not exist"
-            what = "is a folder" if path.is_dir() else missing
-            raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
-        self._path, self._stream = path, path.open("rb")
-        self._size = os.fstat(self._stream.fileno()).st_size
-
-    def __len__(self) -> int:
-        return self._size
-
-    def __getitem__(self, part: slice) -> bytes:
-        start, stop, _ = part.indices(self._size)
-        self._stream.seek(start)
-        found = self._stream.read(max(0, stop - start))
-        if len(found) < stop - start:
-            raise OSError(f"`path` (={str(self._path)!r}) became shorter while it was read")
-        return found
-
-    def close(self) -> None:
-        """Nothing can be read afterwards."""
-        self._stream.close()
-
-
-#: The bytes of a file, at hand or not.
-Content = bytes | FileContent
-
-
-def unpack_at(form: str, data: Content, offset: int) -> tuple[Any, ...]:
-    """`struct.unpack` of what stands at `offset`."""
-    return struct.unpack(form, data[offset : offset + struct.calcsize(form)])
-
-
-def _decode(kind: int, data: bytes, order: str) -> tuple[Any, ...]:
-    if kind == TiffType.ASCII:
-        return (data.split(b"\0")[0].decode("utf-8", "replace").strip(),)
-    if kind == TiffType.UNDEFINED:
-        return (data,)
-    values = struct.unpack(f"{order}{len(data) // struct.calcsize(_FORMATS[kind][0])}"
-                           f"{_FORMATS[kind][0]}", data)  # fmt: skip
-    if kind in (TiffType.RATIONAL, TiffType.SRATIONAL):
-        pairs = zip(values[::2], values[1::2], strict=True)
-        return tuple(a / b if b else float("nan") for a, b in pairs)
-    return values
-
-
-def _read_directory(
-    data: Content, offset: int, order: str, room: int
-) -> tuple[Directory, int, int]:
-    """Tags of the directory at `offset`, where the next one is, and how many bytes they took.
-
-    Broken fields are left out, and those that do not fit into `room` bytes.
-    """
-    if not 8 <= offset <= len(data) - 2:
-        return {}, 0, 0
-    (count,) = unpack_at(f"{order}H", data, offset)
-    end = offset + 2 + 12 * count
-    if end > len(data) or count > _MAX_ENTRIES:
-        return {}, 0, 0
-    tags: Directory = {}
-    used = 0
-    for at in range(offset + 2, end, 12):
-        number, kind, length = unpack_at(f"{order}HHI", data, at)
-        if kind not in _FORMATS or length == 0:
-            continue
-        size = length * struct.calcsize("=" + _FORMATS[kind])
-        start = at + 8 if size <= 4 else unpack_at(f"{order}I", data, at + 8)[0]
-        most = room - used if number in (*_STRIPS, *_TILES) else min(_MAX_VALUE, room - used)
-        if start + size <= len(data) and size <= most:
-            tags[number] = _decode(kind, data[start : start + size], order)
-            used += size
-    following = unpack_at(f"{order}I", data, end)[0] if end + 4 <= len(data) else 0
-    return tags, following, used
-
-
-def read_directories(data: Content) -> list[Directory]:
-    """All directories of a TIFF-structured file, SubIFDs and EXIF included, in reading order.
-
-    Args:
-        data: The file. Maker notes are not followed.
+        stream: The file. At most a few megabytes of it are read, whatever it claims.
 
     Returns:
-        One ``{tag: values}`` per directory, at least one value each; rationals as floats, ASCII as
-        one ``str``, UNDEFINED as one ``bytes``. Empty if `data` is not TIFF-structured.
+        One directory each that holds any of the tags above, in reading order. Damaged directories
+        and tags are left out; the list is empty if the file is not TIFF-structured.
     """
-    order = {b"II": "<", b"MM": ">"}.get(data[:2])
-    if order is None or len(data) < 8:
+    head = _read_at(stream, 0, 8)
+    form = {b"II": tifffile.TIFF.CLASSIC_LE, b"MM": tifffile.TIFF.CLASSIC_BE}.get(head[:2])
+    if form is None or len(head) < 8:
         return []
-    magic, first = unpack_at(f"{order}HI", data, 2)
-    if magic not in _MAGIC:
-        return []
-    pending, seen = [first], set[int]()
+    magic, start = struct.unpack(f"{form.byteorder}HI", head[2:])
+    # All that `TiffTag` needs of a file; `TiffFile` itself also interprets what it finds, and gives
+    # up a whole directory for one damaged tag.
+    file = SimpleNamespace(tiff=form, filehandle=tifffile.FileHandle(stream, offset=0))
     found: list[Directory] = []
-    room = _MAX_VALUES
-    while pending and len(seen) < _MAX_DIRECTORIES:
-        offset = pending.pop(0)
-        if offset in seen:
-            continue
-        seen.add(offset)
-        tags, following, used = _read_directory(data, offset, order, room)
-        room -= used
-        if not tags:
-            continue
-        found.append(tags)
-        for number in SUB_DIRECTORIES:
-            pending += [v for v in tags.get(number, ()) if isinstance(v, int)]
-        if following:
+    pending, seen, room = [start] if magic in _MAGIC else [], set[int](), _MAX_VALUES
+    with _silent_tifffile():
+        while pending and len(seen) < _MAX_DIRECTORIES:
+            offset = pending.pop(0)
+            if offset in seen:
+                continue
+            seen.add(offset)
+            tags: Directory = {}
+            entries, following = _read_entries(file, offset)
+            for at, entry in entries.items():
+                code, _, count = struct.unpack_from(f"{form.byteorder}HHI", entry)
+                if not 0 < count <= room or code not in _WANTED:
+                    continue
+                room -= count
+                with suppress(Exception):  # of a damaged tag, tifffile may raise anything
+                    tag = tifffile.TiffTag.fromfile(file, offset=at, header=entry)  # type: ignore[arg-type]
+                    if code == _EXIF:
+                        pending.append(tag.valueoffset)
+                    elif code == _SUB_DIRECTORIES:
+                        pending += _values(tag)
+                    else:
+                        tags[_NAME_OF_CODE[code]] = _values(tag)
+            found += [tags] if tags else []
             pending.append(following)
     return found
 
 
-def numbers(tags: Directory, tag: int) -> tuple[float, ...]:
-    """The values of a field; empty where it is missing or any is no finite number.
+def _read_entries(file: SimpleNamespace, offset: int) -> tuple[dict[int, bytes], int]:
+    """The entries of a directory by their positions, and where the next directory is."""
+    handle, order = file.filehandle, file.tiff.byteorder
+    handle.seek(offset)
+    head = handle.read(2)
+    count = struct.unpack(f"{order}H", head)[0] if len(head) == 2 and offset >= 8 else 0
+    content = handle.read(12 * count + 4) if count <= _MAX_TAGS else b""
+    if len(content) < 12 * count:
+        return {}, 0
+    following = struct.unpack(f"{order}I", content[-4:])[0] if len(content) % 12 == 4 else 0
+    return {offset + 2 + at: content[at : at + 12] for at in range(0, 12 * count, 12)}, following
 
-    >>> numbers({33434: (0.5,), 33437: (math.nan,), 271: ("Canon",)}, 33434)
+
+@contextmanager
+def _silent_tifffile() -> Iterator[None]:
+    """Keep tifffile from logging what is unusual about a raw, or damaged."""
+
+    def nothing(_: logging.LogRecord) -> bool:
+        return False
+
+    logger = logging.getLogger("tifffile")
+    logger.addFilter(nothing)
+    try:
+        yield
+    finally:
+        logger.removeFilter(nothing)
+
+
+def _values(tag: tifffile.TiffTag) -> tuple[Any, ...]:
+    """The values of a tag as `Directory` has them."""
+    value, kind = tag.value, tag.dtype
+    if kind == tifffile.DATATYPE.ASCII:
+        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+        return (text.split("\0")[0].strip(),)
+    if isinstance(value, bytes):
+        return tuple(value) if kind == tifffile.DATATYPE.BYTE else (value,)
+    values = tuple(np.ravel(value).tolist())
+    if kind in (tifffile.DATATYPE.RATIONAL, tifffile.DATATYPE.SRATIONAL):
+        pairs = zip(values[::2], values[1::2], strict=True)
+        return tuple(a / b if b else math.nan for a, b in pairs)
+    return values
+
+
+def first(directories: Sequence[Directory], name: str) -> tuple[Any, ...] | None:
+    """The values of a tag in the first directory that has it; None if there is none."""
+    return next((tags[name] for tags in directories if name in tags), None)
+
+
+def numbers(tags: Directory, name: str) -> tuple[float, ...]:
+    """The values of a tag; empty where it is missing or any value is no finite number.
+
+    >>> numbers({"ExposureTime": (0.5,), "FNumber": (math.nan,), "Make": ("X",)}, "ExposureTime")
     (0.5,)
     """
-    values = tags.get(tag, ())
+    values = tags.get(name, ())
     return values if all(isinstance(v, int | float) and math.isfinite(v) for v in values) else ()
+
+
+def first_numbers(directories: Sequence[Directory], name: str) -> tuple[float, ...]:
+    """`numbers` of the first directory that has the tag; empty if there is none."""
+    return next((numbers(tags, name) for tags in directories if name in tags), ())
 
 
 def missing_bytes(directories: Sequence[Directory], size: int) -> int:
     """How many bytes of pixels lie beyond the end of a file of `size` bytes; 0 if it is whole."""
     end = size
     for tags in directories:
-        for offsets, counts in (_STRIPS, _TILES):
+        for offsets, counts in (_POSITIONS[:2], _POSITIONS[2:]):
             pairs = zip(numbers(tags, offsets), numbers(tags, counts), strict=False)
             end = max([end, *(int(a + b) for a, b in pairs)])
     return end - size
 
 
-MAKE, MODEL, SOFTWARE = 271, 272, 305
+# -- the kind of file and its camera --------------------------------------------------------------
+
 UNKNOWN_FILE, CANON_CRW = "a file of unknown type", "a Canon CRW file"
-_CIFF_MAKE_MODEL = 0x080A
-_CIFF_HEAP_TYPES = (0x2800, 0x3000)
-#: A Canon CRW has less than ten heaps of less than a hundred records.
-_CIFF_MAX_HEAPS, _CIFF_MAX_RECORDS = 64, 1024
-#: TIFF structures inside of other containers are shorter.
-_EMBEDDED_BYTES = 2**20
 _SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"\xff\xd8\xff", "a JPEG file"),
     (b"\x89PNG\r\n", "a PNG file"),
@@ -295,11 +192,14 @@ _SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"FUJIFILM", "a Fujifilm RAF file"),
     (b"FOVb", "a Sigma X3F file (Foveon: three colours at every pixel)"),
 )
+#: Record type of make and model in Canon's CIFF, and of the heaps that hold further records.
+_CIFF_MAKE_MODEL, _CIFF_HEAPS = 0x080A, (0x2800, 0x3000)
+#: A Canon CRW has less than ten heaps of less than a hundred records.
+_CIFF_MAX_HEAPS, _CIFF_MAX_RECORDS = 64, 1024
 
 
-def describe_file(data: Content) -> str:
-    """What a file is, from its first bytes, in words for an error message."""
-    head = data[:4096]
+def describe_file(head: bytes) -> str:
+    """Kind of a file in words for an error message, from its first 4096 bytes."""
     for signature, words in _SIGNATURES:
         if head.startswith(signature):
             return words
@@ -316,54 +216,60 @@ def describe_file(data: Content) -> str:
     return UNKNOWN_FILE
 
 
-def camera_identity(data: Content, directories: list[Directory]) -> tuple[str, str]:
+def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple[str, str]:
     """Make and model as the camera recorded them; ``("", "")`` where the file does not say.
 
     Args:
-        data: The file.
+        stream: The file.
         directories: Its TIFF directories, empty for other containers.
     """
     for tags in directories:
-        if MODEL in tags:
-            return str(tags.get(MAKE, ("",))[0]), str(tags[MODEL][0])
-    if data[6:14] == b"HEAPCCDR":
-        return _ciff_identity(data, unpack_at("<I", data, 2)[0], len(data))
-    if data[:8] == b"FUJIFILM":
-        return "FUJIFILM", data[28:60].split(b"\0")[0].decode("ascii", "replace").strip()
-    if data[:4] == b"\0MRM":  # Minolta MRW: a TIFF directory in its block TTW
-        block = data[:65536].find(b"\0TTW")
-        return _embedded_identity(data, block + 8) if block > 0 else ("", "")
-    box = data[:65536].find(b"CMT1")  # Canon CR3: a TIFF directory in a box of that name
-    if data[4:8] == b"ftyp" and box > 0:
-        return _embedded_identity(data, box + 4)
+        if "Model" in tags:
+            return str(tags.get("Make", ("",))[0]), str(tags["Model"][0])
+    head = _read_at(stream, 0, 2**16)
+    if head[6:14] == b"HEAPCCDR":
+        return _ciff_identity(stream, struct.unpack_from("<I", head, 2)[0])
+    if head[:8] == b"FUJIFILM":
+        return "FUJIFILM", _text(head[28:60])
+    # Minolta MRW and Canon CR3 have a TIFF directory in a block or box of these names.
+    marker = b"\0TTW" if head[:4] == b"\0MRM" else b"CMT1" if head[4:8] == b"ftyp" else b""
+    at = head.find(marker) if marker else 0
+    if at > 0:
+        start = at + (8 if marker == b"\0TTW" else 4)
+        embedded = io.BytesIO(_read_at(stream, start, 2**20))
+        return camera_identity(io.BytesIO(), read_directories(embedded))
     return "", ""
 
 
-def _embedded_identity(data: Content, at: int) -> tuple[str, str]:
-    """Make and model from a TIFF structure that begins at `at`."""
-    return camera_identity(b"", read_directories(data[at : at + _EMBEDDED_BYTES]))
-
-
-def _ciff_identity(data: Content, start: int, end: int) -> tuple[str, str]:
+def _ciff_identity(stream: BinaryIO, start: int) -> tuple[str, str]:
     """Make and model from Canon CIFF heaps, each with its directory at its end."""
-    heaps = [(start, end)]
+    size = stream.seek(0, io.SEEK_END)
+    heaps = [(start, size)]
     for start, end in heaps:  # grows while it is read
-        if end > len(data) or end - start < 6:
+        if end > size or end - start < 6:
             continue
-        table = start + unpack_at("<I", data, end - 4)[0]
+        table = start + struct.unpack("<I", _read_at(stream, end - 4, 4))[0]
         if not start <= table <= end - 6:
             continue
-        count = min(unpack_at("<H", data, table)[0], _CIFF_MAX_RECORDS)
-        for at in range(table + 2, min(table + 2 + 10 * count, end - 9), 10):
-            kind, size, offset = unpack_at("<HII", data, at)
-            first, last = start + offset, start + offset + size
-            if kind == _CIFF_MAKE_MODEL and last <= end and size < _EMBEDDED_BYTES:
-                make, model = (*data[first:last].split(b"\0"), b"", b"")[:2]
-                return make.decode("ascii", "replace"), model.decode("ascii", "replace")
-            inner = kind & 0x3800 in _CIFF_HEAP_TYPES and kind & 0xC000 == 0
-            if inner and len(heaps) < _CIFF_MAX_HEAPS:
+        records = _read_at(stream, table, min(end - table, 2 + 10 * _CIFF_MAX_RECORDS))
+        count = min(struct.unpack_from("<H", records)[0], (len(records) - 2) // 10)
+        for kind, length, offset in struct.iter_unpack("<HII", records[2 : 2 + 10 * count]):
+            first, last = start + offset, start + offset + length
+            if kind == _CIFF_MAKE_MODEL and last <= end:
+                make, model = (*_read_at(stream, first, min(length, 256)).split(b"\0"), b"")[:2]
+                return _text(make), _text(model)
+            if kind & 0x3800 in _CIFF_HEAPS and kind & 0xC000 == 0 and len(heaps) < _CIFF_MAX_HEAPS:
                 heaps.append((first, last))
     return "", ""
+
+
+def _read_at(stream: BinaryIO, offset: int, size: int) -> bytes:
+    stream.seek(offset)
+    return stream.read(size)
+
+
+def _text(content: bytes) -> str:
+    return content.split(b"\0")[0].decode("ascii", "replace").strip()
 
 
 def normalised_model(make: str, model: str) -> str:
@@ -375,3 +281,129 @@ def normalised_model(make: str, model: str) -> str:
     words = re.findall(r"[a-z0-9]+", make.lower())
     maker = words[0] if words else ""
     return maker + "".join(re.findall(r"[a-z0-9]+", model.lower())).removeprefix(maker)
+
+
+# -- the meaning of DNG tags that LibRaw does not pass on -----------------------------------------
+
+#: ISO speeds above 65534 are in these; PhotographicSensitivity then is 65535.
+_LONG_ISO = ("RecommendedExposureIndex", "ISOSpeed", "StandardOutputSensitivity")
+_EXPOSURE = {
+    "iso": "RecommendedExposureIndex",
+    "exposure_time": "ExposureTime",
+    "f_number": "FNumber",
+}
+#: Beyond these a file is damaged.
+_MAX_BOX_FACTOR, _LARGEST_FACTOR = 4096, 1000.0
+
+
+def read_own_record(directories: Sequence[Directory]) -> OwnRecord | None:
+    """The record of a DNG that `write_dng` wrote, else None.
+
+    A record that no longer agrees with the standard EXIF tags (someone edited them) yields to them
+    where they can be a camera's.
+    """
+    software, comment = first(directories, "Software"), first(directories, "UserComment")
+    if software is None or not str(software[0]).startswith(SOFTWARE_NAME) or comment is None:
+        return None
+    try:
+        fields = json.loads(comment[0].removeprefix(COMMENT_PREFIX).rstrip(b"\0 ").decode("ascii"))
+        settings = CameraSettings(**{key: float(fields[key]) for key in _EXPOSURE})
+        box_factor, source = int(fields["box_factor"]), str(fields["colour_matrix_source"])
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        return None
+    for key, name in _EXPOSURE.items():
+        stated = getattr(settings, key)
+        value = next(iter(first_numbers(directories, name)), stated)
+        written, rounding = stated, 1e-6 * stated
+        if key == "iso":  # whole, and at least 1
+            written, rounding = max(1.0, stated), 0.5
+        if abs(value - written) > rounding:
+            with suppress(ValueError):
+                settings = replace(settings, **{key: float(value)})
+    return OwnRecord(settings, min(max(1, box_factor), _MAX_BOX_FACTOR), source)
+
+
+def read_long_iso(directories: Sequence[Directory]) -> float | None:
+    """The ISO speed that does not fit EXIF's 16 bits, None where the file has none."""
+    values = (first_numbers(directories, name) for name in _LONG_ISO)
+    return next((float(v[0]) for v in values if v and v[0] > 0), None)
+
+
+def read_colour_matrix(
+    directories: Sequence[Directory],
+) -> tuple[tuple[float, float, float], ...] | None:
+    """XYZ to camera RGB of a DNG, for D65 or else for its second or only illuminant.
+
+    AnalogBalance and CameraCalibration are multiplied in (DNG specification 1.4, chapter 6).
+    """
+    chosen = None
+    for number in "12":
+        values = first_numbers(directories, f"ColorMatrix{number}")
+        calibration = first_numbers(directories, f"CameraCalibration{number}")
+        balance = first_numbers(directories, "AnalogBalance")
+        if len(values) != 9 or max(map(abs, (*values, *calibration, *balance))) > _LARGEST_FACTOR:
+            continue
+        matrix = np.array(values, np.float64).reshape(3, 3)
+        if len(calibration) == 9:
+            matrix = np.array(calibration, np.float64).reshape(3, 3) @ matrix
+        if len(balance) == 3:
+            matrix = np.array(balance, np.float64)[:, None] * matrix
+        if abs(np.linalg.det(matrix)) > 1e-6:
+            chosen = tuple(tuple(float(v) for v in row) for row in matrix)
+            if first(directories, f"CalibrationIlluminant{number}") == (D65,):
+                break
+    return chosen  # type: ignore[return-value]
+
+
+def read_noise_profile(directories: Sequence[Directory]) -> NoiseLevelFunction | None:
+    """The noise level function of a DNG's NoiseProfile, None if it has none.
+
+    The tag holds pairs (S, O), one for all colour planes or one per plane in the order of
+    CFAPlaneColor; the variance of a value x between black (0) and white (1) is S x + O
+    (DNG specification 1.4). Values that cannot be a noise profile are ignored: negative slopes, and
+    variances that no capture has.
+    """
+    values = first_numbers(directories, "NoiseProfile")
+    colours = first_numbers(directories, "CFAPlaneColor") or (0, 1, 2)
+    if len(values) == 2:
+        values = tuple(values) * len(colours)
+    if len(values) != 2 * len(colours) or sorted(colours) != [0, 1, 2]:
+        return None
+    if any(abs(v) > VARIANCE_LIMIT for v in values) or any(v < 0 for v in values[::2]):
+        return None
+    pairs = [2 * tuple(colours).index(colour) for colour in (0, 1, 1, 2)]
+    return NoiseLevelFunction(
+        shot=tuple(float(values[i]) for i in pairs),  # type: ignore[arg-type]
+        read=tuple(max(0.0, float(values[i + 1])) for i in pairs),  # type: ignore[arg-type]
+        source="DNG NoiseProfile of the file",
+    )
+
+
+def read_black_level(
+    directories: Sequence[Directory], cfa: BayerPattern, origin: tuple[int, int]
+) -> tuple[float, float, float, float] | None:
+    """Black level per plane R, G1, G2, B with its fraction; None for other forms of the tag.
+
+    Args:
+        directories: The file's.
+        cfa: Order of the colour filter array at `origin`.
+        origin: Row and column of the file's array where the mosaic begins. The tag's tile begins
+            at the corner of the ActiveArea (DNG specification 1.4).
+    """
+    tags = next((tags for tags in directories if "BlackLevel" in tags), None)
+    if tags is None or "BlackLevelDeltaH" in tags or "BlackLevelDeltaV" in tags:
+        return None
+    repeat, values = tags.get("BlackLevelRepeatDim", (1, 1)), numbers(tags, "BlackLevel")
+    if any(v < 0 for v in values):
+        return None
+    if tuple(repeat) == (1, 1) and len(values) == 1:
+        values = tuple(values) * 4
+    elif tuple(repeat) != (2, 2) or len(values) != 4:
+        return None
+    corner = numbers(tags, "ActiveArea")[:2] or (0, 0)
+    if len(corner) != 2:
+        return None
+    down, right = (a - int(b) for a, b in zip(origin, corner, strict=True))
+    return tuple(  # type: ignore[return-value]
+        float(values[2 * ((row + down) % 2) + (column + right) % 2]) for row, column in cfa.offsets
+    )

@@ -20,10 +20,9 @@ from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares
 
 
-# Sums over windows, for `simulator.raw.noise_estimation`; CPU only.
 @kernel()
 def summed_area(image, total):  # type: ignore[no-untyped-def]
-    """Sum over everything above and to the left of each corner of a pixel.
+    """Sum over all pixels above and to the left of each corner of a pixel.
 
     Args:
         image: (H, W), any number type.
@@ -42,7 +41,7 @@ def summed_area(image, total):  # type: ignore[no-untyped-def]
 
 
 _BLOCK, _STEP = 8, 4
-#: Share of each level's blocks, those with the least slope, that are looked at.
+#: Share of each level's blocks that is used: those with the least slope.
 _SMOOTH = 0.3
 #: Quantile of their high-pass energy, and that quantile for white Gaussian noise of variance 1
 #: (simulated once, 140,000 blocks): what makes the low quantile an unbiased variance.
@@ -110,7 +109,7 @@ def estimate_nlf(data: np.ndarray | torch.Tensor) -> NoiseLevelFunction:
     shot, read = 0.0, 1.0
     levels = _level_sets(blocks)
     for _ in range(3):
-        # A level set spans a range of signals: take out the variance's course inside it.
+        # A level set spans a range of signals: correct for the change of the variance inside it.
         level, variance, weight = _variance_by_level(blocks, levels, shot, read)
         # Close to a clip the noise is cut off: leave out levels within three standard deviations.
         sigma = np.sqrt(variance)
@@ -132,18 +131,14 @@ def _central_bands(planes: np.ndarray) -> np.ndarray:
 
 
 def _sums(image: np.ndarray) -> np.ndarray:
-    """(H + 1, W + 1) sum over everything above and to the left of each corner of a pixel."""
-
+    """(H + 1, W + 1) sum over all pixels above and to the left of each corner of a pixel."""
     total = np.empty((image.shape[0] + 1, image.shape[1] + 1))
     summed_area(image, total)
     return total
 
 
 def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.ndarray:
-    """Mean over size x size windows, one every `_STEP` rows and columns from `top` and `left` on.
-
-    As many as there are blocks, wherever the windows lie in them.
-    """
+    """Means of size x size windows, one in each block, at (`top`, `left`) in the block."""
     rows, columns = (range(0, n - _BLOCK, _STEP) for n in total.shape)
     corners = [
         total[top + i : top + i + rows.stop : _STEP, left + j : left + j + columns.stop : _STEP]
@@ -151,7 +146,8 @@ def _box_mean(total: np.ndarray, size: int, top: int = 0, left: int = 0) -> np.n
         for j in (0, size)
     ]
     first, right, below, last = corners
-    return (last - right - below + first) / (size * size)
+    mean: np.ndarray = (last - right - below + first) / (size * size)
+    return mean
 
 
 def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks:
@@ -170,7 +166,7 @@ def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks
 def _blocks_of(plane: np.ndarray, white: float, floor: float) -> tuple[np.ndarray, ...]:
     """Mean, energy and slope of the blocks of one plane; see `_Blocks`."""
     # Immerkaer's [1 -2 1] x [1 -2 1]: blind to slopes and to curvature along one axis; over 6,
-    # it keeps the variance of white noise.
+    # white noise has the same variance after it.
     rows = plane[:-2] - 2.0 * plane[1:-1] + plane[2:]
     high_pass = (rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]) / 6.0
     inner = plane[1:-1, 1:-1]
@@ -220,11 +216,11 @@ def _fit(level: np.ndarray, variance: np.ndarray, weight: np.ndarray) -> tuple[f
     shot, read = _least_squares(signal, variance, weight / variance**2)
     for step in range(40):
         model = np.maximum(shot * signal + read, _TINY)
-        excess = variance / model - 1.0
+        above = variance / model - 1.0
         if step < 30:
-            trust = 1.0 / (1.0 + (np.maximum(excess, 0.0) / _ENVELOPE) ** 2)
+            trust = 1.0 / (1.0 + (np.maximum(above, 0.0) / _ENVELOPE) ** 2)
         else:
-            trust = (excess < _INLIER).astype(np.float64)
+            trust = (above < _INLIER).astype(np.float64)
         shot, read = _least_squares(signal, variance, weight * trust / model**2)
     return shot, read
 

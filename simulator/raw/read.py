@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable
-from contextlib import ExitStack, closing
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,26 +15,26 @@ import numpy as np
 from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera, list_cameras
 from simulator.raw.decoding import (
     COLOUR_FILTER_ARRAY,
-    PHOTOMETRIC,
+    LINEAR_RAW,
     Decoded,
     RawFileError,
     decode_own_dng,
     decode_with_libraw,
 )
-from simulator.raw.dng import NOISE_PROFILE, OwnRecord, read_noise_profile, read_own_record
+from simulator.raw.dng import OwnRecord
 from simulator.raw.image import RawImage, pack_mosaic
 from simulator.raw.metadata import (
     CANON_CRW,
     UNKNOWN_FILE,
-    Content,
     Directory,
-    FileContent,
     camera_identity,
     describe_file,
     missing_bytes,
     normalised_model,
     numbers,
     read_directories,
+    read_noise_profile,
+    read_own_record,
 )
 from simulator.raw.noise_estimation import estimate_nlf
 from simulator.settings import CameraSettings
@@ -44,7 +44,6 @@ logger = logging.getLogger(__name__)
 
 #: A profile whose white level differs by more than this factor is of another bit depth.
 _WHITE_TOLERANCE = 2.0
-_LINEAR_RAW = 34892
 
 
 def read_raw(
@@ -85,15 +84,17 @@ def read_raw(
         FileNotFoundError: If there is no such file.
         RawFileError: (a `ValueError`) If the file is not a raw, not a Bayer raw (X-Trans, Foveon,
             linear DNG, monochrome), cut short or damaged, may not be read, changes meanwhile, or
-            claims more than `simulator.utils.files.MAX_PIXELS` pixels, or `MAX_PIXELS_PER_BYTE` of them
+            claims more than `MAX_PIXELS` of `simulator.utils.files`, or `MAX_PIXELS_PER_BYTE`
             for each byte of the file.
         ValueError: If settings are missing from the file and not given, or `camera` does not fit.
     """
     path = as_path(path)
+    if not path.is_file():
+        missing = "is no ordinary file" if path.exists() else "does not exist"
+        what = "is a folder" if path.is_dir() else missing
+        raise FileNotFoundError(f"`path` (={str(path)!r}) {what}; give a raw file")
     try:
         return _read(path, settings, camera, nlf)
-    except FileNotFoundError:
-        raise
     except OSError as error:
         raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
 
@@ -104,73 +105,91 @@ def _read(
     camera: CameraProfile | str | None,
     nlf: NoiseLevelFunction | None,
 ) -> RawImage:
+    with path.open("rb") as stream:
+        head = stream.read(4096)
+        directories = read_directories(stream)
+        make, model = camera_identity(stream, directories)
+    words = describe_file(head)
+    fault = _fault(os.stat(path).st_size, words, directories, model)
+    if fault:
+        raise RawFileError.of(path, fault)
+    own = read_own_record(directories)
     with ExitStack() as opened:
-        data = opened.enter_context(closing(FileContent(path)))
-        directories = read_directories(data)
-        make, model = camera_identity(data, directories)
-        _refuse_early(path, data, directories, model)
-        own = read_own_record(directories)
-        decoded = None if own is None else decode_own_dng(path, data, directories, own)
+        decoded = None if own is None else decode_own_dng(path, directories, own)
         if decoded is None:
-            decoded = decode_with_libraw(path, data, directories, opened)
+            decoded = decode_with_libraw(path, words, directories, opened)
         known = settings or _settings(path, decoded.exposure, own)
         profile = _profile(path, decoded, make, model, camera, own)
         packed = pack_mosaic(decoded.mosaic, profile)
     if float(packed.max()) > _WHITE_TOLERANCE:
+        times, level = f"{float(packed.max()):.3g}", f"{profile.white_level:g}"
         logger.warning(
-            "%s: its digital numbers reach %.3g times white; its white level (=%g) is wrong: give "
-            "`camera` with the right one",
-            *(path.name, float(packed.max()), profile.white_level),
+            f"{path.name}: its digital numbers reach {times} times white; its white level "
+            f"(={level}) is wrong: give `camera` with the right one"
         )
     box_factor = own.box_factor if own is not None else 1
     noise, source = _noise(packed.numpy(), profile, nlf, directories, box_factor)
     if noise is not None and not profile.nlf_by_iso:
         profile = profile.with_nlf(known.iso, noise)
-    metadata: dict[str, Any] = {"path": path.name, "make": make, "model": model}
-    metadata |= {"nlf_source": source, "white_balance_source": decoded.white_balance_source}
-    metadata |= decoded.extra
-    gains = decoded.white_balance
-    return RawImage(packed, known, profile, noise, gains, box_factor, metadata)
+    return RawImage(
+        packed,
+        known,
+        profile,
+        noise,
+        decoded.white_balance,
+        box_factor,
+        metadata={
+            "path": path.name,
+            "make": make,
+            "model": model,
+            "nlf_source": source,
+            "white_balance_source": decoded.white_balance_source,
+            **decoded.extra,
+        },
+    )
 
 
-def _refuse_early(path: Path, data: Content, directories: list[Directory], model: str) -> None:
-    """Refuse what can be told from the structure: no header, linear DNG, files cut short."""
-    words = describe_file(data)
-    if not len(data):
-        raise RawFileError(f"`path` (={path.name!r}) must be a camera raw, but is {words}")
+def _fault(size: int, words: str, directories: Sequence[Directory], model: str) -> str:
+    """Why a file cannot be a whole Bayer raw, as its structure tells; empty if it can be."""
+    if not size:
+        return f"must be a camera raw, but is {words}"
     if not model and words == UNKNOWN_FILE:
         # LibRaw takes some headerless files for a camera's from their size alone.
-        raise RawFileError(
-            f"`path` (={path.name!r}) must say which camera it is from, but is {UNKNOWN_FILE} "
-            "without a header; read a bare array with numpy.fromfile and RawImage.from_mosaic"
+        return (
+            f"must say which camera it is from, but is {words} without a header; read a bare array "
+            "with numpy.fromfile and RawImage.from_mosaic"
         )
     if not model and words == CANON_CRW:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a whole file, but its directory, with which {words} "
-            "ends, is missing: it is truncated or damaged"
+        return (
+            f"must be a whole file, but its directory, with which {words} ends, is missing: it is "
+            "truncated or damaged"
         )
-    lost = missing_bytes(directories, len(data))
+    lost = missing_bytes(directories, size)
     if lost:
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a whole file, but its directory names {lost} bytes "
-            "beyond its end: it is truncated"
+        return (
+            f"must be a whole file, but its directory names {lost} bytes beyond its end: it is "
+            "truncated"
         )
-    arrays = [d for d in directories if d.get(PHOTOMETRIC) == (COLOUR_FILTER_ARRAY,)]
-    for tags in arrays:
-        height, width = (next(iter(numbers(tags, tag)), 0) for tag in (257, 256))
-        if height < 1 or width < 1 or not (numbers(tags, 273) or numbers(tags, 324)):
-            raise RawFileError(
-                f"`path` (={path.name!r}) must hold an image, but its directory names "
-                f"{height:g} x {width:g} pixels at {tags.get(273, 'no place')}: it is damaged"
+    kinds = [tags.get("PhotometricInterpretation") for tags in directories]
+    if (LINEAR_RAW,) in kinds and (COLOUR_FILTER_ARRAY,) not in kinds:
+        return (
+            "must be a Bayer raw, but is a linear DNG: already demosaicked, its noise is no longer "
+            "per pixel"
+        )
+    for tags in (
+        d for d, kind in zip(directories, kinds, strict=True) if kind == (COLOUR_FILTER_ARRAY,)
+    ):
+        height, width = ((numbers(tags, n) or (0,))[0] for n in ("ImageLength", "ImageWidth"))
+        pixels = numbers(tags, "StripOffsets") or numbers(tags, "TileOffsets")
+        if min(height, width) < 1 or not pixels:
+            return (
+                f"must hold an image, but its directory names {height:g} x {width:g} pixels at "
+                f"{tags.get('StripOffsets', 'no position')}: it is damaged"
             )
-    if not arrays and any(d.get(PHOTOMETRIC) == (_LINEAR_RAW,) for d in directories):
-        raise RawFileError(
-            f"`path` (={path.name!r}) must be a Bayer raw, but is a linear DNG: already "
-            "demosaicked, its noise is no longer per pixel"
-        )
+    return ""
 
 
-def _settings(path: Path, exposure: Iterable[float], own: OwnRecord | None) -> CameraSettings:
+def _settings(path: Path, exposure: Sequence[float], own: OwnRecord | None) -> CameraSettings:
     """Settings from the file: exact from our own DNGs, else as a camera records them."""
     if own is not None:
         return own.settings
@@ -260,7 +279,7 @@ def _noise(
     packed: np.ndarray,
     camera: CameraProfile,
     nlf: NoiseLevelFunction | None,
-    directories: list[Directory],
+    directories: Sequence[Directory],
     box_factor: int,
 ) -> tuple[NoiseLevelFunction | None, str]:
     """NLF of this raw and how it was found; None leaves it to the camera's calibration."""
@@ -269,7 +288,7 @@ def _noise(
     stated = read_noise_profile(directories)
     if stated is not None:
         return stated.scaled(float(box_factor**2)), "DNG NoiseProfile"
-    if any(NOISE_PROFILE in tags for tags in directories):
+    if any("NoiseProfile" in tags for tags in directories):
         logger.warning("the NoiseProfile of the file cannot be one, and is not used")
     if camera.nlf_by_iso:
         return None, f"camera calibration ({camera.name})"

@@ -35,18 +35,18 @@ DRAPED = "draped"
 
 @dataclass(frozen=True, eq=False)
 class ReferenceScene:
-    """What stands before the camera, without noise and in focus throughout.
+    """A scene before the camera, without noise and in focus throughout.
 
     Args:
         scene_id: Unique name.
         group: Source group, the unit of splitting (photograph, panorama, physical subject).
-        kind: Sort of source, such as ``"procedural"``.
+        kind: Kind of source, such as ``"procedural"``.
         light: (4, H, W) float32 >= 0, linear, in camera colours, at `reference`; 1.0 is sensor
             white, not clipped.
         reference: Settings at which `light` is on that scale.
         depth: (H, W) float32, distance from the lens [m], above its focal length, inf allowed;
             None if all is in focus.
-        lens: The lens it is photographed with.
+        lens: The lens that it is photographed with.
         illuminance: Incident light [lux], if known.
         white_balance: Gains of R, G, B of the scene's light.
         source: Where the light comes from.
@@ -89,13 +89,13 @@ class ReferenceScene:
 
 @dataclass(frozen=True)
 class BodyError:
-    """What one body does differently from what its settings say.
+    """Hidden errors of one body: how far its exposures are from what its settings promise.
 
     Args:
         shutter_delay: Added to every exposure time [s].
         shutter_scale: Relative error of every exposure time.
         transmission: Relative error of the light by aperture stop (`CameraSettings.aperture_stop`);
-            a stop that is not there has none.
+            stops that are not listed have no error.
         black_offset: Error of the black level on the packed scale, R, G1, G2, B.
     """
 
@@ -106,12 +106,12 @@ class BodyError:
 
     @classmethod
     def none(cls) -> BodyError:
-        """A body that does what it says."""
+        """A body without errors."""
         return cls()
 
     @classmethod
     def draw(cls, camera: CameraProfile, seed: int) -> BodyError:
-        """A body of `camera` as it might leave the factory.
+        """Draw a body of `camera` as it might leave the factory.
 
         Shutter: 15 us (standard deviation, at most 60 us, so that 1/8000 s stays open) and 1 %.
         Light of each aperture stop: 2 %, at most 6 %. Black: up to 2 digital numbers per plane.
@@ -145,14 +145,14 @@ class BodyError:
         return time
 
     def light_error(self, settings: CameraSettings) -> float:
-        """True light at `settings` over the light that they promise."""
+        """True light at `settings` divided by the light that they promise."""
         time = self.exposure_time(settings.exposure_time) / settings.exposure_time
         return time * (1.0 + self.transmission.get(settings.aperture_stop, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceCapture:
-    """One capture and its truth.
+    """One capture and its ground truth.
 
     Args:
         mean: (4, H, W) without noise, clipped as the capture is, not quantised.
@@ -192,7 +192,7 @@ class ReferenceCamera:
         """Diameter of the circle of confusion, (H, W), in pixels of ``scene.light``, >= 0.
 
         Args:
-            scene: What is photographed.
+            scene: The scene to photograph.
             f_number: As marked on the lens; the blur is that of the stop that it stands for.
         """
         return self._signed_diameter(scene, f_number).abs().to(torch.float32)
@@ -207,10 +207,10 @@ class ReferenceCamera:
         return scene.lens.circle_of_confusion(scene.depth.double(), exact) / pitch
 
     def blurred_light(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
-        """Light on the sensor behind the aperture `f_number`, (4, H, W): defocus and nothing else.
+        """Light on the sensor behind the aperture `f_number`, (4, H, W): defocus alone.
 
-        Still at the exposure of ``scene.reference``, unclipped and without noise: one result serves
-        every ISO and exposure time.
+        It is still at the exposure of ``scene.reference``, unclipped and without noise: one result
+        serves every ISO and exposure time.
         """
         if scene.depth is None:
             return scene.light
@@ -231,11 +231,11 @@ class ReferenceCamera:
         Where the image moves in light that changes, each is integrated by itself.
 
         Args:
-            light: (..., 4, H, W) at the exposure of `reference`, as `optics` gives it.
+            light: (..., 4, H, W) at the exposure of `reference`, from `blurred_light`.
             reference: Settings of `light`.
             settings: Nominal settings of the capture.
             image_speed: Speed of the image along the rows [frame heights per second].
-            lamp: What lights the scene, whose long-term mean `light` is; None for steady light.
+            lamp: The scene's lamp, whose long-term mean `light` is; None for steady light.
                 Rows are read one after the other (`CameraProfile.row_time`).
             start: When the first row begins its exposure [s].
         """
@@ -259,13 +259,13 @@ class ReferenceCamera:
         whole numbers is part of the calibrated read noise, and is not counted twice.
 
         Args:
-            signal: (..., 4, H, W), as `expose` gives it.
+            signal: (..., 4, H, W), from `expose`.
             iso: ISO speed.
             generator: Source of the noise, on the device of `signal`.
         """
         shot, read = nlf_tensors(self.camera.nlf(iso).scaled(1 / self.box_factor**2), signal.device)
         black, well = self._black_offset(signal), self._well(signal, iso)
-        # What is far above a full well fills it in any case; a count of it would overflow.
+        # Light far above a full well fills it in any case; its photon count would overflow.
         light = torch.minimum((signal - black).clamp(min=0.0), 2.0 * well)
         electrons = torch.where(shot > 0, 1.0 / shot, 1.0)  # per unit of signal
         counted = torch.poisson(light * electrons, generator=generator) / electrons
@@ -285,7 +285,7 @@ class ReferenceCamera:
         return torch.tensor(wells).to(signal)[:, None, None]
 
     def clip(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
-        """`signal` (..., 4, H, W) within what a capture at `iso` can show: [-pedestal, 1]."""
+        """Clip `signal` (..., 4, H, W) to what a capture at `iso` can show: [-pedestal, 1]."""
         black = self._black_offset(signal)
         held = torch.minimum(signal, self._well(signal, iso) + black)
         pedestal = torch.tensor(self.camera.pedestal).to(signal)[:, None, None]
@@ -301,16 +301,16 @@ class ReferenceCamera:
         lamp: Lamp | None = None,
         start: float = 0.0,
     ) -> ReferenceCapture:
-        """Photographs a scene that stands still.
+        """Photograph a scene that stands still.
 
         Args:
-            scene: What is photographed.
+            scene: The scene to photograph.
             settings: Nominal settings.
             seed: Seed of the noise, >= 0; the noise is a function of it and of the settings.
-            light: What ``optics(scene, settings.f_number)`` gave, where it is at hand: it serves
-                every capture at that f-number.
-            lamp: See `expose`.
-            start: See `expose`.
+            light: Result of ``blurred_light(scene, settings.f_number)`` if known: it serves every
+                capture at that f-number.
+            lamp: As in `expose`.
+            start: As in `expose`.
         """
         if light is None:
             light = self.blurred_light(scene, settings.f_number)

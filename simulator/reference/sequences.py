@@ -1,4 +1,4 @@
-"""Sequences of captures of one scene, and which two of them a module is trained and tested on."""
+"""Sequences of captures of one scene, and the pairs of them that train and test each module."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Sequence:
     """One scene and the settings it is captured with.
 
     Args:
-        scene: What is photographed.
+        scene: The scene.
         settings: The settings of each capture, at least two.
     """
 
@@ -77,7 +77,7 @@ class Sequence:
 
 @dataclass(frozen=True, order=True)
 class Pair:
-    """Two captures of one sequence: what goes in, and what should come out.
+    """Two captures of one sequence: the input of a module and its target.
 
     Args:
         sequence: Index of the sequence.
@@ -91,7 +91,7 @@ class Pair:
 
 
 def exposure_error(illuminance: float, settings: CameraSettings) -> float:
-    """By how many EV `settings` expose more (> 0) or less than an incident-light meter says.
+    """Exposure error of `settings` against an incident-light meter [EV], > 0 if too bright.
 
     Args:
         illuminance: Light on the scene [lux].
@@ -106,7 +106,7 @@ def exposure_error(illuminance: float, settings: CameraSettings) -> float:
 def draw_settings(
     illuminance: float, rng: np.random.Generator, camera: CameraProfile
 ) -> list[CameraSettings]:
-    """Settings of one sequence, as the paper captured its own (section 4.1).
+    """Draw the settings of one sequence, as the paper captured its own (section 4.1).
 
     20 to 25 different triples of ISO 100 to 16000, 1/8000 to 4 s and f/4 to f/22, all discrete. A
     triple is drawn with a weight that falls with its exposure error (normal, 2 EV, none beyond
@@ -115,7 +115,7 @@ def draw_settings(
 
     Args:
         illuminance: Light on the scene [lux], 1 to 20,000 in the paper.
-        rng: Where the randomness comes from.
+        rng: Source of the randomness.
         camera: The body. ISOs above 2.5 times its highest calibrated one are not drawn.
 
     Returns:
@@ -182,17 +182,17 @@ def _between(ends: tuple[float, float], share: float) -> float:
 def select_pairs(
     sequences: SequenceOf[Sequence], stage: Stage, camera: CameraProfile
 ) -> list[Pair]:
-    """The pairs that a stage of the training uses (paper, section 4.2, "Pair selection").
+    """Select the pairs that a stage of the training uses (paper, section 4.2, "Pair selection").
 
     Args:
-        sequences: Where to choose from.
+        sequences: The sequences to choose from.
         stage: ``"exposure"`` or ``"all"``: any two captures of a sequence, in either direction.
             ``"noise"``: the same f-number, so that defocus does not differ; a target with little
             noise: ISO 400 or less, and at mid grey at most a quarter of the source's noise variance
             once both are at the same exposure; the target exposed to within -3 to +2 EV.
             ``"aperture"``: a target with a smaller f-number than the source, and up to a tenth of
             pairs with the same one, for which nothing should change.
-        camera: The body that takes the sequences; its noise decides what little noise is.
+        camera: The body that takes the sequences; "little noise" is measured by its noise.
 
     Returns:
         The pairs in ascending order; the same arguments give the same pairs.
@@ -262,5 +262,5 @@ def _more_open(sequences: SequenceOf[Sequence], pairs: list[Pair]) -> list[Pair]
     same = [p for p in pairs if stops(p) == 0]
     room = int(len(opened) * _SAME_APERTURE / (1 - _SAME_APERTURE))
     # Evenly spaced, so that every sequence has its share.
-    kept = [same[i * len(same) // room] for i in range(room)] if room < len(same) else same
-    return sorted(opened + kept)
+    chosen = [same[i * len(same) // room] for i in range(room)] if room < len(same) else same
+    return sorted(opened + chosen)

@@ -1,7 +1,8 @@
-"""Results that are kept: the most recent in memory, and files between runs, both bounded."""
+"""The one cache: recently used results in memory, and tensors in files between runs."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import logging
@@ -17,51 +18,36 @@ from typing import Any, Generic, TypeVar
 
 import platformdirs
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 
 from simulator.utils.files import write_atomically
+from simulator.utils.results import package_version
 
 _LOGGER = logging.getLogger(__name__)
 #: Environment variable that names another cache folder.
 CACHE_VARIABLE = "AE_ENV_CACHE"
-#: The cache's folders: what is not in one of them is never removed.
+#: The cache's folders; files elsewhere are never removed.
 CACHE_KINDS = ("scenes", "score_tables", "denoised", "defocus_maps", "opened")
-#: What the files on disk take at most, together [byte].
+#: Most bytes that the files take together.
 DISK_BYTES = 4 * 2**30
-#: Names of the cache's files, finished and half-written; nothing else is ever removed.
+#: Names of the cache's files, finished and half-written, of earlier versions as well; no other
+#: file is ever removed.
 _FILE = re.compile(r"\.?(bundled-.*-)?[0-9a-f]{24,32}\.(safetensors|npz)(\..*\.tmp)?")
 #: A half-written file older than this was left by a killed process [s].
 _ABANDONED = 3600.0
-
-#: Folders of which it was logged that they cannot be used.
-_WARNED: set[Path] = set()
 
 Value = TypeVar("Value")
 
 
 def cache_dir() -> Path:
-    """The cache folder: the one named by ``AE_ENV_CACHE``, else the user's (not created here).
-
-    The user's, too, where the name begins with the home of somebody unknown.
-    """
-    named, own = os.environ.get(CACHE_VARIABLE), Path(platformdirs.user_cache_dir("ae-env"))
-    try:
-        return Path(named).expanduser() if named else own
-    except RuntimeError as error:
-        _warn_once(Path(str(named)), "%s (=%r): %s; using %s", CACHE_VARIABLE, named, error, own)
-        return own
-
-
-def _warn_once(folder: Path, message: str, *values: object) -> None:
-    """Logs what is wrong with a cache folder, as a warning the first time in this process."""
-    level = logging.DEBUG if folder in _WARNED else logging.WARNING
-    _LOGGER.log(level, message, *values)
-    _WARNED.add(folder)
+    """The cache folder: the one that ``AE_ENV_CACHE`` names, else the user's; not created here."""
+    named = os.environ.get(CACHE_VARIABLE)
+    return Path(os.path.expanduser(named) if named else platformdirs.user_cache_dir("ae-env"))
 
 
 def cache_key(parts: Mapping[str, Any]) -> str:
-    """Hexadecimal key of everything that changes a cached result.
+    """Hexadecimal key of a cached result: of all that it depends on, and the package's version.
 
     Args:
         parts: JSON values by name; the order of the names does not matter.
@@ -69,7 +55,8 @@ def cache_key(parts: Mapping[str, Any]) -> str:
     >>> cache_key({"a": 1, "b": 2}) == cache_key({"b": 2, "a": 1}) != cache_key({"a": 1, "b": 3})
     True
     """
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    content = {"package": package_version(), "parts": dict(parts)}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
@@ -95,7 +82,7 @@ class LruCache(Generic[Value]):
     A pickled copy is empty.
 
     Args:
-        max_bytes: What the values may take together; a larger one is not kept.
+        max_bytes: Most bytes of all values together; a larger value is not stored.
 
     >>> cache = LruCache(max_bytes=2)
     >>> for name in "abc":
@@ -117,7 +104,7 @@ class LruCache(Generic[Value]):
 
     @property
     def nbytes(self) -> int:
-        """What the values take [byte]."""
+        """Bytes of all values together."""
         return self._bytes
 
     def get(self, key: Hashable) -> Value | None:
@@ -129,7 +116,7 @@ class LruCache(Generic[Value]):
             return self._items[key][0]
 
     def put(self, key: Hashable, value: Value, size: int) -> None:
-        """Keeps `value` of `size` bytes, and drops the least recently used beyond the bound."""
+        """Store `value` of `size` bytes, and drop the least recently used beyond the bound."""
         with self._lock:
             self._bytes -= self._items.pop(key, (None, 0))[1]
             if size > self.max_bytes:
@@ -140,7 +127,7 @@ class LruCache(Generic[Value]):
                 self._bytes -= self._items.popitem(last=False)[1][1]
 
     def clear(self) -> None:
-        """Drops everything."""
+        """Drop everything."""
         with self._lock:
             self._items.clear()
             self._bytes = 0
@@ -150,15 +137,14 @@ class LruCache(Generic[Value]):
 
 
 class DiskCache:
-    """Tensors in files between runs; several processes may share the folder.
+    """Tensors in safetensors files between runs; several processes may share the folder.
 
-    Files are written whole or not at all, and read only if their content is what was written
-    under that key. A file that is damaged, or a folder that cannot be read or written (once in a
-    process), is logged and costs time only.
+    Files are written whole or not at all. A damaged file, or a folder that cannot be read or
+    written, is logged and costs time only.
 
     Args:
         folder: By default `cache_dir()` at the time of each call.
-        max_bytes: What the files may take together; beyond it those go that were used longest ago.
+        max_bytes: Most bytes of all files together; beyond it those used longest ago are removed.
             Several processes at once may exceed it by a sixteenth each.
     """
 
@@ -166,7 +152,7 @@ class DiskCache:
         if max_bytes < 0:
             raise ValueError(f"`max_bytes` (={max_bytes}) must be at least 0")
         self._folder, self.max_bytes = folder, max_bytes
-        self._unseen: int | None = None  # bytes written since the files were last counted
+        self._uncounted: int | None = None  # bytes written since the files were last counted
 
     @property
     def folder(self) -> Path:
@@ -192,17 +178,15 @@ class DiskCache:
         """
         path = self.path(kind, key)
         try:
-            content = path.read_bytes()  # at once: another process may remove it
-            tensors = load(content)
-            stored = _stored(content)
-            if stored.get("digest") != content_digest(tensors):
+            with safe_open(path, framework="pt") as file:
+                stored = (file.metadata() or {}).get("digest")
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if stored != content_digest(tensors):
                 raise ValueError("its content is not what was written")
-            if stored.get("key", key) != key:  # earlier versions wrote none
-                raise ValueError(f"it was written as {stored['key']}")
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            _warn_once(self.folder, "cached file %s cannot be read: %s", path, error)
+            _warn_once(f"the cache in {self.folder} cannot be read: {error.strerror or error}")
             return None
         except (SafetensorError, ValueError) as error:
             _LOGGER.warning("cached file %s is damaged (%s) and is made again", path, error)
@@ -212,22 +196,24 @@ class DiskCache:
         return tensors
 
     def put(self, kind: str, key: str, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Keeps `tensors`; see `get`."""
+        """Store `tensors` under `key`; the arguments are those of `get`."""
         path = self.path(kind, key)
         own = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        content = save(own, {"digest": content_digest(own), "key": key})
+        content = save(own, {"digest": content_digest(own)})
         if len(content) > self.max_bytes:
             return
         try:
             write_atomically(path, content)
         except OSError as error:  # a full or read-only disk must not stop the run
-            _warn_once(self.folder, "%s could not be cached: %s", path, error)
+            reason = os.strerror(error.errno) if error.errno else error
+            _warn_once(f"results could not be cached in {self.folder}: {reason}")
             return
-        unseen = None if self._unseen is None else self._unseen + len(content)
-        if unseen is None or unseen >= self.max_bytes // 16:
+        # Counting files takes longer than writing one: count when a sixteenth was written.
+        uncounted = None if self._uncounted is None else self._uncounted + len(content)
+        if uncounted is None or uncounted >= self.max_bytes // 16:
             self._trim()
-            unseen = 0
-        self._unseen = unseen
+            uncounted = 0
+        self._uncounted = uncounted
 
     def usage(self) -> dict[str, tuple[int, int]]:
         """Number of files and bytes by kind."""
@@ -235,7 +221,7 @@ class DiskCache:
         return {kind: (len(own), sum(own)) for kind, own in sizes.items()}
 
     def clear(self) -> None:
-        """Removes all files of the cache, and its folders where nothing else is in them.
+        """Remove all files of the cache, and its folders where nothing else is in them.
 
         Raises:
             OSError: If a file cannot be removed.
@@ -247,20 +233,16 @@ class DiskCache:
                 (self.folder / kind).rmdir()
 
     def _files(self, kind: str) -> Iterator[tuple[Path, os.stat_result]]:
-        folder = self.folder / kind
-        try:
-            names = os.listdir(folder)
-        except OSError:  # not there, or nothing that can be listed
-            return
-        for name in sorted(names):
-            with suppress(OSError):  # removed by another process since
-                if _FILE.fullmatch(name):
-                    yield folder / name, (folder / name).stat()
+        with suppress(OSError):  # no such folder, or one that may not be listed
+            for path in sorted((self.folder / kind).iterdir()):
+                with suppress(OSError):  # another process has removed it
+                    if _FILE.fullmatch(path.name):
+                        yield path, path.stat()
 
     def _trim(self) -> None:
-        """Removes what was used longest ago until a sixteenth of the bound is free.
+        """Remove the files used longest ago until a sixteenth of the bound is free.
 
-        So the bound holds until the files are counted again, when a sixteenth was written.
+        So the bound holds until the files are counted again.
         """
         files = [found for kind in CACHE_KINDS for found in self._files(kind)]
         total = sum(stat.st_size for _, stat in files)
@@ -275,7 +257,7 @@ class DiskCache:
                 total -= stat.st_size
 
 
-def _stored(content: bytes) -> dict[str, str]:
-    """What was written beside the tensors: in the header, JSON after eight bytes of its length."""
-    length = int.from_bytes(content[:8], "little")
-    return json.loads(content[8 : 8 + length]).get("__metadata__", {})
+@functools.cache
+def _warn_once(message: str) -> None:
+    """Log a warning the first time in this process."""
+    _LOGGER.warning(message)

@@ -1,4 +1,4 @@
-"""From a YAML file to a validated configuration."""
+"""YAML files: read within bounds, and turned into validated configurations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any, TypeVar, get_args
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-#: A configuration is no larger than this [byte], nor has it more entries, or deeper ones.
+#: Bounds of a YAML file: its bytes, its entries with every alias written out, their nesting.
 MAX_BYTES, MAX_ENTRIES, MAX_DEPTH = 2**20, 10_000, 50
 
-#: What is said in place of the names of Python's types.
+#: Words for pydantic's errors that name Python types.
 _PLAIN = {
     **dict.fromkeys(("tuple_type", "list_type"), "must be a list"),
     **dict.fromkeys(("dict_type", "mapping_type", "model_type"), "must be a mapping"),
@@ -26,7 +26,7 @@ _short.maxstring = _short.maxother = 200
 
 
 class Configuration(BaseModel):
-    """Base of what a YAML file holds: frozen, without unknown entries; true is not the number 1."""
+    """Base of all configurations: frozen, without unknown entries; true is not the number 1."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -48,19 +48,7 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
         ValueError: If the file is missing, unreadable or not YAML, or an entry is unknown, given
             twice or out of range; the message names the file and the entry.
     """
-    file, name = Path(path).expanduser(), f"`config` (={str(path)!r})"
-    try:
-        if not file.is_file():
-            what = "is a folder, not a YAML file" if file.is_dir() else "there is no such file"
-            raise ValueError(f"{name}: {what}")
-        if file.stat().st_size > MAX_BYTES:
-            raise ValueError(f"{name}: must not be larger than {MAX_BYTES} bytes")
-        text = file.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{name} is not YAML: {error}") from error
-    except OSError as error:
-        raise ValueError(f"{name} cannot be read: {error.strerror}") from error
-    content = _parsed(text, name)
+    name, content = f"`config` (={str(path)!r})", read_yaml(path)
     if not isinstance(content, dict):
         found = "is empty" if content is None else f"holds {_short.repr(content)}"
         known = ", ".join(model.model_fields)
@@ -71,13 +59,42 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
         raise ValueError(f"{name}: {one_line(error, model=model)}") from error
 
 
-def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
-    """Every complaint of pydantic's, with the entry that it is about.
+def read_yaml(path: str | Path, *, name: str = "config") -> Any:
+    """The values in a YAML file from anybody: no tags that run code, and bounded in size.
 
     Args:
-        error: What pydantic raised.
+        path: The file; ``~`` is the home folder.
+        name: Argument that gave the path, for error messages.
+
+    Returns:
+        Mappings, lists, numbers, text; None for an empty file.
+
+    Raises:
+        ValueError: If the file is missing, unreadable or not YAML, gives an entry twice, or is
+            larger than `MAX_BYTES`, `MAX_ENTRIES` (aliases written out) or `MAX_DEPTH`.
+    """
+    file, given = Path(path).expanduser(), f"`{name}` (={str(path)!r})"
+    try:
+        if not file.is_file():
+            what = "is a folder, not a YAML file" if file.is_dir() else "there is no such file"
+            raise ValueError(f"{given}: {what}")
+        if file.stat().st_size > MAX_BYTES:
+            raise ValueError(f"{given}: must not be larger than {MAX_BYTES} bytes")
+        text = file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{given} is not YAML: {error}") from error
+    except OSError as error:
+        raise ValueError(f"{given} cannot be read: {error.strerror}") from error
+    return _parsed(text, given)
+
+
+def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
+    """All of pydantic's complaints in one line, each with the entry that it is about.
+
+    Args:
+        error: The error that pydantic raised.
         prefix: Put before the name of every entry.
-        model: What was validated, so that the nearest name is proposed for an unknown one.
+        model: The validated model; for an unknown entry its nearest name is proposed.
     """
     parts = []
     for item in error.errors():
@@ -90,23 +107,23 @@ def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str
     return "; ".join(parts)
 
 
-def _unknown(model: Any, place: tuple[int | str, ...]) -> str:
-    """What to say of an unknown entry at `place` of a configuration."""
-    for key in place[:-1]:
+def _unknown(model: Any, location: tuple[int | str, ...]) -> str:
+    """Message for an unknown entry at `location` of a configuration."""
+    for key in location[:-1]:
         if hasattr(model, "model_fields"):
             model = model.model_fields[key].annotation
             if type(None) in get_args(model):  # an entry that may be left out
                 model = next(t for t in get_args(model) if t is not type(None))
-        else:  # `key` is one of a mapping's, or a place in a list
+        else:  # `key` is one of a mapping's, or an index in a list
             model = next(t for t in reversed(get_args(model)) if t is not Ellipsis)
     known = list(model.model_fields)
-    near = difflib.get_close_matches(str(place[-1]), known, n=1)
+    near = difflib.get_close_matches(str(location[-1]), known, n=1)
     hint = f"; did you mean `{near[0]}`?" if near else ""
     return f"unknown, the entries are {known}{hint}"
 
 
 def _parsed(text: str, name: str) -> Any:
-    """The values in a text of YAML; in errors, the file is called `name`."""
+    """The values in a text of YAML; `name` stands for the file in error messages."""
     with _yaml_errors(name):
         loader = yaml.SafeLoader(text)
         node = loader.get_single_node()
@@ -131,7 +148,7 @@ def _yaml_errors(name: str) -> Iterator[None]:
 
 
 def _check_node(node: yaml.Node, entries: dict[int, int], depth: int = 0) -> int:
-    """Number of entries below `node`, every alias counted as often as it is used.
+    """Number of entries of `node`, every alias counted as often as it is used.
 
     Raises:
         ValueError: If there are too many, or too deep, or an entry is given twice.

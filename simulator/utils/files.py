@@ -1,11 +1,15 @@
-"""Files: which are raws, how weights are named, and writing so that nothing is lost."""
+"""Files: real data, endings of raws, pictures too large to decode, and writing atomically."""
 
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
+
+#: Environment variable that names the folder of real files.
+DATA_VARIABLE = "AE_ENV_DATA"
 
 #: Endings of raw files that LibRaw knows.
 RAW_SUFFIXES = (
@@ -15,13 +19,25 @@ RAW_SUFFIXES = (
     ".x3f",
 )
 
-
-#: Pixels that a raw or a radiance map may claim: 268 million, beyond any camera with a Bayer array.
+#: Most pixels that a raw or a radiance map may claim: more than any camera with a Bayer array has.
 MAX_PIXELS = 2**28
-#: And for each byte of a raw: a flat DNG in deflate has half of that.
+#: Most pixels for each byte of a raw; a flat DNG in deflate has half of that.
 MAX_PIXELS_PER_BYTE = 1024
-#: And of a radiance map: a flat one in OpenEXR's DWAB compression has over 3000.
+#: The same for a radiance map; a flat one in OpenEXR's DWAB compression has over 3000.
 MAX_RADIANCE_PIXELS_PER_BYTE = 2**13
+
+
+def data_folder() -> Path | None:
+    """The folder of real files for tests and measurements.
+
+    Returns:
+        The folder that ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data``
+        beside the checkout. None if there is no such folder.
+    """
+    named = os.environ.get(DATA_VARIABLE)
+    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
+    folder = Path(named).expanduser() if named else beside
+    return folder if folder.is_dir() else None
 
 
 def as_path(path: object) -> Path:
@@ -36,13 +52,16 @@ def as_path(path: object) -> Path:
 
 
 def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXELS_PER_BYTE) -> str:
-    """Why a picture must not be decoded, before memory is taken for it; empty where it may be.
+    """Why a picture must not be decoded: it claims far more pixels than its file can hold.
 
     Args:
         height: Rows that the file claims.
         width: Columns that it claims.
         size: Length of the file [byte].
-        per_byte: Most pixels that each byte of it may stand for.
+        per_byte: Most pixels that each byte of the file may stand for.
+
+    Returns:
+        The reason, for an error message; empty where the picture may be decoded.
 
     >>> refuse_bomb(60_000, 60_000, 4096)
     'claims 60000 x 60000 pixels, where at most 268435456 are read'
@@ -61,7 +80,7 @@ def refuse_bomb(height: int, width: int, size: int, *, per_byte: int = MAX_PIXEL
 def write_atomically(
     path: str | os.PathLike[str], content: bytes | str | Iterable[bytes | memoryview]
 ) -> Path:
-    """Writes `content` under a temporary name beside `path`, then renames it; makes the folder.
+    """Write `content` under a temporary name beside `path`, then rename it; makes the folder.
 
     Args:
         path: File to write or replace.
@@ -72,35 +91,27 @@ def write_atomically(
 
     Raises:
         ValueError: If `path` is not a file's name.
-        OSError: If it cannot be written (no permission, a full disk); nothing half-written stays.
+        OSError: If the file cannot be written (no permission, a full disk); nothing half-written
+            stays.
     """
     path = as_path(path)
+    content = content.encode() if isinstance(content, str) else content
+    pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
+    start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")  # 255 bytes at most
+    temporary = path.parent / f".{start}.{secrets.token_hex(4)}.tmp"
     try:
-        return _replace(path, content)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("xb") as stream:
+            stream.writelines(pieces)
+        os.replace(temporary, path)
     except OSError as error:
         if error.errno is None:
             raise
         reason = f"`path` (={str(path)!r}) cannot be written: {error.strerror}"
         raise OSError(error.errno, reason) from error
-
-
-def _replace(path: Path, content: bytes | str | Iterable[bytes | memoryview]) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    start = path.name.encode(errors="ignore")[:200].decode(errors="ignore")
-    prefix = f".{start}."  # a file's name may have 255 bytes
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=".tmp")
-    content = content.encode() if isinstance(content, str) else content
-    pieces = [content] if isinstance(content, bytes | bytearray | memoryview) else content
-    try:
-        with os.fdopen(descriptor, "wb") as stream:
-            stream.writelines(pieces)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)  # mkstemp's files are private
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    finally:
+        with suppress(OSError):  # after the renaming there is none
+            temporary.unlink()
     return path
 
 

@@ -1,6 +1,6 @@
-"""How the kernels of this package are compiled: once per machine, without the interpreter's lock.
+"""Compiling kernels: once per machine, and run without the interpreter's lock.
 
-What numba compiles is kept next to the source, or in the user's cache folder where that cannot be
+Compiled code is cached beside the source, or in the user's cache folder where that cannot be
 written (``NUMBA_CACHE_DIR`` names another); where neither can, each process compiles for itself.
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import re
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,94 +20,102 @@ import torch
 from numba import types
 from numba.core import event
 
-
-# Images handed to kernels by their address: a batch need not lie in one piece of memory.
-def addresses(images: Sequence[torch.Tensor | None]) -> np.ndarray:
-    """(B,) uintp addresses of contiguous float32 images, 0 for None.
-
-    To be taken anew for each call: sharing a tensor with another process moves its memory.
-    """
-    return np.array([0 if i is None else i.data_ptr() for i in images], np.uintp)
-
-
-@numba.extending.intrinsic
-def as_pointer(typing, address):  # type: ignore[no-untyped-def]
-    """An address as a pointer to float32."""
-
-    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
-
-    return types.CPointer(types.float32)(types.uintp), generate
-
-
 logger = logging.getLogger(__name__)
-#: Modules that hold kernels, or constants and functions of kernels.
-_CONSTANTS = (
-    *("capture/exposure", "capture/kernels", "capture/light_statistics", "noise/generator"),
-    *("optics/blur_kernels", "optics/disc_bank", "optics/shapes", "raw/image"),
-    *("raw/noise_estimation", "utils/jit"),
-)
 _PACKAGE = __name__.partition(".")[0]
+#: Folder of the packages.
+_ROOT = Path(__file__).parents[2]
+#: The modules and names of imports from this project, one line or in parentheses.
+_IMPORTS = re.compile(r"^\s*from ((?:simulator|ae_env)[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator of a function that numba compiles when it is first called.
 
     Args:
-        options: Of `numba.njit`, such as ``fastmath``.
+        options: Options of `numba.njit`, such as ``fastmath``.
     """
 
     def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
+        dispatcher: Callable[..., Any]
         try:
             dispatcher = numba.njit(cache=True, **given)(function)
         except RuntimeError as error:
-            logger.info("%s; it is compiled anew in each process", error)
-            return numba.njit(**given)(function)
-        _harden(dispatcher._cache)
+            logger.info("%s; it is compiled again in each process", error)
+            dispatcher = numba.njit(**given)(function)
+        else:
+            _adapt_cache(dispatcher, Path(function.__code__.co_filename))
         return dispatcher
 
     return compiled
 
 
-def _harden(cache: Any) -> None:
-    """Makes numba's cache of one kernel count for all kernels' code, and a full disk no error.
+def _adapt_cache(dispatcher: Any, module: Path) -> None:
+    """Make numba's cache of a kernel stale when any module changes that the kernel depends on.
 
-    Numba looks at the file of the kernel alone, which calls and names what stands in others.
+    Numba itself looks at the kernel's own module alone, but the functions and constants that a
+    kernel names are compiled into it. Also, a full disk must not be an error.
     """
+    cache = dispatcher._cache
     index, save = cache._cache_file, cache.save_overload
-    index._source_stamp = (index._source_stamp, _sources())
+    index._source_stamp = (index._source_stamp, _checksum(module))
 
     def save_if_possible(*arguments: Any) -> None:
         try:
             save(*arguments)
         except OSError as error:
-            logger.info("%s; it is compiled anew in each process", error)
+            logger.info("%s; it is compiled again in each process", error)
 
     cache.save_overload = save_if_possible
 
 
 @functools.cache
-def _sources() -> int:
-    """Checksum of every module that kernels stand in or take constants from."""
-    folder = Path(__file__).parents[1]
-    files = [folder / f"{name}.py" for name in _CONSTANTS]
+def _checksum(module: Path) -> int:
+    """Checksum of `module` and of every module of this project that it imports, at any depth."""
+    pending, texts = [module], dict[Path, str]()
+    while pending:
+        path = pending.pop()
+        if path not in texts and path.is_file():
+            texts[path] = path.read_text(encoding="utf-8")
+            for name, imported in _IMPORTS.findall(texts[path]):
+                folder = _ROOT.joinpath(*name.split("."))  # a package, or a module without ".py"
+                modules = (folder / part for part in re.findall(r"\w+", imported))
+                pending += [path.with_suffix(".py") for path in (folder, *modules)]
     return functools.reduce(
-        lambda value, path: zlib.crc32(path.read_bytes(), value), sorted(files), 0
+        lambda value, path: zlib.crc32(texts[path].encode(), value), sorted(texts), 0
     )
 
 
-class _Announcer(event.Listener):  # type: ignore[misc]
-    """Logs each kernel of this package that is compiled: the first call of one takes seconds."""
+class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
+    """Logs each kernel of this package before it is compiled: its first call takes seconds."""
 
     def on_start(self, event: Any) -> None:
-        """Called before numba compiles a function, not when it loads one."""
+        """Numba is about to compile a function, not to load one from its cache."""
         function = event.data["dispatcher"].py_func
         if function.__module__.partition(".")[0] == _PACKAGE:
             logger.info("compiling %s.%s", function.__module__, function.__name__)
 
     def on_end(self, event: Any) -> None:
-        """Called afterwards."""
+        """Nothing to log; numba's base class requires the method."""
 
 
-event.register("numba:compile", _Announcer())
+event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
+
+
+# Images are given to kernels by their addresses: a batch need not lie in one piece of memory.
+def addresses(images: Sequence[torch.Tensor | None]) -> np.ndarray:
+    """(B,) uintp addresses of contiguous float32 images, 0 for None.
+
+    Take them again for each call: sharing a tensor with another process moves its memory.
+    """
+    return np.array([0 if i is None else i.data_ptr() for i in images], np.uintp)
+
+
+@numba.extending.intrinsic
+def as_pointer(typing, address):  # type: ignore[no-untyped-def]
+    """An address as a pointer to float32, inside a kernel."""
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(types.float32)(types.uintp), generate  # type: ignore[no-untyped-call]

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import importlib.metadata
 import json
 import os
 import platform
 import subprocess
-import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from simulator.utils.files import write_atomically
 
-_DISTRIBUTIONS = (
-    "ae-env",
+#: Distribution that the three packages are installed as.
+_PACKAGE = "ae-env"
+#: Libraries that numbers depend on.
+_LIBRARIES = (
     "torch",
     "numpy",
     "gymnasium",
@@ -27,7 +29,7 @@ _DISTRIBUTIONS = (
 
 
 def result_meta(command: str, seed: int | None) -> dict[str, Any]:
-    """Where a measurement comes from: what every result file says about itself.
+    """Where a measurement comes from: the ``meta`` of every result file.
 
     Args:
         command: The command line that writes the file again.
@@ -53,11 +55,12 @@ def write_results(
     rows: Iterable[Mapping[str, Any]],
     meta: Mapping[str, Any],
 ) -> Path:
-    """Write ``{"meta": meta, "rows": rows}`` as JSON; readers see the old file or the new one.
+    """Write ``{"meta": meta, "rows": rows}`` as JSON, whole or not at all.
 
     Args:
         path: File to write; its folder is made where missing.
-        rows: One mapping per row, JSON-ready; numpy and torch scalars are taken as numbers.
+        rows: One mapping per row, JSON-ready; scalars and arrays of numpy and torch become numbers
+            and lists.
         meta: As `result_meta` returns it, plus whatever describes this measurement.
 
     Returns:
@@ -92,41 +95,44 @@ def machine() -> dict[str, Any]:
     }
 
 
+@functools.cache
+def package_version() -> str:
+    """Version of this package; ``"0"`` where it is run without being installed."""
+    return _version(_PACKAGE) or "0"
+
+
 def versions() -> dict[str, str]:
-    """Python and the installed versions of the libraries that numbers depend on."""
-    found = {"python": platform.python_version()}
-    for name in _DISTRIBUTIONS:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
+    """Version of Python, of this package and of the installed libraries that numbers depend on."""
+    found = {name: _version(name) for name in (_PACKAGE, *_LIBRARIES)}
+    known = {name: version for name, version in found.items() if version is not None}
+    return {"python": platform.python_version(), **known}
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def _plain(value: Any) -> Any:
     """Scalars and arrays of numpy and torch as plain Python values."""
-    for method in ("tolist", "item"):
-        convert = getattr(value, method, None)
-        if convert is not None:
-            return convert()
+    if hasattr(value, "tolist"):
+        return value.tolist()
     raise TypeError(f"{type(value).__name__} is not a JSON value")
 
 
 def _cpu_name() -> str:
     """Model name of the CPU; the architecture where the system does not say."""
-    if sys.platform.startswith("linux"):
-        try:
-            lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        except OSError:
-            lines = []
-        for line in lines:
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
+    table = Path("/proc/cpuinfo")  # of Linux
+    for line in table.read_text(encoding="utf-8").splitlines() if table.is_file() else ():
+        if line.startswith("model name"):
+            return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
 
 
 def _commit() -> str | None:
-    """Commit of the checkout that this package runs from; None where it is none."""
+    """Commit of the checkout that this package runs from; None where there is no checkout."""
     root = Path(__file__).resolve().parents[2]
     top = _git(root, "rev-parse", "--show-toplevel")
     # An installed copy may lie inside somebody else's repository.

@@ -1,4 +1,4 @@
-"""Work in shares on a few threads of this process, for kernels that release the interpreter.
+"""Work shared between a few threads of this process, for kernels that release Python's lock.
 
 As many threads as torch would use (`torch.set_num_threads`, ``OMP_NUM_THREADS``). They belong to
 the process that made them: a forked child makes its own, where an OpenMP pool would hang or die.
@@ -17,7 +17,7 @@ _inside = threading.local()
 
 
 def thread_count() -> int:
-    """Threads that work is shared between: `torch.get_num_threads()`."""
+    """Number of threads that share work: `torch.get_num_threads()`."""
     import torch
 
     return torch.get_num_threads()
@@ -26,16 +26,16 @@ def thread_count() -> int:
 def in_shares(
     task: Callable[[int, int], object], count: int, *, least: int = 1, threads: int | None = None
 ) -> None:
-    """Calls ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
+    """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
 
-    The caller's thread takes the first share; a task that itself asks for shares gets one. Returns
-    when all are done.
+    The caller's thread takes the first share. A task that calls `in_shares` itself gets one share.
+    Returns when all shares are done.
 
     Args:
         task: Safe to run on several threads at once; an error in any share is raised here.
         count: Number of items, >= 0.
         least: Items below which another thread is not worth waking.
-        threads: At most so many; `thread_count()` by default.
+        threads: Most threads to use; `thread_count()` by default.
     """
     shares = min(thread_count() if threads is None else threads, count // max(least, 1))
     if shares <= 1 or getattr(_inside, "task", False):

@@ -1,4 +1,4 @@
-"""Large frames through a network in tiles, exact to the last pixel, in bounded memory.
+"""Large frames through a network in tiles: the same pixels in bounded memory.
 
 Where a network is needed for some pixels only, the tiles shrink to those: the frame is halved again
 and again, and a half without such a pixel costs nothing.
@@ -15,9 +15,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-#: Side of a tile without its halo [pixel]: larger ones spend less on their halos, and more memory.
+#: Side of a tile without its halo [pixel]: larger tiles waste less on halos and take more memory.
 TILE = 768
-#: Needed pixels are looked at in cells of this side, a multiple of 4 [pixel].
+#: Side of the cells in which pixels count as needed or varying, a multiple of 4 [pixel].
 _CELL = 16
 
 _Index = tuple[EllipsisType, slice, slice]
@@ -25,12 +25,16 @@ _Index = tuple[EllipsisType, slice, slice]
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of a frame, and what a network must see around it [pixel].
+    """A rectangle of a frame, and the halo that a network must see around it [pixel].
 
     Args:
-        top, bottom, left, right: The rectangle; `bottom` and `right` are exclusive.
-        height, width: Of the frame.
-        halo: Pixels that are seen around it, as far as the frame goes.
+        top: First row.
+        bottom: Row after the last.
+        left: First column.
+        right: Column after the last.
+        height: Rows of the frame.
+        width: Columns of the frame.
+        halo: Pixels on each side, as far as the frame reaches.
     """
 
     top: int
@@ -43,26 +47,26 @@ class Tile:
 
     @property
     def inner(self) -> _Index:
-        """Indexes the rectangle in the frame."""
+        """Index of the rectangle in the frame."""
         return ..., slice(self.top, self.bottom), slice(self.left, self.right)
 
     @property
     def outer(self) -> _Index:
-        """Indexes the rectangle with its halo in the frame."""
+        """Index of the rectangle and its halo in the frame."""
         first_row, first_column = self._corner
         rows = slice(first_row, min(self.bottom + self.halo, self.height))
         return ..., rows, slice(first_column, min(self.right + self.halo, self.width))
 
     @property
     def core(self) -> _Index:
-        """Indexes the rectangle in the part that `outer` cuts out."""
+        """Index of the rectangle in the part that `outer` cuts out."""
         row, column = self._corner
         rows = slice(self.top - row, self.bottom - row)
         return ..., rows, slice(self.left - column, self.right - column)
 
     @property
     def area(self) -> int:
-        """Pixels with the halo: what the tile costs."""
+        """Pixels including the halo: the cost of the tile."""
         rows = min(self.bottom + self.halo, self.height) - max(self.top - self.halo, 0)
         return rows * (min(self.right + self.halo, self.width) - max(self.left - self.halo, 0))
 
@@ -74,11 +78,11 @@ class Tile:
 def make_tiles(
     height: int, width: int, *, halo: int, tile: int = TILE, needed: Tensor | None = None
 ) -> list[Tile]:
-    """Rectangles that cover a frame, or all of it that is needed, at little cost.
+    """Tiles that cover a frame, or its needed pixels, at little cost.
 
     Args:
-        height: Of the frame.
-        width: Of the frame.
+        height: Rows of the frame.
+        width: Columns of the frame.
         halo: Multiple of 4 [pixel].
         tile: Largest side of a tile, a multiple of 4 [pixel]; a frame that is no larger than one
             tile and a halo is one tile.
@@ -115,7 +119,9 @@ def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
             min(tile.top + _CELL * rows[1], tile.bottom),
             tile.left + _CELL * columns[0],
             min(tile.left + _CELL * columns[1], tile.right),
-            *(tile.height, tile.width, tile.halo),
+            tile.height,
+            tile.width,
+            tile.halo,
         )
 
     def cover(row: int, column: int, cells: np.ndarray) -> list[Tile]:
@@ -138,11 +144,11 @@ def _shrunk(tile: Tile, needed: Tensor) -> list[Tile]:
 
 
 def varying(image: Tensor, margin: int = 0) -> Tensor:
-    """Where a picture is not constant: saturated and black parts carry neither noise nor detail.
+    """Mask of where a picture is not constant; constant parts carry neither noise nor detail.
 
     Args:
         image: (C, H, W).
-        margin: Pixels around what varies that count as varying, a multiple of 16.
+        margin: Pixels around varying cells that also count as varying, a multiple of 16.
 
     Returns:
         (H, W) bool, in cells of 16 x 16 pixels.
@@ -153,7 +159,7 @@ def varying(image: Tensor, margin: int = 0) -> Tensor:
     high = F.max_pool2d(image, _CELL, ceil_mode=True)
     low = -F.max_pool2d(-image, _CELL, ceil_mode=True)
     cells = (high > low).any(dim=0, keepdim=True).float()
-    if height % _CELL == width % _CELL == 1:  # a single pixel, which tells nothing
+    if height % _CELL == width % _CELL == 1:  # a cell of one pixel cannot show that it varies
         cells[..., -1, -1] = 1.0
     reach = margin // _CELL
     cells = F.max_pool2d(cells, 2 * reach + 1, stride=1, padding=reach)[0].bool()
@@ -169,7 +175,7 @@ def in_tiles(
     needed: Tensor | None = None,
     fallback: Tensor | None = None,
 ) -> Tensor:
-    """`function` of `images`, tile by tile, where it is needed.
+    """Apply `function` to `images` tile by tile, where it is needed.
 
     Args:
         function: Maps images (B, C, h, w) to one (B, D, h, w) or (B, h, w); an output pixel may
@@ -178,17 +184,17 @@ def in_tiles(
         halo: Multiple of 4 [pixel].
         tile: Side of a tile, a multiple of 4 [pixel].
         needed: (H, W) bool, the pixels that need the function; by default all.
-        fallback: What the other pixels get, of the result's shape.
+        fallback: Values of all other pixels, of the result's shape.
 
     Returns:
-        What `function` gives on the whole images, and `fallback` where it is not needed.
+        The result of `function` on the whole images; `fallback` where it is not needed.
 
     Raises:
         ValueError: If `halo` or `tile` is no multiple of 4, or `needed` is not of the images' size
             or comes without `fallback`.
     """
     if needed is not None and fallback is None:
-        raise ValueError("`fallback` (=None) must say what pixels get that are not `needed`")
+        raise ValueError("`fallback` (=None) must give the values of pixels that are not `needed`")
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)
     if needed is None and len(tiles) == 1:

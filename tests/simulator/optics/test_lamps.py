@@ -7,9 +7,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from simulator.optics.lamps import Flash, Lamp, MainsLamp, PulsedLamp
+from tests.strategies import log_uniform
 
 TIMES = (1 / 8000, 1 / 1000, 1 / 120, 0.01, 1 / 60, 0.35)
 STARTS = (0.0, 0.0013, 0.00499999, 3.7)
@@ -122,3 +125,48 @@ def test_extremes_stay_finite_and_in_range(time: float) -> None:
 def test_bad_values_are_refused(make: object, rule: str) -> None:
     with pytest.raises(ValueError, match=rule):
         make()  # type: ignore[operator]
+
+
+# -- any lamp at any moment ---------------------------------------------------------------------
+
+PHASES = st.floats(0.0, 1.0)
+LAMPS = st.one_of(
+    st.builds(Lamp),
+    st.builds(MainsLamp, log_uniform(1, 1e5), st.floats(0, 1), PHASES),
+    st.builds(PulsedLamp, log_uniform(1, 1e5), log_uniform(1e-6, 1), PHASES),
+    st.builds(Flash, st.floats(-1, 1), log_uniform(1e-6, 1), log_uniform(1e-6, 10)),
+)
+
+
+@given(LAMPS, st.floats(-10, 10), log_uniform(1e-6, 10), log_uniform(1e-6, 10))
+def test_lamps_add_up_over_time(lamp: Lamp, start: float, first: float, second: float) -> None:
+    def light(begin: float, time: float) -> float:
+        mean = float(lamp.mean_light(begin, time))
+        assert math.isfinite(mean)
+        assert mean >= 0.0
+        return mean * time
+
+    parts = light(start, first) + light(start + first, second)
+    whole = light(start, first + second)
+    # A moment is known to an ulp of 16 s: so the light at both ends of a part, at its brightest.
+    assert parts == pytest.approx(whole, rel=1e-12, abs=8 * 2.0**-48 * _brightest(lamp))
+
+
+def _brightest(lamp: Lamp) -> float:
+    if isinstance(lamp, PulsedLamp):
+        return 1.0 / lamp.duty
+    return 1.0 + lamp.energy / lamp.decay if isinstance(lamp, Flash) else 2.0
+
+
+@given(LAMPS, st.floats(-10, 10))
+def test_long_exposures_see_the_mean(lamp: Lamp, start: float) -> None:
+    bound = 2e-6 * max(1.0, getattr(lamp, "energy", 0.0))
+    assert float(lamp.mean_light(start, 1e6)) == pytest.approx(1.0, abs=bound)
+
+
+@given(log_uniform(1e-3, 1e9), PHASES, st.floats(-1e3, 1e3), log_uniform(1e-9, 1e6))
+def test_a_pulse_as_long_as_its_period_is_steady(
+    frequency: float, phase: float, start: float, time: float
+) -> None:
+    lamp = PulsedLamp(frequency, 1.0, phase)
+    assert float(lamp.mean_light(start, time)) == pytest.approx(1.0, abs=1e-12)

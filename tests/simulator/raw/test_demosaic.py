@@ -7,10 +7,12 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from simulator.camera import BayerPattern, CameraProfile
+from simulator.camera import BayerPattern
 from simulator.raw.demosaic import demosaic_half, demosaic_malvar
-from simulator.raw.image import pack_mosaic
+from tests.strategies import SEEDS, SHAPES
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # its own imports warn about optional packages
@@ -25,13 +27,6 @@ def pack(mosaic: np.ndarray, pattern: str) -> torch.Tensor:
     order = [red, red ^ 1, blue ^ 1, blue]
     tiles = [mosaic[i // 2 :: 2, i % 2 :: 2] for i in order]
     return torch.from_numpy(np.stack(tiles))[None]
-
-
-@pytest.mark.parametrize("pattern", PATTERNS)
-def test_packing_is_that_of_raw_images(pattern):
-    mosaic = np.arange(48.0).reshape(6, 8)
-    camera = CameraProfile("c", pattern, 0, 1, 1)
-    torch.testing.assert_close(pack(mosaic, pattern)[0].float(), pack_mosaic(mosaic, camera))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 5e-7)])
@@ -70,20 +65,21 @@ def test_malvar_keeps_a_flat_colour_and_the_measured_pixels(pattern):
         assert torch.equal(rgb[:, (0, 1, 1, 2)[plane], row::2, column::2], packed[:, plane])
 
 
-def test_malvar_reproduces_a_grey_ramp():
-    """The filters' Laplacians vanish on a plane, so a linear ramp comes back exactly."""
-    rows, columns = np.mgrid[0:12, 0:16].astype(np.float64)
-    ramp = 0.1 + 0.02 * rows + 0.03 * columns
-    rgb = demosaic_malvar(pack(ramp, "GRBG"), "GRBG")[0].numpy()
-    expected = np.broadcast_to(ramp, (3, 12, 16))
-    np.testing.assert_allclose(rgb[:, 2:-2, 2:-2], expected[:, 2:-2, 2:-2], atol=1e-14)
+#: The order of each order's mirror image.
+MIRRORED = {"RGGB": "GRBG", "GRBG": "RGGB", "BGGR": "GBRG", "GBRG": "BGGR"}
 
 
-def test_malvar_is_the_same_alone_and_in_a_batch():
-    packed = torch.rand(5, 4, 7, 9, generator=torch.Generator().manual_seed(0))
-    batch = demosaic_malvar(packed, "BGGR")
-    for image, expected in zip(packed, batch, strict=True):
-        assert torch.equal(demosaic_malvar(image[None], "BGGR")[0], expected)
+@given(SHAPES, st.sampled_from(sorted(MIRRORED)), SEEDS)
+def test_demosaicing_mirrors_with_the_mosaic(shape: tuple[int, int], cfa: str, seed: int) -> None:
+    height, width = (max(2, n) for n in shape)
+    packed = torch.rand(2, 4, height, width, generator=torch.Generator().manual_seed(seed)).double()
+    rgb = demosaic_malvar(packed, cfa)
+    mirrored = demosaic_malvar(packed.flip(3), MIRRORED[cfa])
+    torch.testing.assert_close(mirrored.flip(3), rgb, rtol=0, atol=1e-14)
+    turned = {"RGGB": "RGGB", "BGGR": "BGGR", "GRBG": "GBRG", "GBRG": "GRBG"}[cfa]
+    across = demosaic_malvar(packed[:, [0, 2, 1, 3]].transpose(2, 3), turned)
+    torch.testing.assert_close(across.transpose(2, 3), rgb, rtol=0, atol=1e-14)
+    assert torch.equal(demosaic_malvar(packed.flip(0), cfa).flip(0), rgb)  # each image by itself
 
 
 def test_half_is_one_pixel_per_tile():

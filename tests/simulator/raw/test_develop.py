@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import rawpy
 import torch
+from hypothesis import example, given
+from hypothesis import strategies as st
 from skimage.color import xyz2rgb
 
 from simulator import CameraSettings, RawImage, develop, get_camera, read_raw, render_srgb
 from simulator.camera import CameraProfile
 from simulator.raw.develop import apply_tone, balance, srgb_encode, srgb_from_camera
+from tests.strategies import lights, log_uniform
 
 Z6 = get_camera("nikon_z6")
 
@@ -96,20 +99,26 @@ def test_only_the_ratio_of_gains_matters():
     )
 
 
-@pytest.mark.parametrize("tone", ["linear", "photographic"])
-@pytest.mark.parametrize("matrix", [None, Z6.colour_matrix])
-@pytest.mark.parametrize("value", [-0.07, -1e6, -3e38, 0.0, 1e-30, 1e6, 3e38])
-def test_extreme_values_stay_finite(value, matrix, tone):
-    images = torch.rand(1, 4, 4, 4, generator=torch.Generator().manual_seed(0))
-    images[0, 1] = value
-    images[0, :, 1, 2] = value
-    out = develop(images, (3.0, 1.0, 0.2), matrix, tone=tone)
-    assert torch.isfinite(out).all()
-    assert out.min() >= 0
-    assert out.max() <= 1
-    raw = RawImage(images[0], CameraSettings(100, 0.01, 4), Z6, None, (3.0, 1.0, 0.2))
-    for exposure_ev in (-32, 32):
-        assert render_srgb(raw, exposure_ev=exposure_ev, tone=tone).shape == (3, 8, 8)
+@example(torch.zeros(4, 1, 1), (1e-30, 1.0, 1e30), "linear")  # gains further apart than float32
+@given(
+    lights(),
+    st.tuples(*[log_uniform(1e-30, 1e30)] * 3),
+    st.sampled_from(["linear", "photographic"]),
+)
+def test_any_light_is_developed_within_the_range(
+    light: torch.Tensor, white_balance: tuple[float, float, float], tone: str
+) -> None:
+    before = light.clone()
+    rgb = develop(light[None], white_balance, Z6.colour_matrix, tone=tone)
+    assert bool(((rgb >= 0) & (rgb <= 1)).all())
+    twice = develop(torch.stack([light.flip(2), light]), white_balance, Z6.colour_matrix, tone=tone)
+    torch.testing.assert_close(twice[1], rgb[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(twice[0].flip(2), rgb[0], rtol=0, atol=1e-6)
+    raw = RawImage(light, CameraSettings(100, 0.01, 4), Z6, white_balance=white_balance)
+    for exposure_ev in (-32, 0, 32):
+        shown = render_srgb(raw, exposure_ev=exposure_ev, tone=tone)
+        assert shown.shape == (3, 2 * light.shape[1], 2 * light.shape[2])
+    assert torch.equal(light, before)
 
 
 def test_shadow_noise_keeps_its_mean():
@@ -120,7 +129,7 @@ def test_shadow_noise_keeps_its_mean():
     assert out[0, 1].item() == pytest.approx(float(srgb(np.array(0.02))), abs=1e-6)
 
 
-@pytest.mark.parametrize("batch", [1, 5, 40])
+@pytest.mark.parametrize("batch", [1, 40])
 def test_per_image_white_balance_and_batching(batch):
     generator = torch.Generator().manual_seed(3)
     images = torch.rand(batch, 4, 40, 48, generator=generator) * 1.2 - 0.1
@@ -131,18 +140,8 @@ def test_per_image_white_balance_and_batching(batch):
         assert torch.equal(together[i], alone[0])
 
 
-def test_inputs_are_left_alone():
-    images = torch.rand(2, 4, 4, 4, generator=torch.Generator().manual_seed(0)) * 2 - 0.5
-    gains = torch.tensor([2.0, 1.0, 1.5])
-    before, gains_before = images.clone(), gains.clone()
-    develop(images, gains, Z6.colour_matrix)
-    render_srgb(RawImage(images[0], CameraSettings(100, 0.01, 4), Z6))
-    assert torch.equal(images, before)
-    assert torch.equal(gains, gains_before)
-
-
 @pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
-@pytest.mark.parametrize("size", [(1, 1), (1, 5), (2, 2), (3, 7), (16, 16)])
+@pytest.mark.parametrize("size", [(1, 5), (2, 2), (3, 7)])
 def test_render_sizes(size, pattern):
     camera = CameraProfile("c", pattern, 0, 1023, 10)
     raw = RawImage(torch.full((4, *size), 0.5), CameraSettings(100, 0.01, 4), camera)
@@ -194,6 +193,8 @@ def test_render_refuses():
         render_srgb(raw, tone="aces")
     with pytest.raises(ValueError, match="`exposure_ev` "):
         render_srgb(raw, exposure_ev=float("nan"))
+    with pytest.raises(ValueError, match=r"`raw` \(=object\) must be a RawImage"):
+        render_srgb(object())  # type: ignore[arg-type]
 
 
 @pytest.mark.real_data

@@ -67,7 +67,7 @@ def test_photographs(name: str, camera: str, iso: int) -> None:
     assert high < 1.25
 
 
-def test_texture_everywhere_errs_upwards_only() -> None:
+def test_texture_everywhere_makes_the_estimate_too_high_only() -> None:
     """Every other pixel of a sharp photograph: no level is smooth; the bound is the docs'."""
     encoded = skimage.data.astronaut()[::2, ::2] / 255.0
     light = np.moveaxis(encoded**2.2, -1, 0)[[0, 1, 1, 2]]
@@ -111,14 +111,6 @@ def test_noise_free_is_zero_on_a_slope() -> None:
     light = np.broadcast_to(np.linspace(0.1, 0.9, 128), (4, 128, 128))
     estimate = estimate_nlf(light.astype(np.float32))
     assert max(estimate.shot) < 1e-10
-
-
-def test_scaling_the_raw_scales_the_estimate() -> None:
-    nlf = get_camera("canon_70d").nlf(800)
-    noisy = with_noise(ramp(), nlf, seed=7)
-    full, half = estimate_nlf(noisy), estimate_nlf(noisy / 2)
-    assert half.shot[0] == pytest.approx(full.shot[0] / 2, rel=1e-3)
-    assert half.read[0] == pytest.approx(full.read[0] / 4, rel=1e-2)
 
 
 def test_large_raws_are_sampled() -> None:

@@ -1,9 +1,13 @@
-"""Reading raw files: CFA orders, levels, margins, metadata, noise, and what is refused."""
+"""Reading raw files: orders, levels, margins, noise, and damaged files refused in words."""
 
 from __future__ import annotations
 
+import errno
 import gc
+import os
 import re
+import struct
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,15 +18,23 @@ import tifffile
 import torch
 from skimage.io import imsave
 
-from simulator import CameraSettings, NoiseLevelFunction, RawImage, get_camera, read_raw, write_dng
-from simulator.camera import BayerPattern, CameraProfile
-from simulator.raw.read import RawFileError
+from simulator import (
+    CameraProfile,
+    CameraSettings,
+    NoiseLevelFunction,
+    RawFileError,
+    RawImage,
+    get_camera,
+    read_raw,
+    write_dng,
+)
+from simulator.camera import BayerPattern
+from simulator.raw import read as read_module
 
 SETTINGS = CameraSettings(iso=100, exposure_time=1 / 60, f_number=4.0)
 NLF = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
 BLACK = (60, 70, 80, 90)  # row by row of the tile
-
-
+MOSAIC = np.random.default_rng(0).integers(100, 4000, (64, 96), dtype=np.uint16)
 CFA_BYTES = {
     "RGGB": b"\x00\x01\x01\x02",
     "BGGR": b"\x02\x01\x01\x00",
@@ -31,64 +43,82 @@ CFA_BYTES = {
 }
 #: XYZ to camera of a Nikon Z 6, any plausible matrix would do.
 MATRIX = (0.9943, -0.3269, -0.0839, -0.5323, 1.3269, 0.2259, -0.1198, 0.2083, 0.7557)
+CODE = tifffile.TIFF.EXIF_TAGS  # of a tag's name
+
+
+def fractions(values: Any) -> tuple[int, ...]:
+    return tuple(part for v in np.ravel(values) for part in (round(v * 10000), 10000))
 
 
 def write_sample_dng(
     path: Path,
-    mosaic: np.ndarray,
+    mosaic: np.ndarray = MOSAIC,
     *,
     cfa: bytes = CFA_BYTES["RGGB"],
     cfa_size: int = 2,
     black: tuple[int, ...] = (64,),
-    white: int = 4095,
-    active_area: tuple[int, int, int, int] | None = None,
-    noise_profile: tuple[float, ...] | None = None,
-    make: str = "Test",
-    model: str = "Sensor",
     photometric: int = 32803,
-    illuminant: int = 21,
-    extra: tuple[tuple[Any, ...], ...] = (),
-) -> None:
-    """A DNG by tifffile, not by the code under test; `black` is row by row of the 2 x 2 tile."""
-    tags: list[tuple[Any, ...]] = [
-        (271, "s", 0, make, True),
-        (272, "s", 0, model, True),
-        (50706, "B", 4, (1, 4, 0, 0), True),
-        (50707, "B", 4, (1, 1, 0, 0), True),
-        (50708, "s", 0, f"{make} {model}", True),
-        (50717, "I", 1, white, True),
-        (50721, "2i", 9, tuple(n for v in MATRIX for n in (round(v * 10000), 10000)), True),
-        (50728, "2I", 3, (1, 2, 1, 1, 2, 3), True),
-        (50778, "H", 1, illuminant, True),
-        *extra,
-    ]
+    rowsperstrip: int | None = None,
+    **changes: tuple[str, Any],
+) -> Path:
+    """A DNG by tifffile, not by the code under test; `black` is row by row of the 2 x 2 tile.
+
+    Args:
+        changes: Type and values of further tags, or of others than the usual ones, by name.
+    """
+    tags: dict[str, tuple[str, Any]] = {
+        "Make": ("s", "Test"),
+        "Model": ("s", "Sensor"),
+        "DNGVersion": ("B", (1, 4, 0, 0)),
+        "DNGBackwardVersion": ("B", (1, 1, 0, 0)),
+        "UniqueCameraModel": ("s", "Test Sensor"),
+        "WhiteLevel": ("I", (4095,)),
+        "ColorMatrix1": ("2i", fractions(MATRIX)),
+        "AsShotNeutral": ("2I", (1, 2, 1, 1, 2, 3)),
+        "CalibrationIlluminant1": ("H", (21,)),
+        "BlackLevel": ("I", black),
+    }
     if photometric == 32803:
-        tags += [
-            (33421, "H", 2, (cfa_size, cfa_size), True),
-            (33422, "B", len(cfa), cfa, True),
-            (50710, "B", 3, (0, 1, 2), True),
-            (50711, "H", 1, 1, True),
-        ]
+        tags["CFARepeatPatternDim"] = ("H", (cfa_size, cfa_size))
+        tags["CFAPattern"], tags["CFAPlaneColor"] = ("B", cfa), ("B", (0, 1, 2))
+        tags["CFALayout"] = ("H", (1,))
     if len(black) == 4:
-        tags.append((50713, "H", 2, (2, 2), True))
-    tags.append((50714, "I", len(black), black if len(black) > 1 else black[0], True))
-    if active_area is not None:
-        tags.append((50829, "I", 4, active_area, True))
-    if noise_profile is not None:
-        tags.append((51041, "d", len(noise_profile), noise_profile, True))
+        tags["BlackLevelRepeatDim"] = ("H", (2, 2))
+    extra = []
+    for name, (kind, values) in (tags | changes).items():
+        count = 0 if kind == "s" else len(values) // (2 if kind.startswith("2") else 1)
+        single = kind != "s" and len(values) == 1
+        extra.append((CODE[name], kind, count, values[0] if single else values, True))
     tifffile.imwrite(
-        path, mosaic, photometric=photometric, extratags=tags, metadata=None, software=False
+        path,
+        mosaic,
+        photometric=photometric,
+        extratags=extra,
+        metadata=None,
+        software=False,
+        rowsperstrip=rowsperstrip,
     )
+    return path
 
 
 @pytest.fixture
-def mosaic() -> np.ndarray:
-    return np.random.default_rng(0).integers(100, 4000, (64, 96), dtype=np.uint16)
+def path(tmp_path: Path) -> Path:
+    """A DNG of another program: black 64, white 4095."""
+    return write_sample_dng(tmp_path / "a.dng")
 
 
-def expected_planes(
-    mosaic: np.ndarray, order: str, area: tuple[int, int, int, int]
-) -> dict[str, np.ndarray]:
+@pytest.fixture
+def own_dng(tmp_path: Path) -> Path:
+    """A DNG of `write_dng`: black 1008, white 15520, 1/60 s."""
+    path = tmp_path / "own.dng"
+    write_dng(path, RawImage.from_mosaic(MOSAIC, SETTINGS, get_camera("nikon_z6"), nlf=NLF))
+    return path
+
+
+# -- what is read ---------------------------------------------------------------------------------
+
+
+def expected_planes(order: str, area: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
     """Planes by the DNG specification's rule, pixel by pixel from the tile at the area's corner.
 
     LibRaw begins an odd visible area one row or column further in.
@@ -97,84 +127,68 @@ def expected_planes(
     rows = np.arange(top + top % 2, bottom)
     columns = np.arange(left + left % 2, right)
     rows, columns = rows[: len(rows) // 2 * 2], columns[: len(columns) // 2 * 2]
-    red_row = order.index("R") // 2
-    names = np.array(
-        [
-            letter if letter != "G" else ("G1" if i // 2 == red_row else "G2")
-            for i, letter in enumerate(order)
-        ]
-    )
+    greens = ("G1", "G2") if order.index("R") // 2 == 0 else ("G2", "G1")
+    names = np.array([c if c != "G" else greens[i // 2] for i, c in enumerate(order)])
     tile = 2 * ((rows[:, None] - top) % 2) + (columns[None] - left) % 2
-    values = (mosaic[np.ix_(rows, columns)] - np.array(BLACK, float)[tile]) / (
-        4095 - np.array(BLACK, float)[tile]
-    )
+    black = np.array(BLACK, float)[tile]
+    values = (MOSAIC[np.ix_(rows, columns)] - black) / (4095 - black)
     shape = (len(rows) // 2, len(columns) // 2)
     return {n: values[names[tile] == n].reshape(shape) for n in ("R", "G1", "G2", "B")}
 
 
 @pytest.mark.parametrize("order", list(CFA_BYTES))
-@pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (3, 5), (2, 4)])
+@pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (3, 5)])
 def test_cfa_orders_black_levels_and_margins(
-    tmp_path: Path, mosaic: np.ndarray, order: str, corner: tuple[int, int]
+    tmp_path: Path, order: str, corner: tuple[int, int]
 ) -> None:
     area = (*corner, 62, 94)
-    write_sample_dng(
-        tmp_path / "a.dng", mosaic, cfa=CFA_BYTES[order], black=BLACK, active_area=area
-    )
-    raw = read_raw(tmp_path / "a.dng", settings=SETTINGS, nlf=NLF)
+    path = tmp_path / "a.dng"
+    write_sample_dng(path, cfa=CFA_BYTES[order], black=BLACK, ActiveArea=("I", area))
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
     for plane, name in zip(raw.data.numpy(), ("R", "G1", "G2", "B"), strict=True):
-        np.testing.assert_allclose(plane, expected_planes(mosaic, order, area)[name], atol=1e-7)
-    by_name = dict(zip(("R", "G1", "G2", "B"), raw.camera.black_level, strict=True))
-    green_with_red = {"RGGB": 70, "BGGR": 80, "GRBG": 60, "GBRG": 90}[order]
-    assert by_name["G1"] == green_with_red
-    assert by_name["R"] == BLACK[order.index("R")]
+        np.testing.assert_allclose(plane, expected_planes(order, area)[name], atol=1e-7)
+    assert raw.camera.black_level[0] == BLACK[order.index("R")]
+    assert raw.camera.black_level[1] == {"RGGB": 70, "BGGR": 80, "GRBG": 60, "GBRG": 90}[order]
 
 
-def test_levels_colour_and_metadata(tmp_path: Path, mosaic: np.ndarray) -> None:
-    write_sample_dng(tmp_path / "a.dng", mosaic)
-    raw = read_raw(str(tmp_path / "a.dng"), settings=SETTINGS, nlf=NLF)
+def test_levels_colour_and_metadata(path: Path) -> None:
+    raw = read_raw(str(path), settings=SETTINGS, nlf=NLF)
     assert raw.settings == SETTINGS  # given settings are not snapped
-    assert raw.camera.black_level == (64.0,) * 4
-    assert raw.camera.white_level == 4095
-    assert raw.camera.bit_depth == 12
+    camera = raw.camera
+    assert (camera.black_level, camera.white_level, camera.bit_depth) == ((64.0,) * 4, 4095, 12)
+    assert camera.name == "test_sensor"
     assert raw.white_balance == pytest.approx((2.0, 1.0, 1.5))
-    assert raw.camera.colour_matrix is not None
-    np.testing.assert_allclose(np.ravel(raw.camera.colour_matrix), MATRIX, atol=1e-6)
-    assert "ColorMatrix of the file" in raw.camera.colour_matrix_source
-    assert raw.camera.name == "test_sensor"
-    assert raw.metadata["path"] == "a.dng"
-    assert (raw.metadata["make"], raw.metadata["model"]) == ("Test", "Sensor")
-    assert raw.metadata["flip"] == 0
-    assert raw.metadata["nlf_source"] == "given"
+    np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
+    assert "ColorMatrix of the file" in camera.colour_matrix_source
+    known = {"path": "a.dng", "make": "Test", "model": "Sensor", "flip": 0, "nlf_source": "given"}
+    assert known.items() <= raw.metadata.items()
     assert raw.noise == NLF
-    np.testing.assert_array_equal(raw.to_mosaic(), mosaic)
+    np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)
 
 
-def test_rotation_is_reported_not_applied(tmp_path: Path, mosaic: np.ndarray) -> None:
-    write_sample_dng(tmp_path / "a.dng", mosaic, extra=((274, "H", 1, 6, True),))
-    raw = read_raw(tmp_path / "a.dng", settings=SETTINGS, nlf=NLF)
+def test_rotation_is_reported_not_applied(tmp_path: Path) -> None:
+    path = write_sample_dng(tmp_path / "a.dng", Orientation=("H", (6,)))
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
     assert raw.metadata["flip"] == 6
     assert raw.data.shape == (4, 32, 48)
 
 
-def test_second_colour_matrix_is_daylight(tmp_path: Path, mosaic: np.ndarray) -> None:
+def test_second_colour_matrix_is_daylight(tmp_path: Path) -> None:
     """A DNG's first matrix is for tungsten light as a rule; CameraCalibration is multiplied in."""
-    half = tuple(n for v in np.diag([0.5, 1, 2]).ravel() for n in (round(v * 10), 10))
-    double = tuple(n for v in np.eye(3).ravel() for n in (round(v * 2), 1))
-    extra = (
-        (50722, "2i", 9, double, True),
-        (50724, "2i", 9, half, True),
-        (50779, "H", 1, 21, True),
+    path = write_sample_dng(
+        tmp_path / "a.dng",
+        CalibrationIlluminant1=("H", (17,)),
+        ColorMatrix2=("2i", fractions(2 * np.eye(3))),
+        CameraCalibration2=("2i", fractions(np.diag([0.5, 1, 2]))),
+        CalibrationIlluminant2=("H", (21,)),
     )
-    write_sample_dng(tmp_path / "a.dng", mosaic, extra=extra, illuminant=17)
-    raw = read_raw(tmp_path / "a.dng", settings=SETTINGS, nlf=NLF)
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
     np.testing.assert_allclose(raw.camera.colour_matrix, np.diag([1.0, 2.0, 4.0]))
 
 
-def test_missing_exposure_must_be_given(tmp_path: Path, mosaic: np.ndarray) -> None:
-    write_sample_dng(tmp_path / "a.dng", mosaic)
+def test_missing_exposure_must_be_given(path: Path) -> None:
     with pytest.raises(ValueError, match=r"`settings`.*iso, exposure_time, f_number"):
-        read_raw(tmp_path / "a.dng")
+        read_raw(path)
 
 
 @pytest.mark.parametrize(
@@ -184,17 +198,10 @@ def test_missing_exposure_must_be_given(tmp_path: Path, mosaic: np.ndarray) -> N
         ((1e-4, 1e-6, 2e-4, 2e-6, 3e-4, 3e-6), (1e-4, 2e-4, 2e-4, 3e-4), (1e-6, 2e-6, 2e-6, 3e-6)),
     ],
 )
-def test_noise_profile_wins(
-    tmp_path: Path, mosaic: np.ndarray, pairs: tuple[float, ...], shot: Any, read: Any
-) -> None:
-    write_sample_dng(
-        tmp_path / "a.dng",
-        mosaic,
-        noise_profile=pairs,
-        make="NIKON CORPORATION",
-        model="NIKON Z 6",
-    )
-    raw = read_raw(tmp_path / "a.dng", settings=SETTINGS)
+def test_noise_profile_wins(tmp_path: Path, pairs: tuple[float, ...], shot: Any, read: Any) -> None:
+    z6 = {"Make": ("s", "NIKON CORPORATION"), "Model": ("s", "NIKON Z 6")}
+    path = write_sample_dng(tmp_path / "a.dng", **z6, NoiseProfile=("d", pairs))
+    raw = read_raw(path, settings=SETTINGS)
     assert raw.noise.shot == pytest.approx(shot)
     assert raw.noise.read == pytest.approx(read)
     assert raw.metadata["nlf_source"] == "DNG NoiseProfile"
@@ -202,33 +209,42 @@ def test_noise_profile_wins(
     assert raw.camera.nlf(400) == get_camera("nikon_z6").nlf(400)
 
 
-def test_built_in_camera_keeps_the_levels_of_the_file(tmp_path: Path, mosaic: np.ndarray) -> None:
-    write_sample_dng(tmp_path / "a.dng", mosaic, make="Canon", model="Canon EOS 70D")
-    raw = read_raw(tmp_path / "a.dng", settings=SETTINGS)
+@pytest.mark.parametrize("profile", [(np.nan, 0.0), (1e300, 0.0), (-1.0, 0.0), (1e-4, -1e300)])
+def test_a_noise_profile_that_cannot_be_one_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, profile: tuple[float, float]
+) -> None:
+    path = write_sample_dng(tmp_path / "a.dng", NoiseProfile=("d", profile))
+    raw = read_raw(path, settings=SETTINGS)
+    assert raw.metadata["nlf_source"] == "blind estimate"
+    assert "NoiseProfile" in caplog.text
+    assert 0 <= max(raw.noise.shot) < 1
+
+
+def test_built_in_camera_keeps_the_levels_of_the_file(tmp_path: Path) -> None:
+    canon = {"Make": ("s", "Canon"), "Model": ("s", "Canon EOS 70D")}
+    raw = read_raw(write_sample_dng(tmp_path / "a.dng", **canon), settings=SETTINGS)
     assert raw.camera.name == "canon_70d"
     assert (raw.camera.black_level[0], raw.camera.white_level) == (64.0, 4095.0)
     assert raw.noise == get_camera("canon_70d").nlf(100)
     assert raw.metadata["nlf_source"] == "camera calibration (canon_70d)"
 
 
-def test_camera_argument(tmp_path: Path, mosaic: np.ndarray) -> None:
-    path = tmp_path / "a.dng"
-    write_sample_dng(path, mosaic)
+def test_camera_argument(path: Path) -> None:
     named = read_raw(path, settings=SETTINGS, camera="nikon_z6")
     assert named.noise == get_camera("nikon_z6").nlf(100)
     assert named.camera.white_level == 4095
     own = CameraProfile("mine", BayerPattern.RGGB, (50.0,) * 4, 4000, 12).with_nlf(100, NLF)
     raw = read_raw(path, settings=SETTINGS, camera=own)
     assert raw.camera == own
-    assert raw.data[0, 0, 0] == pytest.approx((int(mosaic[0, 0]) - 50) / 3950)
-    with pytest.raises(ValueError, match=r"filter order of 'a\.dng', RGGB"):
-        read_raw(path, settings=SETTINGS, camera=replace(own, cfa=BayerPattern.GBRG))
-    with pytest.raises(ValueError, match=r"levels of 'a\.dng', white 4095"):
-        read_raw(path, settings=SETTINGS, camera=get_camera("nikon_z6"))
-    with pytest.raises(ValueError, match="did you mean 'nikon_z6'"):
-        read_raw(path, settings=SETTINGS, camera="nikon_z")
-    with pytest.raises(ValueError, match="`camera`"):
-        read_raw(path, settings=SETTINGS, camera=3)  # type: ignore[arg-type]
+    assert raw.data[0, 0, 0] == pytest.approx((int(MOSAIC[0, 0]) - 50) / 3950)
+    for camera, message in (
+        (replace(own, cfa=BayerPattern.GBRG), r"filter order of 'a\.dng', RGGB"),
+        (get_camera("nikon_z6"), r"levels of 'a\.dng', white 4095"),
+        ("nikon_z", "did you mean 'nikon_z6'"),
+        (3, "`camera`"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_raw(path, settings=SETTINGS, camera=camera)  # type: ignore[arg-type]
 
 
 def test_unknown_camera_is_estimated_and_declared(tmp_path: Path) -> None:
@@ -236,8 +252,7 @@ def test_unknown_camera_is_estimated_and_declared(tmp_path: Path) -> None:
     light = np.broadcast_to(np.linspace(0.02, 0.8, 384), (256, 384))
     noisy = light + np.sqrt(4e-4 * light + 4e-6) * rng.standard_normal(light.shape)
     numbers = np.rint(np.clip(64 + 4031 * noisy, 0, 4095)).astype(np.uint16)
-    write_sample_dng(tmp_path / "a.dng", numbers)
-    raw = read_raw(tmp_path / "a.dng", settings=SETTINGS)
+    raw = read_raw(write_sample_dng(tmp_path / "a.dng", numbers), settings=SETTINGS)
     assert raw.metadata["nlf_source"] == "blind estimate"
     variance = raw.noise.read[1] + 0.18 * raw.noise.shot[1]
     assert variance == pytest.approx(4e-4 * 0.18 + 4e-6, rel=0.15)
@@ -245,29 +260,9 @@ def test_unknown_camera_is_estimated_and_declared(tmp_path: Path) -> None:
     assert raw.camera.nlf(400).shot[1] == pytest.approx(4 * raw.noise.shot[1])
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "txt", "bin", "nothing"])
-def test_files_that_are_no_raw_say_what_they_are(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"a.{suffix}"
-    words = {"jpg": "a JPEG", "png": "a PNG", "tif": "TIFF", "txt": "a text file"}
-    words |= {"bin": "unknown type", "nothing": "an empty file"}
-    picture = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
-    if suffix in ("jpg", "png", "tif"):
-        imsave(path, picture, check_contrast=False)
-    else:
-        path.write_bytes({"txt": b"hello\n" * 99, "bin": b"\0\1" * 999, "nothing": b""}[suffix])
-    with pytest.raises(RawFileError, match=words[suffix]) as caught:
-        read_raw(path, settings=SETTINGS)
-    assert f"a.{suffix}" in str(caught.value)
-    assert str(tmp_path) not in str(caught.value)
-
-
 @pytest.mark.parametrize("own", [False, True])
-def test_what_was_read_does_not_depend_on_the_file(
-    tmp_path: Path, mosaic: np.ndarray, own: bool
-) -> None:
+def test_the_raw_does_not_depend_on_the_file_any_more(path: Path, own: bool) -> None:
     """Neither LibRaw's memory nor the file is looked at once it was read."""
-    path = tmp_path / "a.dng"
-    write_sample_dng(path, mosaic)
     raw = read_raw(path, settings=SETTINGS, nlf=NLF)
     if own:
         write_dng(path, raw)
@@ -277,38 +272,15 @@ def test_what_was_read_does_not_depend_on_the_file(
         stream.write(bytes(path.stat().st_size))
     gc.collect()
     assert torch.equal(raw.data, before)
-    expected = (mosaic[::2, ::2].astype(np.float64) - 64) / (4095 - 64)
-    np.testing.assert_array_equal(raw.data[0].numpy(), expected.astype(np.float32))
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="does not exist"):
-        read_raw(tmp_path / "none.dng")
-    with pytest.raises(FileNotFoundError, match="is a folder"):
-        read_raw(tmp_path)
-
-
-def test_linear_dng_is_refused(tmp_path: Path, mosaic: np.ndarray) -> None:
-    write_sample_dng(tmp_path / "a.dng", np.stack([mosaic] * 3, axis=-1), photometric=34892)
-    with pytest.raises(RawFileError, match="linear DNG"):
-        read_raw(tmp_path / "a.dng", settings=SETTINGS)
-
-
-def test_x_trans_is_refused(tmp_path: Path, mosaic: np.ndarray) -> None:
-    tile = "GBGGRG RGRBGB GBGGRG GRGGBG BGBRGR GRGGBG".replace(" ", "")
-    cfa = bytes("RGB".index(letter) for letter in tile)
-    write_sample_dng(tmp_path / "a.dng", mosaic, cfa=cfa, cfa_size=6)
-    with pytest.raises(RawFileError, match="X-Trans"):
-        read_raw(tmp_path / "a.dng", settings=SETTINGS)
-
-
-@pytest.mark.parametrize("share", [0.05, 0.2, 0.5, 0.9, 0.999])
-def test_truncated_dng_is_refused(tmp_path: Path, mosaic: np.ndarray, share: float) -> None:
-    path = tmp_path / "a.dng"
-    write_sample_dng(path, mosaic)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(RawFileError, match="truncated"):
+def test_a_table_of_very_many_strips_is_read(tmp_path: Path) -> None:
+    mosaic = np.full((17_000, 64), 1000, np.uint16)
+    path = write_sample_dng(tmp_path / "a.dng", mosaic, rowsperstrip=1)
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    np.testing.assert_array_equal(raw.to_mosaic(), mosaic)
+    os.truncate(path, path.stat().st_size - 1)
+    with pytest.raises(RawFileError, match="names 1 bytes beyond its end"):
         read_raw(path, settings=SETTINGS, nlf=NLF)
 
 
@@ -334,22 +306,251 @@ def test_canon_crw(data_dir: Path) -> None:
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.9999])
-def test_truncated_crw_is_refused(data_dir: Path, tmp_path: Path, share: float) -> None:
-    whole = (data_dir / "canon_crw_cc0" / "CRW_0101.CRW").read_bytes()
-    path = tmp_path / "cut.crw"
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(RawFileError, match="truncated"):
-        read_raw(path)
-
-
-@pytest.mark.real_data
 def test_headerless_array(data_dir: Path) -> None:
     path = data_dir / "raw_misc_mit" / "DSC_1339_768x512_rggb.raw"
     numbers = np.fromfile(path, "<u2").reshape(512, 768)
     camera = CameraProfile("mine", BayerPattern.RGGB, (600.0,) * 4, 16383, 14)
     raw = RawImage.from_mosaic(numbers, SETTINGS, camera, nlf=NLF)
-    assert raw.data.shape == (4, 256, 384)
     np.testing.assert_array_equal(raw.to_mosaic(), numbers)
     with pytest.raises(RawFileError, match=re.escape(path.name) + ".*from_mosaic"):
         read_raw(path, settings=SETTINGS)
+
+
+# -- what is refused ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("given", [None, 3, b"x", ["a.dng"]])
+def test_what_is_no_name_of_a_file(given: Any, own_dng: Path) -> None:
+    with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
+        read_raw(given)
+    with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
+        write_dng(given, read_raw(own_dng))
+
+
+def test_missing_files_and_folders(tmp_path: Path) -> None:
+    for path, words in (
+        (tmp_path / "none.dng", "does not exist"),
+        (tmp_path, "is a folder"),
+        (Path(os.devnull), "no ordinary file"),
+    ):
+        with pytest.raises(FileNotFoundError, match=words):
+            read_raw(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("jpg", "a JPEG"),
+        ("png", "a PNG"),
+        ("tif", "TIFF"),
+        (b"hello\n" * 99, "a text file"),
+        (b"\0\1" * 999, "unknown type"),
+        (b"", "an empty file"),
+        (b"II*\0", "a TIFF-structured file"),
+    ],
+)
+def test_files_that_are_no_raw_say_what_they_are(
+    tmp_path: Path, content: str | bytes, words: str
+) -> None:
+    path = tmp_path / "a.dng"
+    if isinstance(content, str):
+        imsave(tmp_path / f"b.{content}", np.zeros((8, 8, 3), np.uint8), check_contrast=False)
+        content = (tmp_path / f"b.{content}").read_bytes()
+    path.write_bytes(content)
+    with pytest.raises(RawFileError, match=words) as caught:
+        read_raw(path, settings=SETTINGS)
+    assert "`path` (='a.dng')" in str(caught.value)
+    assert str(tmp_path) not in str(caught.value)
+
+
+def test_arrays_that_are_not_bayer_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.dng"
+    write_sample_dng(path, np.stack([MOSAIC] * 3, axis=-1), photometric=34892)
+    with pytest.raises(RawFileError, match="linear DNG"):
+        read_raw(path, settings=SETTINGS)
+    tile = "GBGGRGRGBRGBGBGGRGGRGGBGBGBRGRGRGGBG"
+    write_sample_dng(path, cfa=bytes("RGB".index(c) for c in tile), cfa_size=6)
+    with pytest.raises(RawFileError, match="X-Trans"):
+        read_raw(path, settings=SETTINGS)
+
+
+def test_files_that_may_not_be_read_or_shrink(
+    own_dng: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = read_module.read_own_record
+
+    def shrinking(directories: Any) -> Any:
+        os.truncate(own_dng, 2000)
+        return real(directories)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(read_module, "read_own_record", shrinking)
+        with pytest.raises(RawFileError, match=r"truncated or damaged|became shorter"):
+            read_raw(own_dng)
+
+    def forbidden(*_: Any) -> Any:
+        raise PermissionError(errno.EACCES, "Permission denied", str(own_dng))
+
+    monkeypatch.setattr(Path, "open", forbidden)
+    with pytest.raises(RawFileError, match=r"cannot be read: .*Permission denied"):
+        read_raw(own_dng)
+
+
+@pytest.mark.parametrize("name", ["a.dng", "own.dng"])
+def test_a_dng_cut_anywhere_is_refused(path: Path, own_dng: Path, name: str) -> None:
+    cut = path.with_name(name)
+    for size in range(cut.stat().st_size - 1, -1, -512):
+        os.truncate(cut, size)
+        with pytest.raises(RawFileError, match=rf"`path` \(='{name}'"):
+            read_raw(cut, settings=SETTINGS, nlf=NLF)
+
+
+@pytest.mark.real_data
+def test_a_cut_crw_says_so(data_dir: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut.crw"
+    path.write_bytes((data_dir / "canon_crw_cc0" / "CRW_0101.CRW").read_bytes())
+    for size in range(path.stat().st_size - 1, 0, -10 * 1024):
+        os.truncate(path, size)
+        with pytest.raises(RawFileError, match=r"`path` \(='cut.crw'\).*truncated"):
+            read_raw(path)
+
+
+def fields(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
+    """Tag, position of the entry, position of the value (TIFF 6.0); the EXIF directory's, too."""
+    pending = [struct.unpack_from("<I", content, 4)[0]]
+    for offset in pending:
+        for i in range(struct.unpack_from("<H", content, offset)[0]):
+            at = offset + 2 + 12 * i
+            tag, kind, count, value = struct.unpack_from("<HHII", content, at)
+            size = count * {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 10: 8, 12: 8}[kind]
+            yield tag, at, at + 8 if size <= 4 else value
+            if tag == CODE["ExifTag"]:
+                pending.append(value)
+
+
+def patch(path: Path, name: str, form: str, *values: Any) -> None:
+    """Overwrites a tag's value; with the form ``count``, how many values it claims to have."""
+    content = bytearray(path.read_bytes())
+    entry, position = next((at, v) for tag, at, v in fields(content) if tag == CODE[name])
+    if form == "count":
+        struct.pack_into("<I", content, entry + 4, *values)
+    else:
+        struct.pack_into(f"<{form}", content, position, *values)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("white", [0, 65536, 2**32 - 1])
+def test_a_white_level_that_cannot_be_is_the_largest_number(
+    own_dng: Path, path: Path, caplog: pytest.LogCaptureFixture, white: int
+) -> None:
+    for file, black in ((path, 64), (own_dng, 1008)):
+        patch(file, "WhiteLevel", "I", white)
+        raw = read_raw(file, settings=SETTINGS, nlf=NLF)
+        assert raw.camera.white_level == 65535
+        expected = (MOSAIC[0, 0] - float(black)) / (65535 - black)
+        assert float(raw.data[0, 0, 0]) == pytest.approx(expected, rel=1e-6)
+        assert f"{file.name}: its white level (={white}) must be in [1, 65535]" in caplog.text
+
+
+def test_levels_that_contradict_each_other(
+    own_dng: Path, path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for white in (1, 64):
+        for file in (path, own_dng):
+            patch(file, "WhiteLevel", "I", white)
+            with pytest.raises(RawFileError, match=f"above its black levels, .* white {white}"):
+                read_raw(file, settings=SETTINGS, nlf=NLF)
+    patch(path, "WhiteLevel", "I", 1000)
+    assert not caplog.records
+    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    times = (MOSAIC.max() - 64.0) / (1000 - 64)
+    assert float(raw.data.max()) == pytest.approx(times, rel=1e-6)
+    assert f"reach {times:.3g} times white" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values", "changed"),
+    [
+        ("AsShotNeutral", "6I", (0,) * 6, ("white_balance", (1.0, 1.0, 1.0))),  # 0 / 0
+        ("AsShotNeutral", "6I", (0, 1, 0, 1, 0, 1), ("white_balance", (1.0, 1.0, 1.0))),
+        ("AsShotNeutral", "count", (0,), ("white_balance", (1.0, 1.0, 1.0))),
+        ("ExposureTime", "2I", (1, 0), ("settings", SETTINGS)),
+        ("ExposureTime", "2I", (0, 1), ("settings", SETTINGS)),
+        ("FNumber", "count", (0,), ("settings", SETTINGS)),
+        ("RecommendedExposureIndex", "I", (0,), ("settings", SETTINGS)),
+        ("Orientation", "H", (99,), ("flip", 0)),
+        ("Orientation", "count", (0,), ("flip", 0)),
+        ("DateTimeOriginal", "19s", (b"9999:99:99 99:99:99",), ("datetime", None)),
+        ("FocalLength", "2I", (5, 0), ("focal_length", None)),
+    ],
+)  # fmt: skip
+def test_what_an_own_dng_lost_falls_back(
+    own_dng: Path, name: str, form: str, values: tuple[Any, ...], changed: tuple[str, Any]
+) -> None:
+    patch(own_dng, name, form, *values)
+    raw = read_raw(own_dng)
+    key, value = changed
+    found = getattr(raw, key) if hasattr(raw, key) else raw.metadata.get(key)
+    assert found == value
+    np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "values", "words"),
+    [
+        ("ImageWidth", "I", (0,), "64 x 0 pixels"),
+        ("ImageLength", "I", (0,), "0 x 96 pixels"),
+        ("StripOffsets", "count", (2**28,), "at no position"),
+        ("StripOffsets", "I", (2**32 - 1,), "truncated"),
+        ("StripByteCounts", "I", (2**32 - 1,), "truncated"),
+        ("CFAPattern", "4B", (9, 1, 1, 2), r"CFAPattern is \(9, 1, 1, 2\)"),
+        ("CFAPattern", "4B", (0, 0, 0, 0), "CFAPattern"),
+        ("BlackLevel", "I", (70_000,), "white level above its black levels"),
+    ],
+)
+def test_what_an_own_dng_cannot_do_without(
+    own_dng: Path, name: str, form: str, values: tuple[Any, ...], words: str
+) -> None:
+    patch(own_dng, name, form, *values)
+    with pytest.raises(RawFileError, match=words):
+        read_raw(own_dng)
+
+
+@pytest.mark.parametrize(
+    ("side", "words"),
+    [
+        (60_000, "at most 268435456 are read"),
+        (20_000, "at most 268435456 are read"),  # LibRaw would try
+        (8_000, "at most 1024 a byte are read"),
+    ],
+)
+def test_bombs_are_refused_before_they_are_decoded(
+    own_dng: Path, path: Path, side: int, words: str
+) -> None:
+    for file in (path, own_dng):
+        content = bytearray(file.read_bytes())
+        for tag, at, _ in list(fields(content)):
+            if tag in (CODE["ImageWidth"], CODE["ImageLength"]):
+                struct.pack_into("<HII", content, at + 2, 4, 1, side)
+        file.write_bytes(content)
+        with pytest.raises(RawFileError, match=f"claims {side} x {side} pixels.*{words}"):
+            read_raw(file, settings=SETTINGS, nlf=NLF)
+
+
+@pytest.mark.parametrize("name", ["a.dng", "own.dng"])
+def test_damaged_files_are_read_or_refused(path: Path, own_dng: Path, name: str) -> None:
+    """Bytes changed anywhere in the tags: a raw or a `RawFileError`, and nothing else."""
+    content, rng = path.with_name(name).read_bytes(), np.random.default_rng(5)
+    refused = 0
+    for _ in range(150):
+        damaged = bytearray(content)
+        for at in rng.integers(0, 900, rng.integers(1, 5)):
+            damaged[at] = rng.choice([0, 1, 127, 255])
+        path.write_bytes(damaged)
+        try:
+            raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+        except RawFileError:
+            refused += 1
+        else:
+            assert bool(torch.isfinite(raw.data).all())
+    assert 15 < refused < 150

@@ -1,23 +1,26 @@
-"""What is kept: the order and bound in memory, whole files on disk, several processes at once."""
+"""The cache: its order and bound in memory, whole files on disk, several processes at once."""
 
 from __future__ import annotations
 
 import copy
+import errno
 import hashlib
+import json
 import logging
 import multiprocessing
 import os
 import pickle
-import stat
 import threading
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import platformdirs
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
+from simulator.utils import cache as cache_module
 from simulator.utils.cache import (
     CACHE_KINDS,
     DiskCache,
@@ -36,28 +39,28 @@ def test_the_variable_names_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert not cache_dir().exists()
     monkeypatch.setenv("AE_ENV_CACHE", "~/there")
     assert cache_dir() == Path.home() / "there"
-    monkeypatch.delenv("AE_ENV_CACHE")
+    monkeypatch.setenv("AE_ENV_CACHE", "")
     assert cache_dir() == Path(platformdirs.user_cache_dir("ae-env"))
 
 
-def test_cache_key_depends_on_names_and_values() -> None:
+def test_keys_depend_on_names_values_and_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
     assert cache_key({"a": 1, "b": [2]}) == cache_key({"b": [2], "a": 1})
-    assert cache_key({"a": 1}) != cache_key({"a": 2})
-    assert cache_key({"a": 1}) == hashlib.sha256(b'{"a":1}').hexdigest()[:24]
+    keys = {cache_key({"a": 1}), cache_key({"a": 2}), cache_key({"b": 1}), cache_key({"a": [1]})}
+    monkeypatch.setattr(cache_module, "package_version", lambda: "99.0")
+    keys |= {cache_key({"a": 1})}
+    assert len(keys) == 5
+    text = json.dumps({"package": "99.0", "parts": {"a": 1}}, separators=(",", ":"))
+    assert cache_key({"a": 1}) == hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 # -- digests --------------------------------------------------------------------------------------
 
 
-def test_digest_is_that_of_the_bytes() -> None:
-    values = np.arange(6, dtype=np.float32).reshape(2, 3)
-    expected = hashlib.sha256(b"light:torch.float32:(2, 3);" + values.tobytes()).hexdigest()
-    assert content_digest({"light": torch.from_numpy(values)}) == expected
-
-
 def test_digest_sees_content_and_not_layout() -> None:
     light = torch.rand(2, 4, 6, 8)
     digest = content_digest({"light": light})
+    expected = b"light:torch.float32:(2, 4, 6, 8);" + light.numpy().tobytes()
+    assert digest == hashlib.sha256(expected).hexdigest()
     assert content_digest({"light": light.to(memory_format=torch.channels_last)}) == digest
     assert content_digest({"light": light.clone().requires_grad_()}) == digest
     one = light.clone()
@@ -68,16 +71,13 @@ def test_digest_sees_content_and_not_layout() -> None:
         {"light": light.double()},
         {"light": light.reshape(2, 4, 8, 6)},
         {"light": light, "mask": light > 0.5},
-        {"light": light, "mask": light > 0.6},
         {},
     ]
     assert len({digest, *map(content_digest, others)}) == 1 + len(others)
 
 
 @pytest.mark.parametrize(
-    "tensor",
-    [torch.tensor(1.0), torch.zeros(0, 3), torch.ones(3, dtype=torch.bfloat16), torch.arange(3)],
-    ids=["single", "empty", "bfloat16", "integer"],
+    "tensor", [torch.tensor(1.0), torch.zeros(0, 3), torch.ones(3, dtype=torch.bfloat16)]
 )
 def test_any_tensor_has_a_digest(tensor: torch.Tensor) -> None:
     assert content_digest({"x": tensor}) == content_digest({"x": tensor.clone()})
@@ -86,40 +86,22 @@ def test_any_tensor_has_a_digest(tensor: torch.Tensor) -> None:
 # -- in memory ------------------------------------------------------------------------------------
 
 
-def test_the_least_recently_used_goes_first() -> None:
-    cache: LruCache[str] = LruCache(3)
-    for name in "abc":
-        cache.put(name, name.upper(), 1)
-    assert cache.get("a") == "A"  # now b is the oldest
-    cache.put("d", "D", 1)
-    assert [cache.get(name) for name in "abcd"] == ["A", None, "C", "D"]
-    cache.put("c", "C2", 1)  # replaced, and the most recent: a is the oldest
-    cache.put("e", "E", 1)
-    assert [cache.get(name) for name in "acde"] == [None, "C2", "D", "E"]
-
-
 def test_the_bound_holds_in_bytes() -> None:
     cache: LruCache[int] = LruCache(10)
     cache.put("a", 1, 4)
     cache.put("b", 2, 4)
-    assert (len(cache), cache.nbytes) == (2, 8)
     cache.put("c", 3, 7)  # 15: a and b go
     assert (len(cache), cache.nbytes, cache.get("c")) == (1, 7, 3)
-    cache.put("a", 1, 11)  # larger than all of it: not kept, and nothing goes for it
+    cache.put("a", 1, 11)  # larger than all of it: not stored, and nothing goes for it
     assert (len(cache), cache.nbytes, cache.get("a")) == (1, 7, None)
-    cache.put("c", 4, 2)
-    assert (len(cache), cache.nbytes, cache.get("c")) == (1, 2, 4)
     cache.put("c", 5, 11)  # the old value of a key is not the value of the new one
     assert (len(cache), cache.nbytes, cache.get("c")) == (0, 0, None)
     cache.put("d", 6, 10)
     cache.clear()
     assert (len(cache), cache.nbytes, cache.get("d")) == (0, 0, None)
-    nothing: LruCache[int] = LruCache(0)
-    nothing.put("a", 1, 1)
-    assert len(nothing) == 0
 
 
-def test_the_bound_holds_in_any_order() -> None:
+def test_the_least_recently_used_goes_first() -> None:
     """Against a plain list that does the same slowly."""
     rng = np.random.default_rng(0)
     cache: LruCache[int] = LruCache(40)
@@ -173,7 +155,7 @@ def test_a_copy_is_empty() -> None:
 
 
 @pytest.mark.parametrize("make", [LruCache, lambda size: DiskCache(max_bytes=size)])
-def test_a_bound_below_zero_is_refused(make) -> None:
+def test_a_bound_below_zero_is_refused(make: Any) -> None:
     with pytest.raises(ValueError, match=r"`max_bytes` \(=-1\) must be at least 0"):
         make(-1)
 
@@ -198,14 +180,11 @@ def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
     assert load_file(disk.path("denoised", KEYS[0])).keys() == tensors.keys()  # by another reader
     assert disk.get("denoised", KEYS[1]) is None
     assert disk.get("opened", KEYS[0]) is None
-
-
-def test_unknown_kinds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"`kind` \(='pictures'\) must be one of"):
-        DiskCache(tmp_path).get("pictures", KEYS[0])
+        disk.get("pictures", KEYS[0])
 
 
-@pytest.mark.parametrize("damage", ["empty", "cut", "header", "value", "folder"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "header", "value", "foreign", "folder"])
 def test_damaged_files_are_as_if_not_there(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -218,56 +197,52 @@ def test_damaged_files_are_as_if_not_there(
     path.write_bytes(
         {"empty": b"", "cut": content[:-8], "header": b"\xff" * 64}.get(damage, content)
     )
-    if damage == "folder":
+    if damage == "foreign":
+        save_file(tensors, path)
+    elif damage == "folder":
         path.unlink()
         path.mkdir()
     with caplog.at_level(logging.WARNING):
         assert disk.get("denoised", KEYS[0]) is None
-    assert ("cannot be read" if damage == "folder" else "is damaged") in caplog.text
-    if damage != "folder":
+    if damage == "folder":
+        assert "cannot be read" in caplog.text
+    else:
+        assert f"cached file {path} is damaged" in caplog.text
         disk.put("denoised", KEYS[0], tensors)
         assert disk.get("denoised", KEYS[0]) is not None
 
 
-def test_a_folder_that_cannot_be_written_costs_one_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("folder", ["file", "x" * 300, "loop"])
+def test_a_folder_that_cannot_be_used_costs_one_warning(
+    tmp_path: Path, folder: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("in the way")
-    disk = DiskCache(tmp_path / "file")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
     with caplog.at_level(logging.WARNING):
-        for key in KEYS[:3]:
+        for key in KEYS[:3]:  # every environment has a cache of its own
+            disk = DiskCache(tmp_path / folder)
             disk.put("denoised", key, {"light": torch.zeros(4)})
             assert disk.get("denoised", key) is None
-    assert len(caplog.records) == 1
-    assert "could not be cached" in caplog.text
+    messages = {record.getMessage() for record in caplog.records}
+    assert len(messages) == len(caplog.records) <= 2  # once for reading, once for writing
+    assert any("could not be cached" in message for message in messages)
     assert disk.usage() == dict.fromkeys(CACHE_KINDS, (0, 0))
+    disk.clear()
 
 
 def test_a_full_disk_costs_one_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("simulator.utils.files.os.replace", full)
     with caplog.at_level(logging.WARNING):
-        DiskCache(tmp_path).put("denoised", KEYS[0], {"light": torch.zeros(4)})
+        for key in KEYS[:3]:
+            DiskCache(tmp_path).put("denoised", key, {"light": torch.zeros(4)})
+    assert len(caplog.records) == 1
     assert "No space left" in caplog.text
     assert list((tmp_path / "denoised").iterdir()) == []
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_cache_is_read(tmp_path: Path) -> None:
-    disk = DiskCache(tmp_path)
-    disk.put("denoised", KEYS[0], {"light": torch.zeros(4)})
-    folder = tmp_path / "denoised"
-    folder.chmod(stat.S_IRUSR | stat.S_IXUSR)
-    try:
-        assert disk.get("denoised", KEYS[0]) is not None
-        disk.put("denoised", KEYS[1], {"light": torch.zeros(4)})
-        assert disk.get("denoised", KEYS[1]) is None
-    finally:
-        folder.chmod(stat.S_IRWXU)
 
 
 def _age(path: Path, seconds: float) -> None:
@@ -324,22 +299,14 @@ def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
 
 def test_usage_counts_files_and_bytes_by_kind(tmp_path: Path) -> None:
     disk = DiskCache(tmp_path)
-    assert disk.usage() == dict.fromkeys(CACHE_KINDS, (0, 0))
     for kind, keys in (("denoised", KEYS[:3]), ("score_tables", KEYS[:1])):
         for key in keys:
             disk.put(kind, key, {"x": torch.zeros(25)})
-    (tmp_path / "scenes").mkdir()
-    (tmp_path / "scenes" / f"bundled-train-64-{KEYS[0]}.safetensors").write_bytes(b"12345")
     size = disk.path("denoised", KEYS[0]).stat().st_size
-    assert disk.usage() == {
-        "scenes": (1, 5),
-        "score_tables": (1, size),
-        "denoised": (3, 3 * size),
-        "defocus_maps": (0, 0),
-        "opened": (0, 0),
-    }
+    nothing = dict.fromkeys(CACHE_KINDS, (0, 0))
+    assert disk.usage() == nothing | {"score_tables": (1, size), "denoised": (3, 3 * size)}
     disk.clear()
-    assert disk.usage() == dict.fromkeys(CACHE_KINDS, (0, 0))
+    assert disk.usage() == nothing
     assert list(tmp_path.iterdir()) == []
 
 
@@ -356,15 +323,13 @@ def _use(folder: Path, seed: int, rounds: int) -> None:
 
 
 def test_processes_share_a_folder(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=_use, args=(tmp_path, i, 150)) for i in range(2)]
-    for process in processes:
-        process.start()
+    process = multiprocessing.get_context("spawn").Process(target=_use, args=(tmp_path, 1, 150))
+    process.start()
     with caplog.at_level(logging.WARNING):
-        _use(tmp_path, 2, 150)
-    for process in processes:
-        process.join()
-    assert [process.exitcode for process in processes] == [0, 0]
+        while process.is_alive():
+            _use(tmp_path, 2, 20)
+    process.join()
+    assert process.exitcode == 0
     assert not caplog.records
     names = os.listdir(tmp_path / "denoised")
     assert not [name for name in names if name.endswith(".tmp")]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from simulator.utils.config_file import Configuration, load_yaml
+from simulator.utils.config_file import Configuration, load_yaml, read_yaml
 
 #: Nine lists of nine, each of the one before: 3 * 10**8 entries where the aliases are followed.
 BOMB = "a0: &a0 [x]\n" + "".join(
@@ -39,14 +39,27 @@ def load(folder: Path, text: str | bytes) -> Whole:
     return load_yaml(file, Whole)
 
 
-def test_a_good_file(tmp_path: Path) -> None:
+def test_a_good_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load(tmp_path, "name: x\npart: {steps: 4}\n") == Whole(name="x", part=Part(steps=4))
-
-
-def test_the_home_folder_is_expanded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "name: &n x\npart:\n  <<: {steps: 2}\n"  # aliases and merges
+    assert load(tmp_path, text) == Whole(name="x", part=Part(steps=2))
     monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "a.yaml").write_text("name: x")
     assert load_yaml("~/a.yaml", Whole).name == "x"
+
+
+def test_any_values_are_read_within_the_same_bounds(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    for text, value in (
+        ("[1, 2.5, null]", [1, 2.5, None]),
+        ("", None),
+        ("a: {b: c}", {"a": {"b": "c"}}),
+    ):
+        file.write_text(text)
+        assert read_yaml(file) == value
+    for text, message in ((BOMB, "at most 10000 entries"), ("a: 1\na: 2", "given twice")):
+        file.write_text(text)
+        with pytest.raises(ValueError, match=rf"`preset` \(='.*a.yaml'\): .*{message}"):
+            read_yaml(file, name="preset")
 
 
 @pytest.mark.parametrize(
@@ -105,11 +118,6 @@ def test_an_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(Path, "read_text", refuse)  # root may read anything
     with pytest.raises(ValueError, match=r"`config` .*cannot be read: Permission denied"):
         load(tmp_path, "name: x")
-
-
-def test_aliases_and_merges_work(tmp_path: Path) -> None:
-    text = "name: &n x\npart:\n  <<: {steps: 2}\n"
-    assert load(tmp_path, text) == Whole(name="x", part=Part(steps=2))
 
 
 class Numbers(Configuration):

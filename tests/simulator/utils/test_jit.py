@@ -1,13 +1,15 @@
-"""Compilation: announced, kept on disk, and possible where nothing can be kept."""
+"""Compilation: announced, cached on disk, stale when code changes, possible without a cache."""
 
 from __future__ import annotations
 
 import logging
+from pathlib import Path
 
 import numba
 import pytest
 from numba.core import caching
 
+from simulator.utils import jit
 from simulator.utils.jit import kernel
 
 
@@ -15,7 +17,7 @@ def add(a: int, b: int) -> int:
     return a + b
 
 
-def test_kernels_run_without_the_lock_and_are_kept() -> None:
+def test_kernels_run_without_the_lock_and_are_cached() -> None:
     compiled = kernel(fastmath=True)(add)
     assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
     assert compiled(1, 2) == 3
@@ -24,13 +26,13 @@ def test_kernels_run_without_the_lock_and_are_kept() -> None:
     assert compiled.stats.cache_path is not None
 
 
-def test_they_run_where_nothing_can_be_kept(
+def test_they_run_where_nothing_can_be_cached(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     with caplog.at_level(logging.INFO, "simulator.utils.jit"):
         assert kernel()(add)(1, 2) == 3
-    assert "compiled anew" in caplog.text
+    assert "compiled again in each process" in caplog.text
 
 
 def test_only_kernels_of_the_package_are_announced(caplog: pytest.LogCaptureFixture) -> None:
@@ -42,3 +44,33 @@ def test_only_kernels_of_the_package_are_announced(caplog: pytest.LogCaptureFixt
         assert numba.njit(ours)(1) == 2
         assert numba.njit(add)(1, 1) == 2  # of the tests
     assert [r.getMessage() for r in caplog.records] == ["compiling simulator.example.ours"]
+
+
+def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Numba itself would run the kernel that it compiled with a constant's old value."""
+    monkeypatch.setattr(jit, "_ROOT", tmp_path)
+    texts = {
+        "ae_env/kernels.py": "from ae_env.part import (\n    middle,\n)\nimport numpy",
+        "ae_env/part/middle.py": "    from simulator.a.constants import FACTOR",
+        "simulator/a/constants.py": "FACTOR = 2.0",
+        "simulator/a/others.py": "FACTOR = 2.0",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    def checksum() -> int:
+        return jit._checksum.__wrapped__(tmp_path / "ae_env/kernels.py")
+
+    before = checksum()
+    (tmp_path / "simulator/a/others.py").write_text("FACTOR = 3.0")
+    assert checksum() == before
+    for name in list(texts)[:3]:
+        (tmp_path / name).write_text(texts[name] + " # changed")
+        assert checksum() != before
+        (tmp_path / name).write_text(texts[name])
+    monkeypatch.undo()
+    stamp = kernel()(add)._cache._cache_file._source_stamp  # type: ignore[attr-defined]
+    assert stamp[1] == jit._checksum(Path(__file__))

@@ -29,6 +29,7 @@ def test_tiles_of_a_function_of_neighbourhood_and_phase(size: tuple[int, int]) -
     image, other = frame(*size), frame(*size, seed=1)
     tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=12)
     torch.testing.assert_close(tiled, mean_of_neighbours(image, other), rtol=0, atol=1e-6)
+    assert torch.equal(in_tiles(lambda x: x.sum(1), image, halo=4, tile=8), image.sum(1))
 
 
 def test_too_small_a_halo_shows() -> None:
@@ -56,32 +57,10 @@ def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once() -> None:
     assert sizes == [(24, 20)]
 
 
-def test_maps_without_channels() -> None:
-    image = frame(30, 50)
-    assert torch.equal(in_tiles(lambda x: x.sum(1), image, halo=4, tile=8), image.sum(1))
-
-
 @pytest.mark.parametrize(("halo", "tile"), [(3, 8), (4, 10), (4, 0)])
 def test_steps_that_would_break_the_phase_are_refused(halo: int, tile: int) -> None:
     with pytest.raises(ValueError, match="multiples of 4"):
         in_tiles(lambda x: x, frame(8, 8), halo=halo, tile=tile)
-
-
-def test_denoiser_in_tiles_with_the_simulators_halo() -> None:
-    torch.manual_seed(0)
-    module = NoiseModule("compact").eval().requires_grad_(False)
-    module.network = CompactDenoiser((4, 6, 8)).requires_grad_(False)  # depth alone decides
-    module.network.tail.weight.mul_(30)
-    image = frame(150, 133)
-    shot, read = torch.full((1, 4), 1e-2), torch.full((1, 4), 1e-4)
-
-    def network(part: Tensor) -> Tensor:
-        return module(part, shot, read)
-
-    whole = network(image)
-    tiled = in_tiles(network, image, halo=camera_simulator._NOISE_HALO, tile=32)
-    assert (whole - image).abs().mean() > 0.05
-    torch.testing.assert_close(tiled, whole, rtol=0, atol=2e-5 * float(whole.abs().max()))
 
 
 def changed_outside(image: Tensor, halo: int) -> Tensor:
@@ -111,18 +90,6 @@ def test_the_halo_covers_what_the_networks_see() -> None:
         assert torch.equal(network(changed_outside(image, halo))[..., 72:76, 72:76], expected)
         near = network(changed_outside(image, 16))[..., 72:76, 72:76]
         assert not torch.equal(near, expected)
-
-
-def test_defocus_map_in_tiles_with_the_simulators_halo() -> None:
-    torch.manual_seed(0)
-    network = DefocusMap(width=6).eval().requires_grad_(False)
-    network.tail.weight.mul_(20)
-    image = frame(171, 198)
-    deviation = torch.full_like(image, 0.01)
-    whole = network(image, deviation)
-    tiled = in_tiles(network, image, deviation, halo=camera_simulator._MAP_HALO, tile=48)
-    assert float(whole.std()) > 0.05
-    torch.testing.assert_close(tiled, whole, rtol=0, atol=1e-3 * float(whole.std()))
 
 
 # Where it is needed
