@@ -1,12 +1,14 @@
-"""Training states on disk, so that a killed training goes on where it was. No pickle."""
+"""Training states on disk, so that a training that is killed goes on from its last checkpoint."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
+import io
 import json
 import logging
 import time
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,6 +21,54 @@ from simulator.utils.cache import content_digest
 from simulator.utils.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
+
+
+def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
+    """Writes the state of a training with `torch.save`, whole or not at all.
+
+    Where the file cannot be written, as on a full disk, a warning is logged, the previous
+    checkpoint stays, and the training goes on.
+
+    Args:
+        path: The file; its folder is made.
+        state: Tensors, numbers, text, and dicts and lists of them, such as state dicts.
+    """
+    content = io.BytesIO()
+    torch.save(dict(state), content)
+    try:
+        write_atomically(path, content.getvalue())
+    except OSError as error:
+        _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
+
+
+def load_checkpoint(path: str | Path) -> dict[str, Any] | None:
+    """What `save_checkpoint` wrote, with its tensors on the CPU.
+
+    Nothing but tensors and plain values is unpickled (``weights_only=True``), so a checkpoint from
+    somebody else runs no code.
+
+    Returns:
+        The state; None where there is no file, and, with a warning in the log, where it is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        return None
+    try:
+        with zipfile.ZipFile(path) as archive:  # torch itself does not look at the checksums
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"wrong checksum of {damaged}")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise ValueError(f"it holds a {type(state).__name__}, not a dict")
+    except Exception as error:  # zipfile, pickle and torch raise whatever damaged bytes lead to
+        reason = str(error).strip().partition("\n")[0]
+        _LOGGER.warning("checkpoint %s is damaged, training restarts: %s", path, reason)
+        return None
+    return state
+
+
+# -- the former way, until no training uses it any more --
 #: What reading a damaged file, or one of something else, ends in.
 _UNFIT = (
     SafetensorError,
