@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from ae_env.utils.checks import did_you_mean
-from agents.learning.agent_weights import load_agent, sibling
-from agents.learning.regression import RegressionTraining
+from agents.learning.agent_weights import describe_agent, load_agent, save_agent
+from agents.learning.regression_training import RegressionTraining, train_regression
+from agents.parallel import check_stop, run_in_parallel, tell
+from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
+from simulator.utils.files import sibling
+
+if TYPE_CHECKING:
+    from agents.learning.ppo import PPOTraining
 
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
 
 
 class AgentConfig(Configuration):
-    """Everything that decides a training.
+    """A training of an agent.
 
     Args:
         agent: ``"regression"`` or ``"ppo"``.
@@ -51,31 +56,23 @@ class AgentConfig(Configuration):
                 f"environment: `observation` (={options.observation!r}) must be 'uint8', which is "
                 "what the agents' networks take"
             )
-        if self.agent == "ppo":
+        if not isinstance(hyperparameters, RegressionTraining):
             hyperparameters.check_batch(self.num_envs)
         try:
             json.dumps(self.card())
-        except TypeError as error:  # found out before the training, not when it is saved
+        except TypeError as error:  # raises before the training, not when the agent is saved
             raise ValueError(f"every entry must be a JSON value: {error}") from error
         return self
 
-    def hyperparameters(self) -> Any:
-        """`training` as the dataclass of the agent."""
-        if self.agent == "regression":
-            kind: Any = RegressionTraining
-        else:
+    def hyperparameters(self) -> RegressionTraining | PPOTraining:
+        """`training` as the hyperparameters of the agent, defaults filled in."""
+        kind: type[RegressionTraining | PPOTraining] = RegressionTraining
+        if self.agent == "ppo":
             from agents.learning.ppo import PPOTraining as kind
-        known = [field.name for field in fields(kind)]
-        for name, value in self.training.items():
-            if isinstance(value, bool):
-                raise ValueError(f"training.{name} (={value!r}) should not be true or false")
-            if name not in known:
-                hint = did_you_mean(name, known)
-                raise ValueError(f"training.{name} is unknown: the entries are {known}{hint}")
         try:
-            return TypeAdapter(kind).validate_python(self.training)
+            return kind.model_validate(self.training)
         except ValidationError as error:
-            raise ValueError(one_line(error, "training.")) from error
+            raise ValueError(one_line(error, "training.", kind)) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
         """The same training with another seed.
@@ -89,7 +86,7 @@ class AgentConfig(Configuration):
 
     def card(self) -> dict[str, Any]:
         """JSON values that identify the training, every hyperparameter spelled out."""
-        return {**self.model_dump(), "training": asdict(self.hyperparameters())}
+        return {**self.model_dump(), "training": self.hyperparameters().model_dump()}
 
 
 def load_config(path: str | Path) -> AgentConfig:
@@ -122,11 +119,11 @@ def train_agent(
 ) -> Path:
     """Trains an agent and writes it to ``out.safetensors`` and ``out.json``.
 
-    A training that was interrupted goes on at its checkpoint, beside `out`; one that is complete is
-    not repeated.
+    A training that was interrupted goes on from its checkpoint, ``out.checkpoint``; one that is
+    complete is not repeated.
 
     Args:
-        config: What to train.
+        config: The training.
         out: File name without suffix.
         progress: Called now and then.
         tensorboard: Folder for a TensorBoard log.
@@ -140,7 +137,6 @@ def train_agent(
     import gymnasium as gym
 
     import ae_env  # noqa: F401  (registers the environment)
-    from agents.policy import PolicyContext
 
     envs = gym.make_vec(
         "ae_env/AutoExposure-v0",
@@ -148,22 +144,23 @@ def train_agent(
         autoreset_mode="SAME_STEP",
         **config.environment,
     )
-    arguments: dict[str, Any] = {"checkpoint": sibling(out, ".checkpoint"), "device": device}
-    network: Any
-    with closing(envs), _logged(progress, tensorboard) as callback:
-        arguments |= {"progress": callback, "identity": config.card()}
-        context = PolicyContext.from_envs(envs)
-        if config.agent == "regression":
-            from agents.learning.regression import save_regression, train_regression
-
-            network = train_regression(envs, config.hyperparameters(), **arguments)
-            save_regression(out, network, context, config.card())
+    training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
+    with closing(envs), _logged(progress, tensorboard) as report:
+        common: dict[str, Any] = {
+            "checkpoint": checkpoint,
+            "progress": report,
+            "device": device,
+            "identity": config.card(),
+        }
+        if isinstance(training, RegressionTraining):
+            network: Any = train_regression(envs, training, **common)
         else:
-            from agents.learning.ppo import save_ppo, train_ppo
+            from agents.learning.ppo import train_ppo
 
-            network = train_ppo(envs, config.hyperparameters(), **arguments)
-            save_ppo(out, network, context, config.card())
-    sibling(out, ".checkpoint").unlink(missing_ok=True)
+            network = train_ppo(envs, training, **common)
+        context = PolicyContext.from_envs(envs)
+    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
+    checkpoint.unlink(missing_ok=True)
     return out
 
 
@@ -177,7 +174,6 @@ def _logged(progress: Progress | None, folder: Path | None) -> Iterator[Progress
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise ImportError("a TensorBoard log needs: pip install 'ae-env[tensorboard]'") from error
-    writer = SummaryWriter(str(folder))
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
         for name, value in values.items():
@@ -185,5 +181,55 @@ def _logged(progress: Progress | None, folder: Path | None) -> Iterator[Progress
         if progress is not None:
             progress(done, total, values)
 
-    with writer:
+    with SummaryWriter(str(folder)) as writer:
         yield report
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """One of several agents to train at once.
+
+    Args:
+        name: Shown to the user.
+        config: The training.
+        out: File name of the agent, without suffix.
+        device: Torch device of the network.
+    """
+
+    name: str
+    config: AgentConfig
+    out: Path
+    device: str = "cpu"
+
+
+def train_in_parallel(
+    jobs: Sequence[TrainingJob],
+    *,
+    workers: int | None = None,
+    progress: Callable[[str, int, int, dict[str, float]], None] | None = None,
+) -> None:
+    """Trains every job that is not trained yet, each in a process of its own.
+
+    Args:
+        jobs: Agents to train.
+        workers: Processes at a time, each with its share of the cores; by default one per core.
+        progress: Called with the job's name, frames done, frames in all, and losses.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C; every job has its checkpoint, the same call resumes.
+    """
+    waiting = [job for job in jobs if not is_trained(job.config, job.out)]
+    run_in_parallel(_train, waiting, workers=workers, progress=progress)
+
+
+def _train(job: TrainingJob) -> None:
+    last = 0
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        nonlocal last
+        check_stop()
+        if done == total or done - last >= total // 200:
+            last = done
+            tell(job.name, done, total, values)
+
+    train_agent(job.config, job.out, progress=report, device=job.device)
