@@ -55,7 +55,7 @@ def run_in_parallel(
         initargs=(stop, messages, max(1, cores // workers)),
     ) as pool:
         try:
-            running = {pool.submit(work, job) for job in jobs}
+            running = {pool.submit(_run, work, job) for job in jobs}
             while running:
                 done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
                 deliver()
@@ -91,6 +91,11 @@ def check_stop() -> None:
     """
     if _stop is not None and _stop.is_set():
         raise KeyboardInterrupt
+
+
+def _run(work: Callable[[Any], object], job: Any) -> None:
+    check_stop()  # a pool hands out one job more than it has workers, which cannot be cancelled
+    work(job)
 
 
 def _start_worker(stop: Any, messages: Any, threads: int) -> None:

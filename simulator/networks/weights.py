@@ -16,7 +16,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from simulator.networks.aperture_module import ApertureModule
-from simulator.networks.baselines import DecoupledNet, ParameterConcatenation
+from simulator.networks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule
 from simulator.utils.files import sibling, write_atomically

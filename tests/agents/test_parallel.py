@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.slow
 ENVIRONMENT = {"scenes": "bundled:small", "resolution": 36}
 
 
-def jobs(folder: Path, frames: int = 48) -> list[TrainingJob]:
+def jobs(folder: Path, frames: int) -> list[TrainingJob]:
     ppo = {"total_timesteps": frames, "n_steps": 4, "batch_size": 8, "n_epochs": 1, "width": 8}
     trainings = {"regression": {"frames": frames, "width": 8}, "ppo": ppo}
     return [
@@ -32,29 +33,31 @@ def jobs(folder: Path, frames: int = 48) -> list[TrainingJob]:
     ]
 
 
-def test_two_trainings_with_progress(tmp_path: Path) -> None:
-    todo = jobs(tmp_path)
-    seen: dict[str, list[tuple[int, int]]] = {job.name: [] for job in todo}
-    train_in_parallel(todo, progress=lambda name, done, total, _: seen[name].append((done, total)))
-    for job in todo:
-        assert is_trained(job.config, job.out)
-        assert seen[job.name][-1] == (48, 48)
-        assert seen[job.name] == sorted(seen[job.name])
-    # Nothing is left to do, and no process is started.
-    train_in_parallel(todo, progress=lambda *_: pytest.fail("trained again"))
-
-
-def test_an_interrupt_ends_every_job_with_its_checkpoint(tmp_path: Path) -> None:
-    endless = jobs(tmp_path, frames=40_000)  # reports every 200
+def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
+    todo = jobs(tmp_path, frames=240)
+    running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
 
-    with pytest.raises(KeyboardInterrupt):  # and does not wait for the one that has not started
-        train_in_parallel(endless, workers=1, progress=stop)
-    running, waiting = (sibling(job.out, ".checkpoint") for job in endless)
+    with pytest.raises(KeyboardInterrupt):
+        train_in_parallel(todo, workers=1, progress=stop)
     assert running.is_file()
     assert not waiting.exists()
+    seen: dict[str, list[int]] = {job.name: [] for job in todo}
+
+    def report(name: str, done: int, total: int, values: dict[str, float]) -> None:
+        assert total == 240
+        seen[name].append(done)
+
+    train_in_parallel(todo, progress=report)
+    for job in todo:
+        assert is_trained(job.config, job.out)
+        assert seen[job.name][-1] == 240
+        assert seen[job.name] == sorted(seen[job.name])
+    assert seen["ppo"][0] == 4 < seen["regression"][0]
+    # Nothing is left to do, and no process is started.
+    train_in_parallel(todo, progress=lambda *_: pytest.fail("trained again"))
 
 
 def _share(job: int) -> None:
@@ -71,11 +74,13 @@ def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPat
     assert (2, 3) in seen
 
 
-def _train_for_long(folder: Path, pipe: Connection) -> None:
-    def report(*_: object) -> None:
-        pipe.send([process.pid for process in multiprocessing.active_children()])
+def _never_end(job: int) -> None:
+    tell(os.getpid())
+    time.sleep(600)
 
-    train_in_parallel(jobs(folder, frames=40_000), progress=report)
+
+def _wait_for_ever(pipe: Connection) -> None:
+    run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
 
 
 def _runs(pid: int) -> bool:
@@ -86,16 +91,16 @@ def _runs(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
-def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path) -> None:
+def test_workers_do_not_outlive_a_killed_parent() -> None:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    parent = context.Process(target=_train_for_long, args=(tmp_path, there))
+    parent = context.Process(target=_wait_for_ever, args=(there,))
     parent.start()
-    workers = here.recv()
-    assert workers
+    workers = [here.recv(), here.recv()]
+    assert all(_runs(pid) for pid in workers)
     parent.kill()
     parent.join()
     end = time.monotonic() + 30
     while any(_runs(pid) for pid in workers):
-        assert time.monotonic() < end, "they train on for nobody"
+        assert time.monotonic() < end, "they work on for nobody"
         time.sleep(0.1)

@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from simulator.networks.baselines import (
+from simulator.networks.paper_baselines import (
     AdaptiveNorm,
     DecoupledNet,
     GeneratedConvolution,

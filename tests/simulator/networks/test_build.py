@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from simulator.networks.baselines import DecoupledNet, ParameterConcatenation
+from simulator.networks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator.networks.weights import PRESETS, build_modules
 
 
