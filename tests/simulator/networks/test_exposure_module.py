@@ -50,18 +50,8 @@ def test_formula() -> None:
 def test_either_parameter_ends_the_identity(name: str) -> None:
     module = ExposureModule()
     with torch.no_grad():
-        getattr(module, name).add_(
-            torch.tensor([0.0, 0.0, 1e-5, 0.0])[2 if name == "w" else slice(4)]
-        )
+        getattr(module, name).view(-1)[-1] += 1e-5
     assert not module.is_identity
-
-
-def test_the_fit_recovers_w_and_b() -> None:
-    fit = LinearFit()
-    fit.add(*synthetic())
-    module = fit.solve()
-    assert float(module.w) == pytest.approx(W, rel=1e-6)
-    assert module.b.tolist() == pytest.approx(B, abs=1e-6)
 
 
 def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None:
@@ -94,10 +84,9 @@ def test_saturated_pixels_do_not_count() -> None:
     assert float(fit.solve().w) == pytest.approx(W, rel=1e-6)
 
 
-@pytest.mark.parametrize("planes", [0, 3])
-def test_a_plane_without_pixels_is_refused(planes: int) -> None:
+def test_a_plane_without_pixels_is_refused() -> None:
     source, target, ratio = synthetic()
-    source[:, planes:] = 1.0
+    source[:, 3:] = 1.0
     fit = LinearFit()
     fit.add(source, target, ratio)
     with pytest.raises(ValueError, match="every plane"):

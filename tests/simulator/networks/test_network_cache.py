@@ -16,6 +16,7 @@ from torch import nn
 from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, get_camera
 from simulator.capture.denoised import Denoised
 from simulator.networks.network_cache import NetworkCache
+from simulator.utils.cache import DiskCache
 
 CAMERA = get_camera("nikon_z6")
 SOURCE = CameraSettings(6400, 1 / 1024, 8)
@@ -129,6 +130,7 @@ def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path) -> None:
 
 
 def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
+    _denoised(_simulator(), _raw())  # in memory only
     simulator = _simulator(cache=None)
     counter = Counter(simulator)
     _denoised(simulator, _raw())
@@ -136,35 +138,6 @@ def test_without_a_cache_the_networks_run_every_time(folder: Path) -> None:
     _denoised(simulator, _raw())
     assert counter.new() == runs > 0
     assert list(folder.iterdir()) == []
-
-
-def test_memory_leaves_nothing_on_disk(folder: Path) -> None:
-    _denoised(_simulator(), _raw())
-    assert list(folder.iterdir()) == []
-
-
-def test_asking_the_network_itself_runs_it() -> None:
-    simulator = _simulator()
-    prepared = simulator.prepare(_raw())
-    counter = Counter(simulator)
-    simulator.denoise(prepared)
-    simulator.estimate_defocus(prepared)
-    simulator.stages(_raw(), TARGET)
-    assert counter.runs["noise"] >= 2
-    assert counter.runs["aperture"] >= 2
-
-
-def test_no_network_no_digest(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: Any) -> None:
-        raise AssertionError("hashed where no network would run")
-
-    monkeypatch.setattr("simulator.networks.network_cache.content_digest", refuse)
-    simulator, raw = _simulator(), _raw()
-    clean = replace(simulator._prepared(raw), nlf=CAMERA.nlf(6400).zero())
-    simulator.prepare(clean)
-    simulator.prepare(replace(simulator._prepared(raw), denoised=Denoised(raw.data)))
-    CameraSimulator(device="cpu").simulate(raw, TARGET)
-    _simulator(cache=None).prepare(raw)
 
 
 @pytest.mark.parametrize("where", ["memory", "disk"])
@@ -212,7 +185,7 @@ def _step(simulator: CameraSimulator, change: str) -> None:
     if change == "module":
         module = simulator.noise = copy.deepcopy(module)
         parameter = next(iter(module.parameters()))
-    if change in ("plain", "foreach", "fused"):
+    if change in ("plain", "fused"):
         options = {} if change == "plain" else {change: True}
         module.requires_grad_(True)
         optimiser = torch.optim.Adam(module.parameters(), lr=1e-3, **options)
@@ -224,16 +197,11 @@ def _step(simulator: CameraSimulator, change: str) -> None:
         state = {k: v.clone() for k, v in module.state_dict().items()}
         next(iter(state.values())).mul_(1.01)
         module.load_state_dict(state)
-    elif change == "data":
-        parameter.data.mul_(1.01)
     else:
-        with torch.no_grad():
-            parameter.mul_(1.01)
+        parameter.data.mul_(1.01)
 
 
-@pytest.mark.parametrize(
-    "change", ["plain", "foreach", "fused", "loaded", "data", "in place", "module"]
-)
+@pytest.mark.parametrize("change", ["plain", "fused", "loaded", "data", "module"])
 def test_other_weights_are_seen(change: str) -> None:
     simulator, raw = _simulator(), _raw()
     before = _denoised(simulator, raw)
@@ -248,16 +216,6 @@ def test_a_result_changed_in_place_is_made_again() -> None:
     expected = _denoised(simulator, raw).clone()
     _denoised(simulator, raw).mul_(2.0)
     assert torch.equal(_denoised(simulator, raw), expected)
-
-
-def test_results_of_inference_mode_are_kept_too() -> None:
-    simulator, raw = _simulator(), _raw()
-    counter = Counter(simulator)
-    with torch.inference_mode():
-        first = _denoised(simulator, raw)
-        assert counter.new() > 0
-        assert torch.equal(_denoised(simulator, raw), first)
-    assert counter.new() == 0
 
 
 def test_a_damaged_file_is_made_again(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -299,6 +257,17 @@ def test_a_simulator_can_be_copied_and_pickled() -> None:
         assert torch.equal(_denoised(other, raw), expected)
 
 
-def test_unknown_places_are_refused() -> None:
+def test_an_unknown_cache_is_refused() -> None:
     with pytest.raises(ValueError, match=r"`cache` \(='ram'\) must be None or one of"):
         CameraSimulator(device="cpu", cache="ram")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [torch.zeros(4, 3), torch.full((1, 2, 3), torch.nan)])
+def test_an_implausible_result_on_disk_is_made_again(wrong: torch.Tensor, folder: Path) -> None:
+    module, image = nn.Identity(), torch.ones(1, 2, 3)
+    module.weight = nn.Parameter(torch.ones(1))
+    cache = NetworkCache("disk")
+    assert torch.equal(cache.called("opened", module, image), image)
+    (file,) = (folder / "opened").iterdir()
+    DiskCache().put("opened", file.stem, {"result": wrong})
+    assert torch.equal(NetworkCache("disk").called("opened", module, image), image)
