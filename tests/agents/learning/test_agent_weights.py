@@ -82,9 +82,7 @@ def test_missing_file(agent: Path, suffix: str) -> None:
     ("suffix", "content", "message"),
     [
         (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
-        (".safetensors", b"{}" * 40, "the hash of regression-0.5.safetensors .* train or copy"),
         (".json", b"{", "regression-0.5.json is damaged"),
-        (".json", b"[" * 10**6, "regression-0.5.json is damaged"),
         (".json", b"[1]", "must hold a JSON object"),
         (".json", b"{}", "must be a regression agent of format 1, got None"),
         (".json", b'{"kind": "regression", "format": 1}', "width: Field required; context: Field"),
@@ -118,9 +116,6 @@ def test_card_of_an_earlier_version(agent: Path, context: PolicyContext) -> None
     ("entries", "message"),
     [
         ({"aliases": 3}, r"regression-0.5.json: aliases \(=3\): must be a mapping"),
-        ({"aliases": {"a": [1]}}, r"aliases.a \(=\[1\]\): .* valid string"),
-        ({"context": []}, r"context \(=\[\]\): must be a mapping"),
-        ({"width": "8"}, r"width \(='8'\): .* valid integer"),
         ({"width": True}, r"width \(=True\): .* valid integer"),
         ({"width": 10**9}, r"width \(=1000000000\): .* less than or equal to 65536"),
         ({"width": 9}, "do not fit the network"),

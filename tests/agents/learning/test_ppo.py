@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from agents.learning.agent_weights import describe_agent, save_agent
-from agents.learning.ppo import ExposureExtractor, PPOPolicy, PPOTraining, train_ppo
+from agents.learning.ppo import PPOPolicy, PPOTraining, train_ppo
 from agents.policy import PolicyContext, make_policy
 
 TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
@@ -82,24 +81,6 @@ def test_saved_weights_act_identically(make_tiny_envs, tmp_path: Path) -> None:
         allowed = loaded.act(observations, masks)
         assert masks[np.arange(6), allowed].all()
         observations, *_ = envs.step(chosen)
-
-
-def test_features_are_convolutional(make_tiny_envs) -> None:
-    envs = make_tiny_envs(resolution=64)
-    network = train_ppo(envs, TRAINING.model_copy(update={"total_timesteps": 16}))
-    extractor = network.features_extractor
-    assert isinstance(extractor, ExposureExtractor)
-    convolutions = [m for m in extractor.modules() if isinstance(m, nn.Conv2d)]
-    assert len(convolutions) >= 3
-    assert not any(isinstance(m, nn.Flatten) for m in list(extractor.children()))
-    widest = max(m.in_features for m in network.modules() if isinstance(m, nn.Linear))
-    assert widest < 4 * 64 * 64 // 8  # no layer takes the raw pixel by pixel
-    seen: list[torch.Tensor] = []
-    extractor.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]["raw"]))
-    observations, _ = envs.reset(seed=0)
-    network.predict(observations)
-    assert seen[0].shape == (4, 4, 64, 64)  # an image still
-    assert torch.equal(seen[0], torch.from_numpy(observations["raw"]).float() / 255.0)  # once
 
 
 def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:

@@ -56,11 +56,9 @@ def test_a_seed_out_of_range_raises_before_the_training() -> None:
     [
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
         ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression' or 'ppo'"),
-        ("{}", r"agent: Field required"),
         ("", r"is empty: it must have entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\): unknown.*mean `n_steps`"),
-        ("agent: ppo\ntraining: {gamma: much}", r"training.gamma \(='much'\): .*valid number"),
         ("agent: ppo\ntraining: {gamma: 2}", r"training.gamma \(=2\): .*less than or equal to 1"),
         ("agent: ppo\ntraining: {batch_size: 100}", r"`batch_size` \(=100\) must divide"),
         ("agent: regression\ntraining: {frames: -1}", r"training.frames \(=-1\)"),
@@ -68,9 +66,7 @@ def test_a_seed_out_of_range_raises_before_the_training() -> None:
         ("agent: ppo\nenvironment: {resolutoin: 64}", r"`resolutoin`.*mean `resolution`"),
         ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be an integer in"),
         ("agent: ppo\nenvironment: {scorer: balnced}", r"environment: .*balnced"),
-        ("agent: ppo\ntraining: {n_epochs: true}", r"training.n_epochs \(=True\)"),
         ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
-        ("agent: ppo\nenvironment: {1: 2}", r"environment.*valid string"),
     ],
 )
 def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import torch
 from torch import nn
 
 from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, get_camera
-from simulator.capture.denoised import Denoised
 from simulator.networks.network_cache import NetworkCache
 from simulator.utils.cache import DiskCache
 
@@ -99,15 +97,6 @@ def test_the_papers_network_runs_once_for_an_f_number(folder: Path) -> None:
         assert (counter.new() > 0) == (len(opened) != 2)
     assert torch.equal(opened[0], opened[1])
     assert not torch.equal(opened[0], opened[2])
-    denoised = simulator.prepare(raw).denoised
-    assert denoised is not None
-    assert simulator.aperture is not None
-    f_numbers = (torch.tensor([s.effective_f_number]) for s in (SOURCE, target))
-    with torch.no_grad():
-        image = denoised.light[None]
-        assert torch.equal(
-            opened[0], simulator.aperture(image, torch.zeros_like(image), *f_numbers)[0]
-        )
     assert len(list((folder / "opened").iterdir())) == 2
 
 
@@ -163,20 +152,6 @@ def test_everything_that_changes_the_result_is_seen(where: Any, folder: Path) ->
     assert counter.new() == 0
 
 
-def test_a_map_depends_on_the_light_that_it_was_found_in() -> None:
-    simulator, raw = _simulator(), _raw()
-    prepared = simulator.prepare(raw)
-    assert prepared.denoised is not None
-    simulator.prepare(prepared, depth="unknown").aperture_blur.extent(2.8)
-    counter = Counter(simulator)
-    simulator.prepare(prepared, depth="unknown").aperture_blur.extent(2.8)
-    assert counter.new() == 0
-    simulator.prepare(
-        replace(prepared, denoised=Denoised(prepared.denoised.light * 1.5)), depth="unknown"
-    ).aperture_blur.extent(2.8)
-    assert counter.new() > 0
-
-
 def _step(simulator: CameraSimulator, change: str) -> None:
     """One step of training, or whatever else changes weights where they are."""
     assert simulator.noise is not None
@@ -216,45 +191,6 @@ def test_a_result_changed_in_place_is_made_again() -> None:
     expected = _denoised(simulator, raw).clone()
     _denoised(simulator, raw).mul_(2.0)
     assert torch.equal(_denoised(simulator, raw), expected)
-
-
-def test_a_damaged_file_is_made_again(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    raw = _raw()
-    expected = _denoised(_simulator(cache="disk"), raw)
-    (file,) = (folder / "denoised").iterdir()
-    file.write_bytes(file.read_bytes()[:-1])
-    simulator = _simulator(cache="disk")
-    counter = Counter(simulator)
-    assert torch.equal(_denoised(simulator, raw), expected)
-    assert counter.new() > 0
-    assert "damaged" in caplog.text
-    counter = Counter(other := _simulator(cache="disk"))
-    assert torch.equal(_denoised(other, raw), expected)
-    assert counter.new() == 0
-
-
-def test_memory_is_bounded_and_the_oldest_goes() -> None:
-    simulator = _simulator()
-    each = _raw().data.nbytes
-    simulator._results = results = NetworkCache("memory", max_bytes=3 * each)
-    counter = Counter(simulator)
-    for seed in range(5):
-        _denoised(simulator, _raw(seed))
-        assert results.memory.nbytes == min(seed + 1, 3) * each
-    counter.new()
-    for seed in (2, 3, 4):
-        _denoised(simulator, _raw(seed))
-    assert counter.new() == 0
-    _denoised(simulator, _raw(1))
-    assert counter.new() > 0
-
-
-def test_a_simulator_can_be_copied_and_pickled() -> None:
-    simulator, raw = _simulator(), _raw()
-    expected = _denoised(simulator, raw)
-    for other in (copy.deepcopy(simulator), pickle.loads(pickle.dumps(simulator))):
-        assert len(other._results.memory) == 0
-        assert torch.equal(_denoised(other, raw), expected)
 
 
 def test_an_unknown_cache_is_refused() -> None:

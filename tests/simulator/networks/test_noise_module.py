@@ -176,15 +176,6 @@ def test_powers_of_two_pass_through_exactly(exponent: int) -> None:
     assert torch.equal(net(factor * image, factor * deviation), factor * output)
 
 
-@pytest.mark.parametrize("factor", [1 / 4095.3, 3.7])
-def test_any_factor_passes_through_within_rounding(factor: float) -> None:
-    image, deviation = image_and_noise(17, 22)
-    net = network()
-    expected = factor * net(image, deviation)
-    error = (net(factor * image, factor * deviation) - expected).abs().max()
-    assert error <= 2e-6 * expected.abs().max()
-
-
 def test_no_parameter_is_a_bias() -> None:
     """One bias anywhere would end the homogeneity once training moved it from 0."""
     assert all(parameter.ndim == 4 for parameter in CompactDenoiser().parameters())
@@ -196,11 +187,3 @@ def test_padding_does_not_reach_into_the_image_from_afar() -> None:
     net = network()
     whole, part = net(image, deviation), net(image[..., :61], deviation[..., :61])
     torch.testing.assert_close(part[..., :20], whole[..., :20], atol=1e-5, rtol=0)
-
-
-def test_a_new_network_starts_near_the_identity() -> None:
-    """The last layer's small weights: without them the change is 14 times the image."""
-    torch.manual_seed(0)
-    image, deviation = image_and_noise(16, 16)
-    change = CompactDenoiser()(image, deviation) - image
-    assert 0 < change.abs().mean() < 0.5 * image.mean()

@@ -31,14 +31,6 @@ def test_shipped_configurations_are_valid(file: Path) -> None:
     assert load_config(file).preset == file.stem
 
 
-def test_baselines_are_given_the_same_time_as_the_paper_modules_on_the_same_scenes() -> None:
-    """Issue: trained on the same pairs for the same time."""
-    configs = {name: load_config(CONFIGS / f"{name}.yaml") for name in ("paper", "pc", "dl")}
-    minutes = {n: sum(s.minutes or 0 for s in c.stages().values()) for n, c in configs.items()}
-    assert minutes["pc"] == minutes["dl"] == minutes["paper"]
-    assert configs["pc"].scenes == configs["dl"].scenes == configs["paper"].scenes
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -112,21 +112,6 @@ def test_everything_of_a_pair_shows_the_same_crop() -> None:
     assert not torch.equal(far[0], far[1])
 
 
-def test_crops_are_turned_and_mirrored_all_eight_ways() -> None:
-    ramp = torch.arange(32.0)[:, None] * 2 + torch.arange(32.0) + 10
-    light = (ramp / 400).expand(4, -1, -1).contiguous()
-    flat = replace(scene(depth=False), light=light)
-    made = ReferencePairs(
-        [Sequence(flat, (LIGHT, replace(LIGHT, iso=200)))], ReferenceCamera(Z6), "exposure"
-    )
-    target = made.batch(0, 64, 32).target[:, 0]
-    down = torch.sign(target[:, -1, 0] - target[:, 0, 0]).int()
-    right = torch.sign(target[:, 0, -1] - target[:, 0, 0]).int()
-    steep = (target[:, -1, 0] - target[:, 0, 0]).abs() > (target[:, 0, -1] - target[:, 0, 0]).abs()
-    seen = set(zip(down.tolist(), right.tolist(), steep.tolist(), strict=True))
-    assert len(seen) == 8
-
-
 def test_settings_of_a_pair() -> None:
     made = pairs(DARK, LIGHT)
     batch = made.batch(0, 8, 16)
@@ -151,34 +136,6 @@ def test_defocus_is_the_thin_lens_at_the_sources_aperture() -> None:
         assert float(batch.defocus[i].max()) == pytest.approx(expected, rel=1e-4)
         assert float(batch.defocus[i].min()) == 0.0
         assert float((batch.defocus[i] > 0).float().mean()) == 0.5
-
-
-def test_light_is_rendered_once_per_aperture_and_shared_between_stages(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    camera = ReferenceCamera(Z6)
-    rendered: list[float] = []
-    blurred_light = camera.blurred_light
-
-    def spy(*arguments):
-        rendered.append(arguments[1])
-        return blurred_light(*arguments)
-
-    object.__setattr__(camera, "blurred_light", spy)
-    states = (LIGHT, replace(LIGHT, iso=800), DARK)
-    shared: dict = {}
-    calls: list[tuple[int, int]] = []
-    for stage in ("exposure", "all"):
-        made = ReferencePairs(
-            [Sequence(scene(), states)],
-            camera,
-            stage,  # type: ignore[arg-type]
-            blurred_light=shared,
-            progress=lambda done, total: calls.append((done, total)),
-        )
-        made.batch(0, 4, 16)
-    assert sorted(rendered) == [4.0, 5.6]
-    assert calls == [(0, 1), (1, 1)] * 2
 
 
 def test_errors() -> None:
