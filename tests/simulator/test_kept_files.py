@@ -24,7 +24,6 @@ from simulator.networks.network_cache import NetworkCache
 from simulator.networks.weights import build_modules, load_modules, save_modules
 from simulator.utils import files
 from simulator.utils.cache import CACHE_KINDS, DiskCache, cache_dir, cache_key
-from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.results import write_results
 
 KEY = cache_key({"a": 1})
@@ -224,36 +223,7 @@ def test_the_home_of_nobody(monkeypatch: pytest.MonkeyPatch, caplog: Any) -> Non
     assert "AE_ENV_CACHE (='~no-such-user/cache')" in caplog.text
 
 
-# -- checkpoints and results ----------------------------------------------------------------------
-
-
-def test_one_changed_byte_of_a_checkpoint_is_noticed(tmp_path: Path, caplog: Any) -> None:
-    path = tmp_path / "run.checkpoint"
-    module = nn.Linear(3, 3)
-    Checkpoint(path, {"module": module}).save(7, force=True)
-    content = bytearray(path.read_bytes())
-    content[-2] ^= 1
-    path.write_bytes(content)
-    assert Checkpoint(path, {"module": module}).restore() == 0
-    assert "training begins anew: its content is not what was written" in caplog.text
-
-
-def test_a_full_disk_stops_no_training(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
-) -> None:
-    path, module = tmp_path / "run.checkpoint", nn.Linear(3, 3)
-    store = Checkpoint(path, {"module": module})
-    store.save(1, force=True)
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("simulator.utils.files.os.replace", full)
-        store.save(2, force=True)
-    assert "could not be written" in caplog.text
-    assert [p.name for p in tmp_path.iterdir()] == ["run.checkpoint"]
-    assert Checkpoint(path, {"module": module}).restore() == 1
+# -- results ---------------------------------------------------------------------------------------
 
 
 def test_results_are_those_of_before_or_after(

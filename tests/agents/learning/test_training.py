@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +15,20 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
+from agents.learning import training
 from agents.learning.ppo import PPOTraining
 from agents.learning.regression_training import RegressionTraining
-from agents.learning.training import AgentConfig, is_trained, load_config, train_agent
+from agents.learning.training import (
+    AgentConfig,
+    TrainingJob,
+    is_trained,
+    load_config,
+    run_in_parallel,
+    tell,
+    train_agent,
+    train_in_parallel,
+)
+from simulator.utils.files import sibling
 
 CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
 ENVIRONMENT = {"scenes": "bundled:small", "resolution": 36}
@@ -132,3 +147,85 @@ def test_seed_and_tensorboard(tmp_path: Path) -> None:
     events = list((tmp_path / "log").glob("events*"))
     assert events
     assert all(path.stat().st_size > 200 for path in events)
+
+
+# Several at once
+
+
+def jobs(folder: Path, frames: int) -> list[TrainingJob]:
+    trainings = {"regression": {"frames": frames}, "ppo": {"total_timesteps": frames}}
+    return [TrainingJob(n, tiny(n, **own), folder / n) for n, own in trainings.items()]
+
+
+@pytest.mark.slow
+def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
+    todo = jobs(tmp_path, frames=240)
+    running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
+
+    with pytest.raises(KeyboardInterrupt):
+        train_in_parallel(todo, workers=1, progress=stop)
+    assert running.is_file()
+    assert not waiting.exists()
+    seen: list[int] = []
+
+    def report(name: str, done: int, total: int, values: dict[str, float]) -> None:
+        assert (name, total) == ("regression", 240)
+        seen.append(done)
+
+    train_in_parallel(todo[:1], progress=report)
+    assert is_trained(todo[0].config, todo[0].out)
+    assert seen[0] > 4  # it went on
+    assert seen == list(range(seen[0], 241, 4))
+    # Nothing is left to do, and no process is started.
+    train_in_parallel(todo[:1], progress=lambda *_: pytest.fail("trained again"))
+
+
+def _share(job: int) -> None:
+    tell(job, torch.get_num_threads())
+    if job == 2:
+        raise ValueError("job 2 has failed")
+
+
+@pytest.mark.slow
+def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "core_count", lambda: 6)
+    seen: list[tuple[object, ...]] = []
+    with pytest.raises(ValueError, match="job 2 has failed"):
+        run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
+    assert (2, 3) in seen
+
+
+def _never_end(job: int) -> None:
+    tell(os.getpid())
+    time.sleep(600)
+
+
+def _wait_for_ever(pipe: Connection) -> None:
+    run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
+def test_workers_do_not_outlive_a_killed_parent() -> None:
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    parent = context.Process(target=_wait_for_ever, args=(there,))
+    parent.start()
+    workers = [here.recv(), here.recv()]
+    assert all(_runs(pid) for pid in workers)
+    parent.kill()
+    parent.join()
+    end = time.monotonic() + 30
+    while any(_runs(pid) for pid in workers):
+        assert time.monotonic() < end, "they work on for nobody"
+        time.sleep(0.1)
