@@ -279,7 +279,8 @@ def _make(
         if "network" not in options:
             weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
             options = {"weights": weights, "device": device, **options}
-        return _construct(_class_in(f"agents.{head}", _TRAINED[head]), name, context, options)
+        module = f"agents.learning.{head}"
+        return _construct(_class_in(module, _TRAINED[head]), name, context, options)
     if tail and head not in (*METERS, *_SIMPLE, RPI_AGC):
         return _construct(_class_in_module(head, tail, name), name, context, options)
     raise ValueError(_unknown(base))

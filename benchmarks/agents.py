@@ -16,8 +16,7 @@ from rich.progress import Progress
 from agents.cli.quickstart import prepare_tables
 from agents.episodes import make_envs
 from agents.evaluation.protocol import evaluate, fit_policies
-from agents.learning.parallel import TrainingJob, train_in_parallel
-from agents.learning.training import load_config
+from agents.learning.training import TrainingJob, load_config, train_in_parallel
 from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
 from agents.report.of_evaluation import write_report
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from agents.evaluation.protocol import evaluate, fit_policies
 from agents.evaluation.result import EvaluationResult
-from agents.learning.parallel import TrainingJob, train_in_parallel
-from agents.learning.training import AgentConfig
+from agents.learning.training import AgentConfig, TrainingJob, train_in_parallel
 from agents.policy import Policy, PolicyContext, make_policy
 from agents.report.of_evaluation import write_report
 from simulator.utils.files import write_atomically

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
 from agents.evaluation.plan_run import Member, PlanRun
 from agents.evaluation.result import EvaluationResult
-from agents.learning.parallel import core_count, run_in_parallel, tell
+from agents.learning.training import core_count, run_in_parallel, tell
 from agents.policy import training_seeds
 
 if TYPE_CHECKING:

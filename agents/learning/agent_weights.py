@@ -3,27 +3,37 @@
 from __future__ import annotations
 
 import hashlib
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
+from pydantic import BaseModel, Field, ValidationError
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from ae_env.grid import ExposureGrid
-from agents.policy import PolicyContext
+from agents.policy import Policy, PolicyContext
 from simulator.networks.weights import check_finite, read_pair, write_pair
+from simulator.utils.config_file import one_line
 from simulator.utils.files import sibling
 
 FORMAT_VERSION = 1
-#: What every card says, and of what type.
-_ENTRIES = {"width": int, "context": dict, "training": dict, "aliases": dict}
-#: What describes the grid in a card.
+#: Most hidden features of a network.
+MAX_WIDTH = 65536
+#: Entries of a card's context that describe the grid.
 _GRID = ("isos", "exposure_times", "f_numbers")
 #: Nominal values are rounded: 1/1000 s stands for 1/1024 s.
 _ROUNDED = 0.03
-#: Most hidden features of a network.
-MAX_WIDTH = 65536
+
+
+class _Card(BaseModel):
+    """Entries that every card must have."""
+
+    width: int = Field(strict=True, ge=1, le=MAX_WIDTH)
+    context: dict[str, Any]
+    training: dict[str, Any]
+    aliases: dict[str, str]
 
 
 def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, Any]) -> None:
@@ -33,7 +43,7 @@ def save_agent(path: Path, kind: str, module: nn.Module, description: dict[str, 
         path: File name, with or without one of the two endings.
         kind: ``"regression"`` or ``"ppo"``.
         module: Its state is stored.
-        description: JSON values: what the agent expects to observe and how it was trained.
+        description: JSON values, see `describe_agent`.
 
     Raises:
         ValueError: If the weights are not finite; nothing is written then.
@@ -74,23 +84,14 @@ def load_agent(path: str | Path, kind: str) -> tuple[dict[str, Tensor], dict[str
             f"`weights` (={str(path)!r}) must be a {kind} agent of format {FORMAT_VERSION}, got "
             f"{card.get('kind')!r} of format {card.get('format')!r}"
         )
-    _check_entries(card, f"`weights` (={str(path)!r}): {card_path.name}")
-    aliases = {name: source for name, source in card["aliases"].items() if source in tensors}
-    return tensors | {name: tensors[source] for name, source in aliases.items()}, card
-
-
-def _check_entries(card: dict[str, Any], where: str) -> None:
-    missing = [name for name in _ENTRIES if name not in card]
-    if missing:
-        raise ValueError(f"{where} lacks {missing}")
-    for name, kind in _ENTRIES.items():
-        if not isinstance(card[name], kind) or isinstance(card[name], bool):
-            word = "an integer" if kind is int else "a JSON object"
-            raise ValueError(f"{where}: `{name}` (={card[name]!r}) must be {word}")
-    if not 1 <= card["width"] <= MAX_WIDTH:
-        raise ValueError(f"{where}: `width` (={card['width']}) must be in [1, {MAX_WIDTH}]")
-    if not all(isinstance(source, str) for source in card["aliases"].values()):
-        raise ValueError(f"{where}: `aliases` must map names to names")
+    try:
+        aliases = _Card.model_validate(card).aliases
+    except ValidationError as error:
+        raise ValueError(
+            f"`weights` (={str(path)!r}): {card_path.name}: {one_line(error)}"
+        ) from error
+    known = {name: source for name, source in aliases.items() if source in tensors}
+    return tensors | {name: tensors[source] for name, source in known.items()}, card
 
 
 def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -> None:
@@ -106,8 +107,19 @@ def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -
         raise ValueError(f"`weights` (={str(path)!r}) do not fit the network: {text}") from error
 
 
+def describe_agent(width: int, context: PolicyContext, training: dict[str, Any]) -> dict[str, Any]:
+    """Description of an agent for `save_agent`.
+
+    Args:
+        width: Hidden features of its network.
+        context: What it was trained for.
+        training: JSON values that identify the training.
+    """
+    return {"width": width, "context": describe_context(context), "training": training}
+
+
 def describe_context(context: PolicyContext) -> dict[str, Any]:
-    """What a network's shape and meaning depend on."""
+    """Everything that a network's shape and meaning depend on, as JSON values."""
     raw = context.observation_space["raw"]
     return {
         "resolution": list(raw.shape or ()),
@@ -129,10 +141,13 @@ def trained_grid(card: dict[str, Any]) -> ExposureGrid:
 
 
 def check_context(card: dict[str, Any], context: PolicyContext) -> None:
-    """Raises a `ValueError` that names what `context` has other than the agent was trained for.
+    """Checks that the agent of `card` can act in `context`.
 
-    Another grid is well if none of its values lies outside of the range of the trained one: the
-    agent then reads its states off between those that it knows.
+    Any grid whose values lie within the trained ranges works: a state enters the networks by its
+    numbers.
+
+    Raises:
+        ValueError: If it cannot; the message says what differs.
     """
     for name, here in describe_context(context).items():
         trained = card["context"].get(name)
@@ -149,3 +164,54 @@ def check_context(card: dict[str, Any], context: PolicyContext) -> None:
                 f"`weights`: the agent was trained with {name} from {known[0]:g} to {known[-1]:g}, "
                 f"the environment has {here[0]:g} to {here[-1]:g}"
             )
+
+
+class NetworkPolicy(Policy, ABC):
+    """Base of the policies that a trained network decides.
+
+    Args:
+        context: The camera, the grid and the observation.
+        weights: File that a training wrote; or give `network`.
+        network: A network in memory.
+        device: Torch device for `weights`.
+
+    Raises:
+        ValueError: If not exactly one of `weights` and `network` is given, or the weights were
+            trained for another observation or a grid of smaller ranges.
+    """
+
+    #: The name of this kind of agent in its files.
+    kind: ClassVar[str]
+
+    def __init__(
+        self,
+        context: PolicyContext,
+        weights: str | Path | None = None,
+        network: nn.Module | None = None,
+        device: str = "cpu",
+    ) -> None:
+        super().__init__(context)
+        self.name = self.kind
+        if (weights is None) == (network is None):
+            raise ValueError("give either `weights` or `network`")
+        if network is None:
+            tensors, card = load_agent(str(weights), self.kind)
+            check_context(card, context)
+            network = self.make_network(context, card["width"], trained_grid(card))
+            load_into(network, tensors, str(weights))
+            network.to(device)
+        self.network: Any = network.eval()
+        self.reset(0)
+
+    @staticmethod
+    @abstractmethod
+    def make_network(
+        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
+    ) -> nn.Module:
+        """The untrained network that the weights of an agent of this kind fit.
+
+        Args:
+            context: The camera, the grid and the observation.
+            width: Hidden features.
+            trained_on: Grid that the weights come from; by default that of the context.
+        """

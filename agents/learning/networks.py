@@ -1,10 +1,6 @@
-"""The convolutional features that the learnt agents share."""
+"""Networks that the learnt agents share: features of a frame, and values of every state."""
 
 from __future__ import annotations
-
-import math
-import numbers
-from typing import Any
 
 import gymnasium as gym
 import torch
@@ -12,22 +8,6 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES
-
-
-# Checks of numbers in the configurations.
-def check_ranges(configuration: Any, **ranges: tuple[float, float]) -> None:
-    """Raises a `ValueError` if a field of `configuration` is not a number in its range.
-
-    Args:
-        configuration: Any object.
-        ranges: Least and greatest allowed value by field name.
-    """
-    for name, (low, high) in ranges.items():
-        value = getattr(configuration, name)
-        number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-        if not (number and math.isfinite(value) and low <= value <= high):
-            raise ValueError(f"`{name}` (={value!r}) must be in [{low:g}, {high:g}]")
-
 
 #: Range of log2 luminance that the absolute plane maps to about [-1, 1].
 _LUMINANCE_CENTRE, _LUMINANCE_SCALE = 3.0, 8.0
@@ -46,9 +26,10 @@ class ExposureFeatures(nn.Module):
 
     The raw alone does not tell a bright scene from a long exposure. A plane of absolute log
     luminance, log2 of the decoded green plus the EV100 of the frame's settings, does; it is the one
-    input that made the difference in trials. The planes are averaged to about 16 x 16 first, with
-    the maximum of the luminance kept beside: exposure is decided on coarse structure. Beside the
-    CNN's features stand what a light meter reads: mean luminance and clipped share of 4 x 4 zones.
+    input that made the difference in trials. The planes are first averaged to about 16 x 16, with
+    the maximum of the luminance as another plane: exposure is decided on coarse structure. The
+    readings of a light meter, mean luminance and clipped share of 4 x 4 zones, are added to the
+    CNN's features.
 
     Args:
         observation_space: Observation of a single environment, with a uint8 ``raw``.
@@ -107,7 +88,8 @@ class ExposureFeatures(nn.Module):
         clipped = pool((peak >= _CLIPPED).to(codes.dtype), _ZONES)
         features = [self.cnn(torch.cat(planes, dim=1)), zones.flatten(1), clipped.flatten(1)]
         numbers = [settings] if sensors is None else [settings, sensors]
-        return self.head(torch.cat([*features, *numbers], dim=1))
+        joint: torch.Tensor = self.head(torch.cat([*features, *numbers], dim=1))
+        return joint
 
 
 def _decode(codes: torch.Tensor) -> torch.Tensor:
@@ -131,8 +113,8 @@ def _apex_table(grid: ExposureGrid) -> torch.Tensor:
 class StateHead(nn.Module):
     """Values of every exposure state, by one small network that all states share.
 
-    A state enters as its EV100, Av, Tv and Sv, and as the blur that the sensors foretell for it;
-    what is learnt about one state so serves its neighbours, and any grid within the same ranges.
+    A state enters as its EV100, Av, Tv and Sv, and as the blur that the sensors predict for it.
+    So what is learnt about one state serves its neighbours, and any grid within the same ranges.
 
     Args:
         grid: The states.
@@ -183,7 +165,8 @@ class StateHead(nn.Module):
                 raise ValueError("`sensors` must be given: the network was made for them")
             states = torch.cat([states, self._blur(sensors)], dim=2)
         hidden = torch.relu(self.from_features(features)[:, None] + self.from_state(states))
-        return self.values(torch.relu(self.hidden(hidden)))
+        values: torch.Tensor = self.values(torch.relu(self.hidden(hidden)))
+        return values
 
     def _blur(self, sensors: torch.Tensor) -> torch.Tensor:
         """log2 of each state's blur in 64ths of the frame, and its loss of sharpness; scaled."""

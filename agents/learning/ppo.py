@@ -1,20 +1,21 @@
 """The PPO agent: Stable-Baselines3's PPO on the native vector environment.
 
-The image of a static scene does not depend on what was done before, so that the problem is a
-contextual bandit: the default discount is 0.
+The image of a static scene does not depend on earlier actions, so the problem is a contextual
+bandit: the default discount is 0.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
@@ -22,19 +23,22 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.agent_weights import MAX_WIDTH, describe_context, save_agent
-from agents.learning.history import History
-from agents.learning.network_policy import NetworkPolicy
-from agents.learning.networks import ExposureFeatures, StateHead, check_ranges
+from agents.learning.agent_weights import MAX_WIDTH, NetworkPolicy
+from agents.learning.networks import ExposureFeatures, StateHead
 from agents.learning.sb3_adapter import SB3VectorAdapter
 from agents.policy import Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.config_file import Configuration
 
 
 class ExposureExtractor(BaseFeaturesExtractor):
-    """`ExposureFeatures` as SB3 wants it, with the sensors kept beside for the `StateHead`.
+    """`ExposureFeatures` as SB3 wants it, followed by the sensors, which the `StateHead` needs.
 
     SB3 has divided the raw by 255 already.
+
+    Args:
+        observation_space: Observation of a single environment.
+        width: Features without the sensors.
     """
 
     def __init__(self, observation_space: gym.spaces.Dict, width: int = 256) -> None:
@@ -46,11 +50,12 @@ class ExposureExtractor(BaseFeaturesExtractor):
         """Features (B, features_dim)."""
         sensors = observations.get("sensors")
         features = self.features(observations["raw"], observations["settings"], sensors)
-        return features if sensors is None else torch.cat([features, sensors], dim=1)
+        joint: torch.Tensor = features if sensors is None else torch.cat([features, sensors], dim=1)
+        return joint
 
 
 class _StateLogits(nn.Module):
-    """Logit of each state from what `ExposureExtractor` gives."""
+    """Logit of each state from the output of `ExposureExtractor`."""
 
     def __init__(
         self, grid: ExposureGrid, width: int, has_sensors: bool, trained_on: ExposureGrid | None
@@ -58,13 +63,14 @@ class _StateLogits(nn.Module):
         super().__init__()
         self.width = width
         self.head = StateHead(grid, width, has_sensors, trained_on=trained_on)
-        nn.init.orthogonal_(self.head.values.weight, 0.01)  # begin with all states alike
+        nn.init.orthogonal_(self.head.values.weight, 0.01)  # all states start alike
         nn.init.zeros_(self.head.values.bias)
 
-    def forward(self, prepared: torch.Tensor) -> torch.Tensor:
+    def forward(self, extracted: torch.Tensor) -> torch.Tensor:
         """Logits (B, S)."""
-        features, sensors = prepared[:, : self.width], prepared[:, self.width :]
-        return self.head(features, sensors if sensors.shape[1] else None)[..., 0]
+        features, sensors = extracted[:, : self.width], extracted[:, self.width :]
+        values: torch.Tensor = self.head(features, sensors if sensors.shape[1] else None)
+        return values[..., 0]
 
 
 class ExposureActorCritic(MultiInputActorCriticPolicy):
@@ -77,19 +83,19 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
         grid: The exposure states.
         width: Features that describe a frame.
         trained_on: See `StateHead`.
-        kwargs: Further arguments of SB3's policy.
+        use_sde: State-dependent exploration, which SB3 has for continuous actions only.
     """
 
     def __init__(
         self,
         observation_space: gym.spaces.Dict,
-        action_space: gym.Space,
-        lr_schedule: Any,
+        action_space: gym.spaces.Discrete,
+        lr_schedule: Callable[[float], float],
         *,
         grid: ExposureGrid,
         width: int = 256,
         trained_on: ExposureGrid | None = None,
-        **kwargs: Any,
+        use_sde: bool = False,
     ) -> None:
         self.grid, self.width, self.trained_on = grid, width, trained_on
         super().__init__(
@@ -100,19 +106,19 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
             features_extractor_kwargs={"width": width},
             net_arch={"pi": [], "vf": [128]},
             activation_fn=nn.ReLU,
-            **kwargs,
+            use_sde=use_sde,
         )
 
-    def _build(self, lr_schedule: Any) -> None:
+    def _build(self, lr_schedule: Callable[[float], float]) -> None:
         super()._build(lr_schedule)
+        # SB3 has made a plain linear layer for the logits, and an optimiser that knows only that.
         has_sensors = self.features_dim > self.width
         self.action_net = _StateLogits(self.grid, self.width, has_sensors, self.trained_on)
         rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
 
 
-@dataclass(frozen=True)
-class PPOTraining:
+class PPOTraining(Configuration):
     """Hyperparameters of PPO, named as in Stable-Baselines3.
 
     Args:
@@ -128,40 +134,25 @@ class PPOTraining:
         vf_coef: Weight of the value loss.
         max_grad_norm: Gradient clipping.
         width: Hidden features of the network.
-        seed: Of scenes, noise, weights and actions.
+        seed: Seed of scenes, noise, weights and actions.
+
+    Raises:
+        ValueError: If a value is out of range or an entry is unknown; the message names it.
     """
 
-    total_timesteps: int = 200_000
-    n_steps: int = 16
-    batch_size: int = 256
-    n_epochs: int = 4
-    learning_rate: float = 1e-3
-    gamma: float = 0.0
-    gae_lambda: float = 1.0
-    clip_range: float = 0.2
-    ent_coef: float = 0.02
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
-    width: int = 256
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            total_timesteps=(1, 1e12),
-            n_steps=(1, 1e6),
-            batch_size=(2, 1e9),
-            n_epochs=(1, 1e4),
-            learning_rate=(1e-9, 1.0),
-            gamma=(0.0, 1.0),
-            gae_lambda=(0.0, 1.0),
-            clip_range=(1e-6, 1e6),
-            ent_coef=(0.0, 1e6),
-            vf_coef=(0.0, 1e6),
-            max_grad_norm=(1e-9, 1e9),
-            width=(1, MAX_WIDTH),
-            seed=(0, 2**32 - 1),
-        )
+    total_timesteps: int = Field(default=200_000, ge=1, le=10**12)
+    n_steps: int = Field(default=16, ge=1, le=10**6)
+    batch_size: int = Field(default=256, ge=2, le=10**9)
+    n_epochs: int = Field(default=4, ge=1, le=10**4)
+    learning_rate: float = Field(default=1e-3, ge=1e-9, le=1.0)
+    gamma: float = Field(default=0.0, ge=0.0, le=1.0)
+    gae_lambda: float = Field(default=1.0, ge=0.0, le=1.0)
+    clip_range: float = Field(default=0.2, ge=1e-6, le=1e6)
+    ent_coef: float = Field(default=0.02, ge=0.0, le=1e6)
+    vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)
+    max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)
+    width: int = Field(default=256, ge=1, le=MAX_WIDTH)
+    seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
     def check_batch(self, num_envs: int) -> None:
         """Raises a `ValueError` unless `num_envs` rollouts divide into gradient steps."""
@@ -174,7 +165,7 @@ class PPOTraining:
 
 
 class PPOPolicy(NetworkPolicy):
-    """Takes the most probable state; remembers nothing between frames. See `NetworkPolicy`."""
+    """Takes the most probable state and remembers nothing between frames."""
 
     kind = "ppo"
 
@@ -182,7 +173,7 @@ class PPOPolicy(NetworkPolicy):
     def make_network(
         context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
     ) -> ExposureActorCritic:
-        """See `NetworkPolicy`."""
+        """See `NetworkPolicy.make_network`."""
         return ExposureActorCritic(
             context.observation_space,
             gym.spaces.Discrete(len(context.grid)),
@@ -202,41 +193,6 @@ class PPOPolicy(NetworkPolicy):
         return masked_argmax(distribution.logits.cpu().numpy(), action_masks)
 
 
-class _TrainingCallback(BaseCallback):
-    """Progress, falling entropy, and checkpoints between the updates."""
-
-    def __init__(
-        self,
-        training: PPOTraining,
-        store: Checkpoint,
-        history: History,
-        progress: Callable[[int, int, dict[str, float]], None] | None,
-    ) -> None:
-        super().__init__()
-        self.training, self.store, self.progress = training, store, progress
-        self.history = history
-        self.updated: int | None = None  # frames learnt from; None within an update
-        self._rewards: list[float] = []
-
-    def _on_step(self) -> bool:
-        self.history.add(self.locals["actions"])
-        self._rewards.append(float(np.mean(self.locals["rewards"])))
-        if self.progress is not None:
-            recent = float(np.mean(self._rewards[-50:]))
-            self.progress(self.num_timesteps, self.training.total_timesteps, {"reward": recent})
-        return True
-
-    def _on_rollout_start(self) -> None:
-        done = self.num_timesteps / self.training.total_timesteps
-        self.model.ent_coef = self.training.ent_coef * (1.0 - 0.9 * min(done, 1.0))  # type: ignore[attr-defined]
-        self.history.mark(**_random_state(self.model.device))
-        self.updated = self.num_timesteps
-        self.store.save(self.updated)
-
-    def _on_rollout_end(self) -> None:
-        self.updated = None
-
-
 def train_ppo(
     envs: gym.vector.VectorEnv,
     training: PPOTraining,
@@ -251,8 +207,8 @@ def train_ppo(
     Args:
         envs: Vector environments.
         training: Hyperparameters.
-        checkpoint: Where to keep the state of the training; a second run goes on there and ends
-            with the weights that the first would have ended with.
+        checkpoint: File for the state of the training; a second run resumes from it, with new
+            episodes.
         progress: Called with frames done, frames in all, and the mean reward.
         device: Torch device of the network.
         identity: JSON value; the checkpoint of a training with another one is not resumed. By
@@ -263,6 +219,9 @@ def train_ppo(
     """
     training.check_batch(envs.num_envs)
     context = PolicyContext.from_envs(envs)
+    store = Checkpoint(checkpoint, identity or training.model_dump(), lambda: callback.state())
+    past = store.load()
+    done = 0 if past is None else int(past["timesteps"])
     model = PPO(
         ExposureActorCritic,
         SB3VectorAdapter(envs),
@@ -277,68 +236,66 @@ def train_ppo(
         vf_coef=training.vf_coef,
         max_grad_norm=training.max_grad_norm,
         policy_kwargs={"grid": context.grid, "width": training.width},
-        seed=training.seed,
+        seed=_seed(training.seed, done),
         device=device,
     )
-    history = History(envs.num_envs)
-    store = Checkpoint(
-        checkpoint,
-        {"policy": model.policy, "optimiser": model.policy.optimizer, "history": history},
-        identity=identity or asdict(training),
-    )
-    done = store.restore()
-    model.num_timesteps = done
+    if past is not None:
+        model.policy.load_state_dict(past["policy"])
+        model.policy.optimizer.load_state_dict(past["optimizer"])
+        model.num_timesteps = done
+    callback = _TrainingCallback(training, store, done, progress)
+    callback.model = model
     remaining = training.total_timesteps - done
     if remaining > 0:
-        if done:
-            _resume(model, history)
-        callback = _TrainingCallback(training, store, history, progress)
-        try:
+        with store:
             model.learn(remaining, callback=callback, reset_num_timesteps=done == 0)
-        except (KeyboardInterrupt, SystemExit):
-            if callback.updated is not None:
-                store.save(callback.updated, force=True)
-            raise
-    store.save(model.num_timesteps, force=True)
-    return model.policy  # type: ignore[return-value]
+    network = model.policy
+    assert isinstance(network, ExposureActorCritic)
+    return network
 
 
-def _resume(model: PPO, history: History) -> None:
-    """Takes the environments and the random generators to where the history was marked."""
-    envs = cast(SB3VectorAdapter, model.env)
-    observations, starts = envs.reset(), np.ones(envs.num_envs, dtype=bool)
-    for actions in history.actions:
-        observations, _, starts, _ = envs.step(actions)
-    model._last_obs, model._last_episode_starts = observations, starts
-    marked = history.marked
-    words = {"key": marked["numpy_key"].numpy().astype(np.uint32), "pos": marked["numpy_pos"]}
-    np.random.set_state({"bit_generator": "MT19937", "state": words})  # noqa: NPY002
-    torch.set_rng_state(marked["torch"])
-    if model.device.type == "cuda":
-        torch.cuda.set_rng_state(marked["cuda"], model.device)
+class _TrainingCallback(BaseCallback):
+    """Progress, falling entropy, and checkpoints between the updates."""
+
+    def __init__(
+        self,
+        training: PPOTraining,
+        checkpoint: Checkpoint,
+        done: int,
+        progress: Callable[[int, int, dict[str, float]], None] | None,
+    ) -> None:
+        super().__init__()
+        self.training, self.checkpoint, self.progress = training, checkpoint, progress
+        self.learnt = done  # frames of complete updates
+        self._rewards: deque[float] = deque(maxlen=50)
+
+    def state(self) -> dict[str, Any]:
+        """State of the training for its checkpoint. A half-done rollout is taken again."""
+        policy = self.model.policy
+        return {
+            "timesteps": self.learnt,
+            "policy": policy.state_dict(),
+            "optimizer": policy.optimizer.state_dict(),
+        }
+
+    def _on_step(self) -> bool:
+        self._rewards.append(float(np.mean(self.locals["rewards"])))
+        if self.progress is not None:
+            recent = float(np.mean(self._rewards))
+            self.progress(self.num_timesteps, self.training.total_timesteps, {"reward": recent})
+        return True
+
+    def _on_rollout_start(self) -> None:
+        done = self.num_timesteps / self.training.total_timesteps
+        model: Any = self.model
+        model.ent_coef = self.training.ent_coef * (1.0 - 0.9 * min(done, 1.0))
+        self.learnt = self.num_timesteps
+        self.checkpoint.save_when_due()
+
+    def _on_training_end(self) -> None:
+        self.learnt = self.num_timesteps
 
 
-def _random_state(device: torch.device) -> dict[str, Any]:
-    """The global generators that SB3 draws from: torch's for actions, numpy's for batches."""
-    words: Any = np.random.get_state(legacy=False)["state"]  # type: ignore[call-overload]  # noqa: NPY002
-    state = {
-        "torch": torch.get_rng_state(),
-        "numpy_key": torch.from_numpy(words["key"].astype(np.int64)),
-        "numpy_pos": int(words["pos"]),
-    }
-    return state | ({"cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
-
-
-def save_ppo(
-    path: Path,
-    network: ExposureActorCritic,
-    context: PolicyContext,
-    training: dict[str, Any],
-) -> None:
-    """Writes the agent as ``path.safetensors`` and ``path.json``."""
-    description = {
-        "width": network.width,
-        "context": describe_context(context),
-        "training": training,
-    }
-    save_agent(path, "ppo", network, description)
+def _seed(seed: int, done: int) -> int:
+    """Seed of a training that resumes after `done` frames: it must not repeat its first draws."""
+    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) if done else seed

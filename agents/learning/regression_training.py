@@ -1,23 +1,173 @@
-"""What the regression agent learns from: frames that it meets, and those that it remembers."""
+"""Training of the regression agent on score tables that the simulator makes for free."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
+from torch import nn
 
-from agents.learning.history import History
-from agents.policy import Observations
+from agents.learning.agent_weights import MAX_WIDTH
+from agents.learning.regression import RegressionPolicy, ScoreRegressor, observation_tensors
+from agents.policy import Observations, PolicyContext
+from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.config_file import Configuration
 
-if TYPE_CHECKING:
-    from agents.learning.regression import RegressionPolicy, RegressionTraining
+
+class RegressionTraining(Configuration):
+    """Hyperparameters of the regression agent.
+
+    Args:
+        frames: Frames to take.
+        learning_rate: Peak of the one-cycle schedule of AdamW.
+        weight_decay: Of AdamW.
+        replay: Frames of the recent past that each optimiser step sees again, per new frame.
+        memory: Frames that are remembered for it.
+        explore: Share of random actions; the others are the agent's own, so that it learns from
+            the frames it will meet.
+        width: Hidden features of the network.
+        dropout: Share of the features that an optimiser step leaves out.
+        seed: Seed of scenes, noise and weights.
+
+    Raises:
+        ValueError: If a value is out of range or an entry is unknown; the message names it.
+    """
+
+    frames: int = Field(default=100_000, ge=1, le=10**12)
+    learning_rate: float = Field(default=5e-3, ge=1e-9, le=1.0)
+    weight_decay: float = Field(default=1e-3, ge=0.0, le=1.0)
+    replay: int = Field(default=2, ge=0, le=64)
+    memory: int = Field(default=8192, ge=1, le=10**9)
+    explore: float = Field(default=0.5, ge=0.0, le=1.0)
+    width: int = Field(default=256, ge=1, le=MAX_WIDTH)
+    dropout: float = Field(default=0.1, ge=0.0, le=0.99)
+    seed: int = Field(default=0, ge=0, le=2**63)
+
+
+def train_regression(
+    envs: gym.vector.VectorEnv,
+    training: RegressionTraining,
+    *,
+    checkpoint: Path | None = None,
+    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    device: str = "cpu",
+    identity: Any = None,
+) -> ScoreRegressor:
+    """Trains a regression agent on the training scenes of `envs` (autoreset mode SAME_STEP).
+
+    Args:
+        envs: Vector environments.
+        training: Hyperparameters.
+        checkpoint: File for the state of the training, written three times a minute; a second run
+            resumes from it, with new episodes and an empty memory of past frames.
+        progress: Called with frames done, frames in all, and losses.
+        device: Torch device of the network.
+        identity: JSON value; the checkpoint of a training with another one is not resumed. By
+            default the hyperparameters.
+
+    Returns:
+        The trained network.
+    """
+    context = PolicyContext.from_envs(envs)
+    with _seeded("cpu", training.seed):
+        network = ScoreRegressor(
+            context.observation_space, context.grid, training.width, training.dropout
+        )
+    network.to(device)
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
+    )
+    steps = max(2, training.frames // envs.num_envs)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, max_lr=training.learning_rate, total_steps=steps + 1, pct_start=0.1
+    )
+    parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
+    done = 0
+    store = Checkpoint(
+        checkpoint,
+        identity or training.model_dump(),
+        lambda: {"step": done, **{name: part.state_dict() for name, part in parts.items()}},
+    )
+    past = store.load()
+    if past is not None:
+        done = int(past["step"])
+        for name, part in parts.items():
+            part.load_state_dict(past[name])
+    rollout = Rollout(envs, RegressionPolicy(context, network=network), training, done)
+    with store:
+        while done < steps:
+            observations, target = rollout.batch()
+            network.train()
+            with _seeded(device, training.seed, done):  # dropout draws from the global generator
+                loss, error = _loss(network, observations, target)
+            if not math.isfinite(error):
+                raise ValueError(f"the loss (={error}) must be finite; lower `learning_rate`")
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimizer.step()
+            schedule.step()
+            done += 1
+            network.eval()
+            if progress is not None:
+                progress(done * envs.num_envs, steps * envs.num_envs, {"mse": error})
+            store.save_when_due()
+    return network
+
+
+class Rollout:
+    """Frames and the scores of all states, from episodes that the policy itself drives.
+
+    Args:
+        envs: Vector environments.
+        policy: Chooses the actions that are not random.
+        training: Hyperparameters.
+        first_step: Optimiser steps that an earlier run has taken; every start draws other episodes.
+    """
+
+    def __init__(
+        self,
+        envs: gym.vector.VectorEnv,
+        policy: RegressionPolicy,
+        training: RegressionTraining,
+        first_step: int = 0,
+    ) -> None:
+        self.envs, self.policy = envs, policy
+        self.explore, self.base = training.explore, cast(Any, envs.unwrapped)
+        self.rng = np.random.default_rng([training.seed, first_step])
+        self.replay = Replay(training, np.random.default_rng([training.seed, first_step, 1]))
+        self.observations: Observations | None = None
+
+    def batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
+        """The next frame of every episode with its scores, and some earlier ones."""
+        if self.observations is None:
+            self.observations, _ = self.envs.reset(seed=int(self.rng.integers(2**31)))
+            self.policy.reset(self.envs.num_envs)
+        else:
+            actions = self.policy.act(self.observations)
+            random = self.rng.random(len(actions)) < self.explore
+            others = self.rng.integers(len(self.policy.context.grid), size=len(actions))
+            actions = np.where(random, others, actions)
+            self.observations, _, terminated, truncated, _ = self.envs.step(actions)
+            self.policy.forget(terminated | truncated)
+        return self.replay.batch(self.observations, self.base.expected_scores())
 
 
 class Replay:
-    """The last frames and their scores, to be seen again mirrored or not."""
+    """The last frames and their scores, to be seen again, mirrored half of the time.
+
+    Args:
+        training: Hyperparameters.
+        rng: Chooses the frames to see again.
+    """
 
     def __init__(self, training: RegressionTraining, rng: np.random.Generator) -> None:
         self.training, self.rng = training, rng
@@ -26,7 +176,7 @@ class Replay:
     def batch(
         self, observations: Observations, target: NDArray[np.float64]
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
-        """The new frames and some old ones."""
+        """The new frames and some old ones; remembers the new ones and forgets the oldest."""
         new = {**observations, "target": target}
         parts = [new]
         for _ in range(min(self.training.replay, len(self.memory))):
@@ -38,79 +188,34 @@ class Replay:
             if self.rng.random() < 0.5:
                 mixed["raw"] = mixed["raw"][..., ::-1]
             parts.append(mixed)
-        self.remember(observations, target)
+        steps = max(1, self.training.memory // len(target))
+        self.memory = [*self.memory, new][-steps:]
         merged = {key: np.concatenate([p[key] for p in parts]) for key in new}
         return merged, merged.pop("target")
 
-    def remember(self, observations: Observations, target: NDArray[np.float64]) -> None:
-        """Keeps the new frames, and forgets the oldest beyond the memory."""
-        count = self.batches(len(target))
-        self.memory = [*self.memory, {**observations, "target": target}][-count:]
 
-    def batches(self, num_envs: int) -> int:
-        """How many steps of that many frames are remembered."""
-        return max(1, self.training.memory // num_envs)
+def _loss(
+    network: ScoreRegressor, observations: Observations, target: NDArray[np.float64]
+) -> tuple[torch.Tensor, float]:
+    """Loss to minimise, and the mean squared error.
+
+    The mean learns from the plain squared error, the confidence from the likelihood with that
+    error held fixed: a large predicted variance cannot excuse a poor mean.
+    """
+    device = next(network.parameters()).device
+    scores, log_variance = network(*observation_tensors(observations, device))
+    error = (scores - torch.from_numpy(target).float().to(device)).square()
+    likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
+    return error.mean() + 0.01 * likelihood, error.mean().item()
 
 
-class Rollout:
-    """Frames and the scores of all states, from episodes that the policy itself drives."""
-
-    def __init__(
-        self,
-        envs: gym.vector.VectorEnv,
-        policy: RegressionPolicy,
-        training: RegressionTraining,
-        history: History,
-    ) -> None:
-        self.envs, self.policy, self.history = envs, policy, history
-        self.explore, self.base = training.explore, cast(Any, envs.unwrapped)
-        self.rng = np.random.default_rng([training.seed, 0])
-        self.replay = Replay(training, np.random.default_rng([training.seed, 0, 1]))
-        self.observations: Observations | None = None
-
-    def batch(self) -> tuple[dict[str, NDArray[Any]], NDArray[np.float64]]:
-        """The next frame of every episode, with its scores, and some earlier ones."""
-        if self.observations is None:
-            self._reset()
-        else:
-            actions = self.policy.act(self.observations)
-            random = self.rng.random(len(actions)) < self.explore
-            others = self.rng.integers(len(self.policy.context.grid), size=len(actions))
-            self.policy.forget(self._step(np.where(random, others, actions)))
-        return self.replay.batch(self._shown(), self.base.expected_scores())
-
-    def mark(self) -> None:
-        """Makes this moment the one that a checkpoint holds."""
-        known = {name: torch.tensor(own) for name, own in self.policy.accumulated.items()}
-        self.history.mark(
-            rng=self.rng.bit_generator.state,
-            replay_rng=self.replay.rng.bit_generator.state,
-            **known,
-        )
-
-    def resume(self) -> None:
-        """Goes to the moment of the history's mark."""
-        past, marked = self.history.actions, self.history.marked
-        self.history.actions = []
-        self._reset()
-        for left in range(len(past), -1, -1):
-            if left < self.replay.batches(self.envs.num_envs):
-                self.replay.remember(self._shown(), self.base.expected_scores())
-            if left:
-                self._step(past[-left])
-        self.rng.bit_generator.state = marked["rng"]
-        self.replay.rng.bit_generator.state = marked["replay_rng"]
-        self.policy.accumulated = {name: marked[name].numpy() for name in self.policy.accumulated}
-
-    def _reset(self) -> None:
-        self.observations, _ = self.envs.reset(seed=int(self.rng.integers(2**31)))
-        self.policy.reset(self.envs.num_envs)
-
-    def _step(self, actions: NDArray[Any]) -> NDArray[np.bool_]:
-        self.history.add(actions)
-        self.observations, _, terminated, truncated, _ = self.envs.step(actions)
-        return terminated | truncated
-
-    def _shown(self) -> Observations:
-        assert self.observations is not None
-        return self.observations
+@contextmanager
+def _seeded(device: str, *seeds: int) -> Iterator[None]:
+    """Within, torch's global generators are seeded; after, they are as they were before."""
+    cuda = [torch.device(device)] if torch.device(device).type == "cuda" else []
+    with torch.random.fork_rng(devices=cuda):
+        number = int(np.random.SeedSequence(seeds).generate_state(1)[0])
+        torch.default_generator.manual_seed(number)
+        if cuda:
+            torch.cuda.manual_seed(number)
+        yield

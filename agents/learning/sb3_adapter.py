@@ -1,8 +1,8 @@
-"""The native vector environment in Stable-Baselines3's own vector interface."""
+"""Adapter from a Gymnasium vector environment to Stable-Baselines3's `VecEnv`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,13 +14,13 @@ from ae_env.env import single_info
 
 
 class SB3VectorAdapter(VecEnv):
-    """Lets SB3 train on a Gymnasium vector environment with autoreset mode SAME_STEP.
+    """Lets SB3 and sb3-contrib train on a Gymnasium vector environment, wrapped or not.
 
     Rollouts are those of SB3's `DummyVecEnv` over single environments with the same seeds, without
     the cost of stepping them one by one.
 
     Args:
-        envs: The vector environment.
+        envs: The vector environment, of autoreset mode SAME_STEP.
 
     Raises:
         ValueError: If its autoreset mode is another one.
@@ -36,7 +36,7 @@ class SB3VectorAdapter(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Any:
-        """Begins episodes everywhere, with what `seed` and `set_options` have set."""
+        """Begins an episode in every environment, with the seeds and options that were set."""
         seeds: Any = None if all(s is None for s in self._seeds) else self._seeds
         names = {name for own in self._options for name in own}
         options = {name: [own.get(name) for own in self._options] for name in names}
@@ -47,11 +47,11 @@ class SB3VectorAdapter(VecEnv):
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions for `step_wait`."""
+        """Stores the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Takes the step: observations, float32 rewards, dones and infos."""
+        """Takes the step and returns observations, float32 rewards, dones and infos."""
         observations, rewards, terminated, truncated, infos = self.envs.step(self._actions)
         dones = terminated | truncated
         final = infos.get("final_obs")
@@ -86,25 +86,37 @@ class SB3VectorAdapter(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """The attribute, once per environment: all share one object."""
-        value = getattr(self.envs.unwrapped, attr_name)
+        value = self._find(attr_name)
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refused: the environments share one object."""
+        """Not possible, as the environments share one object.
+
+        Raises:
+            AttributeError: Always.
+        """
         raise AttributeError(f"`{attr_name}` cannot be set on the environments of a batch")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Calls the method of the batch and returns its rows."""
-        rows = getattr(self.envs.unwrapped, method_name)(*method_args, **method_kwargs)
+        rows = self._find(method_name)(*method_args, **method_kwargs)
         return [rows[i] for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """No single environment is wrapped."""
+        """Whether each environment is wrapped: none is, wrappers of the batch do not count."""
         return [False for _ in self._get_indices(indices)]
 
-    def _get_indices(self, indices: int | Iterable[int] | None) -> list[int]:
+    def _find(self, name: str) -> Any:
+        """An attribute of the batch, or of the outermost of its wrappers that has it."""
+        layer: Any = self.envs
+        while not hasattr(layer, name) and isinstance(layer, gym.vector.VectorWrapper):
+            layer = layer.env
+        return getattr(layer, name)
+
+    def _get_indices(self, indices: Any) -> list[int]:
+        """Any of SB3's ways to name environments, or a NumPy integer, as a list."""
         if indices is None:
             return list(range(self.num_envs))
-        return [indices] if isinstance(indices, int) else list(indices)
+        return [int(i) for i in np.atleast_1d(indices)]

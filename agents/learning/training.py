@@ -1,27 +1,41 @@
-"""From a YAML file to a trained agent: the one place where configurations become objects."""
+"""From a YAML file to a trained agent, or several at once: here configurations become objects."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import closing, contextmanager
-from dataclasses import asdict, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
-from ae_env.utils.checks import did_you_mean
-from agents.learning.agent_weights import load_agent, sibling
-from agents.learning.regression import RegressionTraining
+from agents.learning.agent_weights import describe_agent, load_agent, save_agent
+from agents.learning.regression_training import RegressionTraining, train_regression
+from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
+from simulator.utils.files import sibling
+
+if TYPE_CHECKING:
+    from agents.learning.ppo import PPOTraining
 
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
+#: Seconds between two looks at the messages of the workers.
+_PATIENCE = 0.2
+#: In a worker: set when it is to end, and where its progress goes.
+_stop: Any = None
+_messages: Any = None
 
 
 class AgentConfig(Configuration):
-    """Everything that decides a training.
+    """A training of an agent.
 
     Args:
         agent: ``"regression"`` or ``"ppo"``.
@@ -51,31 +65,23 @@ class AgentConfig(Configuration):
                 f"environment: `observation` (={options.observation!r}) must be 'uint8', which is "
                 "what the agents' networks take"
             )
-        if self.agent == "ppo":
+        if not isinstance(hyperparameters, RegressionTraining):
             hyperparameters.check_batch(self.num_envs)
         try:
             json.dumps(self.card())
-        except TypeError as error:  # found out before the training, not when it is saved
+        except TypeError as error:  # raises before the training, not when the agent is saved
             raise ValueError(f"every entry must be a JSON value: {error}") from error
         return self
 
-    def hyperparameters(self) -> Any:
-        """`training` as the dataclass of the agent."""
-        if self.agent == "regression":
-            kind: Any = RegressionTraining
-        else:
+    def hyperparameters(self) -> RegressionTraining | PPOTraining:
+        """`training` as the hyperparameters of the agent, defaults filled in."""
+        kind: type[RegressionTraining | PPOTraining] = RegressionTraining
+        if self.agent == "ppo":
             from agents.learning.ppo import PPOTraining as kind
-        known = [field.name for field in fields(kind)]
-        for name, value in self.training.items():
-            if isinstance(value, bool):
-                raise ValueError(f"training.{name} (={value!r}) should not be true or false")
-            if name not in known:
-                hint = did_you_mean(name, known)
-                raise ValueError(f"training.{name} is unknown: the entries are {known}{hint}")
         try:
-            return TypeAdapter(kind).validate_python(self.training)
+            return kind.model_validate(self.training)
         except ValidationError as error:
-            raise ValueError(one_line(error, "training.")) from error
+            raise ValueError(one_line(error, "training.", kind)) from error
 
     def with_seed(self, seed: int) -> AgentConfig:
         """The same training with another seed.
@@ -89,7 +95,7 @@ class AgentConfig(Configuration):
 
     def card(self) -> dict[str, Any]:
         """JSON values that identify the training, every hyperparameter spelled out."""
-        return {**self.model_dump(), "training": asdict(self.hyperparameters())}
+        return {**self.model_dump(), "training": self.hyperparameters().model_dump()}
 
 
 def load_config(path: str | Path) -> AgentConfig:
@@ -122,11 +128,11 @@ def train_agent(
 ) -> Path:
     """Trains an agent and writes it to ``out.safetensors`` and ``out.json``.
 
-    A training that was interrupted goes on at its checkpoint, beside `out`; one that is complete is
-    not repeated.
+    A training that was interrupted goes on from its checkpoint, ``out.checkpoint``; one that is
+    complete is not repeated.
 
     Args:
-        config: What to train.
+        config: The training.
         out: File name without suffix.
         progress: Called now and then.
         tensorboard: Folder for a TensorBoard log.
@@ -140,7 +146,6 @@ def train_agent(
     import gymnasium as gym
 
     import ae_env  # noqa: F401  (registers the environment)
-    from agents.policy import PolicyContext
 
     envs = gym.make_vec(
         "ae_env/AutoExposure-v0",
@@ -148,22 +153,23 @@ def train_agent(
         autoreset_mode="SAME_STEP",
         **config.environment,
     )
-    arguments: dict[str, Any] = {"checkpoint": sibling(out, ".checkpoint"), "device": device}
-    network: Any
-    with closing(envs), _logged(progress, tensorboard) as callback:
-        arguments |= {"progress": callback, "identity": config.card()}
-        context = PolicyContext.from_envs(envs)
-        if config.agent == "regression":
-            from agents.learning.regression import save_regression, train_regression
-
-            network = train_regression(envs, config.hyperparameters(), **arguments)
-            save_regression(out, network, context, config.card())
+    training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
+    with closing(envs), _logged(progress, tensorboard) as report:
+        common: dict[str, Any] = {
+            "checkpoint": checkpoint,
+            "progress": report,
+            "device": device,
+            "identity": config.card(),
+        }
+        if isinstance(training, RegressionTraining):
+            network: Any = train_regression(envs, training, **common)
         else:
-            from agents.learning.ppo import save_ppo, train_ppo
+            from agents.learning.ppo import train_ppo
 
-            network = train_ppo(envs, config.hyperparameters(), **arguments)
-            save_ppo(out, network, context, config.card())
-    sibling(out, ".checkpoint").unlink(missing_ok=True)
+            network = train_ppo(envs, training, **common)
+        context = PolicyContext.from_envs(envs)
+    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
+    checkpoint.unlink(missing_ok=True)
     return out
 
 
@@ -177,7 +183,6 @@ def _logged(progress: Progress | None, folder: Path | None) -> Iterator[Progress
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise ImportError("a TensorBoard log needs: pip install 'ae-env[tensorboard]'") from error
-    writer = SummaryWriter(str(folder))
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
         for name, value in values.items():
@@ -185,5 +190,156 @@ def _logged(progress: Progress | None, folder: Path | None) -> Iterator[Progress
         if progress is not None:
             progress(done, total, values)
 
-    with writer:
+    with SummaryWriter(str(folder)) as writer:
         yield report
+
+
+@dataclass(frozen=True)
+class TrainingJob:
+    """One of several agents to train at once.
+
+    Args:
+        name: Shown to the user.
+        config: The training.
+        out: File name of the agent, without suffix.
+        device: Torch device of the network.
+    """
+
+    name: str
+    config: AgentConfig
+    out: Path
+    device: str = "cpu"
+
+
+def train_in_parallel(
+    jobs: Sequence[TrainingJob],
+    *,
+    workers: int | None = None,
+    progress: Callable[[str, int, int, dict[str, float]], None] | None = None,
+) -> None:
+    """Trains every job that is not trained yet, each in a process of its own.
+
+    Args:
+        jobs: Agents to train.
+        workers: Processes at a time, each with its share of the cores; by default one per core.
+        progress: Called with the job's name, frames done, frames in all, and losses.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C; every job has its checkpoint, the same call resumes.
+    """
+    waiting = [job for job in jobs if not is_trained(job.config, job.out)]
+    run_in_parallel(_train, waiting, workers=workers, progress=progress)
+
+
+def _train(job: TrainingJob) -> None:
+    last = 0
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        nonlocal last
+        check_stop()
+        if done == total or done - last >= total // 200:
+            last = done
+            tell(job.name, done, total, values)
+
+    train_agent(job.config, job.out, progress=report, device=job.device)
+
+
+def run_in_parallel(
+    work: Callable[[Any], object],
+    jobs: Sequence[Any],
+    *,
+    workers: int | None = None,
+    progress: Callable[..., None] | None = None,
+) -> None:
+    """Calls ``work(job)`` for every job, in processes of their own.
+
+    Args:
+        work: A function of a module, which reports with `tell`.
+        jobs: Values that can be sent to another process.
+        workers: Processes at a time, each with its share of the cores; by default one per core.
+        progress: Called with the arguments of every `tell`.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C, when every running job has ended at its next `tell`.
+    """
+    if not jobs:
+        return
+    cores = core_count()
+    workers = min(workers or cores, len(jobs))
+    context = multiprocessing.get_context("spawn")
+    stop, messages = context.Event(), context.SimpleQueue()
+
+    def deliver() -> None:
+        while not messages.empty():
+            message = messages.get()
+            if progress is not None:
+                progress(*message)
+
+    with ProcessPoolExecutor(
+        workers,
+        mp_context=context,
+        initializer=_start_worker,
+        initargs=(stop, messages, max(1, cores // workers)),
+    ) as pool:
+        try:
+            running = {pool.submit(_run, work, job) for job in jobs}
+            while running:
+                done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
+                deliver()
+                for future in done:
+                    future.result()
+        finally:  # after an error or Ctrl-C, the jobs that still run end at their next `tell`
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+def core_count() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def tell(*message: object) -> None:
+    """In a worker: sends progress to the process that waits.
+
+    Raises:
+        KeyboardInterrupt: If the worker is to end.
+    """
+    check_stop()
+    _messages.put(message)
+
+
+def check_stop() -> None:
+    """In a worker: ends the job if it is to end; elsewhere does nothing.
+
+    Raises:
+        KeyboardInterrupt: If the worker is to end.
+    """
+    if _stop is not None and _stop.is_set():
+        raise KeyboardInterrupt
+
+
+def _run(work: Callable[[Any], object], job: Any) -> None:
+    check_stop()  # a pool hands out one job more than it has workers, which cannot be cancelled
+    work(job)
+
+
+def _start_worker(stop: Any, messages: Any, threads: int) -> None:
+    """Prepares a worker process."""
+    global _stop, _messages
+    _stop, _messages = stop, messages
+    # Ctrl-C reaches every process of a terminal. Only the one that waits decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    import torch
+
+    torch.set_num_threads(threads)
+
+
+def _end_with_parent() -> None:
+    """Ends this process as soon as the one that started it has ended, however that ended."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

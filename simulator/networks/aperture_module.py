@@ -8,109 +8,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.networks.noise_module import Preset, check_preset
+from simulator.networks.noise_module import Preset, ResidualBlock, check_preset
 from simulator.networks.unet import AttentionUNet
 from simulator.optics.blur import box_mean, disc_blur
 from simulator.optics.disc_bank import DiscBank
 
-# Estimates how defocused each pixel of a photograph is, from its texture.
-#: Discs whose differences are the bands [pixel of diameter]; 0 is the image itself.
-BAND_DIAMETERS = (0.0, 1.5, 3.0, 5.5, 10.0)
-#: Windows over which a band's energy is averaged, and the contrast that it is compared to.
-_ENERGY_WINDOW, _CONTRAST_WINDOW = 7, 25
-#: The network estimates log(diameter + this): its resolution is even where blur is visible.
-LOG_OFFSET = 0.3
-#: Largest diameter that is estimated [pixel].
-LARGEST = 12.0
-
-
-class DefocusMap(nn.Module):
-    """A small network from local band energies to the circle of confusion.
-
-    Defocus removes fine detail first: the energies of neighbouring difference-of-disc bands,
-    relative to the contrast of the neighbourhood, tell by how much. They do not depend on the
-    exposure. The network looks at half the resolution (pixel unshuffle).
-
-    Args:
-        width: Channels of the network.
-        dilations: One residual block each.
-    """
-
-    def __init__(self, width: int = 48, dilations: tuple[int, ...] = (1, 2, 4, 1)) -> None:
-        super().__init__()
-        bands = len(BAND_DIAMETERS) - 1
-        self.head = nn.Conv2d(4 * (2 * bands + 1), width, 3, padding=1)
-        self.blocks = nn.ModuleList(_Block(width, dilation) for dilation in dilations)
-        self.tail = nn.Conv2d(width, 1, 3, padding=1)
-        nn.init.zeros_(self.tail.bias)  # type: ignore[arg-type]
-        with torch.no_grad():
-            self.tail.weight.mul_(0.1)
-
-    def forward(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Logarithm of the blur, ``log(diameter + 0.3)``.
-
-        Args:
-            image: (B, 4, H, W) raw with little noise, any exposure; H, W >= 1.
-            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
-
-        Returns:
-            (B, H, W); the diameter is in pixels of `image`.
-        """
-        height, width = image.shape[-2:]
-        features = F.pad(
-            band_features(image, deviation), (0, width % 2, 0, height % 2), "replicate"
-        )
-        x = F.relu_(self.head(F.pixel_unshuffle(features, 2)))
-        for block in self.blocks:
-            x = block(x)
-        coarse = self.tail(x).float()
-        size = features.shape[-2:]
-        fine = F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
-        return fine[:, 0, :height, :width]
-
-    def diameter(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Diameter of the circle of confusion of each pixel (B, H, W), in pixels of `image`."""
-        return to_diameter(self(image, deviation))
-
-
-def to_diameter(log_blur: Tensor) -> Tensor:
-    """What ``log(diameter + 0.3)`` stands for, in [0, `LARGEST`]."""
-    return (log_blur.clamp(max=3.0).exp() - LOG_OFFSET).clamp(0.0, LARGEST)
-
-
-class _Block(nn.Module):
-    def __init__(self, width: int, dilation: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation)
-        self.second = nn.Conv2d(width, width, 3, padding=1)
-        with torch.no_grad():
-            self.second.weight.mul_(0.3)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) to the same shape."""
-        return self.second(F.relu_(self.first(x))).add_(x)
-
-
-def band_features(image: Tensor, deviation: Tensor) -> Tensor:
-    """What the network sees, (B, 9, H, W): independent of the exposure.
-
-    Four signed bands relative to the local contrast, the logarithms of their local energies
-    relative to it, and the logarithm of the noise relative to it.
-    """
-    grey = image.float().mean(dim=1)
-    # Noise of the mean of four planes.
-    floor = deviation.float().square().mean(dim=1) / 4.0 + 1e-6 * grey.square() + 1e-24
-    discs = [disc_blur(grey, diameter) for diameter in BAND_DIAMETERS]
-    bands = torch.stack([a - b for a, b in itertools.pairwise(discs)], dim=1)
-    energy = box_mean(bands.square(), _ENERGY_WINDOW)
-    contrast = box_mean(bands.square().sum(dim=1, keepdim=True), _CONTRAST_WINDOW) + floor[:, None]
-    signed = (bands / contrast.sqrt()).clamp(-8.0, 8.0)
-    relative = torch.log(energy / contrast + 1e-5)
-    noise = torch.log(floor[:, None] / contrast + 1e-5)
-    return torch.cat([signed, 0.3 * relative + 1.0, 0.3 * noise + 1.0], dim=1)
-
-
-#: Blur below this diameter [pixel] is not told from sharpness, and left as it is.
+#: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
 DEAD_ZONE = 1.0
 #: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
 #: on as defocused.
@@ -121,8 +24,14 @@ _FULL_CONTRAST = 0.05
 _USABLE_WINDOW = 9
 #: Share of a picture's detail that may be no more than soft where it counts as in focus.
 _IN_FOCUS_SHARE = 0.95
-#: Equal parts of `IN_FOCUS` that the weight is summed in before any value is sorted.
-_STEPS = 512
+#: Discs whose differences are the bands [pixel of diameter]; 0 is the image itself.
+BAND_DIAMETERS = (0.0, 1.5, 3.0, 5.5, 10.0)
+#: Windows over which a band's energy is averaged, and the contrast that it is compared to.
+_ENERGY_WINDOW, _CONTRAST_WINDOW = 7, 25
+#: The network estimates log(diameter + this): its resolution is even where blur is visible.
+LOG_OFFSET = 0.3
+#: Largest diameter that is estimated [pixel].
+LARGEST = 12.0
 
 
 class ApertureModule(nn.Module):
@@ -158,7 +67,7 @@ class ApertureModule(nn.Module):
         return DiscBank(image).blurred(added[:, None])
 
     def defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
-        """Circle of confusion of each pixel of the source (B, H, W) [pixel], as far as trusted.
+        """Circle of confusion of each pixel of the source (B, H, W) [pixel]; see `usable_defocus`.
 
         Raises:
             ValueError: If the preset has no such map.
@@ -176,8 +85,8 @@ class ApertureModule(nn.Module):
         return self.network.diameter(image, deviation)
 
     def _residual(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
-        # One scalar per image makes the network see every exposure alike: it then commutes with
-        # exposure, like the compact one.
+        # One scalar per image is divided out before the network and multiplied in after it. So it
+        # sees every exposure alike and commutes with exposure, like the compact one.
         scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
         f_numbers = torch.stack([f_source, f_target], dim=1).float()
         # Eighteen normalisations in a row: bfloat16 would change half of the residual.
@@ -191,7 +100,7 @@ class ApertureModule(nn.Module):
 
 
 def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:
-    """The part of an estimated map that is to be trusted: none of it where nothing is defocused.
+    """The trusted part of an estimated map: zero where the picture shows no defocus.
 
     Args:
         diameter: (B, H, W) as `ApertureModule.estimate_defocus` gives it [pixel].
@@ -224,36 +133,27 @@ def is_defocused(diameter: Tensor, image: Tensor) -> Tensor:
 
 
 def _quantile(values: Tensor, weight: Tensor, low: float, high: float) -> Tensor:
-    """The value that `_IN_FOCUS_SHARE` of the weight does not exceed, told apart in [low, high].
+    """The value that `_IN_FOCUS_SHARE` of the weight does not exceed, clipped to [low, high].
 
-    Only values between matter, as whole frames are sharp or blurred far outside, and of these only
-    the ones near the answer are sorted.
+    Only the values between are sorted: most whole frames are either sharp or blurred far outside.
     """
     wanted = _IN_FOCUS_SHARE * weight.sum(dtype=torch.float64)
-    below = torch.where(values < low, weight, 0.0).sum(dtype=torch.float64)
-    if bool(below >= wanted):
+    reached = torch.where(values < low, weight, 0.0).sum(dtype=torch.float64)
+    if bool(reached >= wanted):
         return values.new_tensor(low)
-    between = ((values >= low) & (values <= high)).nonzero()[:, 0]
-    chosen, share = values[between], weight[between].double()
-    step = ((chosen - low) * (_STEPS / (high - low))).long()  # ascends with the value
-    sums = torch.zeros(_STEPS + 2, dtype=torch.float64, device=values.device)
-    reached = below + sums.index_add_(0, step + 1, share).cumsum(dim=0)
-    place = int((reached < wanted).sum()) - 1
-    if place > _STEPS:
-        return values.new_tensor(high)
-    near = (step == place).nonzero()[:, 0]
-    chosen, order = chosen[near].sort()
-    reached = reached[place] + share[near][order].cumsum(dim=0)
-    last = min(
-        int((reached < wanted).sum()), len(chosen) - 1
-    )  # sums in another order may fall short
-    return chosen[last]
+    between = (values >= low) & (values <= high)
+    chosen, order = values[between].sort()
+    sums = reached + weight[between].double()[order].cumsum(dim=0)
+    index = int((sums < wanted).sum())
+    return chosen[index] if index < len(chosen) else values.new_tensor(high)
 
 
 def dead_zone(diameter: Tensor, size: float = DEAD_ZONE) -> Tensor:
     """``sqrt(max(c^2 - size^2, 0))``: keeps regions in focus unchanged."""
-    excess = diameter.square() - size**2
-    return torch.where(excess > 0, excess.clamp(min=1e-12).sqrt(), 0.0)  # no infinite gradient
+    remainder = diameter.square() - size**2
+    return torch.where(
+        remainder > 0, remainder.clamp(min=1e-12).sqrt(), 0.0
+    )  # no infinite gradient
 
 
 def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | float) -> Tensor:
@@ -264,3 +164,80 @@ def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | fl
     """
     ratio = torch.as_tensor(f_source) / torch.as_tensor(f_target)
     return diameter * (ratio.square() - 1.0).clamp(min=0.0).sqrt().to(diameter)
+
+
+class DefocusMap(nn.Module):
+    """A small network that estimates how defocused each pixel of a photograph is, from its texture.
+
+    Defocus removes fine detail first: the energies of neighbouring difference-of-disc bands,
+    relative to the contrast of the neighbourhood, tell by how much. They do not depend on the
+    exposure. The network works at half the resolution (pixel unshuffle).
+
+    Args:
+        width: Channels of the network.
+        dilations: Dilation of each residual block.
+    """
+
+    def __init__(self, width: int = 48, dilations: tuple[int, ...] = (1, 2, 4, 1)) -> None:
+        super().__init__()
+        bands = len(BAND_DIAMETERS) - 1
+        self.head = nn.Conv2d(4 * (2 * bands + 1), width, 3, padding=1)
+        self.blocks = nn.ModuleList(
+            ResidualBlock(width, dilation=dilation, bias=True) for dilation in dilations
+        )
+        self.tail = nn.Conv2d(width, 1, 3, padding=1)
+        nn.init.zeros_(self.tail.bias)  # type: ignore[arg-type]
+        with torch.no_grad():  # starts near a constant map
+            self.tail.weight.mul_(0.1)
+            for block in self.blocks:
+                block.second.weight.mul_(0.3)  # type: ignore[operator, union-attr]
+
+    def forward(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """Logarithm of the blur, ``log(diameter + 0.3)``.
+
+        Args:
+            image: (B, 4, H, W) raw with little noise, any exposure; H, W >= 1.
+            deviation: (B, 4, H, W) standard deviation of the noise that was removed from it.
+
+        Returns:
+            (B, H, W); the diameter is in pixels of `image`.
+        """
+        height, width = image.shape[-2:]
+        features = F.pad(
+            band_features(image, deviation), (0, width % 2, 0, height % 2), "replicate"
+        )
+        x = F.relu_(self.head(F.pixel_unshuffle(features, 2)))
+        for block in self.blocks:
+            x = block(x)
+        coarse = self.tail(x).float()
+        size = features.shape[-2:]
+        fine = F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+        return fine[:, 0, :height, :width]
+
+    def diameter(self, image: Tensor, deviation: Tensor) -> Tensor:
+        """Diameter of the circle of confusion of each pixel (B, H, W), in pixels of `image`."""
+        return to_diameter(self(image, deviation))
+
+
+def to_diameter(log_blur: Tensor) -> Tensor:
+    """Diameter whose ``log(diameter + 0.3)`` is `log_blur`, in [0, `LARGEST`]."""
+    return (log_blur.clamp(max=3.0).exp() - LOG_OFFSET).clamp(0.0, LARGEST)
+
+
+def band_features(image: Tensor, deviation: Tensor) -> Tensor:
+    """Input of `DefocusMap`, (B, 9, H, W), which does not depend on the exposure.
+
+    Four signed bands relative to the local contrast, the logarithms of their local energies
+    relative to it, and the logarithm of the noise relative to it.
+    """
+    grey = image.float().mean(dim=1)
+    # Noise of the mean of four planes.
+    floor = deviation.float().square().mean(dim=1) / 4.0 + 1e-6 * grey.square() + 1e-24
+    discs = [disc_blur(grey, diameter) for diameter in BAND_DIAMETERS]
+    bands = torch.stack([a - b for a, b in itertools.pairwise(discs)], dim=1)
+    energy = box_mean(bands.square(), _ENERGY_WINDOW)
+    contrast = box_mean(bands.square().sum(dim=1, keepdim=True), _CONTRAST_WINDOW) + floor[:, None]
+    signed = (bands / contrast.sqrt()).clamp(-8.0, 8.0)
+    relative = torch.log(energy / contrast + 1e-5)
+    noise = torch.log(floor[:, None] / contrast + 1e-5)
+    return torch.cat([signed, 0.3 * relative + 1.0, 0.3 * noise + 1.0], dim=1)

@@ -1,8 +1,6 @@
-"""Exposure module: the linear change of brightness, and what a body gets wrong about it."""
+"""Exposure module: the linear change of brightness, corrected for the errors of a body."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -14,9 +12,9 @@ OVER_EXPOSED = 0.99
 class ExposureModule(nn.Module):
     """``w * ratio * (raw + b)``, w a scalar (from 1) and b one number per plane (from 0).
 
-    b makes up for an inaccurate black level, w for a shutter and a lens that do not do quite what
-    they say (paper, section 3.1; the model of Abdelhamed et al. 2018). The paper clips the result
-    to [0, 1]; here the clip comes last, after blur and noise (see `simulator.capture.record`).
+    b corrects an inaccurate black level, w a shutter and a lens that deviate from their nominal
+    values (paper, section 3.1; the model of Abdelhamed et al. 2018). The paper clips the result
+    to [0, 1]; here the clip comes last, after blur and noise (see `simulator.capture`).
     """
 
     def __init__(self) -> None:
@@ -42,15 +40,14 @@ class ExposureModule(nn.Module):
         return bool(self.w == 1.0) and not bool(self.b.any())
 
 
-@dataclass
 class LinearFit:
-    """Accumulates the weighted least squares of w and b over pairs of captures.
+    """Accumulates the least squares of w and b over pairs of captures.
 
     Minimises ``sum((w ratio (I_1 + b_p) - I_2)^2)`` over pixels with I_1 <= 0.99: linear in w and
     in ``v_p = w b_p``, five unknowns.
     """
 
-    def __post_init__(self) -> None:
+    def __init__(self) -> None:
         self._normal = torch.zeros(5, 5, dtype=torch.float64)
         self._right = torch.zeros(5, dtype=torch.float64)
 
@@ -80,7 +77,7 @@ class LinearFit:
         """
         try:
             solution = torch.linalg.solve(self._normal, self._right)
-        except torch.linalg.LinAlgError:
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
             raise ValueError("`captures` must hold unsaturated pixels of every plane") from None
         module = ExposureModule()
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What networks found out about sources, kept so that no network runs twice for one result."""
+"""Results of networks, cached so that no network runs twice for one result."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from simulator.utils.cache import DiskCache, LruCache, cache_key, content_digest
 
 #: ``"memory"``, or ``"disk"``: both in memory and in files that later runs find.
 Where = Literal["memory", "disk"]
-#: Bumped when the networks are run in another way, such that older results no longer hold.
-RESULT_VERSION = 1
-#: What is kept in memory at most; one 24-megapixel frame takes 96 million [byte].
+#: Most bytes in memory; one 24-megapixel frame takes 96 million.
 MEMORY_BYTES = 2**28
 
 
@@ -22,8 +20,8 @@ class NetworkCache:
     """Results by the content of everything that they depend on: inputs, numbers and weights.
 
     Args:
-        where: Where results are kept; None keeps nothing.
-        max_bytes: What they may take in memory.
+        where: Where results are cached; None caches nothing.
+        max_bytes: Most bytes in memory.
 
     Raises:
         ValueError: If `where` is unknown.
@@ -43,15 +41,20 @@ class NetworkCache:
         modules: Sequence[nn.Module],
         inputs: Mapping[str, Tensor | None],
         make: Callable[[], Tensor],
+        *,
+        shape: Sequence[int] | None = None,
         **numbers: Any,
     ) -> Tensor:
-        """What `make` gives, or gave when everything was the same: the same values, bit by bit.
+        """The result of `make`, or an earlier one of the same inputs: the same values, bit by bit.
+
+        A stored result that is not finite, or of another shape, is made again.
 
         Args:
             kind: One of `simulator.utils.cache.CACHE_KINDS`.
             modules: The networks that `make` runs; their weights may change in between.
             inputs: Tensors that the result depends on; None where there is none.
             make: Makes the result.
+            shape: Shape of the result, where it is known beforehand.
             numbers: JSON values that the result depends on.
         """
         if self.where is None:
@@ -59,7 +62,6 @@ class NetworkCache:
         given = {name: tensor for name, tensor in inputs.items() if tensor is not None}
         device = next(modules[0].parameters()).device
         description = {
-            "version": RESULT_VERSION,
             "kind": kind,
             "weights": [self._fingerprint(module) for module in modules],
             "inputs": content_digest(given),
@@ -67,12 +69,12 @@ class NetworkCache:
             **numbers,
         }
         key = cache_key(description)
-        kept = self.memory.get(key)
-        if kept is not None and kept[1] == _changes(kept[0]):
-            return kept[0]
-        stored = None if self._disk is None else self._disk.get(kind, key)
-        if stored is not None and "result" in stored:
-            tensor = stored["result"].to(device)
+        cached = self.memory.get(key)
+        if cached is not None and cached[1] == _changes(cached[0]):
+            return cached[0]
+        tensor = self._stored(kind, key, shape)
+        if tensor is not None:
+            tensor = tensor.to(device)
         else:
             tensor = make().contiguous()  # as it comes from disk: later sums round alike
             if self._disk is not None:
@@ -81,14 +83,23 @@ class NetworkCache:
         return tensor
 
     def called(self, kind: str, module: nn.Module, *inputs: Tensor) -> Tensor:
-        """``module(*inputs)``, or what it was when everything was the same; see `result`."""
+        """``module(*inputs)``, of the shape of the first input; see `result`."""
         named = {str(i): tensor for i, tensor in enumerate(inputs)}
-        return self.result(kind, [module], named, lambda: module(*inputs))
+        shape = inputs[0].shape
+        return self.result(kind, [module], named, lambda: module(*inputs), shape=shape)
+
+    def _stored(self, kind: str, key: str, shape: Sequence[int] | None) -> Tensor | None:
+        """A result from disk, if there is a plausible one."""
+        stored = None if self._disk is None else self._disk.get(kind, key)
+        tensor = None if stored is None else stored.get("result")
+        if tensor is None or (shape is not None and tensor.shape != tuple(shape)):
+            return None
+        return tensor if bool(tensor.isfinite().all()) else None
 
     def _fingerprint(self, module: nn.Module) -> str:
-        """Digest of the module's weights; worked out again only where one was changed in place."""
+        """Digest of the module's weights, computed again only after one was changed in place."""
         state = module.state_dict()
-        # Fused optimisers change values without counting it, so the sums are looked at, too.
+        # Fused optimisers change values without counting it, so the sums are compared, too.
         sums = torch.stack([tensor.sum(dtype=torch.float64) for tensor in state.values()])
         marks = [*sums.tolist(), *((t.data_ptr(), _changes(t)) for t in state.values())]
         known = self._fingerprints.get(id(module))

@@ -16,14 +16,15 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from simulator.networks.aperture_module import ApertureModule
-from simulator.networks.baselines import DecoupledNet, ParameterConcatenation
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule
+from simulator.networks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator.utils.files import sibling, write_atomically
 
-# From the name of a preset to its untrained modules.
-#: What can be trained: the two presets of the simulator, and the paper's two baselines.
+#: Everything that can be trained: the two presets of the simulator, and the paper's two baselines.
 PRESETS = ("compact", "paper", "pc", "dl")
+#: Increased when the networks change such that older weights no longer fit.
+FORMAT_VERSION = 1
 
 
 def build_modules(preset: str) -> nn.ModuleDict:
@@ -41,10 +42,6 @@ def build_modules(preset: str) -> nn.ModuleDict:
     )
 
 
-#: Bumped when the networks change such that older weights no longer fit.
-FORMAT_VERSION = 1
-
-
 def list_pretrained() -> list[str]:
     """Names of the weights that come with the package."""
     folder = resources.files("simulator").joinpath("pretrained")
@@ -60,7 +57,7 @@ def save_modules(path: Path, modules: nn.Module, preset: str, card: dict[str, An
     Args:
         path: File name, with or without one of the two endings.
         modules: Their state is stored.
-        preset: What `simulator.networks.weights.build_modules` makes them from.
+        preset: Name that `build_modules` makes them from.
         card: JSON values: how they were trained and what they score.
 
     Raises:
@@ -171,7 +168,8 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     except RuntimeError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"`weights` (={str(name)!r}) do not fit the networks: {text}") from error
-    return modules.eval().requires_grad_(False).to(memory_format=torch.channels_last), card  # type: ignore[call-overload, return-value]
+    modules.eval().requires_grad_(False)
+    return modules.to(memory_format=torch.channels_last), card  # type: ignore[call-overload]
 
 
 def _check_card(card: dict[str, Any], name: str | Path) -> None:

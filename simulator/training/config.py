@@ -1,4 +1,4 @@
-"""What decides a training of the simulator's modules."""
+"""Configuration of a training of the simulator's modules."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pydantic import Field, model_validator
 
 from simulator.camera import get_camera
 from simulator.utils.config_file import Configuration, load_yaml
+
+_STAGES = ("exposure", "noise", "aperture", "baseline")
 
 
 class StageConfig(Configuration):
@@ -37,13 +39,12 @@ class StageConfig(Configuration):
 
 
 class SceneConfig(Configuration):
-    """What the reference camera photographs.
+    """Scenes that the reference camera photographs.
 
     Args:
         procedural: Procedural scenes in the training split; three quarters of them have depth.
         size: Height and width of a scene [packed pixel].
-        radiance: Folder of radiance maps (those named in `ae_env.scenes.reference_scenes`), searched with
-            its subfolders; null leaves them out.
+        radiance: Folder of radiance maps, searched with its subfolders; null leaves them out.
     """
 
     procedural: int = Field(default=240, ge=1, le=100_000)
@@ -61,7 +62,7 @@ class SimulatorConfig(Configuration):
         body: Seed of the hidden error of its body.
         seed: Seed of everything that is random.
         precision: Of the networks; weights, optimiser and losses stay float32.
-        scenes: What is photographed.
+        scenes: Scenes of the sequences.
         exposure, noise, aperture: The three stages of a preset.
         baseline: The stage of ``"pc"`` and ``"dl"``.
     """
@@ -80,7 +81,7 @@ class SimulatorConfig(Configuration):
     @model_validator(mode="after")
     def _check(self) -> SimulatorConfig:
         get_camera(self.camera)
-        for name in ("exposure", "noise", "aperture", "baseline"):
+        for name in _STAGES:
             wanted = (name == "baseline") == (self.preset in ("pc", "dl"))
             if wanted != (getattr(self, name) is not None):
                 rule = "must be given" if wanted else "must be left out"
@@ -95,11 +96,10 @@ class SimulatorConfig(Configuration):
 
     def stages(self) -> dict[str, StageConfig]:
         """The stages by name, in order."""
-        names = ("exposure", "noise", "aperture", "baseline")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return {name: getattr(self, name) for name in _STAGES if getattr(self, name) is not None}
 
     def card(self, last_stage: str | None = None) -> dict[str, Any]:
-        """JSON values that identify the training, or what it does up to and with `last_stage`."""
+        """JSON values that identify the training, without the stages after `last_stage`."""
         values = self.model_dump(mode="json", exclude_none=True)
         names = list(self.stages())
         later = [] if last_stage is None else names[names.index(last_stage) + 1 :]

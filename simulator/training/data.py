@@ -17,7 +17,7 @@ from simulator.reference.sequences import Pair, Stage, draw_settings, select_pai
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.settings import CameraSettings, exposure_ratio
 
-#: Called with what is done and what there is to do.
+#: Called with the number of scenes that are rendered, and of all.
 Progress = Callable[[int, int], None]
 
 
@@ -27,7 +27,7 @@ class Batch:
 
     Args:
         source: (B, 4, H, W) the input capture, noisy.
-        target: (B, 4, H, W) what the target settings show without noise, clipped.
+        target: (B, 4, H, W) the target capture without noise, clipped.
         sample: (B, 4, H, W) the target capture, noisy.
         ratio: (B,) nominal exposure ratio from source to target.
         shot: (B, 4) slope of the source's noise variance, on the source's scale.
@@ -71,16 +71,16 @@ def draw_sequences(
 class ReferencePairs:
     """Pairs of one stage, photographed by the reference camera whenever they are asked for.
 
-    Which pairs there are is fixed when this is made. Light behind every aperture is rendered once;
-    a batch then costs the exposure and the noise of its crops. Noise is drawn anew every time: a
-    pair that is shown twice was photographed twice.
+    The pairs are chosen once, at construction. Light behind every aperture is rendered once; a
+    batch then costs the exposure and the noise of its crops. The noise is new every time: a pair
+    that is shown twice was photographed twice.
 
     Args:
         sequences: Scenes and settings.
         camera: The body.
-        stage: Whose pairs, see `simulator.reference.sequences.select_pairs`.
+        stage: Stage to train, see `simulator.reference.sequences.select_pairs`.
         seed: Seed of pairs, crops and noise.
-        optics: Rendered light to share between stages; filled as needed.
+        blurred_light: Rendered light to share between stages; filled as needed.
         progress: Called while the light is rendered.
 
     Raises:
@@ -197,7 +197,7 @@ class ReferencePairs:
 
 
 def settings_parameters(settings: CameraSettings) -> tuple[float, float, float]:
-    """What the baselines are told: log2 of ISO / 100, exposure time [s] and f-number."""
+    """Parameters for the baselines: log2 of ISO / 100, exposure time [s] and f-number."""
     return (
         math.log2(settings.iso / 100.0),
         math.log2(settings.exposure_time),

@@ -1,4 +1,4 @@
-"""What each stage minimises: one number per batch, and values worth a plot."""
+"""Losses of the stages: one number per batch to minimise, and values worth a plot."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from simulator.training.data import Batch
 
 #: Weight of the loss on the logarithm of the circle of confusion beside that on the picture.
 _MAP_WEIGHT = 0.1
-#: Pixels around a clipped highlight that the aperture stage leaves out: what was there is unknown.
+#: Pixels around a clipped highlight that the aperture stage leaves out: the light there is unknown.
 _CLIP_MARGIN = 7
-#: A source with less noise than this (standard deviation) counts as having this much: black, and
-#: free of noise, it would have none to be measured by. Cameras have 7e-5 and more.
+#: Least unit of the noise stage (standard deviation). A black source without noise would have no
+#: noise to measure the error by. Cameras have 7e-5 and more.
 _LEAST_NOISE = 1e-6
 
 

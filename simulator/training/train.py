@@ -1,12 +1,16 @@
-"""From a configuration to weights: the stages in turn, each on its own pairs."""
+"""From a configuration to weights: the stages in turn, each on its own pairs of captures.
+
+Accelerate does the plumbing: devices, precision, several processes, logs.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,45 +21,106 @@ from simulator.camera import get_camera
 from simulator.networks.weights import build_modules, save_modules
 from simulator.reference.reference_camera import DRAPED, BodyError, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Stage
-from simulator.training.config import SimulatorConfig
+from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.loop import train_stage
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
+from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.files import sibling
 from simulator.utils.results import result_meta
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-#: Makes the scenes of a split, ``"train"`` or ``"validation"``; `ae_env.scenes.reference_scenes` has them.
+#: Makes the scenes of a split, ``"train"`` or ``"validation"``, such as
+#: `ae_env.scenes.reference_scenes` does.
 SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]
 #: Fixed batches that a trained stage is validated on.
 _VALIDATION_STEPS, _VALIDATION_BATCH = 8, 8
+#: Pairs that each stage is trained on, see `simulator.reference.sequences.select_pairs`.
 _PAIRS: dict[str, Stage] = {
     "exposure": "exposure",
     "noise": "noise",
     "aperture": "aperture",
     "baseline": "all",
 }
+#: Share of the budget in which the learning rate rises.
+_RISE = 0.05
+#: Largest norm of a gradient.
+_GRADIENT_NORM = 1.0
+#: Steps between two log entries, and the memory of the running means that are logged.
+_LOG_EVERY, _SMOOTHING = 20, 0.98
 
 
-@dataclass
-class Trained:
-    """What a training made.
+def train_and_save(
+    config: SimulatorConfig,
+    make_scenes: SceneMaker,
+    path: Path,
+    *,
+    command: str,
+    device: str = "cpu",
+    tensorboard: bool = False,
+    progress: TrainingProgress | None = None,
+) -> Path:
+    """Trains the stages of `config` and writes the weights with their model card.
+
+    A stage that is done or half done resumes from its checkpoint.
 
     Args:
-        modules: By name: ``exposure``, ``noise``, ``aperture``, or ``baseline``.
-        stages: Per stage: pairs, steps, seconds, and the loss on validation scenes.
-        scenes: Scenes of the training split by kind.
-        is_main: Whether this is the process that writes, of several.
-    """
+        config: The training.
+        make_scenes: Gives the scenes of a split.
+        path: File name of the weights; checkpoints and logs go into its folder.
+        command: The command line that does it again, for the card.
+        device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
+        tensorboard: Whether to log to ``tensorboard`` in that folder.
+        progress: Called while scenes are rendered and every few steps.
 
-    modules: nn.ModuleDict
-    stages: dict[str, dict[str, Any]] = field(default_factory=dict)
-    scenes: dict[str, int] = field(default_factory=dict)
-    is_main: bool = True
+    Returns:
+        The file of the weights.
+    """
+    folder = path.parent
+    accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
+    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
+        torch.default_generator.manual_seed(config.seed)
+        modules = build_modules(config.preset)
+    sources = {split: _Source(config, make_scenes, split) for split in ("train", "validation")}
+    if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
+        progress = None
+    stages: dict[str, dict[str, Any]] = {}
+    for name, stage in config.stages().items():
+        pairs = sources["train"].pairs(name, _titled(progress, f"{name}: rendering"))
+        loss = _loss(name, modules)
+        clock = train_stage(
+            name,
+            loss,
+            modules[name],
+            pairs,
+            stage,
+            accelerator,
+            checkpoint=folder / f"{name}.checkpoint",
+            identity=config.card(last_stage=name),
+            progress=None if progress is None else functools.partial(progress, f"{name}: training"),
+        )
+        held_out = sources["validation"].pairs(name, None)
+        stages[name] = {
+            "pairs": len(pairs.pairs),
+            "steps": clock.step,
+            "seconds": round(clock.seconds, 1),
+            "validation": validate(loss, held_out, stage.crop, accelerator),
+        }
+    is_main = accelerator.is_main_process
+    accelerator.end_training()
+    if is_main:
+        meta = result_meta(command, config.seed)
+        card = {
+            "training": config.card(),
+            "scenes": dict(Counter(s.scene.kind for s in sources["train"].sequences)),
+            "stages": stages,
+            **{k: meta[k] for k in ("command", "commit", "date", "machine", "versions")},
+        }
+        save_modules(path, modules.to("cpu").eval(), config.preset, card)
+    return sibling(path, ".safetensors")
 
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:
@@ -84,62 +149,8 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
     return accelerator
 
 
-def train_simulator(
-    config: SimulatorConfig,
-    make_scenes: SceneMaker,
-    folder: Path,
-    *,
-    device: str = "cpu",
-    tensorboard: bool = False,
-    progress: TrainingProgress | None = None,
-) -> Trained:
-    """Trains the stages of `config`; one that is done or half done is taken up where it was.
-
-    Args:
-        config: The training.
-        make_scenes: Gives the scenes of a split.
-        folder: Where checkpoints and logs go.
-        device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
-        tensorboard: Whether to log there.
-        progress: Called while scenes are rendered and every few steps.
-    """
-    logs = folder / "tensorboard" if tensorboard else None
-    accelerator = make_accelerator(config, device, logs)
-    torch.manual_seed(config.seed)
-    trained = Trained(build_modules(config.preset))
-    sources = {split: _Source(config, make_scenes, split) for split in ("train", "validation")}
-    trained.scenes = dict(Counter(s.scene.kind for s in sources["train"].sequences))
-    for name, stage in config.stages().items():
-        # Nobody looks at the bars of the other processes.
-        shown = progress if accelerator.is_main_process else None
-        pairs = sources["train"].pairs(name, _titled(shown, f"{name}: rendering"))
-        loss = _loss(name, trained.modules)
-        clock = train_stage(
-            name,
-            loss,
-            trained.modules[name],
-            pairs,
-            stage,
-            accelerator,
-            checkpoint=folder / f"{name}.checkpoint",
-            identity=config.card(last_stage=name),
-            progress=None if shown is None else functools.partial(shown, f"{name}: training"),
-        )
-        held_out = sources["validation"].pairs(name, None)
-        trained.stages[name] = {
-            "pairs": len(pairs.pairs),
-            "steps": clock.step,
-            "seconds": round(clock.seconds, 1),
-            "validation": validate(loss, held_out, stage.crop, accelerator),
-        }
-    trained.is_main = accelerator.is_main_process
-    accelerator.end_training()
-    trained.modules.to("cpu").eval()
-    return trained
-
-
 class _Source:
-    """The pairs of one split; what is rendered for a stage serves the next."""
+    """Pairs of one split. Light that is rendered for a stage serves the next."""
 
     def __init__(self, config: SimulatorConfig, make_scenes: SceneMaker, split: str) -> None:
         camera = get_camera(config.camera)
@@ -176,11 +187,182 @@ def _titled(progress: TrainingProgress | None, title: str) -> Callable[[int, int
     return lambda done, total: progress(title, done / max(total, 1), {})
 
 
+def _loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
+    known: Any = modules
+    if stage == "exposure":
+        return ExposureLoss(known["exposure"])
+    if stage == "noise":
+        return NoiseLoss(known["exposure"], known["noise"])
+    if stage == "aperture":
+        return ApertureLoss(known["exposure"], known["noise"], known["aperture"])
+    return BaselineLoss(known["baseline"])
+
+
+def train_stage(
+    name: str,
+    loss: nn.Module,
+    trained: nn.Module,
+    pairs: ReferencePairs,
+    stage: StageConfig,
+    accelerator: Accelerator,
+    *,
+    checkpoint: Path,
+    identity: Any,
+    progress: Callable[[float, dict[str, float]], None] | None = None,
+) -> Clock:
+    """Trains `trained` until the stage's budget is used up.
+
+    A stage that was interrupted resumes from its last checkpoint, at most 20 s back. Batches are
+    drawn by step, so where the budget is in steps it goes on as if it had not been interrupted.
+
+    Args:
+        name: Of the stage, for log and checkpoint.
+        loss: Maps a `Batch` to a mapping with ``"loss"``; holds `trained`.
+        trained: The module whose parameters change.
+        pairs: Where the batches come from.
+        stage: Budget, batch, crop and learning rate.
+        accelerator: Devices, precision, processes.
+        checkpoint: File of the state.
+        identity: JSON value; a checkpoint of another training is not taken over.
+        progress: Called every few steps with the share of the stage that is done, in [0, 1], and
+            the latest values.
+
+    Returns:
+        Steps and seconds that were used.
+
+    Raises:
+        ValueError: If the loss is not finite.
+    """
+    device = accelerator.device
+    loss.requires_grad_(False)
+    trained.requires_grad_(True)
+    loss.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.Adam(trained.parameters(), lr=stage.learning_rate)
+    clock = Clock(stage, on_cpu=device.type == "cpu")
+    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer}
+    if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
+        parts["scaler"] = accelerator.scaler
+    state = Checkpoint(
+        checkpoint,
+        [name, identity],
+        lambda: {
+            "step": clock.step,
+            "seconds": clock.seconds,
+            **{part: own.state_dict() for part, own in parts.items()},
+        },
+        writes=accelerator.is_main_process,
+    )
+    past = state.load()
+    if past is not None:
+        clock.step, clock.seconds = int(past["step"]), float(past["seconds"])
+        for part, own in parts.items():
+            own.load_state_dict(past[part])
+    wrapped, stepper = accelerator.prepare(loss, optimizer)
+    means: dict[str, float] = {}
+    clock.start()
+    with state:
+        while clock.share < 1.0:
+            optimizer.param_groups[0]["lr"] = learning_rate(clock.share, stage.learning_rate)
+            rank = accelerator.process_index
+            batch = pairs.batch(clock.step, stage.batch, stage.crop, process=rank)
+            values = wrapped(batch.to(device))
+            _follow(means, values, name)
+            accelerator.backward(values["loss"])
+            accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
+            stepper.step()
+            clock.tick()
+            _agree(clock, accelerator)
+            stepper.zero_grad()
+            if clock.step % _LOG_EVERY == 0 or clock.share >= 1.0:
+                accelerator.log({f"{name}/{k}": v for k, v in means.items()}, step=clock.step)
+                if progress is not None:
+                    progress(clock.share, means)
+            state.save_when_due()
+    return clock
+
+
+@dataclass
+class Clock:
+    """Steps and time that a stage has used of its budget.
+
+    Args:
+        stage: The budget.
+        on_cpu: Whether minutes are processor minutes of this process or wall-clock minutes.
+        step: Steps so far.
+        seconds: Time so far.
+    """
+
+    stage: StageConfig
+    on_cpu: bool
+    step: int = 0
+    seconds: float = 0.0
+    _started: float = 0.0
+
+    def start(self) -> None:
+        """Starts to count time, from the seconds so far."""
+        self._started = self._now() - self.seconds
+
+    def tick(self) -> None:
+        """Counts a step."""
+        self.step += 1
+        self.seconds = self._now() - self._started
+
+    @property
+    def share(self) -> float:
+        """Share of the budget that is used, in [0, 1]."""
+        if self.stage.steps is not None:
+            return min(self.step / self.stage.steps, 1.0)
+        assert self.stage.minutes is not None
+        return min(self.seconds / (60.0 * self.stage.minutes), 1.0)
+
+    def _now(self) -> float:
+        return time.process_time() if self.on_cpu else time.monotonic()
+
+
+def learning_rate(share: float, peak: float) -> float:
+    """One cycle: rises linearly over the first 5 % of the budget, falls to 0 as a cosine.
+
+    >>> learning_rate(0.05, 1.0), round(learning_rate(0.525, 1.0), 3), learning_rate(1.0, 1.0)
+    (1.0, 0.5, 0.0)
+    """
+    if share < _RISE:
+        return peak * max(share / _RISE, 1e-3)
+    return peak * 0.5 * (1.0 + math.cos(math.pi * (share - _RISE) / (1.0 - _RISE)))
+
+
+def _agree(clock: Clock, accelerator: Accelerator) -> None:
+    """Sets every process's clock by the main one's.
+
+    All of them must stop after the same step, as each step waits for all of them.
+    """
+    if accelerator.num_processes > 1:
+        from accelerate.utils import broadcast
+
+        seconds = torch.tensor(clock.seconds, dtype=torch.float32, device=accelerator.device)
+        clock.seconds = float(broadcast(seconds))
+
+
+def _follow(means: dict[str, float], values: dict[str, torch.Tensor], name: str) -> None:
+    """Updates the running means by the values of a step.
+
+    Raises:
+        ValueError: If the loss is not finite.
+    """
+    for key, value in values.items():
+        number = float(value.detach())
+        if key == "loss" and not math.isfinite(number):
+            raise ValueError(
+                f"stage {name!r}: the loss (={number}) must be finite; lower `learning_rate`"
+            )
+        if math.isfinite(number):
+            means[key] = _SMOOTHING * means.get(key, number) + (1.0 - _SMOOTHING) * number
+
+
 @torch.no_grad()
 def validate(
     loss: nn.Module, pairs: ReferencePairs, crop: int, accelerator: Accelerator
 ) -> dict[str, float]:
-    """Means of what `loss` gives on 64 fixed pairs."""
+    """Means of the values of `loss` on 64 fixed pairs."""
     means: dict[str, float] = {}
     loss.eval()
     for step in range(_VALIDATION_STEPS):
@@ -191,58 +373,3 @@ def validate(
             means[key] = means.get(key, 0.0) + float(value) / _VALIDATION_STEPS
     loss.train()
     return {key: round(value, 5) for key, value in means.items() if math.isfinite(value)}
-
-
-def train_and_save(
-    config: SimulatorConfig,
-    make_scenes: SceneMaker,
-    path: Path,
-    *,
-    command: str,
-    device: str = "cpu",
-    tensorboard: bool = False,
-    progress: TrainingProgress | None = None,
-) -> Path:
-    """Trains, and writes the weights with their model card beside the checkpoints.
-
-    Args:
-        config: The training.
-        make_scenes: Gives the scenes of a split.
-        path: File name of the weights; checkpoints and logs go into its folder.
-        command: The command line that does it again, for the card.
-        device: See `train_simulator`.
-        tensorboard: See `train_simulator`.
-        progress: See `train_simulator`.
-
-    Returns:
-        The file of the weights.
-    """
-    trained = train_simulator(
-        config,
-        make_scenes,
-        path.parent,
-        device=device,
-        tensorboard=tensorboard,
-        progress=progress,
-    )
-    meta = result_meta(command, config.seed)
-    card = {
-        "training": config.card(),
-        "scenes": trained.scenes,
-        "stages": trained.stages,
-        **{k: meta[k] for k in ("command", "commit", "date", "machine", "versions")},
-    }
-    if trained.is_main:
-        save_modules(path, trained.modules, config.preset, card)
-    return sibling(path, ".safetensors")
-
-
-def _loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
-    known: Any = modules
-    if stage == "exposure":
-        return ExposureLoss(known["exposure"])
-    if stage == "noise":
-        return NoiseLoss(known["exposure"], known["noise"])
-    if stage == "aperture":
-        return ApertureLoss(known["exposure"], known["noise"], known["aperture"])
-    return BaselineLoss(known["baseline"])

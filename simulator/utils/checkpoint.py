@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import copy
-import hashlib
+import importlib.metadata
 import io
 import json
 import logging
 import time
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 
-from simulator.utils.cache import content_digest
 from simulator.utils.files import write_atomically
 
 _LOGGER = logging.getLogger(__name__)
+#: Least time between two checkpoints of a training [s].
+INTERVAL = 20.0
 
 
 def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
@@ -68,129 +66,64 @@ def load_checkpoint(path: str | Path) -> dict[str, Any] | None:
     return state
 
 
-# -- the former way, until no training uses it any more --
-#: What reading a damaged file, or one of something else, ends in.
-_UNFIT = (
-    SafetensorError,
-    OSError,
-    LookupError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    RuntimeError,
-)
-
-
-class HasState(Protocol):
-    """A module, an optimiser or a schedule."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Its state."""
-
-    def load_state_dict(self, state: dict[str, Any], /) -> Any:
-        """Takes a state over."""
-
-
 class Checkpoint:
-    """Keeps the state of several objects and a step count in one safetensors file.
+    """The checkpoint of one training, written now and then while the training runs.
+
+    Used as a context manager around the training loop, it also writes the state when the loop ends
+    and when Ctrl-C or SIGTERM ends it. After an error nothing is written: the state may be what
+    went wrong.
 
     Args:
-        path: The file; None keeps nothing.
-        parts: Modules, optimisers, schedules by name.
-        interval: Least time between two saves [s].
-        identity: JSON value that says what is trained and how; the state of another training is
-            not taken over.
+        path: The file; None writes and reads nothing.
+        identity: JSON value that says what is trained and how. A checkpoint of another training, or
+            of another version of this package, is not resumed.
+        state: Called for the state to write; see `save_checkpoint`.
+        writes: False in the processes of a distributed training that only read.
     """
 
     def __init__(
         self,
         path: Path | None,
-        parts: Mapping[str, HasState],
-        interval: float = 20.0,
-        identity: Any = None,
+        identity: Any,
+        state: Callable[[], Mapping[str, Any]],
+        *,
+        writes: bool = True,
     ) -> None:
-        self.path, self.parts, self.interval = path, dict(parts), interval
-        self._identity = json.loads(json.dumps(identity))
+        self.path, self.state, self.writes = path, state, writes
+        version = importlib.metadata.version("ae-env")
+        # Through JSON, as tuples compare unequal to the lists that they come back as.
+        self.identity = json.dumps({"version": version, "training": identity}, sort_keys=True)
         self._saved = time.monotonic()
 
-    def restore(self) -> int:
-        """Takes over the state on disk; returns the steps done so far, 0 where there is none."""
-        if self.path is None or not self.path.exists():
-            return 0
-        before = {name: copy.deepcopy(part.state_dict()) for name, part in self.parts.items()}
-        try:
-            with safe_open(self.path, framework="pt") as stored:
-                tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-                metadata = stored.metadata() or {}
-            if metadata.get("digest", "") not in ("", _digest(metadata["structure"], tensors)):
-                raise ValueError("its content is not what was written")
-            structure = json.loads(metadata["structure"])
-            step = int(structure["step"])
-            if structure["identity"] != self._identity:
-                raise ValueError("it belongs to a training with other settings")
-            lacking = [repr(name) for name in self.parts if name not in structure["parts"]]
-            if lacking:
-                raise ValueError(
-                    f"it lacks {', '.join(lacking)}, as those of an earlier version do"
-                )
-            for name, part in self.parts.items():
-                part.load_state_dict(_unflatten(structure["parts"][name], tensors))
-        except _UNFIT as error:
-            for name, part in self.parts.items():  # nothing of a half-restored state stays
-                part.load_state_dict(before[name])
+    def load(self) -> dict[str, Any] | None:
+        """The state to resume from; None, with a warning in the log, if the file does not fit."""
+        stored = None if self.path is None else load_checkpoint(self.path)
+        if stored is None:
+            return None
+        if stored.get("identity") != self.identity:
             _LOGGER.warning(
-                "checkpoint %s does not fit, training begins anew: %s", self.path, error
-            )
-            return 0
-        return step
-
-    def save(self, step: int, *, force: bool = False) -> None:
-        """Writes the state after `step` steps, unless the last save is too recent.
-
-        Where it cannot be written, as on a full disk, that is logged, the state before it stays,
-        and the training goes on.
-        """
-        if self.path is None or not (force or time.monotonic() - self._saved > self.interval):
-            return
-        tensors: dict[str, torch.Tensor] = {}
-        parts = {name: _flatten(part.state_dict(), tensors) for name, part in self.parts.items()}
-        structure = json.dumps({"step": step, "identity": self._identity, "parts": parts})
-        metadata = {"structure": structure, "digest": _digest(structure, tensors)}
-        try:
-            write_atomically(self.path, save(tensors, metadata=metadata))
-        except OSError as error:
-            _LOGGER.warning(
-                "checkpoint %s could not be written: %s; a training that is killed now goes on at "
-                "the one before",
+                "checkpoint %s is of a training with other settings or of another version, "
+                "training restarts",
                 self.path,
-                error,
             )
+            return None
+        return dict(stored["state"])
+
+    def save(self) -> None:
+        """Writes the state now."""
+        if self.path is not None and self.writes:
+            state = {"identity": self.identity, "state": dict(self.state())}
+            save_checkpoint(self.path, state)
         self._saved = time.monotonic()
 
+    def save_when_due(self) -> None:
+        """Writes the state if the last one is `INTERVAL` seconds old."""
+        if time.monotonic() - self._saved > INTERVAL:
+            self.save()
 
-def _digest(structure: str, tensors: Mapping[str, torch.Tensor]) -> str:
-    text = f"{structure}{content_digest(tensors)}"
-    return hashlib.sha256(text.encode()).hexdigest()
+    def __enter__(self) -> Checkpoint:
+        return self
 
-
-def _flatten(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
-    """`value` as JSON; its tensors go to `tensors` and are replaced by their names."""
-    if isinstance(value, torch.Tensor):
-        name = f"t{len(tensors)}"
-        tensors[name] = value.detach().cpu().clone().contiguous()
-        return {"tensor": name}
-    if isinstance(value, Mapping):
-        return {"map": [[key, _flatten(item, tensors)] for key, item in value.items()]}
-    if isinstance(value, list | tuple):
-        return {"list": [_flatten(item, tensors) for item in value]}
-    return {"value": value}
-
-
-def _unflatten(node: dict[str, Any], tensors: Mapping[str, torch.Tensor]) -> Any:
-    if "tensor" in node:
-        return tensors[node["tensor"]]
-    if "map" in node:
-        return {key: _unflatten(item, tensors) for key, item in node["map"]}
-    if "list" in node:
-        return [_unflatten(item, tensors) for item in node["list"]]
-    return node["value"]
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None or issubclass(kind, KeyboardInterrupt | SystemExit):
+            self.save()

@@ -1,4 +1,4 @@
-"""Trainings that are killed at random moments end with the weights of one that was not."""
+"""Trainings that are killed go on from their last checkpoint."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -18,106 +17,92 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from simulator.utils.checkpoint import Checkpoint
+from simulator.utils import checkpoint
+from simulator.utils.checkpoint import Checkpoint, load_checkpoint
 from simulator.utils.files import sibling
 from tests.agents.conftest import TINY
 
 #: Signals in turn; each interrupts a process in another way.
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-#: Reports that a training makes in all; a kill comes after some of them.
-REPORTS = {"regression": 30, "ppo": 48, "simulator": 30}
+#: Steps that each training takes in all, and reports between two of its checkpoints.
+STEPS = {"regression": 30, "ppo": 48, "simulator": 30}
+PER_CHECKPOINT = {"regression": 1, "ppo": 4, "simulator": 1}
+TRAININGS: dict[str, dict[str, Any]] = {
+    "regression": {"frames": 120, "width": 8, "memory": 40},
+    "ppo": {"total_timesteps": 192, "n_steps": 4, "batch_size": 8, "n_epochs": 2, "width": 8},
+}
 
 
-def train_agent(kind: str, out: Path, report: Callable[[], None]) -> None:
+def train_agent(kind: str, out: Path, pipe: Connection) -> None:
     from agents.learning.training import AgentConfig
     from agents.learning.training import train_agent as train
 
-    hyperparameters: dict[str, dict[str, Any]] = {
-        # The memory forgets the first frames, so that a resumed one must forget the same.
-        "regression": {"frames": 120, "width": 8, "memory": 40},
-        # A discount makes the starts of episodes count.
-        "ppo": {
-            "total_timesteps": 192,
-            "n_steps": 4,
-            "batch_size": 8,
-            "n_epochs": 2,
-            "width": 8,
-            "gamma": 0.5,
-        },
-    }
-    environment = {**TINY, "lighting": "sine", "delay": 1}
     config = AgentConfig(
         agent=kind,  # type: ignore[arg-type]
         num_envs=4,
-        environment=environment,
-        training=hyperparameters[kind],
+        environment={**TINY, "lighting": "sine", "delay": 1},
+        training=TRAININGS[kind],
     )
-    train(config, out, progress=lambda *_: report())
+    train(config, out, progress=lambda done, *_: pipe.send(("step", done // 4)))
 
 
-def train_simulator(out: Path, report: Callable[[], None]) -> None:
-    from simulator.training import loop
-    from simulator.training.train import train_and_save
+def train_simulator(out: Path, pipe: Connection) -> None:
+    from simulator.training import train
     from tests.simulator.training.test_train import config, scenes
 
     stage = {"steps": 10, "batch": 2, "crop": 16}
-    loop._LOG_EVERY = 1
-    train_and_save(
-        config(exposure=stage, noise=stage, aperture=stage),
-        scenes,
-        out,
-        command="",
-        progress=lambda name, *_: report() if name.endswith("training") else None,
-    )
+    stages = ("exposure", "noise", "aperture")
+    train._LOG_EVERY = 1
 
+    def report(task: str, share: float, values: dict[str, float]) -> None:
+        name, _, what = task.partition(": ")
+        if what == "training":
+            pipe.send(("step", round(10 * (stages.index(name) + share))))
 
-def heed_interrupts() -> None:
-    """What runs in the background of a shell ignores them."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    config = config(**dict.fromkeys(stages, stage))
+    train.train_and_save(config, scenes, out, command="", progress=report)
 
 
 def child(kind: str, out: Path, pipe: Connection) -> None:
-    """What runs in the process that is killed; a checkpoint is written after every step."""
+    """Runs in the process that is killed; a checkpoint is written whenever one may be."""
     logging.basicConfig(level=logging.WARNING)
-    heed_interrupts()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
     torch.set_num_threads(1)
-    save, restore = Checkpoint.save, Checkpoint.restore
+    checkpoint.INTERVAL = -1.0
+    load = Checkpoint.load
 
-    def always(self: Checkpoint, step: int, *, force: bool = False) -> None:
-        save(self, step, force=True)
+    def reported(self: Checkpoint) -> dict[str, Any] | None:
+        state = load(self)
+        if state is not None:
+            pipe.send(("resumed", int(state.get("step", state.get("timesteps", 0)))))
+        return state
 
-    def told(self: Checkpoint) -> int:
-        step = restore(self)
-        pipe.send(("resumed", step))
-        return step
-
-    Checkpoint.save, Checkpoint.restore = always, told  # type: ignore[method-assign]
-
-    def report() -> None:
-        pipe.send(("step", 0))
-
+    Checkpoint.load = reported  # type: ignore[method-assign]
     if kind == "simulator":
-        train_simulator(out, report)
+        train_simulator(out, pipe)
     else:
-        train_agent(kind, out, report)
+        train_agent(kind, out, pipe)
 
 
 def run(
     context: Any, kind: str, out: Path, *, kill: tuple[int, float, int] | None
-) -> tuple[int, list[int]]:
-    """Runs a training, killed `kill[1]` seconds after so many reports: exit code, resumed steps."""
+) -> tuple[int, list[int], list[int]]:
+    """Runs a training, killed `kill[1]` seconds after `kill[0]` reports.
+
+    Returns:
+        Exit code, the steps it resumed at, and the steps it took.
+    """
     here, there = context.Pipe()
     process = context.Process(target=child, args=(kind, out, there), daemon=True)
     process.start()
     there.close()
     resumed: list[int] = []
-    seen = 0
+    steps: list[int] = []
     try:
         while True:
             word, step = here.recv()
-            resumed += [step] if word == "resumed" else []
-            seen += word == "step"
-            if kill is not None and seen == kill[0]:
+            (resumed if word == "resumed" else steps).append(step)
+            if kill is not None and len(steps) == kill[0]:
                 time.sleep(kill[1])
                 os.kill(process.pid, kill[2])
                 kill = None
@@ -125,7 +110,7 @@ def run(
         pass
     process.join(60)
     assert process.exitcode is not None
-    return process.exitcode, resumed
+    return process.exitcode, resumed, steps
 
 
 @pytest.fixture(scope="module")
@@ -134,55 +119,54 @@ def context() -> Any:
     if "forkserver" not in multiprocessing.get_all_start_methods():
         pytest.skip("needs POSIX signals")
     found = multiprocessing.get_context("forkserver")
-    used = (
-        "agents.cli.main",
-        "agents.learning.ppo",
-        "agents.learning.training",
-        "ae_env.vector_env",
-        "torch._dynamo",
-    )
+    used = ("agents.cli.main", "agents.learning.ppo", "agents.learning.training", "torch._dynamo")
     tests = ("tests.simulator.training.test_train", "tests.agents.test_killed")
-    found.set_forkserver_preload([*used, *tests])
+    found.set_forkserver_preload([*used, "ae_env.vector_env", *tests])
     return found
 
 
 @pytest.mark.parametrize("kind", ["regression", "ppo", "simulator"])
 def test_killed_at_random_moments(kind: str, context: Any, tmp_path: Path) -> None:
-    """Three kills each: whatever was drawn, seen, remembered or scheduled is there again."""
-    whole = tmp_path / "whole" / "net"
-    assert run(context, kind, whole, kill=None)[0] == 0
-    out, rng = tmp_path / "killed" / "net", np.random.default_rng(len(kind))
-    resumed: list[int] = []
-    for number in SIGNALS:
-        kill = int(rng.integers(3, REPORTS[kind] // 3)), float(rng.uniform(0, 0.02)), number
-        code, steps = run(context, kind, out, kill=kill)
-        resumed += steps
-        assert code == (1 if number == signal.SIGINT else -number)
-        for left in out.parent.iterdir():
-            if left.suffix == ".checkpoint":
-                load_file(left)  # every file is whole, whenever the kill came
-    code, steps = run(context, kind, out, kill=None)
-    assert code == 0
-    assert max([*resumed, *steps]) > 0  # it did go on, and did not begin anew
-    expected, found = (load_file(sibling(path, ".safetensors")) for path in (whole, out))
-    assert found.keys() == expected.keys()
-    assert all(torch.equal(found[name], expected[name]) for name in expected)
+    """Three kills; every run goes on where the one before was, and the last one ends."""
+    out, rng = tmp_path / "net", np.random.default_rng(len(kind))
+    last = 0
+    for number in (*SIGNALS, None):
+        kill = None
+        if number is not None:
+            count = int(rng.integers(PER_CHECKPOINT[kind] + 2, STEPS[kind] // 4))
+            kill = count, float(rng.uniform(0, 0.02)), number
+        code, resumed, steps = run(context, kind, out, kill=kill)
+        # It goes on at the last checkpoint, which is no older than the last report but one.
+        assert steps == list(range(steps[0], steps[-1] + 1))
+        assert last - PER_CHECKPOINT[kind] <= steps[0] - 1 <= last + PER_CHECKPOINT[kind]
+        assert bool(resumed) == (last > 0)
+        last = steps[-1]
+        if number is None:
+            assert code == 0
+        else:
+            assert code == (1 if number == signal.SIGINT else -number)
+            for file in out.parent.glob("*.checkpoint"):
+                assert load_checkpoint(file) is not None  # whole, whenever the kill came
+    assert last == STEPS[kind]
+    assert all(
+        tensor.isfinite().all() for tensor in load_file(sibling(out, ".safetensors")).values()
+    )
 
 
 def command(folder: Path, started: Any) -> None:
-    """What runs as `ae-env train` in the process that is stopped, between its steps 3 and 4."""
+    """Runs as `ae-env train` in the process that is stopped, between its steps 3 and 4."""
     from agents.cli.main import main
 
-    heed_interrupts()
-    save = Checkpoint.save
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    calls: list[int] = []
 
-    def told(self: Checkpoint, step: int, *, force: bool = False) -> None:
-        save(self, step, force=force)  # the first one would be due after twenty seconds
-        if step == 3 and not force:
+    def wait(self: Checkpoint) -> None:  # the first checkpoint would be due after 20 seconds
+        calls.append(1)
+        if len(calls) == 3:
             started.set()
             time.sleep(60)
 
-    Checkpoint.save = told  # type: ignore[method-assign]
+    Checkpoint.save_when_due = wait  # type: ignore[method-assign]
     torch.set_num_threads(1)
     words = os.open(folder / "words", os.O_WRONLY | os.O_CREAT)
     os.dup2(words, 2)
@@ -207,4 +191,6 @@ def test_a_stopped_command(number: int, status: int, context: Any, tmp_path: Pat
     assert "stopped; the same command goes on where it was" in (tmp_path / "words").read_text()
     left = {path.name for path in tmp_path.iterdir()} - {"mine.yaml", "words"}
     assert left == {"agent.checkpoint"}
-    load_file(tmp_path / "agent.checkpoint")
+    stored = load_checkpoint(tmp_path / "agent.checkpoint")
+    assert stored is not None
+    assert stored["state"]["step"] == 3

@@ -82,8 +82,8 @@ def test_bundled_then_again(few_frames: None, tmp_path: Path, monkeypatch) -> No
     def trained_again(*args: object) -> None:
         raise AssertionError("trained again")
 
-    monkeypatch.setattr("agents.learning.parallel.train_agent", trained_again)
-    monkeypatch.setattr("agents.learning.parallel.ProcessPoolExecutor", trained_again)
+    monkeypatch.setattr("agents.learning.training.train_agent", trained_again)
+    monkeypatch.setattr("agents.learning.training.ProcessPoolExecutor", trained_again)
     again = run_quickstart("bundled:small", out, seed=1, progress=Bars(), command="again")
     second = json.loads(again.files["results.json"].read_text())
     for before, after in zip(content["rows"], second["rows"], strict=True):

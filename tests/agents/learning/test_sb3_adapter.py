@@ -79,10 +79,31 @@ def test_attributes_and_methods(make_tiny_envs) -> None:
     masks = envs.env_method("action_masks")
     assert len(masks) == 3
     assert masks[0].shape == (64,)
-    assert len(envs.env_method("expected_scores", indices=[1])) == 1
+    scores = envs.envs.unwrapped.expected_scores()
+    for indices in ([1], 1, np.int64(1), np.array([1])):
+        (row,) = envs.env_method("expected_scores", indices=indices)
+        np.testing.assert_array_equal(row, scores[1])
     assert envs.env_is_wrapped(gym.Wrapper) == [False] * 3
     with pytest.raises(AttributeError, match="`grid` cannot be set"):
         envs.set_attr("grid", None)
+
+
+class Forbids(gym.vector.VectorWrapper):
+    """A user's own rule on top of the environment's masks."""
+
+    def action_masks(self) -> np.ndarray:
+        masks = self.env.unwrapped.action_masks()
+        masks[:, 3] = False
+        return masks
+
+
+def test_wrappers_of_the_batch_count(make_tiny_envs) -> None:
+    envs = SB3VectorAdapter(gym.vector.VectorWrapper(Forbids(make_tiny_envs(num_envs=2))))
+    envs.seed(0)
+    envs.reset()
+    assert envs.has_attr("action_masks")  # as MaskablePPO asks
+    assert [bool(mask[3]) for mask in envs.env_method("action_masks")] == [False, False]
+    assert len(envs.get_attr("grid")[0]) == 64
 
 
 def test_pictures(make_tiny_envs) -> None:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +15,22 @@ import torch
 import yaml
 from safetensors.torch import load_file
 
-import agents.learning.regression_training
+from agents.learning import training
 from agents.learning.ppo import PPOTraining
-from agents.learning.regression import RegressionTraining
-from agents.learning.training import AgentConfig, is_trained, load_config, train_agent
+from agents.learning.regression_training import RegressionTraining
+from agents.learning.training import (
+    AgentConfig,
+    TrainingJob,
+    is_trained,
+    load_config,
+    run_in_parallel,
+    tell,
+    train_agent,
+    train_in_parallel,
+)
+from simulator.utils.files import sibling
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
+CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
 ENVIRONMENT = {"scenes": "bundled:small", "resolution": 36}
 HYPERPARAMETERS: dict[str, dict[str, Any]] = {
     "regression": {"frames": 24, "width": 8},
@@ -47,13 +61,9 @@ def test_shipped_configs(path: Path) -> None:
     assert json.loads(json.dumps(config.card())) == config.card()
 
 
-def test_a_seed_out_of_range_is_told_before_the_training() -> None:
-    with pytest.raises(ValueError, match=r"`seed` \(=4294967296\)"):
+def test_a_seed_out_of_range_raises_before_the_training() -> None:
+    with pytest.raises(ValueError, match=r"training.seed \(=4294967296\)"):
         tiny("ppo").with_seed(2**32)
-
-
-def test_there_is_a_config_for_each_agent() -> None:
-    assert {load_config(path).agent for path in CONFIGS} == {"regression", "ppo"}
 
 
 @pytest.mark.parametrize(
@@ -61,28 +71,17 @@ def test_there_is_a_config_for_each_agent() -> None:
     [
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
         ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression' or 'ppo'"),
-        ("{}", r"agent: Field required"),
         ("", r"is empty: it must have entries"),
-        ("[1, 2]", r"holds \[1, 2\]: it must have entries"),
-        ("agent: [", r"is not YAML"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
-        ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step is unknown.*mean 'n_steps'"),
-        ("agent: ppo\ntraining: {gamma: much}", r"training.gamma \(='much'\): .*valid number"),
-        ("agent: ppo\ntraining: {gamma: 2}", r"`gamma` \(=2.0\) must be in \[0, 1\]"),
+        ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\): unknown.*mean `n_steps`"),
+        ("agent: ppo\ntraining: {gamma: 2}", r"training.gamma \(=2\): .*less than or equal to 1"),
         ("agent: ppo\ntraining: {batch_size: 100}", r"`batch_size` \(=100\) must divide"),
-        ("agent: regression\ntraining: {frames: -1}", r"`frames` \(=-1\) must be in"),
+        ("agent: regression\ntraining: {frames: -1}", r"training.frames \(=-1\)"),
         ("agent: regression\ntraining: {frames: 1.5}", r"training.frames \(=1.5\)"),
         ("agent: ppo\nenvironment: {resolutoin: 64}", r"`resolutoin`.*mean `resolution`"),
         ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be an integer in"),
         ("agent: ppo\nenvironment: {scorer: balnced}", r"environment: .*balnced"),
-        ("agent: ppo\nenvironment: {camera: leica}", r"environment: .*leica"),
-        ("agent: ppo\nenvironment: {costs: 3}", r"environment: `costs` \(=3\) must map"),
-        ("agent: ppo\nenvironment: {lighting: {kind: sine, period: 0}}", r"lighting\['period'\]"),
-        ("agent: ppo\nenvironment: {grid: [1]}", r"environment: `grid` \(=\[1\]\) must be"),
-        ("agent: ppo\nnum_envs: true", r"num_envs \(=True\)"),
-        ("agent: ppo\ntraining: {n_epochs: true}", r"training.n_epochs \(=True\)"),
         ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
-        ("agent: ppo\nenvironment: {1: 2}", r"environment.*valid string"),
     ],
 )
 def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str) -> None:
@@ -92,14 +91,6 @@ def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str
         load_config(path)
     assert "mine.yaml" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_and_binary_files(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"none.yaml'\): there is no such file"):
-        load_config(tmp_path / "none.yaml")
-    (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(ValueError, match=r"a.yaml'\) is not YAML"):
-        load_config(tmp_path / "a.yaml")
 
 
 def test_entries_must_be_json_values() -> None:
@@ -137,7 +128,7 @@ def test_a_failed_save_keeps_the_training(tmp_path: Path, monkeypatch) -> None:
 
     config, out = tiny(), tmp_path / "agent"
     with monkeypatch.context() as patch:
-        patch.setattr(agents.learning.regression_training, "save_regression", full)
+        patch.setattr("agents.learning.training.save_agent", full)
         with pytest.raises(OSError, match="no space"):
             train_agent(config, out)
     calls: list[int] = []
@@ -156,3 +147,85 @@ def test_seed_and_tensorboard(tmp_path: Path) -> None:
     events = list((tmp_path / "log").glob("events*"))
     assert events
     assert all(path.stat().st_size > 200 for path in events)
+
+
+# Several at once
+
+
+def jobs(folder: Path, frames: int) -> list[TrainingJob]:
+    trainings = {"regression": {"frames": frames}, "ppo": {"total_timesteps": frames}}
+    return [TrainingJob(n, tiny(n, **own), folder / n) for n, own in trainings.items()]
+
+
+@pytest.mark.slow
+def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
+    todo = jobs(tmp_path, frames=240)
+    running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
+
+    with pytest.raises(KeyboardInterrupt):
+        train_in_parallel(todo, workers=1, progress=stop)
+    assert running.is_file()
+    assert not waiting.exists()
+    seen: list[int] = []
+
+    def report(name: str, done: int, total: int, values: dict[str, float]) -> None:
+        assert (name, total) == ("regression", 240)
+        seen.append(done)
+
+    train_in_parallel(todo[:1], progress=report)
+    assert is_trained(todo[0].config, todo[0].out)
+    assert seen[0] > 4  # it went on
+    assert seen == list(range(seen[0], 241, 4))
+    # Nothing is left to do, and no process is started.
+    train_in_parallel(todo[:1], progress=lambda *_: pytest.fail("trained again"))
+
+
+def _share(job: int) -> None:
+    tell(job, torch.get_num_threads())
+    if job == 2:
+        raise ValueError("job 2 has failed")
+
+
+@pytest.mark.slow
+def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "core_count", lambda: 6)
+    seen: list[tuple[object, ...]] = []
+    with pytest.raises(ValueError, match="job 2 has failed"):
+        run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
+    assert (2, 3) in seen
+
+
+def _never_end(job: int) -> None:
+    tell(os.getpid())
+    time.sleep(600)
+
+
+def _wait_for_ever(pipe: Connection) -> None:
+    run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
+
+
+def _runs(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
+def test_workers_do_not_outlive_a_killed_parent() -> None:
+    context = multiprocessing.get_context("spawn")
+    here, there = context.Pipe()
+    parent = context.Process(target=_wait_for_ever, args=(there,))
+    parent.start()
+    workers = [here.recv(), here.recv()]
+    assert all(_runs(pid) for pid in workers)
+    parent.kill()
+    parent.join()
+    end = time.monotonic() + 30
+    while any(_runs(pid) for pid in workers):
+        assert time.monotonic() < end, "they work on for nobody"
+        time.sleep(0.1)

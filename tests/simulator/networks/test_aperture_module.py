@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 import scipy.ndimage
@@ -10,13 +13,18 @@ from torch import Tensor
 
 from simulator.networks.aperture_module import (
     DEAD_ZONE,
+    LARGEST,
     ApertureModule,
+    DefocusMap,
     added_blur,
+    band_features,
     dead_zone,
     is_defocused,
+    to_diameter,
     usable_defocus,
 )
 from simulator.networks.noise_module import Preset
+from simulator.optics.blur import disc_blur
 from simulator.optics.thin_lens import Lens
 
 
@@ -52,7 +60,7 @@ def test_the_same_or_a_smaller_aperture_leaves_every_bit(preset: Preset, target:
 
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
-@pytest.mark.parametrize("size", [(16, 16), (17, 21), (1, 1)])
+@pytest.mark.parametrize("size", [(16, 16), (17, 21), (1, 6), (1, 1)])
 def test_every_size(preset: Preset, size: tuple[int, int]) -> None:
     image = picture(*size)
     output = module(preset)(image, torch.full_like(image, 0.01), F11, F4)
@@ -69,13 +77,6 @@ def test_each_image_of_a_batch_has_its_own_f_numbers() -> None:
         output = made(image, torch.zeros_like(image), torch.tensor([8.0, 8.0]), target)
         assert not torch.allclose(output[0], image[0], atol=1e-3)
         assert torch.equal(output[1], image[1])
-
-
-def test_constant_images_come_out_unchanged() -> None:
-    for level in (0.0, 1e-5, 0.4, 50.0):
-        image = torch.full((2, 4, 16, 16), level)
-        output = with_map(5.0)(image, torch.full_like(image, 1e-3), F11, F4)
-        torch.testing.assert_close(output, image, rtol=2e-6, atol=0)
 
 
 def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
@@ -101,32 +102,12 @@ def test_the_paper_preset_commutes_with_exposure() -> None:
         torch.testing.assert_close(result, expected * factor, rtol=1e-4, atol=1e-4 * factor)
 
 
-def test_only_compact_has_a_map() -> None:
-    image = picture(8, 8)
-    assert module().defocus(image, image * 0).shape == (2, 8, 8)
-    with pytest.raises(ValueError, match="must be 'compact' to have a defocus map"):
-        module("paper").defocus(image, image * 0)
-
-
-def test_unknown_preset() -> None:
-    with pytest.raises(ValueError, match=r"`preset` \(='deep'\) must be one of"):
-        ApertureModule("deep")  # type: ignore[arg-type]
-
-
 def test_dead_zone_by_hand() -> None:
     diameter = torch.tensor([0.0, 0.3, 0.5, 1.3, 5.0])
     expected = [0.0, 0.0, 0.0, 1.2, np.sqrt(25 - 0.25)]  # 5, 12, 13 over ten
     assert dead_zone(diameter, 0.5).tolist() == pytest.approx(expected, abs=1e-6)
     assert float(dead_zone(torch.tensor(DEAD_ZONE))) == 0.0
     assert 0.4 <= DEAD_ZONE <= 1.0
-
-
-def test_dead_zone_has_a_finite_gradient_at_its_edge() -> None:
-    diameter = torch.tensor([0.0, DEAD_ZONE, DEAD_ZONE + 1e-7, 3.0], requires_grad=True)
-    dead_zone(diameter).sum().backward()
-    assert diameter.grad is not None
-    assert bool(diameter.grad.isfinite().all())
-    assert diameter.grad[0] == 0
 
 
 @pytest.mark.parametrize(("source", "target"), [(11.0, 4.0), (8.0, 5.6), (16.0, 4.0)])
@@ -193,7 +174,73 @@ def test_defocus_is_judged_at_the_weighted_quantile(spread: float) -> None:
     np.testing.assert_allclose(found.numpy(), expected, atol=0.01)
 
 
-def test_a_picture_without_any_detail_counts_as_in_focus() -> None:
-    assert (
-        float(is_defocused(torch.full((1, 20, 20), 5.0), torch.full((1, 4, 20, 20), 0.25))) == 0.0
-    )
+# The map of the circle of confusion
+
+
+@pytest.fixture(scope="module")
+def network() -> DefocusMap:
+    torch.manual_seed(3)
+    made = DefocusMap(width=8).eval().requires_grad_(False)
+    made.tail.weight.mul_(20.0)  # random, yet far from constant
+    return made
+
+
+def textured(*size: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    image = 0.1 + torch.rand(2, 4, *size, generator=generator)
+    return image, torch.full_like(image, 0.01)
+
+
+def test_exposure_does_not_matter(network: DefocusMap) -> None:
+    image, deviation = textured(24, 30)
+    expected = network(image, deviation)
+    assert float(expected.std()) > 0.05
+    for exponent in (-6, 3, 10):  # powers of two: only the tiny constant floor rounds differently
+        factor = 2.0**exponent
+        result = network(factor * image, factor * deviation)
+        torch.testing.assert_close(result, expected, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3, 1e4])
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+def test_constant_images_give_finite_maps_and_gradients(level: float, noise: float) -> None:
+    torch.manual_seed(0)
+    net = DefocusMap(width=8)
+    image = torch.full((1, 4, 16, 16), level)
+    diameter = net.diameter(image, torch.full_like(image, noise))
+    diameter.sum().backward()
+    assert bool(diameter.isfinite().all())
+    assert all(bool(p.grad.isfinite().all()) for p in net.parameters() if p.grad is not None)
+
+
+def test_diameters_are_in_range_and_invert_the_logarithm() -> None:
+    diameters = torch.tensor([0.0, 0.5, 3.0, 11.9])
+    torch.testing.assert_close(to_diameter(torch.log(diameters + 0.3)), diameters)
+    extremes = to_diameter(torch.tensor([-1e4, 1e4, 88.0]))
+    assert extremes.tolist() == [0.0, LARGEST, LARGEST]
+
+
+def test_blur_lowers_the_finest_band_relative_to_the_others() -> None:
+    """The cue itself: the finest band's share of white noise's energy falls with the disc."""
+    image = torch.from_numpy(np.random.default_rng(0).random((1, 4, 64, 64), dtype=np.float32))
+    deviation = torch.full_like(image, 1e-4)
+    relative = [
+        band_features(disc_blur(image, diameter), deviation)[0, 4, 16:-16, 16:-16].mean()
+        for diameter in (0.0, 1.5, 3.0, 6.0)
+    ]
+    assert relative == sorted(relative, reverse=True)
+    assert relative[0] - relative[-1] > 0.5
+
+
+def test_the_noise_of_four_planes_averages() -> None:
+    """The floor is the variance of their mean: a quarter of one plane's, measured."""
+    field = torch.from_numpy(np.random.default_rng(2).normal(0, 0.01, (1, 4, 200, 200))).float()
+    deviation = torch.full_like(field, 0.01)
+    noise_plane = band_features(field, deviation)[:, 8]
+    # Bands 0 - 1.5 - 3 - 5.5 - 10 px of white noise: their energies, from the kernels' own pixels.
+    kernel = torch.zeros(41, 41)
+    kernel[20, 20] = 1.0
+    discs = [disc_blur(kernel, d) for d in (0.0, 1.5, 3.0, 5.5, 10.0)]
+    energy = sum(float((a - b).square().sum()) for a, b in itertools.pairwise(discs))
+    expected = 1.0 + 0.3 * math.log(1 / (1 + energy))
+    assert float(noise_plane[..., 20:-20, 20:-20].mean()) == pytest.approx(expected, abs=0.01)

@@ -36,32 +36,12 @@ def test_it_starts_as_the_plain_ratio() -> None:
     assert torch.equal(module(raw[0], 8.0), raw[0] * 8)  # not clipped either
 
 
-def test_formula() -> None:
-    module = ExposureModule()
-    with torch.no_grad():
-        module.w.fill_(W)
-        module.b.copy_(torch.tensor(B))
-    assert not module.is_identity
-    source, target, ratio = synthetic()
-    torch.testing.assert_close(module(source, ratio), target)
-
-
 @pytest.mark.parametrize("name", ["w", "b"])
 def test_either_parameter_ends_the_identity(name: str) -> None:
     module = ExposureModule()
     with torch.no_grad():
-        getattr(module, name).add_(
-            torch.tensor([0.0, 0.0, 1e-5, 0.0])[2 if name == "w" else slice(4)]
-        )
+        getattr(module, name).view(-1)[-1] += 1e-5
     assert not module.is_identity
-
-
-def test_the_fit_recovers_w_and_b() -> None:
-    fit = LinearFit()
-    fit.add(*synthetic())
-    module = fit.solve()
-    assert float(module.w) == pytest.approx(W, rel=1e-6)
-    assert module.b.tolist() == pytest.approx(B, abs=1e-6)
 
 
 def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None:
@@ -85,19 +65,9 @@ def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None
     assert module.b.tolist() == pytest.approx([x / w for x in v], abs=1e-7)
 
 
-def test_saturated_pixels_do_not_count() -> None:
+def test_a_plane_without_pixels_is_refused() -> None:
     source, target, ratio = synthetic()
-    source[:, :, 0], target[:, :, 0] = 1.0, 0.3
-    target[:, :, 1] = 1.0
-    fit = LinearFit()
-    fit.add(source, target, ratio)
-    assert float(fit.solve().w) == pytest.approx(W, rel=1e-6)
-
-
-@pytest.mark.parametrize("planes", [0, 3])
-def test_a_plane_without_pixels_is_refused(planes: int) -> None:
-    source, target, ratio = synthetic()
-    source[:, planes:] = 1.0
+    source[:, 3:] = 1.0
     fit = LinearFit()
     fit.add(source, target, ratio)
     with pytest.raises(ValueError, match="every plane"):

@@ -30,26 +30,6 @@ def equal(a: Batch, b: Batch) -> bool:
     return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Batch))
 
 
-def test_shapes_and_types() -> None:
-    batch = pairs().batch(0, 3, 20)
-    shapes = {f.name: tuple(getattr(batch, f.name).shape) for f in fields(Batch)}
-    image = (3, 4, 20, 20)
-    assert shapes == {
-        "source": image,
-        "target": image,
-        "sample": image,
-        "ratio": (3,),
-        "shot": (3, 4),
-        "read": (3, 4),
-        "f_source": (3,),
-        "f_target": (3,),
-        "parameters": (3, 6),
-        "defocus": (3, 20, 20),
-    }
-    assert all(getattr(batch, f.name).dtype == torch.float32 for f in fields(Batch))
-    assert equal(batch.to(torch.device("cpu")), batch)
-
-
 def test_the_same_step_is_the_same_batch_whatever_came_before() -> None:
     first, second = pairs(), pairs()
     later = [first.batch(step, 2, 16) for step in range(4)][3]
@@ -66,15 +46,6 @@ def test_steps_processes_and_seeds_differ() -> None:
         for other in batches[i + 1 :]:
             assert not torch.equal(one.source, other.source)
             assert not torch.equal(one.defocus, other.defocus)  # not only the noise: crops, too
-
-
-def test_a_pair_shown_twice_was_photographed_twice() -> None:
-    """Whole-frame crops of one pair: their noise is uncorrelated."""
-    made = pairs(depth=False)
-    made.pairs = made.pairs[:1]
-    batch = made.batch(0, 8, 32)
-    error = batch.sample - batch.target
-    assert not any(torch.equal(error[0], error[i]) for i in range(1, 8))
 
 
 def test_source_and_sample_have_the_noise_that_is_stated() -> None:
@@ -113,16 +84,6 @@ def test_the_target_is_clipped_as_the_camera_clips() -> None:
     assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
 
 
-def test_box_averaged_captures_state_averaged_noise() -> None:
-    camera = ReferenceCamera(Z6, box_factor=3)
-    made = ReferencePairs([Sequence(scene(), (DARK, LIGHT))], camera, "exposure")
-    batch = made.batch(0, 8, 16)
-    dark = batch.ratio > 1
-    assert bool(dark.any())
-    for row in batch.shot[dark]:
-        assert row.tolist() == pytest.approx([s / 9 for s in Z6.nlf(6400).shot])
-
-
 def test_everything_of_a_pair_shows_the_same_crop() -> None:
     """The light tells the depth of its pixel, so target, source and defocus must agree on it."""
     near = scene(depth=True, size=48)
@@ -151,21 +112,6 @@ def test_everything_of_a_pair_shows_the_same_crop() -> None:
     assert not torch.equal(far[0], far[1])
 
 
-def test_crops_are_turned_and_mirrored_all_eight_ways() -> None:
-    ramp = torch.arange(32.0)[:, None] * 2 + torch.arange(32.0) + 10
-    light = (ramp / 400).expand(4, -1, -1).contiguous()
-    flat = replace(scene(depth=False), light=light)
-    made = ReferencePairs(
-        [Sequence(flat, (LIGHT, replace(LIGHT, iso=200)))], ReferenceCamera(Z6), "exposure"
-    )
-    target = made.batch(0, 64, 32).target[:, 0]
-    down = torch.sign(target[:, -1, 0] - target[:, 0, 0]).int()
-    right = torch.sign(target[:, 0, -1] - target[:, 0, 0]).int()
-    steep = (target[:, -1, 0] - target[:, 0, 0]).abs() > (target[:, 0, -1] - target[:, 0, 0]).abs()
-    seen = set(zip(down.tolist(), right.tolist(), steep.tolist(), strict=True))
-    assert len(seen) == 8
-
-
 def test_settings_of_a_pair() -> None:
     made = pairs(DARK, LIGHT)
     batch = made.batch(0, 8, 16)
@@ -192,34 +138,6 @@ def test_defocus_is_the_thin_lens_at_the_sources_aperture() -> None:
         assert float((batch.defocus[i] > 0).float().mean()) == 0.5
 
 
-def test_light_is_rendered_once_per_aperture_and_shared_between_stages(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    camera = ReferenceCamera(Z6)
-    rendered: list[float] = []
-    blurred_light = camera.blurred_light
-
-    def spy(*arguments):
-        rendered.append(arguments[1])
-        return blurred_light(*arguments)
-
-    object.__setattr__(camera, "blurred_light", spy)
-    states = (LIGHT, replace(LIGHT, iso=800), DARK)
-    shared: dict = {}
-    calls: list[tuple[int, int]] = []
-    for stage in ("exposure", "all"):
-        made = ReferencePairs(
-            [Sequence(scene(), states)],
-            camera,
-            stage,  # type: ignore[arg-type]
-            blurred_light=shared,
-            progress=lambda done, total: calls.append((done, total)),
-        )
-        made.batch(0, 4, 16)
-    assert sorted(rendered) == [4.0, 5.6]
-    assert calls == [(0, 1), (1, 1)] * 2
-
-
 def test_errors() -> None:
     with pytest.raises(ValueError, match=r"scene 'a': `illuminance` must be known"):
         draw_sequences([replace(scene(), illuminance=None)], Z6, 0)
@@ -229,7 +147,7 @@ def test_errors() -> None:
         pairs().batch(0, 1, 33)
 
 
-def test_sequences_are_drawn_by_seed_and_place() -> None:
+def test_sequences_are_drawn_by_seed_and_index() -> None:
     scenes = [scene("a"), scene("b")]
     first, again, other = (draw_sequences(scenes, Z6, seed) for seed in (0, 0, 1))
     assert [s.settings for s in first] == [s.settings for s in again]

@@ -1,10 +1,11 @@
-"""From a configuration to weights: the stages together, on scenes of 32 x 32 pixels."""
+"""From a configuration to weights, on scenes of 32 x 32 pixels; one stage alone on numbers."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,20 @@ import pytest
 import torch
 from torch import nn
 
-from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
+from simulator import get_camera
 from simulator.networks.weights import load_modules
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from simulator.training.config import SimulatorConfig
+from simulator.training import train
+from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.train import make_accelerator, train_and_save, train_simulator, validate
+from simulator.training.train import (
+    Clock,
+    learning_rate,
+    make_accelerator,
+    train_and_save,
+    train_stage,
+    validate,
+)
 from tests.simulator.training.scenes import scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
@@ -47,18 +56,14 @@ def card_of(file: Path) -> dict[str, Any]:
     return json.loads(file.with_suffix(".json").read_text())
 
 
-def test_files(trained: Path) -> None:
-    assert trained.name == "net.safetensors"
-    assert sorted(p.name for p in trained.parent.iterdir()) == [
-        "aperture.checkpoint",
-        "exposure.checkpoint",
-        "net.json",
-        "net.safetensors",
-        "noise.checkpoint",
-    ]
+def same(a: nn.Module, b: nn.Module) -> bool:
+    others = b.state_dict()
+    return all(torch.equal(value, others[name]) for name, value in a.state_dict().items())
 
 
 def test_the_card_says_what_was_done(trained: Path) -> None:
+    names = ("aperture.checkpoint", "exposure.checkpoint", "net.json", trained.name)
+    assert sorted(p.name for p in trained.parent.iterdir()) == [*names, "noise.checkpoint"]
     card = card_of(trained)
     assert card["preset"] == "compact"
     assert card["training"] == config().card()
@@ -78,22 +83,6 @@ def test_the_card_says_what_was_done(trained: Path) -> None:
     assert card["stages"]["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
 
 
-def test_the_weights_load_and_run(trained: Path) -> None:
-    modules, _ = load_modules(trained)
-    torch.manual_seed(config().seed)
-    simulator = CameraSimulator.from_pretrained(trained, device="cpu")
-    light = scene(depth=False).light
-    raw = RawImage(light, CameraSettings(6400, 1 / 64, 8), get_camera("nikon_z6"))
-    result = simulator.simulate(raw, CameraSettings(100, 1, 4), depth="unknown")
-    assert bool(result.data.isfinite().all())
-    w: Any = modules["exposure"].w
-    assert float(w) != 1.0  # two steps moved it
-
-
-def weights(modules: nn.Module) -> dict[str, torch.Tensor]:
-    return {name: value.clone() for name, value in modules.state_dict().items()}
-
-
 def test_a_second_run_trains_nothing_and_ends_the_same(trained: Path) -> None:
     before, card = trained.read_bytes(), card_of(trained)
     calls: list[str] = []
@@ -109,43 +98,21 @@ def test_a_second_run_trains_nothing_and_ends_the_same(trained: Path) -> None:
     assert not any("training" in task for task in calls)
 
 
-def test_a_killed_training_ends_where_one_run_ends(trained: Path, tmp_path: Path) -> None:
-    """Stopped as the noise stage begins its second step."""
-
-    class Stopped(Exception):
-        pass
-
-    real = ReferencePairs.batch
-
-    def batch(self, step, *arguments, **options):
-        if self.stage == "noise" and step == 1:
-            raise Stopped
-        return real(self, step, *arguments, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ReferencePairs, "batch", batch)
-        with pytest.raises(Stopped):
-            train_and_save(config(), scenes, tmp_path / "net", command="")
-    assert not (tmp_path / "net.safetensors").exists()
-    resumed = train_and_save(config(), scenes, tmp_path / "net", command="")
-    assert resumed.read_bytes() == trained.read_bytes()
-
-
-def test_another_seed_is_another_training(trained: Path, tmp_path: Path) -> None:
-    other = train_simulator(config(seed=1), scenes, tmp_path).modules.state_dict()
-    first = load_modules(trained)[0].state_dict()
-    assert not any(
-        torch.equal(first[n], other[n]) for n in ("exposure.b", "noise.network.head.weight")
-    )
-
-
-def test_progress_goes_from_rendering_to_the_end_of_each_stage(tmp_path: Path) -> None:
+def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path) -> None:
+    """Drawn weights are those of the seed, and the global generator stays as it was."""
     calls: list[tuple[str, float]] = []
-    train_simulator(
-        config(),
+    before = torch.random.get_rng_state()
+    other = train_and_save(
+        config(seed=1),
         scenes,
-        tmp_path,
+        tmp_path / "net",
+        command="",
         progress=lambda task, share, values: calls.append((task, share)),
+    )
+    assert torch.equal(torch.random.get_rng_state(), before)
+    first, second = (load_modules(file)[0].state_dict() for file in (trained, other))
+    assert not any(
+        torch.equal(first[n], second[n]) for n in ("exposure.b", "noise.network.head.weight")
     )
     order = list(dict.fromkeys(task for task, _ in calls))
     assert order == [
@@ -170,7 +137,7 @@ def test_a_baseline(preset: str, tmp_path: Path) -> None:
 def test_tensorboard_logs_each_stage(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    train_simulator(config("pc"), scenes, tmp_path, tensorboard=True)
+    train_and_save(config("pc"), scenes, tmp_path / "pc", command="", tensorboard=True)
     (events,) = (tmp_path / "tensorboard").rglob("events.out*")
     log = EventAccumulator(str(events.parent)).Reload()
     (entry,) = log.Scalars("baseline/loss")
@@ -180,34 +147,27 @@ def test_tensorboard_logs_each_stage(tmp_path: Path) -> None:
 def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
     camera = get_camera("nikon_z6")
     pairs = ReferencePairs(draw_sequences([scene()], camera, 0), ReferenceCamera(camera), "all")
+    seen: list[float] = []
 
-    class Loss(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.seen, self.modes = [], []
+    class Mean(nn.Module):
+        def forward(self, batch: Any) -> dict[str, torch.Tensor]:
+            assert not self.training
+            seen.append(float(batch.source.mean()))
+            value = torch.tensor(float(len(seen)))
+            return {"loss": value, "gain_db": value / 0 if len(seen) == 3 else value}
 
-        def forward(self, batch):
-            self.seen.append(float(batch.source.mean()))
-            self.modes.append(self.training)
-            value = torch.tensor(float(len(self.seen)))
-            return {"loss": value, "gain_db": value / 0 if len(self.seen) == 3 else value}
-
-    loss = Loss()
-    accelerator = make_accelerator(config(), "cpu", None)
-    assert validate(loss, pairs, 16, accelerator) == {
-        "loss": 4.5
-    }  # mean of 1 to 8; inf is left out
-    assert not any(loss.modes)
+    loss, accelerator = Mean(), make_accelerator(config(), "cpu", None)
+    assert validate(loss, pairs, 16, accelerator) == {"loss": 4.5}  # of 1 to 8; inf is left out
     assert loss.training
-    first = list(loss.seen)
     validate(loss, pairs, 16, accelerator)
-    assert loss.seen[8:] == first
+    assert seen[8:] == seen[:8]
 
 
 def test_a_precision_after_another_in_one_process(tmp_path: Path) -> None:
     for precision in ("float32", "bfloat16", "float32"):
-        made = train_simulator(config("pc", precision=precision), scenes, tmp_path / precision)
-        assert all(p.dtype == torch.float32 for p in made.modules.parameters())
+        path = tmp_path / precision / "pc"
+        train_and_save(config("pc", precision=precision), scenes, path, command="")
+        assert all(p.dtype == torch.float32 for p in load_modules(path)[0].parameters())
 
 
 def test_without_the_extra_it_says_what_to_install(
@@ -215,4 +175,155 @@ def test_without_the_extra_it_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "accelerate", None)
     with pytest.raises(ImportError, match=r"pip install 'ae-env\[train\]'"):
-        train_simulator(config(), scenes, tmp_path)
+        train_and_save(config(), scenes, tmp_path / "net", command="")
+
+
+# The loop of one stage
+
+STEPS = 12
+
+
+class Pairs:
+    """Batches of numbers by step; calls `hook` before each."""
+
+    def __init__(self, hook: Callable[[int], None] | None = None, *, broken: int = -1) -> None:
+        self.hook, self.broken, self.steps = hook, broken, []
+
+    def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> torch.Tensor:
+        assert (size, crop, process) == (3, 16, 0)
+        if self.hook is not None:
+            self.hook(step)
+        self.steps.append(step)
+        values = torch.randn(size, 4, generator=torch.Generator().manual_seed(step))
+        return values * (math.inf if step == self.broken else 1.0)
+
+
+class Loss(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.trained, self.frozen = nn.Linear(4, 2), nn.Linear(2, 1)
+
+    def forward(self, batch: torch.Tensor) -> dict[str, torch.Tensor]:
+        value = self.frozen(self.trained(batch).tanh() + 0 * batch[:, :2]).square().mean()
+        return {"loss": value, "undefined": value.detach() * math.nan}
+
+
+def run(
+    file: Path,
+    hook: Callable[[int], None] | None = None,
+    *,
+    broken: int = -1,
+    stage: StageConfig | None = None,
+    identity: Any = "one",
+    progress: Any = None,
+) -> tuple[Loss, Clock, Pairs]:
+    made, pairs = Loss(), Pairs(hook, broken=broken)
+    clock = train_stage(
+        "noise",
+        made,
+        made.trained,
+        pairs,  # type: ignore[arg-type]
+        stage or StageConfig(steps=STEPS, batch=3, crop=16, learning_rate=0.05),
+        make_accelerator(config("pc"), "cpu", None),
+        checkpoint=file,
+        identity=identity,
+        progress=progress,
+    )
+    return made, clock, pairs
+
+
+def stop_at(step: int) -> Callable[[int], None]:
+    def hook(now: int) -> None:
+        if now == step:
+            raise KeyboardInterrupt
+
+    return hook
+
+
+def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path: Path) -> None:
+    whole, *_ = run(tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "part", stop_at(6))
+    resumed, clock, pairs = run(tmp_path / "part")
+    assert pairs.steps == list(range(6, STEPS))
+    assert clock.step == STEPS
+    assert same(resumed, whole)
+
+
+def test_another_trainings_checkpoint_is_not_taken_over(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run(tmp_path / "a")
+    _, _, pairs = run(tmp_path / "a", identity="other")
+    assert pairs.steps == list(range(STEPS))
+    assert "other settings or of another version, training restarts" in caplog.text
+
+
+def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"stage 'noise': the loss \(=nan\) must be finite"):
+        run(tmp_path / "a", broken=5)
+    assert not (tmp_path / "a").exists()  # nothing is due yet, and a state of it is not written
+
+
+# Budgets
+
+
+class Watch:
+    """Stands for both clocks of the machine."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.cpu, self.wall = 1000.0, 50.0
+        monkeypatch.setattr("time.process_time", lambda: self.cpu)
+        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
+
+
+@pytest.mark.parametrize("on_cpu", [True, False])
+def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(
+    on_cpu: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watch = Watch(monkeypatch)
+    clock = Clock(StageConfig(minutes=2), on_cpu=on_cpu)
+    clock.start()
+    watch.cpu, watch.wall = 1030.0, 140.0  # 30 s of work in 90 s
+    clock.tick()
+    assert clock.seconds == (30.0 if on_cpu else 90.0)
+    assert clock.share == (0.25 if on_cpu else 0.75)
+    watch.cpu = watch.wall = 1e6
+    clock.tick()
+    assert (clock.step, clock.share) == (2, 1.0)
+
+
+def test_a_stage_ends_with_its_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step takes 7 s here, a minute nine steps; stopped after four, five are left."""
+    watch = Watch(monkeypatch)
+
+    def second(step: int) -> None:
+        watch.cpu += 7.0
+
+    def stopped(step: int) -> None:
+        stop_at(4)(step)
+        second(step)
+
+    stage = StageConfig(minutes=1, batch=3, crop=16)
+    whole, clock, _ = run(tmp_path / "whole", second, stage=stage)
+    assert (clock.step, clock.seconds) == (9, 63.0)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "part", stopped, stage=stage)
+    resumed, clock, pairs = run(tmp_path / "part", second, stage=stage)
+    assert pairs.steps == [4, 5, 6, 7, 8]
+    assert clock.seconds == 63.0
+    assert same(resumed, whole)
+
+
+def test_one_cycle() -> None:
+    """Rises to the peak at 5 %, is half of it in the middle of the cosine, ends at 0."""
+    shares = [i / 1000 for i in range(1001)]
+    rates = [learning_rate(share, 2.0) for share in shares]
+    assert rates[50] == max(rates) == pytest.approx(2.0)
+    assert rates[25] == pytest.approx(1.0)
+    assert rates[525] == pytest.approx(1.0)
+    assert rates[-1] == 0.0
+    assert rates[0] > 0  # the first step is not lost
+    assert rates[:51] == sorted(rates[:51])
+    assert rates[50:] == sorted(rates[50:], reverse=True)

@@ -1,155 +1,169 @@
-"""Training states: restored exactly, or begun anew with a warning."""
+"""Training states: resumed where they fit, and a warning where they do not."""
 
 from __future__ import annotations
 
-import logging
+import errno
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from simulator.utils.checkpoint import Checkpoint
+from simulator.utils import checkpoint
+from simulator.utils.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 
 
-class Run:
-    """A module with AdamW and a one-cycle schedule, on fixed data."""
-
-    def __init__(self, path: Path | None, *, hidden: int = 8, identity: object = "a") -> None:
-        generator = torch.Generator().manual_seed(3)
-        self.inputs = torch.randn(40, 16, 5, generator=generator)
-        self.module = nn.Sequential(nn.Linear(5, hidden), nn.Tanh(), nn.Linear(hidden, 1))
-        with torch.no_grad():
-            for parameter in self.module.parameters():
-                parameter.copy_(torch.randn(parameter.shape, generator=generator) * 0.3)
-        self.optimiser = torch.optim.AdamW(self.module.parameters(), lr=1e-2, weight_decay=1e-2)
-        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self.optimiser, max_lr=1e-2, total_steps=41, pct_start=0.3
-        )
-        parts = {"module": self.module, "optimiser": self.optimiser, "schedule": self.schedule}
-        self.store = Checkpoint(path, parts, identity=identity)
-
-    def steps(self, first: int, last: int) -> list[float]:
-        losses = []
-        for step in range(first, last):
-            loss = (self.module(self.inputs[step]) - 1.0).square().mean()
-            self.optimiser.zero_grad()
-            loss.backward()
-            self.optimiser.step()
-            self.schedule.step()
-            losses.append(loss.item())
-        return losses
-
-    def weights(self) -> list[torch.Tensor]:
-        return [p.detach().clone() for p in self.module.parameters()]
+def store(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
+    return Checkpoint(path, identity, lambda: {"step": 7, **values})
 
 
-def test_training_goes_on_exactly(tmp_path: Path) -> None:
-    whole = Run(None)
-    expected = whole.steps(0, 40)
-    path = tmp_path / "run.checkpoint"
-    first = Run(path)
+def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path: Path) -> None:
+    """AdamW and a one-cycle schedule on fixed data: their states come back complete."""
+    generator = torch.Generator().manual_seed(3)
+    inputs = torch.randn(40, 16, 5, generator=generator)
+
+    class Run:
+        def __init__(self) -> None:
+            with torch.random.fork_rng():
+                torch.manual_seed(1)
+                self.module = nn.Linear(5, 1)
+            self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=1e-2)
+            self.schedule = torch.optim.lr_scheduler.OneCycleLR(self.optimizer, 1e-2, 41)
+            self.store = Checkpoint(
+                tmp_path / "run",
+                {"width": (5, 1)},
+                lambda: {name: part.state_dict() for name, part in self.parts().items()},
+            )
+
+        def parts(self) -> dict[str, Any]:
+            own = {"module": self.module, "optimizer": self.optimizer}
+            return {**own, "schedule": self.schedule}
+
+        def steps(self, first: int, last: int) -> list[float]:
+            losses = []
+            for step in range(first, last):
+                loss = (self.module(inputs[step]) - 1.0).square().mean()
+                self.optimizer.zero_grad()
+                loss.backward()
+                self.optimizer.step()
+                self.schedule.step()
+                losses.append(loss.item())
+            return losses
+
+    expected, first, second = Run().steps(0, 40), Run(), Run()
     losses = first.steps(0, 17)
-    first.store.save(17, force=True)
-    second = Run(path)
-    assert second.store.restore() == 17
-    assert second.schedule.last_epoch == 17
-    assert second.optimiser.param_groups[0]["lr"] == first.optimiser.param_groups[0]["lr"]
-    losses += second.steps(17, 40)
-    assert losses == expected
-    assert all(torch.equal(a, b) for a, b in zip(second.weights(), whole.weights(), strict=True))
+    first.store.save()
+    state = second.store.load()
+    assert state is not None
+    for name, part in second.parts().items():
+        part.load_state_dict(state[name])
+    assert losses + second.steps(17, 40) == expected
 
 
-def test_nothing_to_restore(tmp_path: Path) -> None:
-    assert Run(tmp_path / "none").store.restore() == 0
-    run = Run(None)
-    run.store.save(3, force=True)
-    assert run.store.restore() == 0
+def test_nothing_to_resume(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert store(tmp_path / "none").load() is None
+    nowhere = store(None)
+    nowhere.save()
+    assert nowhere.load() is None
+    assert not caplog.records
 
 
-def test_saves_now_and_then(tmp_path: Path) -> None:
+def test_it_saves_when_it_is_due_and_at_the_end(tmp_path: Path, monkeypatch: Any) -> None:
     path = tmp_path / "run"
-    run = Run(path)
-    run.store.save(1)
+    now = 100.0
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    own = store(path)
+    now += checkpoint.INTERVAL
+    own.save_when_due()
     assert not path.exists()
-    run.store.interval = 0.0
-    run.store.save(2)
+    now += 1.0
+    own.save_when_due()
+    assert path.exists()
+    path.unlink()
+    own.save_when_due()
+    assert not path.exists()
+    with own:
+        pass
     assert path.exists()
 
 
-def damage_cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-50])
+@pytest.mark.parametrize(
+    ("error", "kept"), [(KeyboardInterrupt, True), (SystemExit, True), (ValueError, False)]
+)
+def test_what_ends_a_training_decides_whether_its_state_is_kept(
+    error: type[BaseException], kept: bool, tmp_path: Path
+) -> None:
+    with pytest.raises(error), store(tmp_path / "run"):
+        raise error
+    assert (tmp_path / "run").exists() == kept
 
 
-def damage_text(path: Path) -> None:
-    path.write_text("not a checkpoint at all")
+def test_a_process_that_does_not_write(tmp_path: Path) -> None:
+    with Checkpoint(tmp_path / "run", "a", lambda: {"step": 7}, writes=False):
+        pass
+    assert not (tmp_path / "run").exists()
 
 
-def damage_empty(path: Path) -> None:
-    path.write_bytes(b"")
+def flip_a_byte(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1  # the weights are by far the largest part
+    path.write_bytes(content)
 
 
-def damage_foreign(path: Path) -> None:
-    save_file({"weight": torch.zeros(2)}, path)
+class Harm:
+    """Would run code on unpickling."""
 
-
-def damage_structure(path: Path) -> None:
-    save_file({"t0": torch.zeros(2)}, path, metadata={"structure": '{"step": 4, "parts": []}'})
-
-
-def damage_folder(path: Path) -> None:
-    path.unlink()
-    path.mkdir()
+    def __reduce__(self) -> Any:
+        return Path.touch, (Path("harmed"),)
 
 
 @pytest.mark.parametrize(
     "damage",
-    [damage_cut, damage_text, damage_empty, damage_foreign, damage_structure, damage_folder],
+    [
+        lambda path: path.write_bytes(path.read_bytes()[:-50]),
+        lambda path: path.write_text("not a checkpoint at all"),
+        lambda path: path.write_bytes(b""),
+        lambda path: save_file({"weight": torch.zeros(2)}, path),
+        lambda path: torch.save([1, 2], path),
+        lambda path: torch.save({"identity": Harm()}, path),
+        flip_a_byte,
+    ],
 )
-def test_damaged_or_foreign(tmp_path: Path, damage, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "run.checkpoint"
-    first = Run(path)
-    first.steps(0, 5)
-    first.store.save(5, force=True)
+def test_damaged_or_foreign(
+    damage: Callable[[Path], object], tmp_path: Path, monkeypatch: Any, caplog: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "run"
+    store(path, weight=torch.ones(1000)).save()
     damage(path)
-    second = Run(path)
-    before = second.weights()
-    with caplog.at_level(logging.WARNING):
-        assert second.store.restore() == 0
-    assert "training begins anew" in caplog.text
-    assert str(path) in caplog.text
-    assert all(torch.equal(a, b) for a, b in zip(second.weights(), before, strict=True))
-    assert second.steps(0, 3) == Run(None).steps(0, 3)
+    assert store(path).load() is None
+    assert f"{path} is damaged, training restarts" in caplog.text
+    assert not (tmp_path / "harmed").exists()
 
 
-def test_another_network_leaves_no_trace(tmp_path: Path, caplog) -> None:
+def test_another_training_or_version(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
     path = tmp_path / "run"
-    wide = Run(path, hidden=9)
-    wide.steps(0, 5)
-    wide.store.save(5, force=True)
-    with caplog.at_level(logging.WARNING):
-        run = Run(path)
-        assert run.store.restore() == 0
-    assert "size mismatch" in caplog.text
-    assert run.steps(0, 3) == Run(None).steps(0, 3)
+    store(path, {"seed": 0}).save()
+    assert store(path, {"seed": 0}).load() == {"step": 7}
+    assert store(path, {"seed": 1}).load() is None
+    monkeypatch.setattr("importlib.metadata.version", lambda _: "77")
+    assert store(path, {"seed": 0}).load() is None
+    assert caplog.text.count("other settings or of another version, training restarts") == 2
 
 
-def test_one_of_an_earlier_version_says_what_it_lacks(tmp_path: Path, caplog) -> None:
+def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
     path = tmp_path / "run"
-    run = Run(path)
-    Checkpoint(path, {"module": run.module}, identity="a").save(5, force=True)
-    with caplog.at_level(logging.WARNING):
-        assert run.store.restore() == 0
-    assert "it lacks 'optimiser', 'schedule', as those of an earlier version do" in caplog.text
+    save_checkpoint(path, {"step": 1})
 
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-def test_another_training_is_not_resumed(tmp_path: Path, caplog) -> None:
-    path = tmp_path / "run"
-    one = Run(path, identity={"seed": 0, "rate": (1, 2)})
-    one.steps(0, 5)
-    one.store.save(5, force=True)
-    assert Run(path, identity={"seed": 0, "rate": (1, 2)}).store.restore() == 5
-    with caplog.at_level(logging.WARNING):
-        assert Run(path, identity={"seed": 1, "rate": (1, 2)}).store.restore() == 0
-    assert "other settings" in caplog.text
+    with monkeypatch.context() as patch:
+        patch.setattr("simulator.utils.files.os.replace", full)
+        save_checkpoint(path, {"step": 2})
+    assert "not saved" in caplog.text
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert load_checkpoint(path) == {"step": 1}

@@ -1,4 +1,4 @@
-"""The paper's two baselines (section 4.3): networks told the settings, but nothing of physics.
+"""The paper's two baselines (section 4.3): networks that know the settings, but no physics.
 
 Both take ``parameters``: log2(ISO / 100), log2(exposure time / s) and log2(f-number) of the
 source, then of the target. Both predict the target raw itself, not a residual.
@@ -19,7 +19,7 @@ from simulator.networks.unet import LEAK, instance_norm
 NUM_PARAMETERS = 6
 #: Networks get ``(parameters + offset) / unit``: of an image's order and, from ISO 100, 1/8000 s
 #: and f/1 up, not negative. Leaky layers that start as the identity would shrink a negative plane
-#: to 0.2^9 of itself: a network not told the exposure time.
+#: to 0.2^9 of itself, and the exposure time would be lost.
 PARAMETER_OFFSET = (0.0, 13.0, 0.0, 0.0, 13.0, 0.0)
 PARAMETER_UNIT = 8.0
 
@@ -33,9 +33,11 @@ def scaled_parameters(parameters: Tensor, image: Tensor) -> Tensor:
     return (parameters.to(image) + image.new_tensor(PARAMETER_OFFSET)) / PARAMETER_UNIT
 
 
-def _check_width(width: int) -> None:
+def _check(width: int, dilations: Sequence[int]) -> None:
     if width < 1:
         raise ValueError(f"`width` (={width!r}) must be >= 1")
+    if not dilations or min(dilations) < 1:
+        raise ValueError(f"`dilations` (={dilations!r}) must be one or more integers >= 1")
 
 
 class AdaptiveNorm(nn.Module):
@@ -53,7 +55,8 @@ class AdaptiveNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape. In training B * H * W must exceed 1."""
-        return self.identity * x + self.normalised * self.norm(x)
+        normalised: Tensor = self.norm(x)
+        return self.identity * x + self.normalised * normalised
 
 
 class ParameterConcatenation(nn.Module):
@@ -82,9 +85,7 @@ class ParameterConcatenation(nn.Module):
         self, *, width: int = 32, dilations: Sequence[int] = (1, 2, 4, 8, 16, 32, 64, 128, 1)
     ) -> None:
         super().__init__()
-        _check_width(width)
-        if not dilations or min(dilations) < 1:
-            raise ValueError(f"`dilations` (={dilations!r}) must be one or more integers >= 1")
+        _check(width, dilations)
         layers: list[nn.Module] = []
         inputs = 4 + NUM_PARAMETERS
         for dilation in dilations:
@@ -107,7 +108,8 @@ class ParameterConcatenation(nn.Module):
         """
         scaled = scaled_parameters(parameters, image)
         planes = scaled[:, :, None, None].expand(-1, -1, *image.shape[-2:])
-        return self.body(torch.cat([image, planes], dim=1))
+        result: Tensor = self.body(torch.cat([image, planes], dim=1))
+        return result
 
 
 class GeneratedConvolution(nn.Module):
@@ -145,7 +147,8 @@ class GeneratedConvolution(nn.Module):
 
     def kernels(self, parameters: Tensor) -> Tensor:
         """(B, outputs, inputs, k, k) from scaled parameters (B, 6); transposed if it upsamples."""
-        return self.generator(parameters).unflatten(1, self.shape)
+        values: Tensor = self.generator(parameters)
+        return values.reshape(-1, *self.shape)
 
     def forward(self, x: Tensor, parameters: Tensor) -> Tensor:
         """(B, inputs, H, W) and scaled parameters (B, 6), to (B, outputs, H', W')."""
@@ -243,9 +246,7 @@ class DecoupledNet(nn.Module):
         self, *, width: int = 64, dilations: Sequence[int] = (2, 4, 4, 8, 8, 16, 1)
     ) -> None:
         super().__init__()
-        _check_width(width)
-        if any(dilation < 1 for dilation in dilations):
-            raise ValueError(f"`dilations` (={dilations!r}) must be integers >= 1")
+        _check(width, dilations)
         self.head = nn.ModuleList(
             [
                 _NormalisedGenerated(5, width),
@@ -281,4 +282,5 @@ class DecoupledNet(nn.Module):
             x = block(x, scaled)
         for layer in self.neck:
             x = F.relu(layer(x, scaled)[..., :height, :width])  # an odd size came out one larger
-        return self.tail(x, scaled)
+        result: Tensor = self.tail(x, scaled)
+        return result
