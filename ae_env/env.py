@@ -9,15 +9,17 @@ import numpy as np
 
 from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.episodes.draws import check_options
+from ae_env.episodes.state import Episode
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
+from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.checks import check_actions, check_seed, check_word
 from simulator.camera import CameraProfile
 
 Observation = dict[str, np.ndarray]
-_PLACE = np.array([0])
+_FIRST = np.array([0])
 
 
 class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
@@ -125,9 +127,22 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         return self.core.first_scenes
 
     @property
+    def delay(self) -> int:
+        """Frames between an action and the first capture that has it."""
+        return self.core.delay
+
+    @property
     def state(self) -> int:
         """Index of the current exposure state."""
         return self.core.episode(0).state
+
+    def episode(self, env_index: int = 0) -> Episode:
+        """What was drawn for the running episode, and where it is now."""
+        return self.core.episode(env_index)
+
+    def scene(self, env_index: int = 0) -> Scene:
+        """The scene that is photographed now; of a sequence, that of the current frame."""
+        return self.core.scene(env_index)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -135,24 +150,28 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         """Begins an episode; see the class for `options`."""
         chosen = check_options(options)
         super().reset(seed=check_seed(seed))
-        self.core.start(0, self.np_random, chosen)
-        self._last = self.core.observe(_PLACE)
+        self.core.begin(_FIRST, [self.np_random], [chosen])
+        self._last = self.core.observe(_FIRST)
         return _first(self._last.observation), single_info(self._last.info, 0)
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
-        self.core.act(_PLACE, check_actions("action", action, ())[None])
-        self._last = self.core.observe(_PLACE)
+        self.core.transition(_FIRST, check_actions("action", action, ())[None])
+        self._last = self.core.observe(_FIRST)
         info = single_info(self._last.info, 0)
         return _first(self._last.observation), float(self._last.reward[0]), False, False, info
 
     def action_masks(self) -> np.ndarray:
-        """(S,) bool: states that may be chosen."""
-        return self.core.action_masks()
+        """(S,) bool: states that the scene allows."""
+        return self.core.action_masks(_FIRST)[0]
 
     def expected_scores(self) -> np.ndarray:
         """(S,) float64: expectation over noise of every state's score in the current frame."""
-        return self.core.expected_scores(0).mean
+        return self.score_table().mean
+
+    def score_table(self, env_index: int = 0) -> ScoreTable:
+        """Expected scores in the current frame, with their standard errors and parts."""
+        return self.core.score_table(env_index)
 
     def render(self) -> np.ndarray:  # type: ignore[override]
         """(H, W, 3) uint8: the developed capture with its settings and score written on it."""

@@ -14,10 +14,12 @@ from gymnasium.vector.utils import batch_space
 
 from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.episodes.draws import check_options
+from ae_env.episodes.state import Episode
 from ae_env.grid import ExposureGrid, plain, plain_list
 from ae_env.options import EnvOptions
 from ae_env.registration import SpecProperty
 from ae_env.scenes import Scene
+from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.checks import check_actions, check_integer, check_seed, check_word
 from simulator.camera import CameraProfile
 
@@ -92,18 +94,35 @@ class AutoExposureVectorEnv(
         return self.core.first_scenes
 
     @property
+    def delay(self) -> int:
+        """Frames between an action and the first capture that has it."""
+        return self.core.delay
+
+    @property
     def states(self) -> np.ndarray:
         """(N,) int64: current exposure state of each episode."""
         self.core.episode(0)
         return self.core.episodes.state.copy()
 
+    def episode(self, env_index: int = 0) -> Episode:
+        """What was drawn for the running episode of an environment, and where it is now."""
+        return self.core.episode(env_index)
+
+    def scene(self, env_index: int = 0) -> Scene:
+        """The scene that an environment photographs now; of a sequence, the current frame's."""
+        return self.core.scene(env_index)
+
     def action_masks(self) -> np.ndarray:
-        """(N, S) bool: states that may be chosen."""
-        return np.tile(self.core.action_masks(), (self.num_envs, 1))
+        """(N, S) bool: states that the scene of each environment allows."""
+        return self.core.action_masks(self._everyone)
 
     def expected_scores(self) -> np.ndarray:
         """(N, S) float64: expected score of every state in the current frame of each episode."""
-        return np.stack([self.core.expected_scores(i).mean for i in range(self.num_envs)])
+        return np.stack([self.score_table(i).mean for i in range(self.num_envs)])
+
+    def score_table(self, env_index: int = 0) -> ScoreTable:
+        """Expected scores in an environment's current frame, with standard errors and parts."""
+        return self.core.score_table(env_index)
 
     def reset(
         self,
@@ -142,7 +161,7 @@ class AutoExposureVectorEnv(
         if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
         running = np.flatnonzero(~self._done)
-        self.core.act(running, actions[running])
+        self.core.transition(running, actions[running])
         self._steps[running] += 1
         if len(resetting):  # NEXT_STEP: this step begins their new episodes
             self._begin(resetting)

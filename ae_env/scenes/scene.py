@@ -100,6 +100,8 @@ class Scene:
             no noise, or no such module.
         defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
             scene whose own defocus is to grow as the aperture opens; None takes it as far.
+        allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
+            them; None for every state of any grid.
 
     Raises:
         ValueError: If a value has the wrong shape or lies outside its range.
@@ -121,6 +123,7 @@ class Scene:
     saturated: torch.Tensor | None = None
     denoised: torch.Tensor | None = None
     defocus_map: torch.Tensor | None = None
+    allowed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("scene_id", "group", "kind"):
@@ -139,6 +142,14 @@ class Scene:
             raise ValueError(f"`box_factor` (={self.box_factor}) must be at least 1")
         self._check_saturated()
         self._check_networks()
+        if self.allowed is not None:
+            allowed = np.asarray(self.allowed)
+            if allowed.dtype != np.bool_ or allowed.ndim != 1 or not allowed.any():
+                raise ValueError(
+                    f"`allowed` ({allowed.dtype}, shape {allowed.shape}) must be bool of shape "
+                    "(S,) with at least one state that is allowed"
+                )
+            object.__setattr__(self, "allowed", allowed)
 
     def _check_saturated(self) -> None:
         mask = self.saturated

@@ -119,9 +119,9 @@ def test_reset_options_choose_scene_state_and_frame() -> None:
     assert env.reset(options={"scene": 3})[1]["scene_id"] == scene.scene_id
     options = {"scene": 3, "state": 17}
     bright, _ = env.reset(seed=1, options=options)
-    first = env.unwrapped.core.episode(0)
+    first = env.unwrapped.episode()
     dark, _ = env.reset(seed=1, options={**options, "frame": 5})
-    second = env.unwrapped.core.episode(0)
+    second = env.unwrapped.episode()
     assert dark["raw"].mean() < bright["raw"].mean()
     # The draws do not depend on the options: the episode is the same otherwise.
     assert (first.speed, first.defocus) == (second.speed, second.defocus)
@@ -285,9 +285,9 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
     env = _make(resolution=36).unwrapped
     speeds, defocus = [], []
     for seed in range(400):
-        env.core.start(0, np.random.default_rng(seed), {})
-        speeds.append(env.core.episode(0).speed)
-        defocus.append(env.core.episode(0).defocus)
+        env.core.begin(np.array([0]), [np.random.default_rng(seed)])
+        speeds.append(env.episode().speed)
+        defocus.append(env.episode().defocus)
     assert np.mean(np.array(speeds) == 0) == pytest.approx(1 / 3, abs=0.08)  # 3.4 sigma
     assert min(defocus) >= 0.1
     assert max(defocus) <= 8.0
@@ -351,8 +351,8 @@ def test_bundled_oracle_is_spread_over_every_control() -> None:
     env = gym.make(ID, scenes="bundled", split="test", resolution=64).unwrapped
     states = []
     for i in range(len(env.scenes)):
-        env.core.start(0, np.random.default_rng(i), {"scene": i})
-        states.append(env.core.expected_scores(0).oracle)
+        env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
+        states.append(env.score_table().oracle)
     for control in env.grid.controls(np.array(states)).T:
         assert np.bincount(control).max() <= 0.6 * len(states)
 
@@ -380,7 +380,7 @@ def test_frames_are_the_simulators_own() -> None:
     env = _make(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
     for state in (0, 21, 42, 63):
         observation, _ = env.reset(seed=1, options={"state": state})
-        episode = env.core.episode(0)
+        episode = env.episode()
         scene = env.scenes[episode.scene]
         prepared = prepare_scene(scene, env.camera, speed=episode.speed, defocus=episode.defocus)
         light = prepared.expected(env.grid[state]).numpy().astype(np.float64)
