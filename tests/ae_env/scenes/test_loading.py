@@ -10,7 +10,7 @@ import torch
 
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
-from ae_env.scenes.grouping import Shot, group_shots, split_groups
+from ae_env.scenes.split import Shot, group_shots, split_groups
 from simulator.camera import get_camera
 from simulator.settings import CameraSettings
 
@@ -149,7 +149,7 @@ def test_shots_are_grouped_in_the_order_of_their_times() -> None:
         ("bundeld", r"did you mean 'bundled'"),
         ("bundled:smal", r"did you mean 'bundled:small'"),
         ("no/such/folder", r"`scenes` \(='no/such/folder'\) must name an existing file"),
-        ("no_such_module:scenes", "cannot import"),
+        ("no_such_module:scenes", "cannot be loaded: ModuleNotFound"),
         (f"{__name__}:MINES", "did you mean 'MINE'"),
         ("math:pi", "must give a list of Scene, not float"),
         ([1], r"scenes\[0\] \(=int\) must be a Scene"),

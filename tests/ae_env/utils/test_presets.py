@@ -151,7 +151,7 @@ def test_importing_loads_nothing_heavy() -> None:
 
 def test_every_package_and_the_presets_are_installed() -> None:
     """`packages` is a list, as `configs` is no folder of `ae_env`: nothing may be forgotten."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(__file__).resolve().parents[3]
     project = tomllib.loads((root / "pyproject.toml").read_text())
     setuptools = project["tool"]["setuptools"]
     found = {
