@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -11,105 +13,41 @@ from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.episodes.draws import check_options
 from ae_env.episodes.state import Episode
 from ae_env.grid import ExposureGrid
-from ae_env.options import EnvOptions
-from ae_env.registration import SpecProperty
-from ae_env.scenes import Scene
+from ae_env.lighting import Lighting
+from ae_env.options import (
+    DEFAULT_SIMULATOR,
+    DEFAULT_TOLERANCE,
+    Crop,
+    Depth,
+    EnvOptions,
+    Motion,
+    Noise,
+    ObservationKind,
+    Reward,
+    Split,
+)
+from ae_env.registration import SpecProperty, names_nearest
+from ae_env.scenes import Scene, SceneSpec
+from ae_env.scorers import Scorer
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.checks import check_actions, check_seed, check_word
 from simulator.camera import CameraProfile
+
+logger = logging.getLogger(__name__)
 
 Observation = dict[str, np.ndarray]
 _FIRST = np.array([0])
 
 
-class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
-    """Choose ISO, shutter and aperture, frame by frame, for a scene on a simulated raw sensor.
+class AutoExposureBase(SpecProperty):
+    """The public surface that `AutoExposureEnv` and `AutoExposureVectorEnv` have in common.
 
-    ## Description
-
-    Each episode photographs one scene. An action picks one of the exposure states of a grid; the
-    camera simulator turns the scene's light into the raw that the camera would have recorded there,
-    with the noise, the blur and the clipping of these settings; a scorer rates it. The image may
-    move and may be out of focus: only a shorter exposure or a smaller aperture helps, at the price
-    of noise.
-
-    ## Action Space
-
-    `Discrete(64)`: index into `ExposureGrid.default()`,
-    `(iso_index * 4 + time_index) * 4 + aperture_index`.
-
-    | control | values |
-    |---|---|
-    | ISO | 100, 400, 1600, 6400 |
-    | exposure time [s] | 1/1000, 1/125, 1/15, 1/2 |
-    | f-number | 4, 5.6, 8, 11 |
-
-    `action_masks()` tells which states may be chosen. Wrappers in `ae_env.wrappers` offer the
-    controls one by one, relative steps, and continuous APEX values.
-
-    ## Observation Space
-
-    A `Dict`; `ae_env.observation` has the functions that invert each entry.
-
-    | key | space | meaning |
-    |---|---|---|
-    | `raw` | `Box(0, 255, (4, R, R), uint8)` | planes R, G1, G2, B, `255 sqrt((x + p) / (1 + p))`, x clipped to [-p, 1], p = 1/1024 |
-    | `settings` | `Box(-1, 1, (3,), float32)` | Av, Tv, Sv of the current state, from [0, 10], [-5, 15], [4, 17] |
-    | `sensors` | `Box(-1, 1, (2,), float32)` | log2 image speed [frame heights/s] from [-9, 3] and log2 defocus [pixel of a 64-pixel frame at f/4] from [-4, 4], each with 15 % noise |
-
-    ## Rewards
-
-    Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`.
-
-    ## Starting State
-
-    `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
-    log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
-    defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
-    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses; of a recorded sequence, `frame` is the raw that it begins with.
-
-    ## Episode End
-
-    A scene never terminates; `max_episode_steps` truncates, by default after 8 steps.
-
-    ## Arguments
-
-    | name | default | meaning |
-    |---|---|---|
-    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene` |
-    | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
-    | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
-    | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
-    | `costs` | `{}` | weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
-    | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
-    | `sensors` | `True` | whether `sensors` is observed |
-    | `resolution` | 64 | height and width R of the packed frame, >= 36 |
-    | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |
-    | `motion` | `"random"` | `"random"`, `"none"`, or a speed [frame heights/s] |
-    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4 |
-    | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
-    | `delay` | 0 | frames between an action and the first capture that has it |
-    | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
-    | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
-    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise.generator`), `"exact"` draws it, which takes longer |
-    | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
-    | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
-    | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
-
-    ## Version History
-
-    * v0: first version
+    Policies and evaluations need nothing else of an environment.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
-
-    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
-        check_word("render_mode", render_mode, ("rgb_array",), None)
-        self.render_mode = render_mode
-        self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs=1)
-        self.action_space = gym.spaces.Discrete(len(self.core.grid))
-        self.observation_space: Any = self.core.observation_space()
-        self._last: Frames | None = None
+    core: EpisodeCore
+    render_mode: str | None
+    _last: Frames | None
 
     @property
     def grid(self) -> ExposureGrid:
@@ -131,18 +69,188 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         """Frames between an action and the first capture that has it."""
         return self.core.delay
 
+    def episode(self, env_index: int = 0) -> Episode:
+        """The drawn values of an environment's episode, and its current frame and state."""
+        return self.core.episode(env_index)
+
+    def scene(self, env_index: int = 0) -> Scene:
+        """The scene that an environment photographs now; of a sequence, the current frame's."""
+        return self.core.scene(env_index)
+
+    def score_table(self, env_index: int = 0) -> ScoreTable:
+        """Expected scores in an environment's current frame, with standard errors and parts."""
+        return self.core.score_table(env_index)
+
+    def _pictures(self, num_envs: int) -> tuple[np.ndarray, ...] | None:
+        """The latest captures, developed, one per environment; None without a render mode."""
+        from ae_env.rendering import render_frame
+
+        if self.render_mode is None:
+            logger.warning(
+                "render() returns None, because the environment was made without a render mode; "
+                "give render_mode='rgb_array' to gymnasium.make"
+            )
+            return None
+        if self._last is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        return tuple(render_frame(self.core, i, self._last) for i in range(num_envs))
+
+
+class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
+    """Choose ISO, shutter and aperture, frame by frame, for a scene on a simulated raw sensor.
+
+    ## Description
+
+    Each episode photographs one scene. An action picks one of the exposure states of a grid; the
+    camera simulator turns the scene's light into the raw that the camera would have recorded there,
+    with the noise, the blur and the clipping of these settings; a scorer rates it. The image may
+    move and may be out of focus: only a shorter exposure or a smaller aperture helps, at the price
+    of noise.
+
+    ## Action Space
+
+    `Discrete(64)`: index into `ExposureGrid.default()`,
+    `(iso_index * 4 + time_index) * 4 + aperture_index`.
+
+    | control | values |
+    |---|---|
+    | ISO | 100, 400, 1600, 6400 |
+    | exposure time [s] | 1/1000, 1/125, 1/15, 1/2 |
+    | f-number | 4, 5.6, 8, 11 |
+
+    `action_masks()` gives the states that the current scene allows: all of them, unless the scene
+    is a recorded grid with holes (`Scene.allowed`). Wrappers in `ae_env.wrappers` offer the
+    controls one by one, relative steps, and continuous APEX values.
+
+    ## Observation Space
+
+    A `Dict`; the functions of `ae_env.observation` invert each entry.
+
+    | key | space | meaning |
+    |---|---|---|
+    | `raw` | `Box(0, 255, (4, R, R), uint8)` | planes R, G1, G2, B, `255 sqrt((x + p) / (1 + p))`, x clipped to [-p, 1], p = 1/1024 |
+    | `settings` | `Box(-1, 1, (3,), float32)` | Av, Tv, Sv of the current state, from [0, 10], [-5, 15], [4, 17] |
+    | `sensors` | `Box(-1, 1, (2,), float32)` | log2 image speed [frame heights/s] from [-9, 3] and log2 defocus [pixel of a 64-pixel frame at f/4] from [-4, 4], each with 15 % noise |
+
+    ## Rewards
+
+    Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`.
+
+    ## Info
+
+    The same keys from `reset` and `step`.
+
+    | key | meaning |
+    |---|---|
+    | `scene_id` | name of the scene |
+    | `state` | index of the exposure state of this capture |
+    | `iso`, `exposure_time`, `f_number`, `ev100` | its settings |
+    | `clipped_high`, `clipped_low` | shares of the samples at white, and at or below 2^-10 of it |
+    | `excess_noise` | noise variance beyond that of the camera at these settings |
+    | `modules` | steps of the simulator that this capture took |
+    | `rewards` | dictionary of the scorer's parts, `score` and the costs |
+    | `oracle_state`, `regret` | best state, and its expected score minus that of `state`; only with `with_oracle` |
+
+    ## Starting State
+
+    `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
+    log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
+    defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
+    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses; in a recorded sequence, `frame` is the raw to begin with.
+
+    ## Episode End
+
+    A scene never terminates; `max_episode_steps` truncates, by default after 8 steps.
+
+    ## Arguments
+
+    | name | default | meaning |
+    |---|---|---|
+    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene` |
+    | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
+    | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
+    | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
+    | `costs` | `None` | mapping to the weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
+    | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
+    | `sensors` | `True` | whether `sensors` is observed |
+    | `resolution` | 64 | height and width R of the packed frame, >= 36 |
+    | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |
+    | `motion` | `"random"` | `"random"`, `"none"`, or a speed [frame heights/s] |
+    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4 |
+    | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
+    | `delay` | 0 | frames between an action and the first capture that has it |
+    | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
+    | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
+    | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise.generator`), `"exact"` draws it, which takes longer |
+    | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
+    | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
+    | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
+    | `render_mode` | `None` | `"rgb_array"`: `render()` returns the developed capture, (H, W, 3) uint8, with its settings and score written on it; `None`: it returns None |
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+
+    @names_nearest
+    def __init__(
+        self,
+        *,
+        scenes: SceneSpec = "bundled",
+        split: Split = "train",
+        grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default",
+        scorer: str | Mapping[str, float] | Scorer = "balanced",
+        costs: Mapping[str, float] | None = None,
+        observation: ObservationKind = "uint8",
+        sensors: bool = True,
+        resolution: int = 64,
+        crop: Crop = "box",
+        motion: Motion | float = "random",
+        depth: Depth | float = "random",
+        lighting: str | Mapping[str, Any] | Lighting = "static",
+        delay: int = 0,
+        camera: str | CameraProfile = "nikon_z6",
+        simulator: str | None = DEFAULT_SIMULATOR,
+        noise: bool | Noise = True,
+        tolerance: float = DEFAULT_TOLERANCE,
+        reward: Reward = "capture",
+        with_oracle: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        check_word("render_mode", render_mode, ("rgb_array",), None)
+        self.render_mode = render_mode
+        options = EnvOptions(
+            scenes=scenes,
+            split=split,
+            grid=grid,
+            scorer=scorer,
+            costs={} if costs is None else costs,
+            observation=observation,
+            sensors=sensors,
+            resolution=resolution,
+            crop=crop,
+            motion=motion,
+            depth=depth,
+            lighting=lighting,
+            delay=delay,
+            camera=camera,
+            simulator=simulator,
+            noise=noise,
+            tolerance=tolerance,
+            reward=reward,
+            with_oracle=with_oracle,
+        )
+        self.core = EpisodeCore(options, num_envs=1)
+        self.action_space = gym.spaces.Discrete(len(self.core.grid))
+        self.observation_space: Any = self.core.observation_space()
+        self._last = None
+
     @property
     def state(self) -> int:
         """Index of the current exposure state."""
         return self.core.episode(0).state
-
-    def episode(self, env_index: int = 0) -> Episode:
-        """What was drawn for the running episode, and where it is now."""
-        return self.core.episode(env_index)
-
-    def scene(self, env_index: int = 0) -> Scene:
-        """The scene that is photographed now; of a sequence, that of the current frame."""
-        return self.core.scene(env_index)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -163,23 +271,20 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
 
     def action_masks(self) -> np.ndarray:
         """(S,) bool: states that the scene allows."""
-        return self.core.action_masks(_FIRST)[0]
+        mask: np.ndarray = self.core.action_masks(_FIRST)[0]
+        return mask
 
     def expected_scores(self) -> np.ndarray:
         """(S,) float64: expectation over noise of every state's score in the current frame."""
         return self.score_table().mean
 
-    def score_table(self, env_index: int = 0) -> ScoreTable:
-        """Expected scores in the current frame, with their standard errors and parts."""
-        return self.core.score_table(env_index)
+    def render(self) -> np.ndarray | None:
+        """The developed capture, (H, W, 3) uint8, with its settings and score written on it.
 
-    def render(self) -> np.ndarray:  # type: ignore[override]
-        """(H, W, 3) uint8: the developed capture with its settings and score written on it."""
-        from ae_env.rendering import render_frame
-
-        if self._last is None:
-            raise gym.error.ResetNeeded("call reset() before render()")
-        return render_frame(self.core, 0, self._last)
+        None, and a warning in the log, without a `render_mode`.
+        """
+        pictures = self._pictures(1)
+        return None if pictures is None else pictures[0]
 
 
 def _first(observation: Observation) -> Observation:

@@ -35,11 +35,13 @@ BUNDLED: dict[str, Size] = {
 }
 #: Those of one kind, or of the hard part.
 BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
+#: Ways to name scenes, see `load_scenes`.
+SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any]
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
 def load_scenes(
-    spec: str | Path | Sequence[Scene] | Mapping[str, Any],
+    spec: SceneSpec,
     split: Split = "train",
     *,
     camera: CameraProfile,
