@@ -11,7 +11,6 @@ from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, SceneSpec, load_scenes
 from ae_env.scenes.bundled import Split as Split
-from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
 from ae_env.scenes.loading import (
     BUNDLED,
     BUNDLED_PARTS,
@@ -20,6 +19,7 @@ from ae_env.scenes.loading import (
     is_sequence,
     without_noise,
 )
+from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
 from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer

@@ -207,7 +207,7 @@ class AutoExposureVectorEnv(
         """
         return self._pictures(self.num_envs)
 
-    # -- helpers ------------------------------------------------------------------------------
+    # -- helpers ----------------------------------------------------------------------------------
 
     def _begin(
         self, env_indices: np.ndarray, options: Sequence[dict[str, Any]] | None = None

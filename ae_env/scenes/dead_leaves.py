@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Times that the leaves cover the frame; what they leave open shows the ground.
+#: Number of times that the leaves cover the frame; gaps show the ground.
 _COVERAGE = 3.0
 #: A square of this half side has about the area of the unit disc.
 _SQUARE_HALF_SIDE = 0.886
@@ -21,7 +21,7 @@ _CHUNK = 16_384
 
 @dataclass(frozen=True)
 class LeafStyle:
-    """What dead leaves look like.
+    """Appearance of dead leaves.
 
     Args:
         smallest: Smallest radius [pixels].
@@ -59,7 +59,7 @@ def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = N
     Args:
         rng: Source of all randomness.
         size: Height and width [pixels].
-        style: What the leaves look like.
+        style: Appearance of the leaves.
 
     Returns:
         (3, size, size) float32 reflectance in linear sRGB, in [0.005, 0.97].

@@ -33,7 +33,7 @@ class Photograph:
         name: Its name there, and the name of its source group.
         file: File name in ``skimage/data``.
         split: ``"train"`` or ``"test"``; fixed.
-        illuminance: Range of the light that it is put under [lux].
+        illuminance: Range of the light assumed for it [lux].
         tint: Range of the light's colour, see `temperature_tint`.
         credit: Photographer or institution and licence, as scikit-image states them.
     """

@@ -8,16 +8,16 @@ docstring of each kind says where that is.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ae_env.scenes.colour import temperature_tint
-from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise, scale_to_mean
+from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
+from ae_env.utils.checks import did_you_mean
 
-#: Part of every cache key: raise it with any change of what is drawn.
+#: Part of every cache key: raise it with any change of the drawings.
 GENERATOR_VERSION = 1
 #: Packed pixels a side at which procedural scenes are drawn.
 NATIVE_SIZE = 256
@@ -54,8 +54,7 @@ def draw(kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE) -> Drawin
         ValueError: If there is no such kind; the message proposes the nearest name.
     """
     if kind not in _KINDS:
-        near = difflib.get_close_matches(str(kind), _KINDS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(kind, _KINDS)
         raise ValueError(f"`kind` (={kind!r}) must be one of {list_kinds()}{hint}")
     drawing = _KINDS[kind](rng, size)
     return Drawing(_lens(drawing.light), drawing.illuminance, drawing.illuminant)
@@ -361,15 +360,3 @@ def _add_neon(rng: np.random.Generator, light: np.ndarray) -> None:
         tube = np.exp(-(((ring - radius) / 0.0025) ** 2))
         value = np.exp(rng.uniform(np.log(20.0), np.log(80.0)))
         light += (_neon_colour(rng)[:, None, None] * np.float32(value) * tube).astype(np.float32)
-
-
-__all__ = [
-    "GENERATOR_VERSION",
-    "HARD_KINDS",
-    "MOTION_SPEED",
-    "NATIVE_SIZE",
-    "Drawing",
-    "draw",
-    "list_kinds",
-    "scale_to_mean",
-]

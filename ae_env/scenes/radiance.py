@@ -53,9 +53,8 @@ def read_radiance(path: str | Path) -> np.ndarray:
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, is empty of light or is neither kind, or claims more
-            pixels than `simulator.utils.files.MAX_PIXELS`, or `MAX_RADIANCE_PIXELS_PER_BYTE` of them for
-            each byte of the file.
+        ValueError: If the file cannot be read, holds no light or is neither kind, or claims more
+            pixels than `simulator.utils.files` allows for a file of its length.
     """
     path = as_path(path)
     if not path.is_file():
@@ -92,7 +91,7 @@ def radiance_scenes(
 
     Args:
         path: The file.
-        camera: Whose colours the light is taken to.
+        camera: Camera in whose colours the light is stated.
         name: Prefix of the scene ids.
         group: Source group.
         resolution: Packed pixels a side; None keeps 256.
@@ -140,7 +139,7 @@ def _near_one(image: np.ndarray) -> np.ndarray:
 
 
 def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
-    """log2 of the exposure that a view asks for: its mean, clipped at white, against 0.12."""
+    """log2 of the mean of a view's green, clipped at white, relative to 0.12."""
     matrix, _ = camera_from_srgb(camera)
     green = torch.from_numpy(np.tensordot(matrix[1], view, axes=1))
     return -math.log2(mean_anchor(green))
@@ -235,7 +234,7 @@ def _read_hdr(path: Path) -> np.ndarray:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
     content = path.read_bytes()
     _refuse_lies(path, *_hdr_size(content), len(content))
-    level = cv2.utils.logging.setLogLevel(0)  # what is wrong is said below, and only there
+    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
     try:
         flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None

@@ -1,4 +1,4 @@
-"""Luma, luminance and gradients of developed pictures: what several scorers start from."""
+"""Luma, luminance and gradients of developed pictures, which several scorers share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ LUMINANCE_SHARES = (0.2126, 0.7152, 0.0722)
 #: Weight of the middle and of each side in one direction of a gradient filter, and of all together.
 SOBEL = (2.0, 1.0)
 SCHARR = (10.0, 3.0)
-_PART = 2**18  # samples
+#: Samples that `by_parts` gives to a function at a time.
+_PART = 2**18
 
 
 def luma_of(images: torch.Tensor) -> torch.Tensor:

@@ -12,8 +12,8 @@ import torch
 import torch.nn.functional as functional
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.external import Brisque
-from ae_env.scorers.keypoints import luma_bytes
+from ae_env.scorers.opencv import Brisque
+from ae_env.scorers.opencv import luma_bytes
 
 cv2 = pytest.importorskip("cv2")
 

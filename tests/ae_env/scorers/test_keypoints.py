@@ -14,7 +14,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.keypoints import reference_pictures
+from ae_env.scorers.opencv import reference_pictures
 from ae_env.scorers.protocol import Captures
 from simulator import CameraSettings, get_camera, incident_ev100
 
