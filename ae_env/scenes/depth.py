@@ -119,7 +119,7 @@ def _plane(rng: np.random.Generator, side: int, level: float, slant: float) -> n
     axis = np.linspace(-0.5, 0.5, side, dtype=np.float32)
     rise = rng.uniform(0.0, slant)
     plane = level + rise * (np.sin(angle) * axis[:, None] + np.cos(angle) * axis[None, :])
-    return plane.astype(np.float32)
+    return np.asarray(plane.astype(np.float32))
 
 
 def _background(
@@ -227,7 +227,7 @@ def _leaves(rng: np.random.Generator, size: int) -> np.ndarray:
     light = dead_leaves(rng, size, style)
     strength = rng.uniform(0.0, 0.6) if rng.random() < 0.8 else 0.0
     grain = np.exp(np.float32(strength) * fractal_noise(rng, size, rng.uniform(0.6, 1.3)))
-    return np.clip(light * grain, 0.003, 0.97).astype(np.float32)
+    return np.asarray(np.clip(light * grain, 0.003, 0.97).astype(np.float32))
 
 
 def _add_highlights(rng: np.random.Generator, light: np.ndarray, surface: np.ndarray) -> None:
@@ -255,4 +255,4 @@ def _soften(light: np.ndarray, weight: float) -> np.ndarray:
     padded = np.pad(light, ((0, 0), (1, 1), (1, 1)), mode="edge")
     rows = weight * (padded[:, :-2] + padded[:, 2:]) + (1.0 - 2.0 * weight) * padded[:, 1:-1]
     both = weight * (rows[..., :-2] + rows[..., 2:]) + (1.0 - 2.0 * weight) * rows[..., 1:-1]
-    return both.astype(np.float32)
+    return np.asarray(both.astype(np.float32))

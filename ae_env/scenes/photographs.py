@@ -122,7 +122,7 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     linear = np.where(flat <= 0.04045, flat / 12.92, ((flat + 0.055) / 1.055) ** 2.4)
     peak = shown.max(axis=0)
     blown = np.clip((peak - _CLIPPED) / (1.0 - _CLIPPED), 0.0, 1.0) ** 2
-    return (linear * np.exp2(blown * rng.uniform(0.0, 2.5))).astype(np.float32)
+    return np.asarray((linear * np.exp2(blown * rng.uniform(0.0, 2.5))).astype(np.float32))
 
 
 def _read(name: str) -> np.ndarray:

@@ -227,7 +227,7 @@ def _shadows(rng: np.random.Generator, size: int, share: float, depth: float) ->
     field = fractal_noise(rng, size, 1.6)
     edge = np.quantile(field, share)
     lit = 1.0 / (1.0 + np.exp(-np.clip((field - edge) / 0.06, -60, 60)))
-    return (depth + (1.0 - depth) * lit).astype(np.float32)
+    return np.asarray((depth + (1.0 - depth) * lit).astype(np.float32))
 
 
 def _falloff(rng: np.random.Generator, size: int, stops: float) -> np.ndarray:
@@ -236,7 +236,7 @@ def _falloff(rng: np.random.Generator, size: int, stops: float) -> np.ndarray:
     axis = np.linspace(-0.5, 0.5, size, dtype=np.float32)
     ramp = np.sin(angle) * axis[:, None] + np.cos(angle) * axis[None, :]
     field = stops * ramp + 0.1 * stops * fractal_noise(rng, size, 2.0)
-    return np.exp2(field - np.median(field)).astype(np.float32)
+    return np.asarray(np.exp2(field - np.median(field)).astype(np.float32))
 
 
 def _scatter(rng: np.random.Generator, size: int, share: float) -> np.ndarray:
@@ -272,7 +272,7 @@ def _sky_above_skyline(rng: np.random.Generator, size: int) -> np.ndarray:
     ridge = np.cumsum(rng.standard_normal(size))
     ridge = (ridge - np.linspace(ridge[0], ridge[-1], size)) / (np.abs(ridge).max() + 1e-6)
     skyline = rng.uniform(0.3, 0.65) + rng.uniform(0.02, 0.1) * ridge
-    return np.linspace(0.0, 1.0, size)[:, None] < skyline[None, :]
+    return np.asarray(np.linspace(0.0, 1.0, size)[:, None] < skyline[None, :])
 
 
 def _windows(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -331,7 +331,7 @@ def _warm(rng: np.random.Generator) -> np.ndarray:
 def _neon_colour(rng: np.random.Generator) -> np.ndarray:
     colour = np.array([0.08, 0.08, 0.08])
     colour[rng.integers(0, 3)] = 1.0
-    return np.maximum(colour, rng.uniform(0.0, 0.6, 3)).astype(np.float32)
+    return np.asarray(np.maximum(colour, rng.uniform(0.0, 0.6, 3)).astype(np.float32))
 
 
 def _add_lit_windows(rng: np.random.Generator, light: np.ndarray) -> None:

@@ -135,7 +135,7 @@ def _near_one(image: np.ndarray) -> np.ndarray:
     if abs(exponent) <= _USUAL_EXPONENT:
         return image
     with np.errstate(over="ignore", under="ignore"):
-        return np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100))
+        return np.asarray(np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100)))
 
 
 def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
@@ -198,7 +198,9 @@ def perspective(
     column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
     row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
     view = _bilinear(panorama, row, np.broadcast_to(column, row.shape))
-    return view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
+    return np.asarray(
+        view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
+    )
 
 
 def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -211,7 +213,7 @@ def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     x0 = x0 % width
     above = (1.0 - fx) * image[:, y0, x0] + fx * image[:, y0, x1]
     below = (1.0 - fx) * image[:, y1, x0] + fx * image[:, y1, x1]
-    return (1.0 - fy) * above + fy * below
+    return np.asarray((1.0 - fy) * above + fy * below)
 
 
 def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
@@ -224,7 +226,7 @@ def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
         )
     top, left = (height - k * size) // 2, (width - k * size) // 2
     square = image[:, top : top + k * size, left : left + k * size]
-    return square.reshape(3, size, k, size, k).mean(axis=(2, 4))
+    return np.asarray(square.reshape(3, size, k, size, k).mean(axis=(2, 4)))
 
 
 def _read_hdr(path: Path) -> np.ndarray:

@@ -35,7 +35,8 @@ from ae_env.scenes.radiance import (
 from ae_env.scenes.scene import Scene, reference_settings
 from ae_env.utils.checks import check_integer, check_word
 from simulator.camera import CameraProfile
-from simulator.reference.reference_camera import DRAPED, Lens, ReferenceScene
+from simulator.optics.thin_lens import Lens
+from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from simulator.settings import incident_ev100
 
 logger = logging.getLogger(__name__)

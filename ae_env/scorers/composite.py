@@ -85,7 +85,8 @@ class CompositeScorer:
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of raw `images` (B, 4, H, W) in [0, 1]."""
-        return self.combine(self.score_parts(images, captures))
+        scores: torch.Tensor = self.combine(self.score_parts(images, captures))
+        return scores
 
     def score_parts(
         self,
@@ -267,7 +268,8 @@ def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
     scores = scores.detach().to("cpu", torch.float64)
     if not bool(((scores >= -ROUNDING) & (scores <= 1 + ROUNDING)).all()):
         raise UserCodeError(f"scorer {name!r} returned {_describe_range(scores)}: rule is [0, 1]")
-    return scores.clamp(0.0, 1.0)
+    scores: torch.Tensor = scores.clamp(0.0, 1.0)
+    return scores
 
 
 def _describe_range(values: Any) -> str:

@@ -45,7 +45,8 @@ def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
     codes += LEVELS * torch.arange(count, device=luma.device)[:, None]
     bins = torch.bincount(codes.flatten(), minlength=LEVELS * count).reshape(count, LEVELS)
     shares = bins.double() / codes.shape[1]
-    return torch.special.entr(shares).sum(dim=1).div_(math.log(2.0)).clamp_(min=0.0)
+    bits: torch.Tensor = torch.special.entr(shares).sum(dim=1).div_(math.log(2.0))
+    return bits.clamp_(min=0.0)
 
 
 def shim_response(

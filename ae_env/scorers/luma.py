@@ -61,7 +61,7 @@ def by_parts(
     step = len(images)
     if images.device.type == "cpu":
         step = max(1, _PART // max(1, images[0].numel()))
-    return torch.cat([function(part) for part in images.split(step)])
+    return torch.cat([function(part) for part in images.split(step)])  # type: ignore[no-untyped-call]
 
 
 def squared_gradient(luma: torch.Tensor, weights: tuple[float, float]) -> torch.Tensor:

@@ -113,7 +113,8 @@ def nima_network(weights: dict[str, Tensor]) -> NimaMobileNet:
     for layer in network.features:
         assert isinstance(layer, ConvNormReLU6)
         layer.fuse()
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network
 
 
 # -- the published weights: from Keras' HDF5 to safetensors, without Keras ------------------------
@@ -336,7 +337,7 @@ def mean_rating(network: nn.Module, images: Tensor) -> Tensor:
     ratings = torch.arange(1.0, RATINGS + 1.0, dtype=torch.float64)
     means = []
     with torch.no_grad():
-        for part in images.split(_CHUNK):
+        for part in images.split(_CHUNK):  # type: ignore[no-untyped-call]
             if part.shape[2:] != size:
                 part = functional.interpolate(part, size, mode="bilinear", antialias=True)
             part = (2.0 * part.clamp(0.0, 1.0) - 1.0).to(memory_format=torch.channels_last)

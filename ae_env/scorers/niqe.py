@@ -278,7 +278,8 @@ def niqe_distance(images: Tensor, model: NiqeModel, block: int = BLOCK) -> Tenso
     inverse = torch.linalg.pinv((covariance + pristine) / 2.0, hermitian=True)
     difference = mean - torch.from_numpy(model.mean)
     squared = (difference[:, None] @ inverse @ difference[..., None]).flatten()
-    return squared.clamp(min=0.0).sqrt()
+    distance: Tensor = squared.clamp(min=0.0).sqrt()
+    return distance
 
 
 class Niqe:

@@ -142,7 +142,8 @@ def registered_scorer(name: str) -> Callable[[], Any] | None:
     return _REGISTRY.get(name)
 
 
-def _find_scorer(name: str) -> Scorer:
+def _find_scorer(name: str) -> Any:
+    """The scorer of a name; `CompositeScorer` checks that it is one."""
     factory = _REGISTRY.get(name)
     if factory is not None:
         # The errors of this package's own scorers are clear already.
@@ -399,7 +400,7 @@ def _domains(found: Any) -> set[str]:
 
 
 def _package(point: Any) -> str:
-    return point.dist.name if point.dist is not None else point.module.partition(".")[0]
+    return str(point.dist.name if point.dist is not None else point.module.partition(".")[0])
 
 
 def _origin(factory: Callable[[], Any]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 
 class UserCodeError(ValueError):
-    """A scorer or a policy of the user's own raised, or returned what it must not return."""
+    """A user's scorer or policy raised an error, or returned an invalid value."""
 
 
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
