@@ -265,11 +265,10 @@ def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
         if isinstance(scores, torch.Tensor):
             found = f"{tuple(scores.shape)} {scores.dtype}"
         raise UserCodeError(f"scorer {name!r} returned {found}: it must return a tensor ({count},)")
-    scores = scores.detach().to("cpu", torch.float64)
-    if not bool(((scores >= -ROUNDING) & (scores <= 1 + ROUNDING)).all()):
-        raise UserCodeError(f"scorer {name!r} returned {_describe_range(scores)}: rule is [0, 1]")
-    scores: torch.Tensor = scores.clamp(0.0, 1.0)
-    return scores
+    found64: torch.Tensor = scores.detach().to("cpu", torch.float64)
+    if not bool(((found64 >= -ROUNDING) & (found64 <= 1 + ROUNDING)).all()):
+        raise UserCodeError(f"scorer {name!r} returned {_describe_range(found64)}: rule is [0, 1]")
+    return found64.clamp(0.0, 1.0)
 
 
 def _describe_range(values: Any) -> str:
