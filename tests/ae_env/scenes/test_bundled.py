@@ -1,5 +1,7 @@
 """Bundled scenes: statistics, splits, determinism, cache."""
 
+from __future__ import annotations
+
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,8 @@ from simulator.camera import get_camera
 from simulator.utils.cache import cache_dir
 
 CAMERA = get_camera("nikon_z6")
+
+
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
@@ -156,16 +160,6 @@ def test_unprocess_inverts_tone_and_gamma() -> None:
     assert np.abs(again * 255 - shown).max() <= 0.51
     with pytest.raises(ValueError, match="`image`"):
         unprocess(np.zeros((4, 4)), rng)
-
-
-def test_photographs_of_one_picture_stay_in_one_group(unseen: list[Scene]) -> None:
-    groups: dict[str, int] = {}
-    for scene in unseen:
-        if scene.kind == "photograph":
-            groups[scene.group] = groups.get(scene.group, 0) + 1
-            assert "scikit-image" in scene.source
-    assert len(groups) == 4
-    assert set(groups.values()) == {3}
 
 
 def cached_files() -> list[Path]:

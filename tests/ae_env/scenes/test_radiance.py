@@ -1,14 +1,20 @@
-"""Radiance maps: reading, cleaning, perspective views."""
+"""Radiance maps: reading, cleaning, perspective views, lying files."""
+
+from __future__ import annotations
 
 import logging
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ae_env.scenes import load_scenes
 from ae_env.scenes.radiance import assumed_ev100, perspective, radiance_scenes, read_radiance
+from simulator import get_camera
 from simulator.camera import get_camera
+from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")
 
@@ -46,18 +52,6 @@ def test_a_small_lamp_keeps_its_energy() -> None:
     panorama[:, 256, 512] = 1.0
     fine, coarse = perspective(panorama, 0.0, 512), perspective(panorama, 0.0, 16)
     assert coarse.mean() == pytest.approx(fine.mean(), rel=0.05)
-
-
-def test_invalid_field_of_view() -> None:
-    with pytest.raises(ValueError, match="`field_of_view`"):
-        perspective(np.ones((3, 4, 8), np.float32), 0.0, 4, 180.0)
-
-
-def write_exr(path: Path, image: np.ndarray) -> None:
-    openexr = pytest.importorskip("OpenEXR")
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    with openexr.File(header, {"RGB": image}) as file:
-        file.write(str(path))
 
 
 def test_exr_is_read_and_cleaned(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -147,3 +141,68 @@ def test_real_maps_load(data_dir: Path) -> None:
         assert scene.light.shape == (4, 64, 64)
         assert scene.light[1].clamp(max=1.0).mean().item() == pytest.approx(0.12, rel=0.15)
         assert 1.0 < scene.ev100 < 15.0
+
+
+HDR_HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (b"-Y 60000 +X 60000", "claims 60000 x 60000 pixels, where at most 268435456"),
+        (b"-Y 8000 +X 8000", "claims 8000 x 8000 pixels in .* bytes, where at most 8192 a byte"),
+        (b"-Y 99999999999 +X 4", "claims 99999999999 x 4"),
+        (b"-Y 17 +X 32", "complete"),
+        (b"-Y 0 +X 0", "complete"),
+        (b"", "complete"),
+    ],
+)
+def test_lying_radiance_files(tmp_path: Path, size: bytes, words: str) -> None:
+    pytest.importorskip("cv2")
+    path = tmp_path / "a.hdr"
+    path.write_bytes(HDR_HEAD + size + b"\n" + 16 * 32 * b"\x80\x80\x80\x80")
+    with pytest.raises(ValueError, match=rf"radiance map '.*a\.hdr' .*{words}"):
+        read_radiance(path)
+
+
+def test_lying_and_cut_exr_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, np.random.default_rng(0).random((32, 64)))
+    whole = path.read_bytes()
+    window = whole.index(b"dataWindow\0box2i\0") + 21
+    for corner, words in (((59_999, 59_999), "60000 x 60000"), ((19_999, 12_999), "8192 a byte")):
+        content = bytearray(whole)
+        struct.pack_into("<2i", content, window + 8, *corner)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"a\.exr' claims .*{words}"):
+            read_radiance(path)
+    for size in (0, 4, 100, 400, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match="must be a complete OpenEXR file"):
+            read_radiance(path)
+    for bad in (None, 3, b"a.exr"):
+        with pytest.raises(ValueError, match="must be a file's name"):
+            read_radiance(bad)  # type: ignore[arg-type]
+
+
+def test_a_flat_map_that_is_packed_most_densely(tmp_path: Path) -> None:
+    path = tmp_path / "flat.exr"
+    write_exr(path, np.full((2048, 3072), 0.5), "DWAB")
+    assert 2048 * 3072 / path.stat().st_size > 1024
+    np.testing.assert_allclose(read_radiance(path)[:, ::64, ::64], 0.5, rtol=1e-2)
+
+
+@pytest.mark.parametrize("scale", [2.0**-100, 2.0**110])
+def test_the_scale_of_a_map_does_not_matter(tmp_path: Path, scale: float) -> None:
+    # Nothing says how bright a radiance map is: any scale gives the same scene.
+    image = np.random.default_rng(0).uniform(0.1, 4.0, (32, 32))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    write_exr(tmp_path / "a" / "map.exr", image)
+    write_exr(tmp_path / "b" / "map.exr", image.astype(np.float32) * scale)
+    (first,), (second,) = (
+        load_scenes(tmp_path / "a", "all", camera=CAMERA, resolution=8),
+        load_scenes(tmp_path / "b", "all", camera=CAMERA, resolution=8),
+    )
+    assert second.ev100 == pytest.approx(first.ev100, abs=1e-6)
+    torch.testing.assert_close(second.light, first.light, rtol=1e-5, atol=0.0)

@@ -1,4 +1,6 @@
-"""Scenes of the reference camera: splits, light, depth of real photographs."""
+"""Scenes of the reference camera: splits, light, depth of real photographs, draped pictures."""
+
+from __future__ import annotations
 
 import logging
 from dataclasses import replace
@@ -13,16 +15,24 @@ from ae_env.scenes.reference_scenes import (
     RADIANCE_MAPS,
     assumed_illuminance,
     depth_photographs,
+    draped_scenes,
     fill_from_nearest,
     packed_pitch,
     reference_scenes,
+    sharpened,
 )
+from simulator import CameraSettings, get_camera
 from simulator.camera import get_camera
-from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from simulator.settings import CameraSettings
+from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")
+
+
 SPLITS = ("train", "validation", "test")
+
+
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
@@ -36,13 +46,6 @@ def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
     assert scene.depth is not None
     f, s, z = scene.lens.focal_length, scene.lens.focus_distance, scene.depth.double().numpy()
     return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
-
-
-def write_exr(path: Path, image: np.ndarray) -> None:
-    openexr = pytest.importorskip("OpenEXR")
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    with openexr.File(header, {"RGB": image.astype(np.float32)}) as file:
-        file.write(str(path))
 
 
 def test_no_source_is_in_two_splits(scenes: dict[str, list[ReferenceScene]]) -> None:
@@ -244,3 +247,49 @@ def test_real_maps_and_cones(data_dir: Path) -> None:
         assert scene.depth.shape == (187, 225)
         assert bool(torch.isfinite(scene.depth).all())
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
+
+
+def picture(kind: str = "indoor", size: int = 64) -> ReferenceScene:
+    generator = torch.Generator().manual_seed(1)
+    return ReferenceScene(
+        scene_id="a",
+        group="the-group",
+        kind=kind,
+        light=torch.rand(4, size, size, generator=generator),
+        reference=CameraSettings(100, 1 / 64, 4),
+        illuminance=100.0,
+    )
+
+
+def test_light_and_group_stay_and_depth_is_new() -> None:
+    scene = picture()
+    first, second = draped_scenes([scene], CAMERA, copies=2)
+    for copy in (first, second):
+        assert torch.equal(copy.light, sharpened(scene).light)
+        assert (copy.group, copy.kind) == ("the-group", DRAPED)
+        assert copy.depth is not None
+    assert first.scene_id != second.scene_id
+    assert not torch.equal(first.depth, second.depth)  # type: ignore[arg-type]
+
+
+def test_blur_is_what_the_thin_lens_says() -> None:
+    """|1/s - 1/z| f^2 / N / (1 - f / s) over the packed pixel, at most 7 px at f/11."""
+    for scene in draped_scenes([picture(size=128)], CAMERA, copies=6):
+        assert scene.depth is not None
+        f, s = scene.lens.focal_length, scene.lens.focus_distance
+        depth = scene.depth.double().numpy()
+        blur = np.abs(1 / s - 1 / depth) * f**2 / 11 / (1 - f / s) / (2 * 5.94e-6)
+        assert blur.max() <= 7.0 + 1e-3
+        assert blur.min() < 0.35  # something is in focus
+
+
+def test_photographs_and_scenes_with_depth_are_passed_over() -> None:
+    scenes = [s for s in reference_scenes("train", CAMERA, number=1, size=32) if s.kind == "depth"]
+    assert scenes
+    assert not list(draped_scenes([*scenes, picture("photograph")], CAMERA))
+
+
+def test_sharpened_is_the_mean_of_2_by_2() -> None:
+    scene = picture(size=5)
+    expected = scene.light.numpy()[:, :4, :4].reshape(4, 2, 2, 2, 2).mean((2, 4))
+    assert sharpened(scene).light.numpy() == pytest.approx(expected)

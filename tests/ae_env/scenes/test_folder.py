@@ -1,0 +1,352 @@
+"""A user's files: folders of raws and maps with bad files in them, and recorded sequences."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.folder import find_files, sequence_bounds
+from simulator import CameraSettings, RawImage, get_camera, write_dng
+from simulator.camera import get_camera
+from simulator.settings import CameraSettings
+from tests.ae_env.scene_files import write_exr, write_hdr
+
+CAMERA = get_camera("nikon_z6")
+
+
+def load(folder: Path, **options: Any) -> list[Scene]:
+    resize = options.pop("resize", Scene.resized)
+    spec = {"path": folder, **options}
+    return load_scenes(spec, "all", camera=CAMERA, resolution=8, resize=resize)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Four raws, ``good1.dng`` to ``good4.dng``."""
+    data = torch.rand(4, 16, 16, generator=torch.Generator().manual_seed(0))
+    for i in range(1, 5):
+        write_dng(tmp_path / f"good{i}.dng", RawImage(data, CameraSettings(100, 0.01, 4), CAMERA))
+    return tmp_path
+
+
+def ids(scenes: list[Scene]) -> list[str]:
+    return [scene.scene_id for scene in scenes]
+
+
+def test_bad_files_stop_or_are_skipped_with_a_reason(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "ae_env.scenes")
+    for i in range(7):
+        (folder / f"bad{i}.dng").write_bytes(b"" if i % 2 else b"some words")
+    (folder / "good1.hdr").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"scene file '.*bad0\.dng': .*text file.*'skip'"):
+        load(folder)
+    assert f"reading 12 scene files of {folder}" in caplog.text  # before it fails
+    scenes = load(folder, on_error="skip")
+    assert ids(scenes) == ["good1.dng", "good2", "good3", "good4"]
+    (line,) = (r.getMessage() for r in caplog.records if "skipped" in r.getMessage())
+    assert "8 of 12 scene files skipped" in line
+    assert "bad0.dng" in line
+    assert "an empty file" in line
+    assert line.endswith("and 3 more)")
+
+
+def test_nothing_left_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.dng").write_bytes(b"")
+    (tmp_path / "b.dng").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"all 2 were skipped \(a\.dng: .*empty file"):
+        load(tmp_path, on_error="skip")
+    with pytest.raises(ValueError, match="empty file") as caught:
+        load(tmp_path / "a.dng")
+    assert "skip" not in str(caught.value)  # which would not help with one file
+
+
+@pytest.mark.parametrize("change", ["vanishes", "shrinks"])
+def test_a_folder_that_changes_meanwhile(
+    folder: Path, caplog: pytest.LogCaptureFixture, change: str
+) -> None:
+    content = (folder / "good3.dng").read_bytes()
+
+    def resize(scene: Scene, *arguments: Any) -> Scene:
+        if scene.scene_id == "good2":
+            if change == "vanishes":
+                (folder / "good3.dng").unlink()
+            else:
+                os.truncate(folder / "good3.dng", 900)
+        return scene.resized(*arguments)
+
+    with pytest.raises(ValueError, match=r"good3\.dng.*(does not exist|truncated)"):
+        load(folder, resize=resize)
+    (folder / "good3.dng").write_bytes(content)
+    assert ids(load(folder, resize=resize, on_error="skip")) == ["good1", "good2", "good4"]
+    assert "1 of 4 scene files skipped (good3.dng: " in caplog.text
+
+
+def test_a_map_is_skipped_as_a_whole(folder: Path) -> None:
+    write_exr(folder / "panorama.exr", np.ones((32, 64)))
+
+    def resize(scene: Scene, *arguments: Any) -> Scene:
+        if scene.scene_id == "panorama-180":
+            raise ValueError("a bad view")
+        return scene.resized(*arguments)
+
+    scenes = load(folder, resize=resize, on_error="skip")
+    assert ids(scenes) == ["good1", "good2", "good3", "good4"]
+
+
+def test_a_black_frame_stops_or_is_skipped(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    settings = CameraSettings(100, 0.01, 4)
+    write_dng(folder / "black.dng", RawImage(torch.zeros(4, 64, 64), settings, CAMERA))
+    with pytest.raises(ValueError, match=r"scene file '.*black\.dng': `light` is 0 .*'skip'"):
+        load(folder)
+    assert ids(load(folder, on_error="skip")) == ["good1", "good2", "good3", "good4"]
+    assert "1 of 5 scene files skipped (black.dng: `light` is 0" in caplog.text
+    assert len(load(folder, illuminance=100.0)) == 5  # then its exposure is known
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"on_error": "skp"}, r"`on_error` \(='skp'\).*'stop', 'skip'; did you mean 'skip'"),
+        ({"on_error": None}, "`on_error`"),
+        ({"on_eror": "skip"}, "did you mean 'on_error'"),
+        ({"illuminance": -1.0}, r"`illuminance` \(=-1.0\)"),
+        ({"illuminance": {"good1.dng": float("nan")}}, "`illuminance`"),
+        ({"hard": 1}, "`hard`"),
+        ({"kind": 3}, "`kind`"),
+        ({"median_speed": float("inf")}, "`median_speed`"),
+        ({"ev100": "bright"}, "`ev100`"),
+    ],
+)
+def test_options_are_refused_before_anything_is_read(
+    options: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        load(tmp_path / "is not there", **options)
+
+
+@pytest.mark.parametrize("name", ["x" * 3000, "~nobody-of-that-name/x", "a\0b"])
+def test_names_that_no_system_has(name: str) -> None:
+    with pytest.raises(ValueError, match="`scenes`"):
+        load_scenes(name, camera=CAMERA)
+
+
+def test_options_reach_the_scenes(tmp_path: Path) -> None:
+    write_hdr(tmp_path / "a.hdr", 0)
+    write_hdr(tmp_path / "b.hdr", 1)
+    options = {"illuminance": {"a.hdr": 250.0}, "kind": "mine", "hard": True}
+    a, b = load(tmp_path, median_speed=0.5, **options)
+    assert (a.illuminance, b.illuminance) == (250.0, None)
+    assert {(s.kind, s.hard, s.median_speed) for s in (a, b)} == {("mine", True, 0.5)}
+    (only,) = load(tmp_path / "b.hdr", ev100=8.0)
+    assert only.ev100 == pytest.approx(8.0, abs=0.05)
+
+
+def test_hidden_files_are_left_out(tmp_path: Path) -> None:
+    write_hdr(tmp_path / "a.hdr")
+    write_hdr(tmp_path / ".trash" / "b.hdr")
+    write_hdr(tmp_path / "._a.hdr")
+    assert [p.name for p in find_files(tmp_path)[1]] == ["a.hdr"]
+
+
+# -- sequences: raws in name order are the frames of an episode ------------------------------------
+
+
+ID = "ae_env/AutoExposure-v0"
+
+
+#: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same
+#: in the first and the second, twice that in the third.
+FRAMES = ((0.1, 100, 1 / 64), (0.2, 200, 1 / 64), (0.2, 100, 1 / 64))
+
+
+NAMES = ("IMG_2", "IMG_9", "IMG_10")
+
+
+#: ISO 100, 1/60 s, f/8 in a grid of one state.
+GRID = {"isos": [100, 200], "exposure_times": [1 / 64], "f_numbers": [8]}
+
+
+ARGUMENTS: dict[str, Any] = {
+    "split": "test",
+    "resolution": 36,
+    "grid": GRID,
+    "simulator": None,
+    "motion": "none",
+    "depth": "far",
+}
+
+
+def _write(recorded: Path, scale: float = 1.0) -> None:
+    recorded.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    texture = 1.0 + 0.1 * rng.standard_normal((4, 36, 40)).astype(np.float32)
+    for name, (signal, iso, time) in zip(NAMES, FRAMES, strict=True):
+        raw = RawImage(scale * signal * texture, CameraSettings(iso, time, 8.0), CAMERA)
+        write_dng(recorded / f"{name}.dng", raw)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    base = tmp_path_factory.mktemp("recorded")
+    _write(base / "street")
+    _write(base / "yard" / "day", scale=0.5)
+    return base
+
+
+def _env(path: Path, **arguments: Any) -> Any:
+    given = {"scenes": {"sequence": str(path)}, **ARGUMENTS, **arguments}
+    return gym.make(ID, **given).unwrapped
+
+
+def _signal(observation: dict[str, np.ndarray]) -> float:
+    return float(observation["raw"].mean())
+
+
+def test_frame_t_shows_raw_t_and_the_last_one_stays(recorded: Path) -> None:
+    env = _env(recorded / "street", noise=False, observation="linear")
+    observation, info = env.reset(seed=0, options={"state": 0})
+    shown = [(info["scene_id"], _signal(observation))]
+    for _ in range(4):
+        observation, _, _, _, info = env.step(0)
+        shown.append((info["scene_id"], _signal(observation)))
+    assert [name for name, _ in shown] == [*NAMES, NAMES[-1], NAMES[-1]]
+    # Light is absolute through each raw's own settings.
+    assert [s for _, s in shown] == pytest.approx([0.1, 0.1, 0.2, 0.2, 0.2], rel=5e-3)
+    assert _signal(env.step(1)[0]) == pytest.approx(0.4, rel=5e-3)
+
+
+@pytest.mark.parametrize(("frame", "name"), [(0, "IMG_2"), (1, "IMG_9"), (2, "IMG_10")])
+def test_an_episode_may_begin_later(recorded: Path, frame: int, name: str) -> None:
+    env = _env(recorded / "street")
+    assert env.reset(seed=0, options={"frame": frame})[1]["scene_id"] == name
+    assert env.reset(seed=0, options={"frame": 77})[1]["scene_id"] == "IMG_10"
+
+
+def test_folders_are_sequences_and_source_groups(recorded: Path) -> None:
+    env = _env(recorded)
+    assert [s.scene_id for s in env.scenes] == ["street/IMG_2", "yard/day/IMG_2"]
+    assert [s.group for s in env.scenes] == ["street", "yard/day"]
+    scenes = load_scenes({"sequence": recorded}, "all", camera=CAMERA, resolution=36)
+    assert [s.group for s in scenes] == ["street"] * 3 + ["yard/day"] * 3
+    first, last = sequence_bounds(scenes)
+    assert first.tolist() == [0, 0, 0, 3, 3, 3]
+    assert last.tolist() == [2, 2, 2, 5, 5, 5]
+    for wanted in ("yard/day", "yard/day/IMG_2", 1):
+        info = env.reset(options={"scene": wanted, "frame": 1})[1]
+        assert info["scene_id"] == "yard/day/IMG_9"
+    with pytest.raises(ValueError, match=r"`options\['scene'\]` \(='street/IMG_9'\)"):
+        env.reset(options={"scene": "street/IMG_9"})
+    drawn = {env.reset(seed=i)[1]["scene_id"] for i in range(20)}
+    assert drawn == {"street/IMG_2", "yard/day/IMG_2"}
+
+
+@pytest.mark.parametrize(
+    ("folders", "groups"),
+    [
+        (("", "rec"), {".", "rec"}),
+        (("", "other"), {"rec", "other"}),
+        (("rec", "other"), {"rec", "other"}),
+        (("rec", "other/rec"), {"rec", "other/rec"}),
+    ],
+)
+def test_recordings_of_one_name_are_apart(
+    tmp_path: Path, folders: tuple[str, str], groups: set[str]
+) -> None:
+    base = tmp_path / "rec"
+    for recorded in folders:
+        _write(base / recorded)
+    env = _env(base)
+    assert {s.group for s in env.scenes} == groups
+    for group in groups:
+        env.reset(seed=0, options={"scene": group})
+        shown = [env.step(0)[4]["scene_id"] for _ in range(3)]
+        place = "" if group == "." or group not in folders else f"{group}/"
+        assert shown == [f"{place}{name}" for name in (*NAMES[1:], NAMES[-1])]
+
+
+def test_a_broken_frame_is_an_error(tmp_path: Path) -> None:
+    """Without it all later ones would come too early, so nothing proposes to skip it."""
+    _write(tmp_path)
+    (tmp_path / "IMG_3.dng").write_bytes(b"II*\0")
+    with pytest.raises(ValueError, match=r"scene file '.*IMG_3\.dng'") as caught:
+        load_scenes({"sequence": tmp_path}, "test", camera=CAMERA, resolution=36)
+    assert "skip" not in str(caught.value)
+
+
+def test_scores_are_those_of_the_frame(recorded: Path) -> None:
+    """The third raw has twice the light: ISO 100 there scores what ISO 200 does before."""
+    env = _env(recorded / "street", scorer="brightness", with_oracle=True)
+    env.reset(seed=0, options={"state": 0})
+    before = env.expected_scores()
+    after = [env.step(0) for _ in range(2)][-1]
+    scores = env.expected_scores()
+    scene = env.core.scenes[2]
+    # Unknown light: the right exposure has the mean of green at 0.12.
+    stops = np.log2([0.2 / 0.12, 0.4 / 0.12])
+    np.testing.assert_allclose(scores, np.exp(1 - np.sqrt(1 + stops**2)), rtol=5e-3)
+    assert scene.scene_id == after[4]["scene_id"] == "IMG_10"
+    assert after[1] == pytest.approx(scores[0], abs=1e-9)
+    assert before[0] > scores[0]
+
+
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {"motion": "random", "depth": "random", "with_oracle": True, "delay": 1},
+        {"lighting": "flicker", "observation": "linear", "with_oracle": True},
+    ],
+)
+def test_many_at_once_are_as_single_ones(recorded: Path, extra: dict[str, Any]) -> None:
+    arguments = {"scenes": {"sequence": str(recorded)}, **ARGUMENTS, **extra}
+    envs = gym.make_vec(ID, num_envs=3, max_episode_steps=4, **arguments)
+    singles = [gym.make(ID, **arguments) for _ in range(3)]
+    shown, _ = envs.reset(seed=8)
+    for i, env in enumerate(singles):
+        np.testing.assert_array_equal(shown["raw"][i], env.reset(seed=8 + i)[0]["raw"])
+    for step in range(3):
+        actions = (np.arange(3) + step) % 2
+        shown, rewards, *_, infos = envs.step(actions)
+        for i, env in enumerate(singles):
+            observation, reward, *_, info = env.step(actions[i])
+            np.testing.assert_array_equal(shown["raw"][i], observation["raw"])
+            assert rewards[i] == pytest.approx(reward, rel=1e-8)
+            assert infos["scene_id"][i] == info["scene_id"]
+            if "with_oracle" in extra:
+                assert infos["regret"][i] == pytest.approx(info["regret"], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("spec", "split", "message"),
+    [
+        ({"sequence": "{}"}, "train", "needs at least 15 source groups"),
+        ({"sequence": "{}/none"}, "test", "must name an existing file, folder or glob"),
+        ({"sequence": 3}, "test", "must have a 'path' or a 'sequence'"),
+        ({"sequence": "{}", "path": "{}"}, "test", "field 'path' must be one of"),
+        ({"sequence": "{}", "on_error": "skip"}, "test", r"`on_error` \(='skip'\) must be 'stop'"),
+        ({"sequence": "{}", "hrad": True}, "test", "did you mean 'hard'"),
+        ({"sequence": "bundled:snow"}, "test", "give the name 'bundled:snow' itself"),
+    ],
+)
+def test_bad_sequences_are_refused(
+    recorded: Path, spec: dict[str, Any], split: Any, message: str
+) -> None:
+    named = {k: v.format(recorded) if isinstance(v, str) else v for k, v in spec.items()}
+    with pytest.raises(ValueError, match=message):
+        load_scenes(named, split, camera=CAMERA, resolution=36)
+
+
+def test_radiance_maps_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\n")
+    with pytest.raises(ValueError, match=r"must hold raws .*radiance maps have no settings"):
+        load_scenes({"sequence": tmp_path}, "test", camera=CAMERA)
