@@ -23,7 +23,11 @@ from ae_env.scorers.terms import Highlights, Noise, Shadows
 from simulator import get_camera
 
 CAMERA = get_camera("nikon_z6")
+
+
 GRID = ExposureGrid.default()
+
+
 TERMS = dict.fromkeys(("brightness", "highlights", "shadows", "noise", "sharpness"), 1.0)
 
 
@@ -152,7 +156,7 @@ def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: floa
     assert changed.oracle == wanted.oracle
 
 
-def test_what_is_compiled_and_what_is_loaded_agree_to_the_last_bit(tmp_path: Path) -> None:
+def test_compiled_and_loaded_code_agree_to_the_last_bit(tmp_path: Path) -> None:
     """The first process of a fresh installation compiles; all others load what it kept."""
     code = (
         "import sys, numpy as np; from ae_env.scorers.fused import fused_means as f\n"

@@ -1,7 +1,4 @@
-"""NIMA against Keras: the same network with the same random weights, from files that Keras wrote.
-
-Keras runs in a process of its own: it warns when it is imported.
-"""
+"""NIMA against Keras: the same network with the same random weights, from files that Keras wrote."""
 
 from __future__ import annotations
 

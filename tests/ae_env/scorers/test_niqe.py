@@ -113,13 +113,6 @@ def test_features_are_those_of_a_loop_over_blocks() -> None:
     assert sharpness[0, 5] == pytest.approx(float(deviation[0, 64:, 128:].mean()))
 
 
-def test_a_batch_is_its_pictures() -> None:
-    luma = 255.0 * torch.rand(3, 50, 71, generator=torch.Generator().manual_seed(0)).double()
-    together, _ = block_features(luma, 24)
-    alone = torch.cat([block_features(picture[None], 24)[0] for picture in luma])
-    torch.testing.assert_close(together, alone, rtol=1e-9, atol=1e-12)
-
-
 def test_distance_is_zero_on_its_own_statistics() -> None:
     pictures = _photographs()
     luma = (pictures[0].double() * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0)
