@@ -51,58 +51,28 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+#: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {
-    "env": ("AutoExposureEnv",),
-    "grid": ("ExposureGrid",),
+    "env": "AutoExposureEnv",
+    "grid": "ExposureGrid",
     "lighting": (
-        "FlickerLighting",
-        "LensCapLighting",
-        "Lighting",
-        "RampLighting",
-        "ScheduleLighting",
-        "SineLighting",
-        "StepLighting",
-        "TunnelLighting",
-        "make_lighting",
+        "FlickerLighting LensCapLighting Lighting RampLighting ScheduleLighting SineLighting "
+        "StepLighting TunnelLighting make_lighting"
     ),
-    "observation": (
-        "decode_observation",
-        "decode_sensors",
-        "decode_settings",
-    ),
-    "rendering": ("contact_sheet",),
-    "scenes": (
-        "Scene",
-        "load_scenes",
-    ),
-    "scorers": (
-        "Captures",
-        "CompositeScorer",
-        "Scorer",
-        "list_scorers",
-        "make_scorer",
-        "register_scorer",
-    ),
-    "scorers.score_table": (
-        "ScoreTable",
-        "ScoreTables",
-    ),
-    "utils.checks": ("UserCodeError",),
-    "utils.presets": (
-        "list_presets",
-        "load_preset",
-    ),
-    "vector_env": ("AutoExposureVectorEnv",),
+    "observation": "decode_observation decode_sensors decode_settings",
+    "rendering": "contact_sheet",
+    "scenes": "Scene load_scenes",
+    "scorers": "Captures CompositeScorer Scorer list_scorers make_scorer register_scorer",
+    "scorers.score_table": "ScoreTable ScoreTables",
+    "utils.checks": "UserCodeError",
+    "utils.presets": "list_presets load_preset",
+    "vector_env": "AutoExposureVectorEnv",
     "wrappers": (
-        "ContinuousActions",
-        "ControlActions",
-        "RelativeActions",
-        "VectorContinuousActions",
-        "VectorControlActions",
-        "VectorRelativeActions",
+        "ContinuousActions ControlActions RelativeActions VectorContinuousActions "
+        "VectorControlActions VectorRelativeActions"
     ),
 }
-_EXPORTS = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names}
+_EXPORTS = {name: module for module, names in _NAMES_BY_MODULE.items() for name in names.split()}
 _MODULES = ("lighting", "wrappers")
 __all__ = sorted((*_EXPORTS, *_MODULES))
 

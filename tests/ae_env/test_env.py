@@ -119,16 +119,6 @@ def test_reset_options_choose_scene_state_and_frame() -> None:
     assert (first.speed, first.defocus) == (second.speed, second.defocus)
 
 
-def test_bad_actions_are_refused() -> None:
-    env = _make().unwrapped
-    with pytest.raises(gym.error.ResetNeeded):
-        env.step(0)
-    env.reset(seed=0)
-    for action in (64, -1, 2.5, "3", [1, 2]):
-        with pytest.raises(ValueError, match="`action`"):
-            env.step(action)
-
-
 def _rollout(seed: int, **arguments: Any) -> list[Any]:
     env = _make(**arguments)
     frames = [env.reset(seed=seed)]

@@ -43,13 +43,6 @@ def test_settings_map_fixed_ranges() -> None:
         np.testing.assert_allclose(got, expected, atol=1e-6)
 
 
-def test_ev100_of_the_settings() -> None:
-    # f/8, 1/125 s, ISO 400: EV100 = log2(64 * 125) - 2
-    apex = np.array([6.0, math.log2(125), math.log2(400 / 3.125)])
-    av, tv, sv = decode_settings(encode_settings(apex))
-    assert av + tv - (sv - 5) == pytest.approx(math.log2(64 * 125) - 2, abs=1e-5)
-
-
 def test_sensor_noise_is_fifteen_percent() -> None:
     noise = np.random.default_rng(0).standard_normal((20_000, 2))
     sensors = encode_sensors(np.full(20_000, 0.25), np.full(20_000, 1.0), noise)

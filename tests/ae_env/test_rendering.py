@@ -15,7 +15,7 @@ from PIL import Image
 from ae_env import contact_sheet
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
-from ae_env.rendering import _averaged, _Sheet, _visits
+from ae_env.rendering import _Sheet, _visits
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
@@ -109,18 +109,6 @@ def test_other_grids_and_shapes(grid: ExposureGrid) -> None:
     wide = _scene(60, 90, nlf=nlf)
     sheet = contact_sheet(replace(wide, illuminance=None), grid=grid, path=[0], camera=CAMERA)
     assert min(sheet.size) > 100
-
-
-def test_large_scenes_are_averaged_as_a_whole() -> None:
-    nlf = NoiseLevelFunction((9e-4,) * 4, (9e-6,) * 4)
-    scene = _scene(600, 800, nlf=nlf)
-    small = _averaged(scene, 192)
-    assert small.light.shape == (4, 200, 266)
-    assert small.box_factor == 3
-    np.testing.assert_allclose(small.nlf.shot, 1e-4)
-    mean = scene.light[2, 3:6, 6:9].double().mean()
-    assert float(small.light[2, 1, 2]) == pytest.approx(float(mean), rel=1e-6)
-    assert _averaged(_scene(), 192) is not None
 
 
 @pytest.mark.parametrize(

@@ -214,30 +214,6 @@ def test_a_finished_episode_needs_a_reset_when_autoreset_is_off() -> None:
         envs.step(np.zeros(NUM_ENVS, np.int64))
 
 
-@pytest.mark.parametrize("mask", [[True, True, True], [False, True, False]])
-def test_final_observations_are_the_callers_own(mask: list[bool]) -> None:
-    """Where all episodes end together, and where only some do."""
-    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=2)
-    envs.reset(seed=0)
-    if not all(mask):
-        envs.step(np.array([7, 8, 9]))
-        envs.reset(options={"reset_mask": ~np.array(mask)})
-        finished = envs.step(np.array([4, 5, 6]))
-    else:
-        envs.step(np.array([7, 8, 9]))
-        finished = envs.step(np.array([4, 5, 6]))
-    observation, _, _, truncated, info = finished
-    assert truncated.tolist() == mask
-    assert [final is not None for final in info["final_obs"]] == mask
-    for i in np.flatnonzero(mask):
-        final = info["final_obs"][i]
-        before = final["raw"].copy()
-        assert (before != observation["raw"][i]).any()
-        observation["raw"][i] = 0
-        envs.step(np.array([1, 2, 3]))
-        np.testing.assert_array_equal(final["raw"], before)
-
-
 def test_info_of_some_is_laid_out_as_gymnasium_does() -> None:
     """The last frames of episodes that end apart from the others, against `VectorEnv._add_info`."""
     costs = {"costs": {"switch": 0.1}, "with_oracle": True}
@@ -282,16 +258,6 @@ def test_scores_and_pictures_of_every_environment() -> None:
     assert len(pictures) == NUM_ENVS
     assert all(p.dtype == np.uint8 and p.shape[2] == 3 and p.shape[0] >= 256 for p in pictures)
     assert _native().render() is None
-
-
-def test_rendering_follows_a_masked_reset() -> None:
-    envs = _native(render_mode="rgb_array", autoreset_mode="DISABLED")
-    envs.reset(seed=0, options={"scene": 0, "state": 0})
-    before = envs.render()
-    mask = np.array([False, True, False])
-    envs.reset(options={"reset_mask": mask, "scene": 1, "state": 30})
-    after = envs.render()
-    assert [(a != b).any() for a, b in zip(after, before, strict=True)] == mask.tolist()
 
 
 def test_no_episode_goes_on_where_one_action_is_bad() -> None:

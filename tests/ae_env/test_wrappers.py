@@ -54,24 +54,6 @@ def test_control_actions_are_positions_in_the_lists() -> None:
     assert env.action_masks().all()
 
 
-@pytest.mark.parametrize(
-    ("start", "steps", "expected"),
-    [
-        ((1, 1, 1), (2, 0, 1), (2, 0, 1)),
-        ((0, 3, 2), (0, 2, 2), (0, 3, 3)),  # the first two stay at the ends of their lists
-        ((3, 0, 0), (1, 1, 1), (3, 0, 0)),
-    ],
-)
-def test_relative_actions_step_every_control_and_stop_at_the_ends(
-    start: tuple[int, ...], steps: tuple[int, ...], expected: tuple[int, ...]
-) -> None:
-    env = RelativeActions(_make())
-    grid = env.unwrapped.grid
-    env.reset(seed=0, options={"state": grid.index(*start)})
-    _, _, _, _, info = env.step(np.array(steps))
-    assert info["state"] == grid.index(*expected)
-
-
 def test_continuous_actions_take_the_nearest_apex_values() -> None:
     env = ContinuousActions(_make())
     grid = env.unwrapped.grid
@@ -90,13 +72,6 @@ def test_continuous_actions_take_the_nearest_apex_values() -> None:
     assert (settings.iso, settings.f_number) == (400, 5.6)
     assert settings.exposure_time == pytest.approx(1 / 15)
     assert env.action(np.full(3, 9.0)) == env.action(np.ones(3))  # clipped
-
-
-def test_continuous_ties_go_to_the_lower_iso() -> None:
-    grid = {"isos": [100, 400], "exposure_times": [0.01], "f_numbers": [4]}
-    env = ContinuousActions(_make(grid=grid))
-    assert env.action(np.zeros(3)) == 0
-    assert env.action(np.array([0.3, -0.7, 0.01])) == 1  # one value of time and aperture: ignored
 
 
 @pytest.mark.parametrize(("single", "vector"), PAIRS)
@@ -135,16 +110,6 @@ def test_wrapped_spec_round_trips_through_json(single: type) -> None:
     env.action_space.seed(0)
     action = env.action_space.sample()
     assert env.step(action)[1] == again.step(action)[1]
-
-
-def test_wrappers_follow_gymnasium() -> None:
-    for single, vector in PAIRS:
-        assert issubclass(single, gym.ActionWrapper)
-        assert issubclass(vector, gym.vector.VectorActionWrapper)
-        for wrapper in (single, vector):
-            assert issubclass(wrapper, gym.utils.RecordConstructorArgs)
-            assert wrapper.__doc__
-            assert getattr(wrappers, wrapper.__name__) is wrapper
 
 
 def test_masks_are_the_union_per_control() -> None:

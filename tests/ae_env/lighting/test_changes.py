@@ -61,22 +61,6 @@ def test_lens_cap_goes_on_and_off() -> None:
     assert gains == [1.0, 2.0**-20, 2.0**-20, 1.0]
 
 
-@pytest.mark.parametrize("name", sorted(set(KINDS) - {"schedule"}))
-def test_every_kind_is_made_from_its_name_with_positive_gains(name: str) -> None:
-    lighting = make_lighting(name)
-    assert isinstance(lighting, Lighting)
-    assert lighting.name == name
-    assert make_lighting(lighting) is lighting
-    assert all(0 < gain < math.inf for gain in _gains(name, 40, phase=0.3))
-
-
-@pytest.mark.parametrize("stops", [-MAX_STOPS, MAX_STOPS])
-@pytest.mark.parametrize("name", sorted(set(KINDS) - {"static", "flicker", "schedule"}))
-def test_the_most_stops_are_finite_in_float32(name: str, stops: int) -> None:
-    gains = np.array(_gains({"kind": name, "stops": stops}, 40), np.float32)
-    assert ((gains >= 2.0**-MAX_STOPS) & (gains <= 2.0**MAX_STOPS)).all()
-
-
 @pytest.mark.parametrize("frame", [5.0, np.float32(5), np.int64(5)])
 def test_whole_numbers_are_frames(frame: float) -> None:
     lighting = make_lighting({"kind": "step", "at": frame})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -40,15 +38,6 @@ def test_dead_leaves_are_what_they_were_before_their_painting_was_shared() -> No
     np.testing.assert_allclose(picture.mean(axis=(1, 2), dtype=float), mean, rtol=1e-5)
 
 
-@pytest.mark.parametrize("focus", FOCUSES)
-def test_same_seed_same_picture(focus: str) -> None:
-    first, second, other = drawn(3, focus=focus), drawn(3, focus=focus), drawn(4, focus=focus)
-    np.testing.assert_array_equal(first.drawing.light, second.drawing.light)
-    np.testing.assert_array_equal(first.blur, second.blur)
-    assert (first.far, first.drawing.illuminance) == (second.far, second.drawing.illuminance)
-    assert not np.array_equal(first.drawing.light, other.drawing.light)
-
-
 def test_a_thing_hides_what_is_farther_and_nothing_else() -> None:
     ramp = np.repeat(np.linspace(-4.0, 4.0, 48, dtype=np.float32)[None], 48, axis=0)
     visible = 0
@@ -64,31 +53,6 @@ def test_a_thing_hides_what_is_farther_and_nothing_else() -> None:
         assert not seen[ramp < -2.0].any()  # no thing is slanted by more than 1.8 pixels
         visible += seen.any()
     assert visible >= 6
-
-
-def test_the_nearest_leaf_of_foliage_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each leaf is drawn alone by the equation of its ellipse or square; the least depth wins."""
-    calls = []
-    original = depth.paint_leaves
-    monkeypatch.setattr(depth, "paint_leaves", lambda *a: calls.append(a) or original(*a))
-    mask, blur, _ = depth._foliage(np.random.default_rng(1), 60, 2.0)
-    size, radius, centre_y, centre_x, (angle, elongation, box) = calls[0]
-    y, x = np.mgrid[:size, :size].astype(float)
-    depths, covers = [], []
-    for i in range(len(radius)):
-        dy, dx = y - centre_y[i], x - centre_x[i]
-        u = (dx * math.cos(angle[i]) + dy * math.sin(angle[i])) / (radius[i] * elongation[i])
-        v = (dy * math.cos(angle[i]) - dx * math.sin(angle[i])) / (radius[i] / elongation[i])
-        cover = np.maximum(abs(u), abs(v)) < 0.886 if box[i] else np.hypot(u, v) < 1.0
-        visible = blur[cover]
-        depths.append(visible.max())  # seen somewhere at its own depth, elsewhere nearer ones are
-        covers.append(cover)
-    np.testing.assert_array_equal(np.any(covers, axis=0), mask)
-    nearest = np.full((size, size), np.inf)
-    for cover, level in zip(covers, depths, strict=True):
-        nearest[cover] = np.minimum(nearest[cover], level)
-    np.testing.assert_array_equal(nearest, blur)
-    assert len(np.unique(blur[mask])) > 5
 
 
 def test_depth_gives_the_blur_back_by_the_thin_lens() -> None:
@@ -115,13 +79,6 @@ def test_what_is_in_focus() -> None:
             assert np.abs(blur).max() <= 7.0
 
 
-def test_every_class_of_blur_has_its_share_of_the_area() -> None:
-    defocused = [drawn(i, 64, f).blur for i in range(25) for f in ("front", "back", "middle")]
-    share = np.histogram(np.abs(defocused), [0.0, 0.7, 1.5, 3.0, 7.0])[0] / np.size(defocused)
-    assert share.sum() == pytest.approx(1.0)
-    assert (share > [0.15, 0.1, 0.15, 0.15]).all(), share
-
-
 def test_light_is_positive_and_sharp_at_the_pixel_with_bare_places() -> None:
     ratios, bare = [], []
     for seed in range(12):
@@ -136,17 +93,6 @@ def test_light_is_positive_and_sharp_at_the_pixel_with_bare_places() -> None:
     assert min(ratios) > 0.35
     assert max(ratios) < 0.6
     assert 0.05 < np.mean(bare) < 0.6
-
-
-def test_a_third_of_the_scenes_has_highlights_each_on_one_thing() -> None:
-    peaks = np.array([drawn(i, 32).drawing.light.max() for i in range(90)])
-    assert 0.2 < np.mean(peaks > 1.0) < 0.47
-    assert peaks.max() < 100 * 2**1.5 * 1.5
-    light, surface = np.zeros((3, 64, 64), np.float32), np.zeros((64, 64), int)
-    surface[:, 32:] = 1
-    depth._add_highlights(np.random.default_rng(0), light, surface)
-    assert light[1].max() > 2.0
-    assert (light[:, :, 31:33] == 0).all()
 
 
 def test_errors_name_the_argument() -> None:

@@ -24,11 +24,9 @@ from ae_env.scenes.loading import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import ScoreTables
-from simulator import CameraSettings, CameraSimulator, PreparedScene, get_camera
-from simulator.camera import get_camera
+from simulator import CameraSettings, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
-from simulator.settings import CameraSettings
 from tests.ae_env.scene_files import write_hdr
 
 CAMERA = get_camera("nikon_z6")
@@ -98,23 +96,6 @@ def test_unknown_split_and_too_small_scenes() -> None:
         load(MINE, resolution=17)
     with pytest.raises(ValueError, match=r"dead_leaves-1000.*`resolution` \(=512\)"):
         load("bundled", "test", resolution=512)
-
-
-def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    (tmp_path / "readme.txt").write_text("no scenes here")
-    with pytest.raises(ValueError, match=r"\.txt.*must hold raws"):
-        load(tmp_path)
-    (tmp_path / "broken.dng").write_bytes(b"II*\0 not a raw")
-    with pytest.raises(ValueError, match=r"scene file .*broken\.dng"):
-        load(tmp_path)
-    (tmp_path / "broken.dng").unlink()
-    pytest.importorskip("cv2")
-    (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 9 +X 9\n")
-    with pytest.raises(ValueError, match=r"broken\.hdr"):
-        load(tmp_path)
-    write_hdr(tmp_path / "broken.hdr", height=12, width=20)
-    with pytest.raises(ValueError, match=r"broken\.hdr.*at least 16"):
-        load(tmp_path)
 
 
 ID = "ae_env/AutoExposure-v0"
@@ -240,19 +221,6 @@ def test_capture_of_denoised_light_has_the_cameras_noise(weights: str) -> None:
     assert observation["raw"].mean() == pytest.approx(signal, rel=1e-3)
 
 
-def test_each_state_starts_from_its_own_light(weights: str) -> None:
-    """States of one aperture share their blurred light only if they start from the same."""
-    scene = flat_scene(0.2, denoised=0.1)
-    env = _make(scenes=[scene], simulator=weights, motion="none", depth=2.0, observation="linear")
-    clean, noisy = _state(env, 100, 1 / 125, 11), _state(env, 6400, 1 / 1000, 11)
-    levels = {clean: 0.1 * (1024 / 125) / 64 / 2, noisy: 0.2 * 1.024 / 2}  # f/11 for f/8
-    observation, _ = env.reset(seed=0, options={"state": noisy})
-    for state in (noisy, clean, noisy, clean, clean):
-        observation, _, _, _, info = env.step(state)
-        assert observation["raw"].mean() == pytest.approx(levels[state], rel=0.01)
-        assert ("noise_reduction" in info["modules"]) == (state == clean)
-
-
 def test_closed_forms_are_those_of_the_denoised_light(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,18 +279,6 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
         assert modules[f_number] == "exposure"
 
 
-def test_closing_leaves_a_scene_from_f4_exactly_as_it_is(weights: str) -> None:
-    scene = point_scene(40, f_number=4.0)
-    frames = [
-        _make(scenes=[scene], simulator=weights, depth=depth, motion="none", sensors=False)
-        for depth in ("unknown", "far")
-    ]
-    for f_number in (4, 11):
-        state = _state(frames[0], 100, 1 / 125, f_number)
-        found, far = (env.reset(seed=0, options={"state": state})[0]["raw"] for env in frames)
-        np.testing.assert_array_equal(found, far)
-
-
 def test_score_and_sensor_tell_the_same_blur(weights: str) -> None:
     env = _make(scenes=[point_scene()], simulator=weights, depth="unknown", motion="none")
     scene = env.unwrapped.scenes[0]  # type: ignore[attr-defined]
@@ -343,27 +299,6 @@ def test_score_and_sensor_tell_the_same_blur(weights: str) -> None:
     assert info["rewards"]["sharpness"] == pytest.approx(sharpness, rel=1e-5)
     # 15 % noise, 40 readings: 2.4 %.
     assert 2.0 ** np.mean(readings) == pytest.approx(2.0 * working * 64 / 40, rel=0.08)
-
-
-def test_a_known_depth_ignores_the_map(weights: str) -> None:
-    scene = replace(point_scene(40), defocus_map=torch.full((40, 40), 3.0))
-    far = _make(scenes=[scene], simulator=weights, depth="far").unwrapped
-    assert far.scenes[0].defocus_map is None  # type: ignore[attr-defined]
-    unknown = _make(scenes=[scene], simulator=weights, depth="unknown").unwrapped
-    assert unknown.scenes[0].own_blur(8.0) == pytest.approx(3.0)  # type: ignore[attr-defined]
-
-
-@pytest.mark.parametrize("lighting", ["static", "sine"])
-def test_memory_spared_changes_nothing(
-    weights: str, lighting: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also for states that are planned already when an episode comes back to them."""
-    arguments = {"simulator": weights, "depth": "unknown", "motion": 0.5, "lighting": lighting}
-    narrow, wide = 15, 12  # slow: the narrow one is blurred by motion alone
-    actions = [narrow, wide, narrow, wide - 4, wide, narrow - 4, narrow, narrow]
-    kept = _rollout(lambda: _make(**arguments), actions=actions)
-    monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
-    _assert_equal(_rollout(lambda: _make(**arguments), actions=actions), kept)
 
 
 def test_vector_environment_equals_single_ones(weights: str) -> None:
@@ -438,35 +373,6 @@ def test_maps_are_kept_and_made_again_where_damaged(
     assert torch.equal(third.defocus_map, first.defocus_map)  # type: ignore[arg-type]
     SceneNetworks(weights).resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
     assert len(list((tmp_path / "defocus_maps").iterdir())) == 2
-
-
-def test_denoised_light_is_kept_between_runs(
-    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    scene, runs = NOISY_SCENES[0], []
-    denoise = CameraSimulator.denoise
-
-    def counted(self: CameraSimulator, prepared: PreparedScene) -> torch.Tensor:
-        runs.append(prepared)
-        return denoise(self, prepared)
-
-    monkeypatch.setattr(CameraSimulator, "denoise", counted)
-    made = SceneNetworks(weights, cache=False).denoised(scene).denoised
-    assert not any(tmp_path.iterdir())
-    first = SceneNetworks(weights).denoised(scene).denoised
-    assert len(runs) == 2
-    again = SceneNetworks(weights).denoised(scene).denoised
-    assert len(runs) == 2
-    for found in (first, again):
-        assert torch.equal(found, made)  # type: ignore[arg-type]
-    SceneNetworks(weights).denoised(replace(scene, nlf=scene.nlf.scaled(0.5)))
-    SceneNetworks(weights).denoised(replace(scene, light=scene.light * 0.5))
-    assert len(runs) == 4
-    modules = build_modules("compact")
-    save_modules(tmp_path / "other", modules, "compact", {})
-    SceneNetworks(str(tmp_path / "other.safetensors")).denoised(scene)
-    assert len(runs) == 5
 
 
 def test_every_source_of_scenes_is_seen_at_its_finest(

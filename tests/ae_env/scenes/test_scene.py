@@ -16,10 +16,8 @@ import ae_env  # noqa: F401  (registers the environment)
 from ae_env.scenes import Scene
 from ae_env.scenes.colour import camera_from_srgb, temperature_tint
 from simulator import CameraSettings, NoiseLevelFunction, get_camera
-from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
-from simulator.camera_simulator import CameraSimulator
+from simulator.camera import CameraProfile
 from simulator.raw.image import RawImage
-from simulator.settings import CameraSettings
 from tests.strategies import SEEDS, lights
 
 CAMERA = get_camera("nikon_z6")
@@ -64,20 +62,6 @@ def test_colours_go_through_xyz_to_the_camera() -> None:
     raw_white = rgb2xyz(np.ones((1, 1, 3)))[0, 0] @ np.array(CAMERA.colour_matrix).T
     np.testing.assert_allclose(linear[0] @ matrix.T, raw / raw_white[1], rtol=2e-3)
     np.testing.assert_allclose(white, raw_white / raw_white[1], rtol=2e-3)
-
-
-def test_camera_without_colour_matrix_keeps_the_colours() -> None:
-    rgb = np.random.default_rng(1).uniform(0.0, 2.0, (3, 6, 6)).astype(np.float32)
-    scene = radiance_scene(rgb, PLAIN, illuminance=100.0)
-    factor = 250 / (120 * math.pi)
-    np.testing.assert_allclose(scene.light[[0, 1, 3]], rgb * factor, rtol=1e-5)
-    assert scene.white_balance == (1.0, 1.0, 1.0)
-
-
-def test_colours_outside_the_gamut_stay_light() -> None:
-    red = np.zeros((3, 2, 2), np.float32)
-    red[2] = 1.0
-    assert radiance_scene(red, illuminance=10.0).light.min() >= 0
 
 
 def test_unknown_light_is_anchored_to_the_mean() -> None:
@@ -141,19 +125,6 @@ def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
     assert scene.own_blur(2.0) == pytest.approx(10.0)
     assert scene.own_blur(4.0) == scene.own_blur(11.0) == pytest.approx(5.0)
     assert array_scene(torch.ones(4, 2, 2)).own_blur(2.0) == 0.0
-
-
-def test_a_scene_can_be_photographed_by_the_simulator() -> None:
-    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    fields = {"denoised": torch.full((4, 8, 8), 0.2), "defocus_map": torch.ones(8, 8)}
-    scene = array_scene(torch.full((4, 8, 8), 0.1), nlf=nlf, box_factor=3, **fields)
-    prepared = CameraSimulator(device="cpu").prepare(scene)
-    assert (prepared.camera, prepared.nlf, prepared.box_factor) == (PLAIN, nlf, 3)
-    assert prepared.denoised is not None
-    assert prepared.denoised.light is scene.denoised
-    assert prepared.aperture_blur is not None
-    assert prepared.aperture_blur.f_number == 4.0
-    assert array_scene(torch.ones(4, 8, 8)).prepared.aperture_blur is None
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from pathlib import Path
 
@@ -123,21 +122,6 @@ def test_any_frame_is_scored(name: str, size: tuple[int, int]) -> None:
     assert torch.equal(scores, make_scorer(name)(images, captures))
 
 
-def test_a_frame_scores_alike_alone_and_in_a_batch() -> None:
-    scene = _scene(_camera_man())
-    states = [GRID[i] for i in (5, 21, 37, 53)]
-    captures = _captures([scene] * 4, states)
-    images = captures.light.clamp(0.0, 1.0)
-    for name in ("keypoints", "matches"):
-        together = make_scorer(name)(images, captures)
-        alone = [
-            make_scorer(name)(images[i, None], _captures([scene], [s]))
-            for i, s in enumerate(states)
-        ]
-        assert torch.equal(together, torch.cat(alone))
-    assert math.isfinite(float(together.sum()))
-
-
 def _photographs(size: int) -> torch.Tensor:
     pictures = [skimage.data.astronaut(), skimage.data.coffee(), skimage.data.chelsea()]
     cut = [torch.from_numpy(p[:300, :300].copy()).permute(2, 0, 1) / 255.0 for p in pictures]
@@ -186,13 +170,6 @@ def test_values_are_those_of_opencv(model: Path) -> None:
     scores = Brisque(model)(pictures, None)  # type: ignore[arg-type]
     np.testing.assert_allclose(scores.numpy(), 1.0 - np.array(values) / 100.0, atol=1e-5)
     assert scores[:3].mean() > scores[6:].mean() > scores[3:6].mean()
-
-
-def test_pictures_without_statistics_score_zero(model: Path) -> None:
-    scorer = Brisque(model)
-    pictures = torch.stack([torch.zeros(3, 64, 64), torch.ones(3, 64, 64)])
-    assert scorer(pictures, None).tolist() == [0.0, 0.0]  # type: ignore[arg-type]
-    assert scorer(torch.rand(2, 3, 1, 5), None).tolist() == [0.0, 0.0]  # type: ignore[arg-type]
 
 
 def test_the_model_is_asked_for(

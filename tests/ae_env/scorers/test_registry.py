@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import sys
 import types
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,12 @@ import ae_env  # noqa: F401, registers the environment  # noqa: F401  (registers
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import (
-    Balanced,
     CompositeScorer,
     list_scorers,
     make_scorer,
     register_scorer,
     registry,
 )
-from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
 from ae_env.scorers.score_table import TIE, ScoreTables
@@ -114,17 +111,6 @@ def test_the_list_tells_of_each_scorer() -> None:
     sys.modules.pop("their_scores", None)
 
 
-def test_one_of_several_parts_sees_what_they_see(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Mixed(CompositeScorer):
-        """All of it."""
-
-        def __init__(self) -> None:
-            super().__init__({name: make_scorer(name) for name in ("entropy", "clipping", "snr")})
-
-    monkeypatch.setitem(registry._REGISTRY, "mixed", Mixed)
-    assert {row.name: row.domain for row in describe_scorers()}["mixed"] == "raw, srgb"
-
-
 def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> None:
     """As docs/scorers.md says of a scorer from a file, whose class no other process knows."""
     (tmp_path / "my_scorer.py").write_text(MINE)
@@ -165,16 +151,6 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
         make_scorer({"no.py:Level": 1.0})
     with pytest.raises(ValueError, match=r"must be callable"):
         make_scorer("my_scorer.py:torch")
-
-
-def test_scores_of_a_file_are_kept_only_if_it_has_a_version(tmp_path: Path) -> None:
-    file = tmp_path / "my_scorer.py"
-    prints = []
-    for version in ("", "    version = 1\n", "    version = 2\n"):
-        file.write_text(MINE + version)
-        prints.append(registry.scorer_fingerprint(make_scorer(f"{file}:Level")))
-    assert prints[0] is None
-    assert prints[1] not in (None, prints[2])
 
 
 class FakeMetric:
@@ -267,27 +243,6 @@ def test_registered_scorers_work_by_name() -> None:
 def test_bad_scorers_are_refused(spec: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_scorer(spec)
-
-
-def test_scorers_of_packages_that_are_broken(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "breaks_on_import.py").write_text("raise OSError('no licence')\n")
-    (tmp_path / "does_not_parse.py").write_text("def (:\n")
-    (tmp_path / "cannot_be_made.py").write_text("class Mine:\n    def __init__(self, size): ...\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    modules = ("not_installed_at_all", "breaks_on_import", "does_not_parse", "cannot_be_made")
-    points = [EntryPoint(name, f"{name}:Mine", registry.ENTRY_POINT_GROUP) for name in modules]
-    monkeypatch.setattr(registry, "entry_points", lambda group: points)
-    assert {"balanced", *modules} <= set(list_scorers())
-    assert isinstance(make_scorer("balanced"), Balanced)
-    causes = (ModuleNotFoundError, OSError, SyntaxError, TypeError)
-    for name, cause in zip(modules, causes, strict=True):
-        for spec in (name, {name: 1.0}, f"{name}:Mine"):
-            with pytest.raises(ValueError, match=rf"`scorer` \(='{name}.*{cause.__name__}") as e:
-                make_scorer(spec)
-            assert isinstance(e.value.__cause__, cause)
-    assert "breaks_on_import" not in sys.modules
 
 
 def test_pyiqa_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
