@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
-from ae_env.scenes.scene import Crop, Resize, Scene
+from ae_env.scenes.scene import Scene, SceneRequest
 from ae_env.scenes.split import (
     FEWEST_GROUPS_TO_SPLIT,
     Shot,
@@ -30,7 +30,6 @@ from ae_env.scenes.split import (
     too_few_groups,
 )
 from ae_env.utils.checks import check_flag, check_number, check_word
-from simulator.camera import CameraProfile
 from simulator.raw.read import read_raw
 from simulator.utils.files import RAW_SUFFIXES
 
@@ -99,13 +98,7 @@ class FolderOptions:
 
 
 def folder_scenes(
-    spec: str | Path,
-    split: str,
-    camera: CameraProfile,
-    resolution: int | None = 64,
-    crop: Crop = "box",
-    options: FolderOptions | None = None,
-    resize: Resize = Scene.resized,
+    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
 ) -> list[Scene]:
     """The scenes of `split` among the user's files.
 
@@ -115,12 +108,8 @@ def folder_scenes(
 
     Args:
         spec: See `find_files`.
-        split: ``"train"``, ``"test"`` or ``"all"``.
-        camera: Camera in whose colours the light of radiance maps is stated.
-        resolution: Packed pixels a side; None keeps each scene's own size.
-        crop: See `Scene.resized`.
+        request: Split, camera and size. Each scene is resized before the next file is read.
         options: Facts about the files that the caller knows.
-        resize: Brings each scene to `resolution`, before the next file is read.
 
     Raises:
         ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
@@ -128,33 +117,19 @@ def folder_scenes(
     """
     base, files = find_files(spec)
     named = named_groups(sorted({base, *(p.parent for p in files)}))
-    if split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
+    if request.split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
         raise too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    reader = _Reader(
-        base=base,
-        names=_scene_names(base, files),
-        named={p: named[p.resolve()] for p in files if p.resolve() in named},
-        options=options or FolderOptions(),
-        camera=camera,
-        resolution=resolution,
-        crop=crop,
-        resize=resize,
-    )
+    groups = {p: named[p.resolve()] for p in files if p.resolve() in named}
+    reader = _Reader(base, _scene_names(base, files), groups, options or FolderOptions(), request)
     scenes, shots = _read_all(spec, files, reader, _HOW_TO_SKIP)
     found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
     scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
     log_groups(str(spec), scenes)
-    return scenes_of_split(spec, scenes, split)
+    return scenes_of_split(spec, scenes, request.split)
 
 
 def sequence_scenes(
-    spec: str | Path,
-    split: str,
-    camera: CameraProfile,
-    resolution: int | None = 64,
-    crop: Crop = "box",
-    options: FolderOptions | None = None,
-    resize: Resize = Scene.resized,
+    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
 ) -> list[Scene]:
     """The frames of every sequence of `split`, one sequence after the other.
 
@@ -165,12 +140,8 @@ def sequence_scenes(
 
     Args:
         spec: A folder, searched with its sub-folders, or a glob.
-        split: ``"train"``, ``"test"`` or ``"all"``; fewer than 15 sequences are all for test.
-        camera: Not used, because every raw brings its own; here as in `folder_scenes`.
-        resolution: Packed pixels a side; None keeps each raw's own size.
-        crop: See `Scene.resized`.
+        request: Split and size; fewer than 15 sequences are all for test.
         options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
-        resize: Brings each scene to `resolution`, before the next file is read.
 
     Raises:
         ValueError: If there are no raws, one cannot be read, there are no sequences of `split`, or
@@ -191,23 +162,15 @@ def sequence_scenes(
             f"`scenes` (={{'sequence': {str(spec)!r}}}) must hold raws ({_RAW_ENDINGS}): radiance "
             "maps have no settings of their own"
         )
-    if split == "train" and len(by_folder) < FEWEST_GROUPS_TO_SPLIT:
+    if request.split == "train" and len(by_folder) < FEWEST_GROUPS_TO_SPLIT:
         raise too_few_groups(spec, str(len(by_folder)))  # before any time is spent on reading
     files = [path for paths in by_folder.values() for path in paths]
     sequences = _sequence_names(base, list(by_folder))
-    reader = _Reader(
-        base=base,
-        names=_scene_names(base, files),
-        named={path: sequences[path.parent] for path in files},
-        options=options,
-        camera=camera,
-        resolution=resolution,
-        crop=crop,
-        resize=resize,
-    )
+    groups = {path: sequences[path.parent] for path in files}
+    reader = _Reader(base, _scene_names(base, files), groups, options, request)
     scenes, _ = _read_all(spec, files, reader, "")
     log_groups(str(spec), scenes)
-    return scenes_of_split(spec, scenes, split)
+    return scenes_of_split(spec, scenes, request.split)
 
 
 def _sequence_names(base: Path, folders: list[Path]) -> dict[Path, str]:
@@ -305,26 +268,25 @@ def _scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
 
 @dataclass(frozen=True)
 class _Reader:
-    """Makes the scenes of one file after the other; the arguments are those of `folder_scenes`.
+    """Makes the scenes of one file after the other.
 
     Args:
         base: Folder that the files are under.
         names: Scene id of each file.
-        named: Source group of the files whose group is known by name.
+        groups: Source group of the files whose group is known by name.
+        options: See `folder_scenes`.
+        request: See `folder_scenes`.
     """
 
     base: Path
     names: Mapping[Path, str]
-    named: Mapping[Path, str]
+    groups: Mapping[Path, str]
     options: FolderOptions
-    camera: CameraProfile
-    resolution: int | None
-    crop: Crop
-    resize: Resize
+    request: SceneRequest
 
     def read(self, path: Path) -> tuple[list[Scene], Shot | None]:
         """The scenes of a file; with a `Shot` where that has to tell the group of a raw."""
-        name, group = self.names[path], self.named.get(path)
+        name, group = self.names[path], self.groups.get(path)
         grouped = group is not None or path.parent != self.base
         if group is None:
             group = path.parent.relative_to(self.base).as_posix() if grouped else name
@@ -334,10 +296,9 @@ class _Reader:
             source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
             scene = Scene.from_raw(raw, scene_id=name, group=group, source=source, **fields)
             shot = None if grouped else describe(raw)
-            scenes = [self.resize(scene, self.resolution, self.crop)]
+            scenes = [self.request.sized(scene)]
         else:
-            fields |= {"resolution": self.resolution, "crop": self.crop, "resize": self.resize}
-            scenes = list(radiance_scenes(path, self.camera, name=name, group=group, **fields))
+            scenes = list(radiance_scenes(path, self.request, name=name, group=group, **fields))
         for scene in scenes:
             _ = scene.ev100  # raises where a frame is black and its light unknown
         return scenes, shot

@@ -16,7 +16,7 @@ import torch
 
 from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
-from ae_env.scenes.scene import Crop, Resize, Scene
+from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest
 from ae_env.utils.checks import did_you_mean
 from ae_env.utils.user_code import load_attribute
 from simulator.camera import CameraProfile
@@ -84,16 +84,17 @@ def load_scenes(
     """
     if split not in get_args(Split):
         raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
+    request = SceneRequest(split, camera, resolution, crop, resize)
     if isinstance(spec, Mapping):
         load = sequence_scenes if is_sequence(spec) else folder_scenes
         path, options = _options(spec)
-        scenes = load(path, split, camera, resolution, crop, options, resize)
+        scenes = load(path, request, options)
     elif isinstance(spec, Path):
-        scenes = folder_scenes(spec, split, camera, resolution, crop, resize=resize)
+        scenes = folder_scenes(spec, request)
     elif isinstance(spec, str):
-        scenes = _by_name(spec, split, camera, resolution, crop, resize)
+        scenes = _by_name(spec, split, request)
     elif isinstance(spec, Sequence):
-        scenes = [resize(s, resolution, crop) for s in _checked(spec, "scenes")]
+        scenes = [request.sized(scene) for scene in _checked(spec, "scenes")]
     else:
         raise ValueError(
             f"`scenes` (={spec!r}) must be a name, a path, a mapping or a list of Scene"
@@ -113,20 +114,14 @@ def is_sequence(spec: object) -> bool:
     return isinstance(spec, Mapping) and "sequence" in spec
 
 
-def _by_name(
-    spec: str,
-    split: Split,
-    camera: CameraProfile,
-    resolution: int | None,
-    crop: Crop,
-    resize: Resize,
-) -> list[Scene]:
+def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
+    camera, resolution = request.camera, request.resolution
     if spec in BUNDLED or spec in BUNDLED_PARTS:
         size, part = BUNDLED.get(spec, "normal"), BUNDLED_PARTS.get(spec)
-        if resize is Scene.resized:
-            return bundled_scenes(split, camera, resolution, crop, size=size, part=part)
+        if request.resize is Scene.resized:
+            return bundled_scenes(split, camera, resolution, request.crop, size=size, part=part)
         finest = bundled_scenes(split, camera, None, size=size, part=part)
-        return [resize(scene, resolution, crop) for scene in finest]
+        return [request.sized(scene) for scene in finest]
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
@@ -134,15 +129,15 @@ def _by_name(
                 known = {"split": split, "camera": camera, "resolution": resolution}
                 names = inspect.signature(found).parameters
                 found = found(**{name: given for name, given in known.items() if name in names})
-            return [resize(scene, resolution, crop) for scene in _checked(found, spec)]
-        names_known = [*BUNDLED, *BUNDLED_PARTS]
-        hint = did_you_mean(spec, names_known, cutoff=0.7)
+            return [request.sized(scene) for scene in _checked(found, spec)]
+        bundled = [*BUNDLED, *BUNDLED_PARTS]
+        hint = did_you_mean(spec, bundled, cutoff=0.7)
         if hint or spec.startswith("bundled:"):
             raise ValueError(
-                f"`scenes` (={spec!r}) must be one of {names_known}, an existing file, folder or "
-                f"glob, or 'pkg.mod:attr'{hint}"
+                f"`scenes` (={spec!r}) must be one of {bundled}, an existing file, folder or glob, "
+                f"or 'pkg.mod:attr'{hint}"
             )
-    return folder_scenes(spec, split, camera, resolution, crop, resize=resize)
+    return folder_scenes(spec, request)
 
 
 def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:

@@ -20,7 +20,7 @@ import torch
 
 from ae_env.scenes.colour import camera_from_srgb
 from ae_env.scenes.procedural import NATIVE_SIZE
-from ae_env.scenes.scene import Crop, Resize, Scene, mean_anchor
+from ae_env.scenes.scene import Scene, SceneRequest, mean_anchor
 from simulator.camera import CameraProfile
 from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
@@ -73,14 +73,11 @@ def read_radiance(path: str | Path) -> np.ndarray:
 
 def radiance_scenes(
     path: str | Path,
-    camera: CameraProfile,
+    request: SceneRequest,
     *,
     name: str,
     group: str,
-    resolution: int | None = 64,
-    crop: Crop = "box",
     ev100: float | None = None,
-    resize: Resize = Scene.resized,
     **fields: Any,
 ) -> Iterator[Scene]:
     """The scenes of one radiance map, all in one source group.
@@ -91,14 +88,11 @@ def radiance_scenes(
 
     Args:
         path: The file.
-        camera: Camera in whose colours the light is stated.
+        request: Camera and size; without a resolution the views have 256 packed pixels a side.
         name: Prefix of the scene ids.
         group: Source group.
-        resolution: Packed pixels a side; None keeps 256.
-        crop: See `Scene.resized`.
         ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
             their relative brightness), if known; see `assumed_ev100`.
-        resize: Brings each view to `resolution`.
         **fields: Further arguments of `Scene.from_radiance`.
     """
     image = read_radiance(path)
@@ -110,23 +104,25 @@ def radiance_scenes(
         fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
     fields.setdefault("source", Path(path).name)
     if abs(width / height - 2.0) <= 0.01:
-        size = native_size(resolution)
+        size = native_size(request.resolution)
         views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
     else:
-        size = native_size(resolution, min(height, width))
+        size = native_size(request.resolution, min(height, width))
         views = [(name, _central_square(image, size, Path(path).name))]
     try:
-        levels = [_log2_level(view, camera) for _, view in views]
+        levels = [_log2_level(view, request.camera) for _, view in views]
     except ValueError as error:
         raise ValueError(f"radiance map {str(path)!r}: {error}") from error
     for (scene_id, view), level in zip(views, levels, strict=True):
         if ev100 is not None:  # one scale for the whole map: a darker view stays darker
             fields["ev100"] = ev100 + level - float(np.mean(levels))
         try:
-            scene = Scene.from_radiance(view, camera, scene_id=scene_id, group=group, **fields)
+            scene = Scene.from_radiance(
+                view, request.camera, scene_id=scene_id, group=group, **fields
+            )
         except ValueError as error:
             raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
-        yield resize(scene, resolution, crop)
+        yield request.sized(scene)
 
 
 def _near_one(image: np.ndarray) -> np.ndarray:

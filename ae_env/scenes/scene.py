@@ -442,3 +442,26 @@ class Scene:
         _, height, width = self.light.shape
         light = "unknown light" if self.illuminance is None else f"{self.illuminance:.4g} lux"
         return f"Scene({self.scene_id!r}, {self.kind}, {height} x {width} packed, {light})"
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """The split, the camera and the size that scenes are loaded for.
+
+    Args:
+        split: ``"train"``, ``"test"`` or ``"all"``.
+        camera: Camera in whose colours light is stated, unless a raw brings its own.
+        resolution: Packed pixels a side; None keeps each scene's own size.
+        crop: See `Scene.resized`.
+        resize: Brings each scene to `resolution`, as `Scene.resized` does.
+    """
+
+    split: str
+    camera: CameraProfile
+    resolution: int | None = 64
+    crop: Crop = "box"
+    resize: Resize = Scene.resized
+
+    def sized(self, scene: Scene) -> Scene:
+        """`scene` at the resolution asked for."""
+        return self.resize(scene, self.resolution, self.crop)

@@ -12,6 +12,7 @@ import torch
 
 from ae_env.scenes import load_scenes
 from ae_env.scenes.radiance import assumed_ev100, perspective, radiance_scenes, read_radiance
+from ae_env.scenes.scene import SceneRequest
 from simulator import get_camera
 from tests.ae_env.scene_files import write_exr
 
@@ -82,7 +83,8 @@ def test_views_of_a_panorama_share_one_scale(tmp_path: Path) -> None:
     panorama = np.ones((64, 128, 3), np.float32)
     panorama[:, 48:80] = 4.0  # ahead (90 degrees wide) is four times as bright: 2 EV
     write_exr(tmp_path / "p.exr", panorama)
-    scenes = list(radiance_scenes(tmp_path / "p.exr", CAMERA, name="p", group="p", resolution=32))
+    request = SceneRequest("all", CAMERA, 32)
+    scenes = list(radiance_scenes(tmp_path / "p.exr", request, name="p", group="p"))
     assert [s.scene_id for s in scenes] == ["p-000", "p-090", "p-180", "p-270"]
     assert {s.group for s in scenes} == {"p"}
     ev = [s.ev100 for s in scenes]
