@@ -13,11 +13,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 ID = "ae_env/AutoExposure-v0"
-
-
 ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
-
-
 INFO_KEYS = {
     *("scene_id", "state", "iso", "exposure_time", "f_number", "ev100"),
     *("clipped_high", "clipped_low", "excess_noise", "modules", "rewards"),
@@ -94,13 +90,6 @@ def test_info_has_the_same_keys_and_plain_numbers() -> None:
     assert (second["iso"], second["f_number"]) == (100.0, 5.6)
     assert second["ev100"] == pytest.approx(np.log2(5.6**2 / second["exposure_time"]))
     assert second["modules"].startswith("exposure")
-
-
-def test_episode_is_truncated_after_eight_steps_and_never_terminates() -> None:
-    env = _make()
-    env.reset(seed=0)
-    flags = [env.step(3)[2:4] for _ in range(8)]
-    assert flags == [(False, False)] * 7 + [(False, True)]
 
 
 def test_reset_options_choose_scene_state_and_frame() -> None:

@@ -17,14 +17,8 @@ from ae_env.scenes import Scene
 from simulator import CameraSettings, get_camera
 
 SMALL: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
-
-
 NAN, INF, HUGE, ARRAY = math.nan, math.inf, 10**30, np.array([1, 2])
-
-
 ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], [0.5], ARRAY]
-
-
 #: Values of `ODD` that an argument takes.
 TAKES: dict[str, list[Any]] = {
     "split": [],
@@ -47,8 +41,6 @@ TAKES: dict[str, list[Any]] = {
     "with_oracle": [True],
     "render_mode": [None],
 }
-
-
 TAKES_VECTOR: dict[str, list[Any]] = {
     "num_envs": [],
     "max_episode_steps": [None, HUGE],
@@ -180,11 +172,7 @@ def envs() -> AutoExposureVectorEnv:
 
 
 BAD_SEEDS = [True, "x", 1.5, -1, NAN, {}, object(), b"x", np.array(3.0)]
-
-
 BAD_OPTIONS = [True, "x", 1.5, [], object(), ["state"], {"stat": 1}, {1: 1}]
-
-
 BAD_CHOICES = [True, 1.5, -1, NAN, {}, object(), HUGE, "x", b"x"]
 
 

@@ -19,8 +19,6 @@ import ae_env
 from ae_env.options import EnvOptions
 
 ID = "ae_env/AutoExposure-v0"
-
-
 ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
 
 

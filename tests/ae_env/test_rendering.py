@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,15 +14,13 @@ from PIL import Image
 from ae_env import contact_sheet
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
-from ae_env.rendering import _Sheet, _visits
+from ae_env.rendering import _Sheet
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from simulator import NoiseLevelFunction, develop, get_camera
+from simulator import develop, get_camera
 
 CAMERA = get_camera("nikon_z6")
-
-
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
 
 
@@ -89,26 +86,6 @@ def test_paths_are_drawn_in_their_own_colours() -> None:
     found = {tuple(c) for c in np.asarray(drawn).reshape(-1, 3).tolist()}
     assert colours <= found
     assert not colours & {tuple(c) for c in plain.reshape(-1, 3).tolist()}
-
-
-def test_frames_of_a_state_are_numbered_in_runs() -> None:
-    assert _visits([5, 9, 9, 9, 5, 5]) == {5: "0,4-5", 9: "1-3"}
-    assert _visits([2]) == {2: "0"}
-
-
-@pytest.mark.parametrize(
-    "grid",
-    [
-        ExposureGrid((100,), (0.01,), (4,)),
-        ExposureGrid((100, 200, 400), (1 / 60,), (2, 4, 8)),
-        ExposureGrid((100,), tuple(2.0**-i for i in range(8, 0, -1)), (4, 8)),
-    ],
-)
-def test_other_grids_and_shapes(grid: ExposureGrid) -> None:
-    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    wide = _scene(60, 90, nlf=nlf)
-    sheet = contact_sheet(replace(wide, illuminance=None), grid=grid, path=[0], camera=CAMERA)
-    assert min(sheet.size) > 100
 
 
 @pytest.mark.parametrize(

@@ -21,14 +21,8 @@ import ae_env  # noqa: F401  (registers the environment)
 from tests.strategies import SEEDS
 
 ID = "ae_env/AutoExposure-v0"
-
-
 ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
-
-
 NUM_ENVS = 3
-
-
 PAIRED = {"balanced": 0.7, "banding": 0.3}
 
 
@@ -214,20 +208,6 @@ def test_a_finished_episode_needs_a_reset_when_autoreset_is_off() -> None:
         envs.step(np.zeros(NUM_ENVS, np.int64))
 
 
-def test_info_of_some_is_laid_out_as_gymnasium_does() -> None:
-    """The last frames of episodes that end apart from the others, against `VectorEnv._add_info`."""
-    costs = {"costs": {"switch": 0.1}, "with_oracle": True}
-    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=2, **costs)
-    alone = _make_single(**costs)
-    envs.reset(seed=0)
-    alone.reset(seed=1)
-    alone.step(8)
-    envs.step(np.array([7, 8, 9]))
-    envs.reset(options={"reset_mask": np.array([True, False, True])})
-    info = envs.step(np.array([4, 5, 6]))[4]["final_info"]
-    _assert_same(info, envs.unwrapped._add_info({}, alone.step(5)[4], 1))
-
-
 def test_reset_options_per_environment() -> None:
     envs = _native()
     ids = [envs.unwrapped.scenes[i].scene_id for i in (0, 2, 4)]
@@ -238,8 +218,8 @@ def test_reset_options_per_environment() -> None:
     assert info["scene_id"].tolist() == [ids[1]] * 3
     assert info["state"].tolist() == [9, 9, 9]
     states = torch.tensor([4, 5, 6])
-    for given in (states, list(states), deque([4, 5, 6])):
-        envs.reset(options={"state": given})
+    for own in (states, list(states), deque([4, 5, 6])):
+        envs.reset(options={"state": own})
         np.testing.assert_array_equal(envs.unwrapped.states, [4, 5, 6])
     envs.reset(options={"state": states[0]})
     np.testing.assert_array_equal(envs.unwrapped.states, [4, 4, 4])

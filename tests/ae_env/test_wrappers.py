@@ -27,11 +27,7 @@ from ae_env.wrappers import (
 from tests.strategies import SEEDS, grids
 
 ID = "ae_env/AutoExposure-v0"
-
-
 ARGUMENTS = {"scenes": "bundled:small", "resolution": 36}
-
-
 PAIRS = [
     (ControlActions, VectorControlActions),
     (RelativeActions, VectorRelativeActions),

@@ -19,8 +19,6 @@ from simulator.camera import get_camera
 from simulator.utils.cache import cache_dir
 
 CAMERA = get_camera("nikon_z6")
-
-
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
@@ -174,21 +172,3 @@ def test_cached_scenes_equal_fresh_ones(
         caplog.clear()
         load_scenes("bundled:small", "test", camera=CAMERA, resolution=48)
         assert not caplog.records
-
-
-def test_every_argument_has_its_own_cache_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    other = replace(CAMERA, colour_matrix=None)
-    seen = []
-    for camera, resolution, crop in (
-        *((CAMERA, 32, "box"), (CAMERA, 64, "box"), (CAMERA, 32, "native")),
-        *((other, 32, "box"), (get_camera("canon_70d"), 32, "box")),
-    ):
-        scenes = load_scenes(
-            "bundled:small", "test", camera=camera, resolution=resolution, crop=crop
-        )  # type: ignore[arg-type]
-        seen.append(scenes[0].light.mean().item())
-        assert scenes[0].camera is camera
-    assert len(cached_files()) == len(seen) == len(set(seen))

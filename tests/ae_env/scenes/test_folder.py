@@ -13,7 +13,7 @@ import torch
 
 import ae_env  # noqa: F401  (registers the environment)
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.folder import find_files, sequence_bounds
+from ae_env.scenes.folder import sequence_bounds
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 from tests.ae_env.scene_files import write_hdr
 
@@ -110,31 +110,16 @@ def test_options_reach_the_scenes(tmp_path: Path) -> None:
     assert only.ev100 == pytest.approx(8.0, abs=0.05)
 
 
-def test_hidden_files_are_left_out(tmp_path: Path) -> None:
-    write_hdr(tmp_path / "a.hdr")
-    write_hdr(tmp_path / ".trash" / "b.hdr")
-    write_hdr(tmp_path / "._a.hdr")
-    assert [p.name for p in find_files(tmp_path)[1]] == ["a.hdr"]
-
-
 # -- sequences: raws in name order are the frames of an episode ------------------------------------
 
 
 ID = "ae_env/AutoExposure-v0"
-
-
 #: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same
 #: in the first and the second, twice that in the third.
 FRAMES = ((0.1, 100, 1 / 64), (0.2, 200, 1 / 64), (0.2, 100, 1 / 64))
-
-
 NAMES = ("IMG_2", "IMG_9", "IMG_10")
-
-
 #: ISO 100, 1/60 s, f/8 in a grid of one state.
 GRID = {"isos": [100, 200], "exposure_times": [1 / 64], "f_numbers": [8]}
-
-
 ARGUMENTS: dict[str, Any] = {
     "split": "test",
     "resolution": 36,

@@ -17,12 +17,10 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 
 import ae_env  # noqa: F401  (registers the environment)
-from ae_env.observation import decode_sensors
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.loading import SceneNetworks
 from ae_env.scorers import make_scorer
-from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE
@@ -89,26 +87,11 @@ def test_errors_name_the_value_and_the_rule(spec: object, words: str) -> None:
         load(spec)
 
 
-def test_unknown_split_and_too_small_scenes() -> None:
-    with pytest.raises(ValueError, match=r"`split` \(='val'\)"):
-        load(MINE, "val")
-    with pytest.raises(ValueError, match=r"`resolution` \(=17\)"):
-        load(MINE, resolution=17)
-    with pytest.raises(ValueError, match=r"dead_leaves-1000.*`resolution` \(=512\)"):
-        load("bundled", "test", resolution=512)
-
-
 ID = "ae_env/AutoExposure-v0"
-
-
 #: Circle of confusion that the networks of these tests find everywhere [pixel].
 FOUND = 4.0
-
-
 #: What is left of it after the dead zone.
 DIAMETER = math.sqrt(FOUND**2 - DEAD_ZONE**2)
-
-
 NOISY = CameraSettings(6400, 1 / 1024, 8)
 
 
@@ -140,8 +123,6 @@ def noisy_scenes(resolution: int = 40, count: int = 2) -> list[Scene]:
 
 
 NOISY_SCENES = noisy_scenes()
-
-
 NAMED = f"{__name__}:NOISY_SCENES"
 
 
@@ -277,28 +258,6 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
         sharp[20, 20] = 0.9 * 8.0 ** (2 * (f_number < 8)) / (1 if f_number == 8 else 2)
         np.testing.assert_allclose(raw[f_number], sharp, atol=1 / CAMERA.span[0])
         assert modules[f_number] == "exposure"
-
-
-def test_score_and_sensor_tell_the_same_blur(weights: str) -> None:
-    env = _make(scenes=[point_scene()], simulator=weights, depth="unknown", motion="none")
-    scene = env.unwrapped.scenes[0]  # type: ignore[attr-defined]
-    working = DIAMETER / 2.0
-    assert scene.own_blur(8.0) == pytest.approx(working, rel=1e-5)
-    none = np.zeros(4)
-    settings = [CameraSettings(100, 1 / 125, n) for n in (4, 5.6, 8, 11)]
-    captures = describe_captures(
-        [scene] * 4, settings, CAMERA, speed=none, defocus=none, gain=none + 1.0
-    )
-    blur = working * np.array([2.0, math.sqrt(2.0), 1.0, 1.0])
-    np.testing.assert_allclose(captures.blur_px, blur, rtol=1e-5)
-    readings = []
-    for seed in range(40):
-        observation, info = env.reset(seed=seed, options={"state": 0})  # f/4
-        readings.append(math.log2(decode_sensors(observation["sensors"])[1]))
-    sharpness = 1.0 / (1.0 + (2.0 * working * 64 / 40) ** 2)
-    assert info["rewards"]["sharpness"] == pytest.approx(sharpness, rel=1e-5)
-    # 15 % noise, 40 readings: 2.4 %.
-    assert 2.0 ** np.mean(readings) == pytest.approx(2.0 * working * 64 / 40, rel=0.08)
 
 
 def test_vector_environment_equals_single_ones(weights: str) -> None:

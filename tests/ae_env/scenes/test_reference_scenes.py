@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes.photographs import PHOTOGRAPHS
 from ae_env.scenes.reference_scenes import (
     RADIANCE_MAPS,
     depth_photographs,
     draped_scenes,
-    fill_from_nearest,
-    packed_pitch,
     reference_scenes,
     sharpened,
 )
@@ -25,11 +21,7 @@ from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")
-
-
 SPLITS = ("train", "validation", "test")
-
-
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
 
 
@@ -54,16 +46,6 @@ def test_no_source_is_in_two_splits(scenes: dict[str, list[ReferenceScene]]) -> 
     assert len(set().union(*stems)) == 13
     ids = [s.scene_id for split in SPLITS for s in scenes[split]]
     assert len(ids) == len(set(ids))
-
-
-def test_photographs_keep_their_split_and_one_validates(
-    scenes: dict[str, list[ReferenceScene]],
-) -> None:
-    names = {p.name for p in PHOTOGRAPHS}
-    found = {split: {s.group for s in scenes[split]} & names for split in SPLITS}
-    assert found["test"] == {"chelsea", "coins", "grass", "rocket"}
-    assert found["validation"] == {"coffee"}
-    assert found["train"] == {"astronaut", "brick", "camera", "gravel"}
 
 
 def test_scenes_are_reproducible_and_more_of_them_keep_the_first(
@@ -101,19 +83,6 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
         assert scene.illuminance * exposure / 2.5 == pytest.approx(1.0, rel=1e-6)
     surfaces = [s.light[1].median().item() / WHITE for s in train if s.kind == "depth"]
     assert 0.05 < np.median(surfaces) < 0.3  # reflectances of nature
-
-
-def test_blur_in_pixels_is_that_of_the_camera() -> None:
-    """A finer sensor has its own distances, and the same blur in its own pixels."""
-    canon = get_camera("canon_70d")
-    assert packed_pitch(canon) == pytest.approx(8.22e-6)
-    ours, theirs = (reference_scenes("train", c, number=2, size=48)[1] for c in (CAMERA, canon))
-    assert ours.depth is not None
-    assert theirs.depth is not None
-    assert not torch.equal(ours.depth, theirs.depth)
-    np.testing.assert_allclose(blur(ours), blur(theirs, 8.22e-6), atol=1e-3)
-    with pytest.raises(ValueError, match=r"`pixel_pitch_um` \(=None\)"):
-        reference_scenes("train", replace(CAMERA, pixel_pitch_um=None), number=1, size=16)
 
 
 def test_radiance_maps_by_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -159,33 +128,6 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     np.testing.assert_allclose(ours, np.sort(four[known], axis=1)[:, 2], rtol=1e-5)
     assert 1.8 < front.depth.min() < front.depth.max() < 6.0
     assert bool((front.light >= 0).all())
-
-
-@pytest.mark.parametrize("name", ["nikon_z6", "canon_70d"])
-def test_focus_of_the_photographs(name: str) -> None:
-    camera = get_camera(name)
-    front, middle = depth_photographs(camera)
-    for scene in (front, middle):
-        c = blur(scene, 2e-6 * camera.pixel_pitch_um)
-        assert np.quantile(c, 0.01) < 0.3
-        assert 4.5 < np.quantile(c, 0.97) < 6.3
-        assert 0.03 < scene.lens.focal_length < 0.12
-        assert scene.reference == CameraSettings(100, scene.reference.exposure_time, 4)
-    assert front.depth is not None
-    assert (front.depth < front.lens.focus_distance).float().mean().item() < 0.06
-    share = (middle.depth < middle.lens.focus_distance).float().mean().item()
-    assert share == pytest.approx(0.5, abs=0.02)
-
-
-def test_gaps_take_the_nearest_value() -> None:
-    values = np.array([[1.0, np.nan, np.inf, 7.0], [1.0, 2.0, np.nan, 7.0]])
-    filled = fill_from_nearest(values)
-    assert filled[0, 1] in (1.0, 2.0)
-    assert filled[0, 2] == 7.0
-    assert filled[1, 2] in (2.0, 7.0)
-    np.testing.assert_array_equal(filled[np.isfinite(values)], values[np.isfinite(values)])
-    with pytest.raises(ValueError, match="finite"):
-        fill_from_nearest(np.full((2, 2), np.nan))
 
 
 @pytest.mark.parametrize(
@@ -251,9 +193,3 @@ def test_blur_is_what_the_thin_lens_says() -> None:
         blur = np.abs(1 / s - 1 / depth) * f**2 / 11 / (1 - f / s) / (2 * 5.94e-6)
         assert blur.max() <= 7.0 + 1e-3
         assert blur.min() < 0.35  # something is in focus
-
-
-def test_photographs_and_scenes_with_depth_are_passed_over() -> None:
-    scenes = [s for s in reference_scenes("train", CAMERA, number=1, size=32) if s.kind == "depth"]
-    assert scenes
-    assert not list(draped_scenes([*scenes, picture("photograph")], CAMERA))

@@ -21,8 +21,6 @@ from simulator.raw.image import RawImage
 from tests.strategies import SEEDS, lights
 
 CAMERA = get_camera("nikon_z6")
-
-
 PLAIN = CameraProfile("plain", "RGGB", 0, 1023, 10)
 
 

@@ -46,8 +46,6 @@ def _mean(images: torch.Tensor, captures: Captures) -> torch.Tensor:
 
 
 CAMERA = get_camera("nikon_z6")
-
-
 GRID = ExposureGrid.default()
 
 

@@ -20,10 +20,6 @@ from benchmarks import defects as benchmark
 from simulator.raw.develop import srgb_encode
 from tests.ae_env.scorer_images import CAMERA, check_image_scorer, random_pictures
 
-#: Signal of an 18 % card at the exposure of the light that falls on it.
-CARD = 0.18 * 0.6635
-
-
 MEASURES = [f"analytic_{defect}" for defect in DEFECTS]
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
@@ -23,11 +22,7 @@ from ae_env.scorers.terms import Highlights, Noise, Shadows
 from simulator import get_camera
 
 CAMERA = get_camera("nikon_z6")
-
-
 GRID = ExposureGrid.default()
-
-
 TERMS = dict.fromkeys(("brightness", "highlights", "shadows", "noise", "sharpness"), 1.0)
 
 
@@ -73,17 +68,6 @@ def test_scores_are_those_of_the_terms(scorer: Any, bands: bool, size: int) -> N
         wanted = made.score_parts(None, captures)
         for name, found in scores.scores(captures, scores.means(scenes, captures)).items():
             np.testing.assert_allclose(found, wanted[name], atol=1e-6, err_msg=f"{name} {gain}")
-
-
-def test_scorers_of_ones_own_are_called() -> None:
-    class Strict(Noise):
-        def __call__(self, images: Any, captures: Captures) -> torch.Tensor:
-            return super().__call__(images, captures) ** 2
-
-    tables = ScoreTables(GRID, CAMERA, CompositeScorer({"strict": Strict(), "noise": Noise()}))
-    assert set(tables.fused.parts) == {"noise"}
-    parts = tables.table(_scene(), gain=3.0).parts
-    np.testing.assert_allclose(parts["strict"], parts["noise"] ** 2, atol=1e-6)
 
 
 @pytest.mark.parametrize("on_the_class", [True, False])

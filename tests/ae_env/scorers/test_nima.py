@@ -19,10 +19,8 @@ from ae_env.scorers.nima import (
     PUBLISHED,
     NimaMobileNet,
     convert_nima,
-    git_blob_id,
     mean_rating,
     nima_network,
-    published_as,
     read_weights,
 )
 
@@ -165,12 +163,3 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_weights(tmp_path / "nothing.safetensors")
     with pytest.raises(ValueError, match=r"must end in .safetensors"):
         convert_nima(text, tmp_path / "out.h5")
-
-
-def test_files_are_known_by_gits_blob_id(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The ids of git hash-object for an empty file and for one line.
-    assert git_blob_id(b"") == "e69de29bb2d1d6434b8b29ae775ad8c2e48c5391"
-    assert git_blob_id(b"hello\n") == "ce013625030ba8dba906f756967f9e9ca394464a"
-    assert published_as(b"hello\n") is None
-    monkeypatch.setitem(PUBLISHED, "nima_technical", git_blob_id(b"hello\n"))
-    assert published_as(b"hello\n") == "nima_technical"

@@ -20,14 +20,8 @@ from ae_env.scorers.protocol import Captures
 from simulator import CameraSettings, get_camera, incident_ev100
 
 cv2 = pytest.importorskip("cv2")
-
-
 CAMERA = get_camera("nikon_z6")
-
-
 GRID = ExposureGrid.default()
-
-
 EV = incident_ev100(1000.0)
 
 
@@ -48,27 +42,6 @@ def _captures(scenes: list[Scene], states: list[CameraSettings]) -> Captures:
 
 def _camera_man(size: int = 128) -> np.ndarray:
     return 0.6 * (skimage.data.camera()[: 4 * size : 4, : 4 * size : 4] / 255.0) ** 2.2
-
-
-def _squares(count: int) -> torch.Tensor:
-    """sRGB (1, 3, 100, 100): `count` single bright pixels of corners, well apart."""
-    picture = torch.full((1, 3, 100, 100), 0.2)
-    for i in range(count):
-        row, column = divmod(i, 4)
-        picture[..., 20 + 16 * row : 26 + 16 * row, 20 + 16 * column : 26 + 16 * column] = 0.9
-    return picture
-
-
-def test_the_count_is_mapped() -> None:
-    """Each small square has its corners; with nothing there is nothing."""
-    scorer = make_scorer("keypoints").parts["keypoints"]
-    scores = [float(scorer(_squares(n), None)) for n in (0, 1, 4, 12)]  # type: ignore[arg-type]
-    assert scores[0] == 0.0
-    assert scores == sorted(scores)
-    counts = -np.log(1.0 - np.array(scores)) * 15.0 * (100 - 2 * 15) ** 2 / 1000.0
-    np.testing.assert_allclose(counts, counts.round(), atol=1e-6)  # whole numbers of keypoints
-    assert counts[1] >= 1
-    assert counts[2] == pytest.approx(4 * counts[1], rel=0.5)
 
 
 def test_the_reference_is_the_right_exposure_without_noise() -> None:

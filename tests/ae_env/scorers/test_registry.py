@@ -33,11 +33,7 @@ from simulator import NoiseLevelFunction, get_camera
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 ID = "ae_env/AutoExposure-v0"
-
-
 SMALL = {"scenes": "bundled:small", "split": "test", "resolution": 36}
-
-
 MINE = '''
 import torch
 
@@ -121,15 +117,6 @@ def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> N
     other = gym.make(pickle.loads(content))
     rewards = [(e.reset(seed=0), e.step(5))[1][1] for e in (env, other)]
     assert rewards[0] == rewards[1] > 0.0
-
-
-def test_only_the_self_contained(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = list_scorers(self_contained=True)
-    assert {"balanced", "noise"} <= set(names) < set(list_scorers())
-    needy = {"brisque", "keypoints", "matches", "nima_aesthetic", "nima_technical", "niqe"}
-    assert not needy & set(names)
-    for name in names:
-        make_scorer(name)
 
 
 def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,8 +242,6 @@ def test_pyiqa_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 CAMERA = get_camera("nikon_z6")
-
-
 GRID = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
 
 

@@ -20,8 +20,6 @@ from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, NoiseLevelFunction, get_camera, incident_ev100
 
 CAMERA = get_camera("nikon_z6")
-
-
 GRID = ExposureGrid.default()
 
 

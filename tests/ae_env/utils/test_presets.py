@@ -41,17 +41,6 @@ def test_presets_run_on_small_scenes(name: str) -> None:
     assert envs.step(np.array([1, 2]))[0]["raw"].shape == (2, 4, 36, 36)
 
 
-def test_the_office_has_shutters_of_whole_periods() -> None:
-    env = gym.make(ID, **_load("office_led")).unwrapped
-    assert set(env.grid.exposure_times) >= {1 / 50, 1 / 60, 1 / 100, 1 / 120}
-    env.reset(seed=0)
-    banding = env.score_table().parts["banding"]
-    times = np.array([state.exposure_time for state in env.grid.states])
-    whole = np.isin(times, [1 / 100, 1 / 50, 1 / 25])
-    assert (banding[whole] == 1.0).all()
-    assert banding[~whole].max() < 0.99
-
-
 @pytest.mark.parametrize(("name", "kind"), [("snow", "snow"), ("concert", "spot_light")])
 def test_scenes_of_one_kind(name: str, kind: str) -> None:
     options = EnvOptions(scenes=ae_env.load_preset(name)["scenes"], split="test", resolution=36)
