@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -9,18 +11,92 @@ import numpy as np
 
 from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.episodes.draws import check_options
+from ae_env.episodes.state import Episode
 from ae_env.grid import ExposureGrid
-from ae_env.options import EnvOptions
-from ae_env.registration import SpecProperty
-from ae_env.scenes import Scene
+from ae_env.lighting import Lighting
+from ae_env.options import (
+    DEFAULT_SIMULATOR,
+    DEFAULT_TOLERANCE,
+    Crop,
+    Depth,
+    EnvOptions,
+    Motion,
+    Noise,
+    ObservationKind,
+    Reward,
+    Split,
+)
+from ae_env.registration import SpecProperty, names_nearest
+from ae_env.scenes import Scene, SceneSpec
+from ae_env.scorers import Scorer
+from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.checks import check_actions, check_seed, check_word
 from simulator.camera import CameraProfile
 
+logger = logging.getLogger(__name__)
+
 Observation = dict[str, np.ndarray]
-_PLACE = np.array([0])
+_FIRST = np.array([0])
 
 
-class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
+class AutoExposureBase(SpecProperty):
+    """The public surface that `AutoExposureEnv` and `AutoExposureVectorEnv` have in common.
+
+    Policies and evaluations need nothing else of an environment.
+    """
+
+    core: EpisodeCore
+    render_mode: str | None
+    _last: Frames | None
+
+    @property
+    def grid(self) -> ExposureGrid:
+        """The states that actions choose from."""
+        return self.core.grid
+
+    @property
+    def camera(self) -> CameraProfile:
+        """The simulated body."""
+        return self.core.camera
+
+    @property
+    def scenes(self) -> list[Scene]:
+        """Scenes that episodes draw from; of a sequence, its first frame."""
+        return self.core.first_scenes
+
+    @property
+    def delay(self) -> int:
+        """Frames between an action and the first capture that has it."""
+        return self.core.delay
+
+    def episode(self, env_index: int = 0) -> Episode:
+        """The drawn values of an environment's episode, and its current frame and state."""
+        return self.core.episode(env_index)
+
+    def scene(self, env_index: int = 0) -> Scene:
+        """The scene that an environment photographs now; of a sequence, the current frame's."""
+        return self.core.scene(env_index)
+
+    def score_table(self, env_index: int = 0) -> ScoreTable:
+        """Expected scores in an environment's current frame, with standard errors and parts."""
+        return self.core.score_table(env_index)
+
+    def _pictures(self, num_envs: int) -> tuple[np.ndarray, ...] | None:
+        """The latest captures, developed, one per environment; None without a render mode."""
+        from ae_env.rendering import render_frame
+
+        if self.render_mode is None:
+            logger.warning(
+                "render() returns None, because the environment was made without a render mode; "
+                "give render_mode='rgb_array' to gymnasium.make"
+            )
+            return None
+        if self._last is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        return tuple(render_frame(self.core, i, self._last) for i in range(num_envs))
+
+
+class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     """Choose ISO, shutter and aperture, frame by frame, for a scene on a simulated raw sensor.
 
     ## Description
@@ -42,12 +118,13 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | exposure time [s] | 1/1000, 1/125, 1/15, 1/2 |
     | f-number | 4, 5.6, 8, 11 |
 
-    `action_masks()` tells which states may be chosen. Wrappers in `ae_env.wrappers` offer the
+    `action_masks()` gives the states that the current scene allows: all of them, unless the scene
+    is a recorded grid with holes (`Scene.allowed`). Wrappers in `ae_env.wrappers` offer the
     controls one by one, relative steps, and continuous APEX values.
 
     ## Observation Space
 
-    A `Dict`; `ae_env.observation` has the functions that invert each entry.
+    A `Dict`; the functions of `ae_env.observation` invert each entry.
 
     | key | space | meaning |
     |---|---|---|
@@ -59,12 +136,27 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
 
     Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`.
 
+    ## Info
+
+    The same keys from `reset` and `step`.
+
+    | key | meaning |
+    |---|---|
+    | `scene_id` | name of the scene |
+    | `state` | index of the exposure state of this capture |
+    | `iso`, `exposure_time`, `f_number`, `ev100` | its settings |
+    | `clipped_high`, `clipped_low` | shares of the samples at white, and at or below 2^-10 of it |
+    | `excess_noise` | noise variance beyond that of the camera at these settings |
+    | `modules` | steps of the simulator that this capture took |
+    | `rewards` | dictionary of the scorer's parts, `score` and the costs |
+    | `oracle_state`, `regret` | best state, and its expected score minus that of `state`; only with `with_oracle` |
+
     ## Starting State
 
     `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
     log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
     defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
-    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses; of a recorded sequence, `frame` is the raw that it begins with.
+    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses; in a recorded sequence, `frame` is the raw to begin with.
 
     ## Episode End
 
@@ -78,7 +170,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
     | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
-    | `costs` | `{}` | weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
+    | `costs` | `None` | mapping to the weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
     | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
     | `sensors` | `True` | whether `sensors` is observed |
     | `resolution` | 64 | height and width R of the packed frame, >= 36 |
@@ -93,6 +185,7 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
     | `tolerance` | 0.1 | how far the distribution of a pixel may move by blur and noise reduction that are left out, in units of the noise's standard deviation; 0 leaves out only what changes nothing |
     | `reward` | `"capture"` | `"capture"` scores the capture, `"expected"` its expectation over noise |
     | `with_oracle` | `False` | adds `oracle_state` and `regret` to `info` |
+    | `render_mode` | `None` | `"rgb_array"`: `render()` returns the developed capture, (H, W, 3) uint8, with its settings and score written on it; `None`: it returns None |
 
     ## Version History
 
@@ -101,28 +194,58 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
 
-    def __init__(self, *, render_mode: str | None = None, **arguments: Any) -> None:
+    @names_nearest
+    def __init__(
+        self,
+        *,
+        scenes: SceneSpec = "bundled",
+        split: Split = "train",
+        grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default",
+        scorer: str | Mapping[str, float] | Scorer = "balanced",
+        costs: Mapping[str, float] | None = None,
+        observation: ObservationKind = "uint8",
+        sensors: bool = True,
+        resolution: int = 64,
+        crop: Crop = "box",
+        motion: Motion | float = "random",
+        depth: Depth | float = "random",
+        lighting: str | Mapping[str, Any] | Lighting = "static",
+        delay: int = 0,
+        camera: str | CameraProfile = "nikon_z6",
+        simulator: str | None = DEFAULT_SIMULATOR,
+        noise: bool | Noise = True,
+        tolerance: float = DEFAULT_TOLERANCE,
+        reward: Reward = "capture",
+        with_oracle: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
         check_word("render_mode", render_mode, ("rgb_array",), None)
         self.render_mode = render_mode
-        self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs=1)
+        options = EnvOptions(
+            scenes=scenes,
+            split=split,
+            grid=grid,
+            scorer=scorer,
+            costs={} if costs is None else costs,
+            observation=observation,
+            sensors=sensors,
+            resolution=resolution,
+            crop=crop,
+            motion=motion,
+            depth=depth,
+            lighting=lighting,
+            delay=delay,
+            camera=camera,
+            simulator=simulator,
+            noise=noise,
+            tolerance=tolerance,
+            reward=reward,
+            with_oracle=with_oracle,
+        )
+        self.core = EpisodeCore(options, num_envs=1)
         self.action_space = gym.spaces.Discrete(len(self.core.grid))
         self.observation_space: Any = self.core.observation_space()
-        self._last: Frames | None = None
-
-    @property
-    def grid(self) -> ExposureGrid:
-        """The states that actions choose from."""
-        return self.core.grid
-
-    @property
-    def camera(self) -> CameraProfile:
-        """The simulated body."""
-        return self.core.camera
-
-    @property
-    def scenes(self) -> list[Scene]:
-        """Scenes that episodes draw from; of a sequence, its first frame."""
-        return self.core.first_scenes
+        self._last = None
 
     @property
     def state(self) -> int:
@@ -135,32 +258,33 @@ class AutoExposureEnv(SpecProperty, gym.Env[Observation, np.int64]):
         """Begins an episode; see the class for `options`."""
         chosen = check_options(options)
         super().reset(seed=check_seed(seed))
-        self.core.start(0, self.np_random, chosen)
-        self._last = self.core.observe(_PLACE)
+        self.core.begin(_FIRST, [self.np_random], [chosen])
+        self._last = self.core.observe(_FIRST)
         return _first(self._last.observation), single_info(self._last.info, 0)
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
-        self.core.act(_PLACE, check_actions("action", action, ())[None])
-        self._last = self.core.observe(_PLACE)
+        self.core.transition(_FIRST, check_actions("action", action, ())[None])
+        self._last = self.core.observe(_FIRST)
         info = single_info(self._last.info, 0)
         return _first(self._last.observation), float(self._last.reward[0]), False, False, info
 
     def action_masks(self) -> np.ndarray:
-        """(S,) bool: states that may be chosen."""
-        return self.core.action_masks()
+        """(S,) bool: states that the scene allows."""
+        mask: np.ndarray = self.core.action_masks(_FIRST)[0]
+        return mask
 
     def expected_scores(self) -> np.ndarray:
         """(S,) float64: expectation over noise of every state's score in the current frame."""
-        return self.core.expected_scores(0).mean
+        return self.score_table().mean
 
-    def render(self) -> np.ndarray:  # type: ignore[override]
-        """(H, W, 3) uint8: the developed capture with its settings and score written on it."""
-        from ae_env.rendering import render_frame
+    def render(self) -> np.ndarray | None:
+        """The developed capture, (H, W, 3) uint8, with its settings and score written on it.
 
-        if self._last is None:
-            raise gym.error.ResetNeeded("call reset() before render()")
-        return render_frame(self.core, 0, self._last)
+        None, and a warning in the log, without a `render_mode`.
+        """
+        pictures = self._pictures(1)
+        return None if pictures is None else pictures[0]
 
 
 def _first(observation: Observation) -> Observation:

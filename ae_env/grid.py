@@ -1,4 +1,4 @@
-"""The exposure states that an agent can choose from."""
+"""`ExposureGrid`: the exposure states that an agent can choose from."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from simulator.settings import CameraSettings
 
 
 def plain(value: Any) -> Any:
-    """Numbers and lists for scalars and arrays of NumPy and torch; anything else is `value`."""
+    """`value` as numbers and lists where it is a scalar or an array of NumPy or torch."""
     return value.tolist() if hasattr(value, "tolist") else value
 
 
 def plain_list(value: Any) -> list[Any] | None:
-    """The entries of any iterable but a text, each as `plain` gives it; None for what is none.
+    """The entries of any iterable but a text, each as `plain` gives it; None for anything else.
 
     >>> plain_list(np.array([1, 2])), plain_list(iter((3, np.int64(4)))), plain_list(np.array(5))
     ([1, 2], [3, 4], None)
@@ -61,13 +61,13 @@ class ExposureGrid:
             given = getattr(self, name)
             values = tuple(plain_list(given) or ())
             numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in values)
-            # What is out of range is refused by CameraSettings, NaN here.
+            # NaN is not ascending; `CameraSettings` checks the ranges below.
             if not (values and numbers and all(a < b for a, b in pairwise(values))):
                 raise ValueError(
                     f"`{name}` (={given!r}) must be a strictly ascending list of numbers"
                 )
             object.__setattr__(self, name, tuple(float(v) for v in values))
-        assert self.states  # every combination is checked by CameraSettings
+        assert self.states  # makes, and so checks, every CameraSettings
 
     @classmethod
     def default(cls) -> ExposureGrid:

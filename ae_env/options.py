@@ -1,85 +1,95 @@
-"""Arguments of the environment, checked in one place."""
+"""The arguments of the environments: checked in one place, and made into objects."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
-from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes import Scene, SceneSpec, load_scenes
+from ae_env.scenes.bundled import Split as Split
 from ae_env.scenes.loading import (
-    DEFAULT_SIMULATOR,
+    BUNDLED,
+    BUNDLED_PARTS,
     SceneNetworks,
     check_weights,
     is_sequence,
     without_noise,
 )
+from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
+from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import Resize
-from ae_env.scorers import CompositeScorer, make_scorer
+from ae_env.scorers import CompositeScorer, Scorer, make_scorer
 from ae_env.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.exposure import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
+from simulator.capture.exposure import check_tolerance
 from simulator.utils.cache import LruCache
 
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36
 COSTS = ("flicker", "switch")
-DEPTHS = ("random", "far", "unknown")
-NOISES = ("bank", "exact")
+ObservationKind = Literal["uint8", "linear", "dn"]
+Motion = Literal["random", "none"]
+Depth = Literal["random", "far", "unknown"]
+Noise = Literal["bank", "exact"]
+Reward = Literal["capture", "expected"]
 #: Longest delay [frame].
 MAX_DELAY = 16
 #: Highest image speed [frame heights/s] and blur diameter [pixel of a 64-pixel frame].
 MAX_BLUR = 1e3
-#: Nominal settings are rounded: 1/30 s stands for 1/32 s.
+#: Relative tolerance of the range of settings, because nominal ones are rounded: 1/30 s for 1/32 s.
 _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
+#: Bundled scenes by all that decides them; the bound is on the memory of their light [byte].
+_LOADED: LruCache[list[Scene]] = LruCache(2**30)
 
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Arguments of `AutoExposureEnv` and `AutoExposureVectorEnv`; see there for their meaning."""
+    """Arguments of `AutoExposureEnv` and `AutoExposureVectorEnv`, which document them."""
 
-    scenes: Any = "bundled"
-    split: str = "train"
-    grid: Any = "default"
-    scorer: Any = "balanced"
+    scenes: SceneSpec = "bundled"
+    split: Split = "train"
+    grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default"
+    scorer: str | Mapping[str, float] | Scorer = "balanced"
     costs: Mapping[str, float] = field(default_factory=dict)
-    observation: str = "uint8"
+    observation: ObservationKind = "uint8"
     sensors: bool = True
     resolution: int = 64
-    crop: str = "box"
-    motion: str | float = "random"
-    depth: str | float = "random"
-    lighting: Any = "static"
+    crop: Crop = "box"
+    motion: Motion | float = "random"
+    depth: Depth | float = "random"
+    lighting: str | Mapping[str, Any] | Lighting = "static"
     delay: int = 0
-    camera: Any = "nikon_z6"
+    camera: str | CameraProfile = "nikon_z6"
     simulator: str | None = DEFAULT_SIMULATOR
-    noise: bool | str = True
+    noise: bool | Noise = True
     tolerance: float = DEFAULT_TOLERANCE
-    reward: str = "capture"
+    reward: Reward = "capture"
     with_oracle: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.scenes, str) and not self.scenes:
             raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
-        check_word("split", self.split, ("train", "test", "all"))
-        check_word("observation", self.observation, ("uint8", "linear", "dn"))
-        check_word("crop", self.crop, ("box", "native"))
-        check_word("reward", self.reward, ("capture", "expected"))
-        check_word("noise", self.noise, NOISES, True, False)  # True is "bank"
+        check_word("split", self.split, get_args(Split))
+        check_word("observation", self.observation, get_args(ObservationKind))
+        check_word("crop", self.crop, get_args(Crop))
+        check_word("reward", self.reward, get_args(Reward))
+        check_word("noise", self.noise, get_args(Noise), True, False)  # True is "bank"
         check_flag("sensors", self.sensors)
         check_flag("with_oracle", self.with_oracle)
         check_tolerance(self.tolerance)
         why = ": the default CNNs of RL libraries take no smaller image"
         resolution = check_integer("resolution", self.resolution, MIN_RESOLUTION, 4096, more=why)
         delay = check_integer("delay", self.delay, 0, MAX_DELAY, more=" frames")
-        object.__setattr__(self, "resolution", resolution)  # those of numpy, too, as an int
+        object.__setattr__(self, "resolution", resolution)  # NumPy's integers as an int
         object.__setattr__(self, "delay", delay)
-        for name, words in (("motion", ("random", "none")), ("depth", DEPTHS)):
+        for name, words in (("motion", get_args(Motion)), ("depth", get_args(Depth))):
             value = getattr(self, name)
             if isinstance(value, str):
                 check_word(name, value, words)
@@ -102,7 +112,11 @@ class EnvOptions:
 
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
-        """Options from keyword arguments; an unknown one is refused with the nearest name."""
+        """Options from the entries of a file or another mapping.
+
+        Raises:
+            ValueError: If one is unknown; the message proposes the nearest name.
+        """
         known = [f.name for f in fields(cls)]
         for name in kwargs:
             if name not in known:
@@ -129,7 +143,7 @@ class EnvOptions:
         return make_scorer(self.scorer)
 
     def make_lighting(self) -> Lighting:
-        """How the light changes."""
+        """The change of the light during an episode."""
         return make_lighting(self.lighting)
 
     @property
@@ -138,24 +152,17 @@ class EnvOptions:
         return is_sequence(self.scenes)
 
     def load_scenes(self) -> list[Scene]:
-        """The scenes of the split at this resolution; kept for the next environment like this.
+        """The scenes of the split at this resolution; of sequences, all frames.
 
-        Of sequences, all frames (`ae_env.scenes.folder`).
+        Bundled ones stay in memory for the next environment with the same arguments.
         """
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
-        key = (
-            repr(self.scenes),
-            self.split,
-            camera,  # its colours and levels, too
-            self.resolution,
-            self.crop,
-            finds_defocus,
-        )
-        by_name = isinstance(self.scenes, str) and ":" not in self.scenes.removeprefix("bundled:")
-        # Weights in a file of one's own may be others next time.
-        kept = by_name and (not finds_defocus or self.simulator == DEFAULT_SIMULATOR)
-        known = _LOADED.get(key) if kept else None
+        key = (self.scenes, self.split, camera, self.resolution, self.crop, finds_defocus)
+        cacheable = isinstance(self.scenes, str) and self.scenes in (*BUNDLED, *BUNDLED_PARTS)
+        # A user's weights may have other content next time.
+        cacheable &= not finds_defocus or self.simulator == DEFAULT_SIMULATOR
+        known = _LOADED.get(key) if cacheable else None
         if known is not None:
             return list(known)
         networks = None if self.simulator is None else SceneNetworks(self.simulator)
@@ -164,17 +171,15 @@ class EnvOptions:
             resize = networks.resized
         scenes = load_scenes(
             self.scenes,
-            self.split,  # type: ignore[arg-type]
+            self.split,
             camera=camera,
             resolution=self.resolution,
-            crop=self.crop,  # type: ignore[arg-type]
+            crop=self.crop,
             resize=resize,
         )
-        if not scenes:
-            raise ValueError(f"`scenes` (={self.scenes!r}) has none in split {self.split!r}")
         scenes = [self._prepared(scene, networks) for scene in scenes]
         _check_light(scenes)
-        if kept and self.scenes.startswith("bundled"):
+        if cacheable:
             _LOADED.put(key, list(scenes), sum(scene.light.nbytes for scene in scenes))
         return scenes
 
@@ -204,13 +209,9 @@ def _check_shown(grid: ExposureGrid) -> None:
 
 
 def _check_light(scenes: list[Scene]) -> None:
-    """Raises a `ValueError` where the light is unknown and cannot be told from the scene."""
+    """Raises a `ValueError` where the light is unknown and cannot be estimated from the scene."""
     for scene in scenes:
         try:
-            _ = scene.ev100  # kept: every score asks for it
+            _ = scene.ev100  # a cached property, which every score asks for
         except ValueError as error:
             raise ValueError(f"scene {scene.scene_id!r}: {error}") from error
-
-
-#: Bundled scenes by what they were made for; at most so many bytes of light.
-_LOADED: LruCache[list[Scene]] = LruCache(2**30)

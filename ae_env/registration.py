@@ -1,14 +1,20 @@
-"""Makes the environments known to Gymnasium, and keeps their specs honest."""
+"""Registration with Gymnasium, and the parts of it that both environments need."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
+from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from typing import Any, ParamSpec
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from ae_env.utils.checks import did_you_mean
+
+P = ParamSpec("P")
 ENV_IDS = ("ae_env/AutoExposure-v0",)
 
 
@@ -24,11 +30,31 @@ def register_envs() -> None:
     )
 
 
+def names_nearest(init: Callable[P, None]) -> Callable[P, None]:
+    """Decorates a constructor: its error for an unknown argument proposes the nearest name.
+
+    The error stays Python's own `TypeError` with its wording, which Gymnasium's consumers look for.
+    """
+    known = [name for name in inspect.signature(init).parameters if name != "self"]
+
+    @functools.wraps(init)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> None:
+        for name in kwargs:
+            if name not in known:
+                raise TypeError(
+                    f"{init.__qualname__}() got an unexpected keyword argument {name!r}"
+                    f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
+                )
+        init(*args, **kwargs)
+
+    return checked
+
+
 class InProcessSpec(EnvSpec):
     """Spec of an environment with an argument, such as a callable, that JSON cannot hold."""
 
     def to_json(self) -> str:
-        """Refuses, naming the argument.
+        """Raises, and names the argument.
 
         Raises:
             ValueError: Always.
@@ -43,13 +69,13 @@ class InProcessSpec(EnvSpec):
 
 
 class SpecProperty:
-    """Mixin for the environments: their ``spec`` says clearly why it cannot become JSON."""
+    """Mixin for the environments: their ``spec`` says why it cannot become JSON."""
 
     _spec: EnvSpec | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What Gymnasium made the environment from; None if it was constructed directly."""
+        """Spec that Gymnasium made the environment from; None if it was constructed directly."""
         return self._spec
 
     @spec.setter

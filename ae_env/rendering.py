@@ -1,4 +1,4 @@
-"""Pictures to look at: one capture with its settings and score, and all states of a scene."""
+"""Pictures for people: one capture with its settings and score, and all states of a scene."""
 
 from __future__ import annotations
 
@@ -29,21 +29,24 @@ if TYPE_CHECKING:
 FRAME_PIXELS = 256
 #: A contact sheet of more states than this would be unreadable.
 MAX_SHEET_STATES = 256
-#: Height of one picture on the contact sheet [pixel]; and the height that scenes are averaged to.
-THUMB_PIXELS, CAPTURE_PIXELS = 104, 192
+#: Height of one picture on the contact sheet [pixel].
+THUMB_PIXELS = 104
+#: Height that scenes are averaged to for it [packed pixel].
+CAPTURE_PIXELS = 192
 #: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
 PATH_COLOURS = ("#E69F00", "#56B4E9", "#D55E00", "#F0E442", "#CC79A7", "#009E73", "#0072B2")
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
-_BORDER, _GAP, _MARGIN, _PANEL_GAP, _LABEL_WIDTH, _LABEL_HEIGHT = 5, 4, 18, 22, 48, 20
+_BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
+_TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
 
 
 def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
     """The latest capture of an episode, developed, with its settings and score written on it.
 
     Args:
-        core: Where the episode runs.
-        index: Which of its episodes.
-        frames: What all its episodes show.
+        core: The core that the episode runs on.
+        index: Index of the episode.
+        frames: Current frames of all episodes.
 
     Returns:
         (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
@@ -72,7 +75,7 @@ def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
 def developed(signal: torch.Tensor, scene: Scene) -> np.ndarray:
     """Captures (B, 4, H, W) of `scene` as sRGB pictures (B, H, W, 3) uint8."""
     rgb = develop(signal, scene.white_balance, scene.camera.colour_matrix)
-    return rgb.mul(255.0).round_().byte().permute(0, 2, 3, 1).numpy()
+    return np.asarray(rgb.mul(255.0).round_().byte().permute(0, 2, 3, 1).numpy())
 
 
 def _captioned(picture: Image.Image, lines: Sequence[str]) -> Image.Image:
@@ -118,7 +121,7 @@ def contact_sheet(
         scene: The scene, of any size and shape; large ones are averaged down first.
         camera: The body; that of the scene by default.
         grid: The states; the default grid's 64 by default.
-        scorer: What rates them, as `make_scorer` takes it.
+        scorer: Scorer of the captures, as `make_scorer` takes it.
         speed: Image speed [frame heights per second].
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
         path: States that a policy went through, the start state first; or several by name.
@@ -208,7 +211,7 @@ def _visits(states: Sequence[int]) -> dict[int, str]:
 
 @dataclass(frozen=True)
 class _Sheet:
-    """Where everything goes on the sheet."""
+    """Layout and drawing of a contact sheet."""
 
     grid: ExposureGrid
     table: ScoreTable
@@ -239,11 +242,6 @@ class _Sheet:
 
         return min(range(1, count + 1), key=lopsidedness)
 
-    @property
-    def top(self) -> int:
-        """Height of the title."""
-        return 76
-
     def corner(self, state: int) -> tuple[int, int]:
         """Upper left corner of the picture of `state`."""
         iso, time, aperture = self.grid.controls(state)
@@ -255,7 +253,9 @@ class _Sheet:
         """Upper left corner of a panel's first picture."""
         width, height = self.panel
         x = _MARGIN + _LABEL_WIDTH + column * (width + _LABEL_WIDTH + _PANEL_GAP)
-        return x, self.top + 2 * _LABEL_HEIGHT + row * (height + 2 * _LABEL_HEIGHT + _PANEL_GAP)
+        return x, _TITLE_HEIGHT + 2 * _LABEL_HEIGHT + row * (
+            height + 2 * _LABEL_HEIGHT + _PANEL_GAP
+        )
 
     def draw(self, title: tuple[str, str]) -> Image.Image:
         """The finished sheet."""

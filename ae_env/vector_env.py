@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from typing import Any
 
 import gymnasium as gym
@@ -12,24 +12,37 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from ae_env.env import AutoExposureBase, Observation
 from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.episodes.draws import check_options
 from ae_env.grid import ExposureGrid, plain, plain_list
-from ae_env.options import EnvOptions
-from ae_env.registration import SpecProperty
-from ae_env.scenes import Scene
+from ae_env.lighting import Lighting
+from ae_env.options import (
+    DEFAULT_SIMULATOR,
+    DEFAULT_TOLERANCE,
+    Crop,
+    Depth,
+    EnvOptions,
+    Motion,
+    Noise,
+    ObservationKind,
+    Reward,
+    Split,
+)
+from ae_env.registration import names_nearest
+from ae_env.scenes import SceneSpec
+from ae_env.scorers import Scorer
 from ae_env.utils.checks import check_actions, check_integer, check_seed, check_word
 from simulator.camera import CameraProfile
 
-Observation = dict[str, np.ndarray]
 #: Most environments in one process: at 64 pixels, they observe 1 GiB.
 MAX_ENVS = 2**16
 
 
 class AutoExposureVectorEnv(
-    SpecProperty, gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]
+    AutoExposureBase, gym.vector.VectorEnv[Observation, np.ndarray, np.ndarray]
 ):
-    """`num_envs` episodes of `AutoExposureEnv`, photographed in batches; see there.
+    """`num_envs` episodes of `AutoExposureEnv`, photographed in batches.
 
     Environment i behaves exactly as a single environment seeded with ``seed + i``.
 
@@ -38,18 +51,37 @@ class AutoExposureVectorEnv(
         autoreset_mode: ``"NEXT_STEP"`` (default), ``"SAME_STEP"`` (``final_obs``, ``final_info``)
             or ``"DISABLED"`` (``reset(options={"reset_mask": mask})``).
         max_episode_steps: Steps after which an episode is truncated; None for never.
-        render_mode: None or ``"rgb_array"``.
-        arguments: As of `AutoExposureEnv`.
+
+    All other arguments are those of `AutoExposureEnv`.
     """
 
+    @names_nearest
     def __init__(
         self,
         num_envs: int = 1,
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = 8,
+        scenes: SceneSpec = "bundled",
+        split: Split = "train",
+        grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default",
+        scorer: str | Mapping[str, float] | Scorer = "balanced",
+        costs: Mapping[str, float] | None = None,
+        observation: ObservationKind = "uint8",
+        sensors: bool = True,
+        resolution: int = 64,
+        crop: Crop = "box",
+        motion: Motion | float = "random",
+        depth: Depth | float = "random",
+        lighting: str | Mapping[str, Any] | Lighting = "static",
+        delay: int = 0,
+        camera: str | CameraProfile = "nikon_z6",
+        simulator: str | None = DEFAULT_SIMULATOR,
+        noise: bool | Noise = True,
+        tolerance: float = DEFAULT_TOLERANCE,
+        reward: Reward = "capture",
+        with_oracle: bool = False,
         render_mode: str | None = None,
-        **arguments: Any,
     ) -> None:
         num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVS)
         if max_episode_steps is not None:
@@ -64,32 +96,38 @@ class AutoExposureVectorEnv(
         }
         self.num_envs, self.render_mode = num_envs, render_mode
         self.max_episode_steps = max_episode_steps
-        self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs)
+        options = EnvOptions(
+            scenes=scenes,
+            split=split,
+            grid=grid,
+            scorer=scorer,
+            costs={} if costs is None else costs,
+            observation=observation,
+            sensors=sensors,
+            resolution=resolution,
+            crop=crop,
+            motion=motion,
+            depth=depth,
+            lighting=lighting,
+            delay=delay,
+            camera=camera,
+            simulator=simulator,
+            noise=noise,
+            tolerance=tolerance,
+            reward=reward,
+            with_oracle=with_oracle,
+        )
+        self.core = EpisodeCore(options, num_envs)
         self.single_action_space = gym.spaces.Discrete(len(self.core.grid))
         self.single_observation_space = self.core.observation_space()
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._everyone = np.arange(num_envs)
-        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._all = np.arange(num_envs)
+        self._rngs: dict[int, np.random.Generator] = {}  # by environment, from the first reset on
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._done = np.zeros(num_envs, dtype=bool)
-        self._shown: Observation | None = None  # a copy, where autoreset is off
-        self._last: Frames | None = None
-
-    @property
-    def grid(self) -> ExposureGrid:
-        """The states that actions choose from."""
-        return self.core.grid
-
-    @property
-    def camera(self) -> CameraProfile:
-        """The simulated body."""
-        return self.core.camera
-
-    @property
-    def scenes(self) -> list[Scene]:
-        """Scenes that episodes draw from; of a sequence, its first frame."""
-        return self.core.first_scenes
+        self._shown: Observation | None = None  # a copy, only where autoreset is off
+        self._last = None
 
     @property
     def states(self) -> np.ndarray:
@@ -98,12 +136,12 @@ class AutoExposureVectorEnv(
         return self.core.episodes.state.copy()
 
     def action_masks(self) -> np.ndarray:
-        """(N, S) bool: states that may be chosen."""
-        return np.tile(self.core.action_masks(), (self.num_envs, 1))
+        """(N, S) bool: states that the scene of each environment allows."""
+        return self.core.action_masks(self._all)
 
     def expected_scores(self) -> np.ndarray:
         """(N, S) float64: expected score of every state in the current frame of each episode."""
-        return np.stack([self.core.expected_scores(i).mean for i in range(self.num_envs)])
+        return np.stack([self.score_table(i).mean for i in range(self.num_envs)])
 
     def reset(
         self,
@@ -122,16 +160,17 @@ class AutoExposureVectorEnv(
         options = check_options(options, "reset_mask")
         mask = self._reset_mask(options.pop("reset_mask", None))
         per_env = self._split_options(options)
-        places = np.flatnonzero(mask)
+        env_indices = np.flatnonzero(mask)
         if not self.core.episodes.begun[~mask].all():
             raise gym.error.ResetNeeded("the first reset() must be of all environments")
-        for i in places.tolist():
-            if seeds[i] is not None or self._rngs[i] is None:
+        for i in env_indices.tolist():
+            if seeds[i] is not None or i not in self._rngs:
                 self._rngs[i], _ = seeding.np_random(seeds[i])
-        self._begin(places, per_env)
-        frames = self.core.observe(places)
-        self._remember(frames, places)
-        return self._place(frames.observation, places), self._vector_info(frames.info, places)
+        self._begin(env_indices, per_env)
+        frames = self.core.observe(env_indices)
+        self._remember_frames(frames, env_indices)
+        observation = self._merged(frames.observation, env_indices)
+        return observation, self._vector_info(frames.info, env_indices)
 
     def step(
         self, actions: np.ndarray
@@ -142,11 +181,11 @@ class AutoExposureVectorEnv(
         if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
         running = np.flatnonzero(~self._done)
-        self.core.act(running, actions[running])
+        self.core.transition(running, actions[running])
         self._steps[running] += 1
         if len(resetting):  # NEXT_STEP: this step begins their new episodes
             self._begin(resetting)
-        frames = self.core.observe(self._everyone)
+        frames = self.core.observe(self._all)
         frames.reward[resetting] = 0.0
         truncated = np.zeros(self.num_envs, dtype=bool)
         if self.max_episode_steps is not None:
@@ -155,40 +194,34 @@ class AutoExposureVectorEnv(
             observation, infos = self._restart(np.flatnonzero(truncated), frames)
         else:
             self._done = truncated.copy()
-            self._remember(frames)
+            self._remember_frames(frames)
             observation = frames.observation
-            infos = self._vector_info(frames.info, self._everyone)
-        self._keep(observation)
+            infos = self._vector_info(frames.info, self._all)
+        self._remember_shown(observation)
         return observation, frames.reward, np.zeros_like(truncated), truncated, infos
 
-    def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
-        """One (H, W, 3) uint8 picture per environment; None without a render mode."""
-        from ae_env.rendering import render_frame
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture (H, W, 3) uint8 per environment, as `AutoExposureEnv.render` draws it.
 
-        if self.render_mode is None:
-            return None
-        if self._last is None:
-            raise gym.error.ResetNeeded("call reset() before render()")
-        return tuple(render_frame(self.core, i, self._last) for i in range(self.num_envs))
+        None, and a warning in the log, without a `render_mode`.
+        """
+        return self._pictures(self.num_envs)
 
-    # -- helpers ------------------------------------------------------------------------------
+    # -- helpers ----------------------------------------------------------------------------------
 
-    def _begin(self, places: np.ndarray, options: Sequence[dict[str, Any]] | None = None) -> None:
-        rngs = []
-        for i in places.tolist():
-            rng = self._rngs[i]
-            if rng is None:
-                raise gym.error.ResetNeeded("call reset() before step()")
-            rngs.append(rng)
-        self.core.begin(places, rngs, [options[i] for i in places] if options else None)
-        self._steps[places] = 0
-        self._done[places] = False
+    def _begin(
+        self, env_indices: np.ndarray, options: Sequence[dict[str, Any]] | None = None
+    ) -> None:
+        rngs = [self._rngs[i] for i in env_indices.tolist()]
+        self.core.begin(env_indices, rngs, [options[i] for i in env_indices] if options else None)
+        self._steps[env_indices] = 0
+        self._done[env_indices] = False
 
     def _restart(self, finished: np.ndarray, frames: Frames) -> tuple[Observation, dict[str, Any]]:
-        """Begins new episodes in place of those whose last frames are shown, at `finished`."""
+        """Begins new episodes in the environments `finished`, whose last frames are `frames`."""
         whole = len(finished) == self.num_envs
-        last = frames.observation if whole else _taken(frames.observation, finished)
-        last_info = frames.info if whole else _taken(frames.info, finished)
+        last = frames.observation if whole else _rows_of(frames.observation, finished)
+        last_info = frames.info if whole else _rows_of(frames.info, finished)
         final_obs = np.full(self.num_envs, None, dtype=object)
         for row, i in enumerate(finished.tolist()):
             final_obs[i] = {name: values[row] for name, values in last.items()}
@@ -202,53 +235,58 @@ class AutoExposureVectorEnv(
         if whole:
             frames = Frames(fresh.observation, fresh.info, frames.reward)
         else:
-            _put(frames.observation, fresh.observation, finished)
-            _put(frames.info, fresh.info, finished)
-        self._remember(frames)
-        return frames.observation, infos | self._vector_info(frames.info, self._everyone)
+            _assign_rows(frames.observation, fresh.observation, finished)
+            _assign_rows(frames.info, fresh.info, finished)
+        self._remember_frames(frames)
+        return frames.observation, infos | self._vector_info(frames.info, self._all)
 
-    def _remember(self, frames: Frames, places: np.ndarray | None = None) -> None:
-        """Keeps `frames`, of all or of `places`, for rendering."""
+    def _remember_frames(self, frames: Frames, env_indices: np.ndarray | None = None) -> None:
+        """Stores `frames`, of all or of `env_indices`, for rendering."""
         if self.render_mode is None:
             return
-        if self._last is not None and places is not None:
+        if self._last is not None and env_indices is not None:
             last = copy.deepcopy(self._last)  # the caller has its arrays
-            _put(last.observation, frames.observation, places)
-            _put(last.info, frames.info, places)
-            last.reward[places] = frames.reward
+            _assign_rows(last.observation, frames.observation, env_indices)
+            _assign_rows(last.info, frames.info, env_indices)
+            last.reward[env_indices] = frames.reward
             frames = last
         self._last = frames
 
-    def _place(self, observation: Observation, places: np.ndarray) -> Observation:
-        """`observation` of `places` among what the others show; it is theirs to change."""
-        if len(places) < self.num_envs:
+    def _merged(self, observation: Observation, env_indices: np.ndarray) -> Observation:
+        """`observation` of `env_indices`, with the unchanged frames of all other environments.
+
+        The arrays are new or private copies, so that the caller may write to them.
+        """
+        if len(env_indices) < self.num_envs:
             shown = self._shown
-            if shown is None:  # the same frames again
-                shown = self.core.observe(self._everyone).observation
-            _put(shown, observation, places)
+            if shown is None:  # the same noise keys give the same frames again
+                shown = self.core.observe(self._all).observation
+            _assign_rows(shown, observation, env_indices)
             observation = shown
-        self._keep(observation)
+        self._remember_shown(observation)
         return observation
 
-    def _keep(self, observation: Observation) -> None:
+    def _remember_shown(self, observation: Observation) -> None:
+        """Copies the observation, where a masked reset has to show it again."""
         if self.autoreset_mode == AutoresetMode.DISABLED:
             self._shown = {name: values.copy() for name, values in observation.items()}
 
-    def _vector_info(self, columns: dict[str, Any], places: np.ndarray) -> dict[str, Any]:
-        """Columns of `places` as Gymnasium wants them: as long as there are environments.
+    def _vector_info(self, columns: dict[str, Any], env_indices: np.ndarray) -> dict[str, Any]:
+        """Info columns of `env_indices` in the layout of Gymnasium's vector environments.
 
-        Each has a mask beside it; what is not of `places` is 0 or None.
+        Every column has one entry per environment, 0 or None for those that are not in
+        `env_indices`, and a mask beside it.
         """
         info: dict[str, Any] = {}
         masks = np.zeros((len(columns), self.num_envs), dtype=bool)
-        masks[:, places] = True
+        masks[:, env_indices] = True
         for mask, (name, values) in zip(masks, columns.items(), strict=True):
             if isinstance(values, dict):
-                values = self._vector_info(values, places)
-            elif len(places) < self.num_envs:
+                values = self._vector_info(values, env_indices)
+            elif len(env_indices) < self.num_envs:
                 empty = None if values.dtype == object else 0
                 some, values = values, np.full(self.num_envs, empty, values.dtype)
-                values[places] = some
+                values[env_indices] = some
             info[name], info[f"_{name}"] = values, mask
         return info
 
@@ -266,8 +304,12 @@ class AutoExposureVectorEnv(
     def _reset_mask(self, mask: Any) -> np.ndarray:
         if mask is None:
             return np.ones(self.num_envs, dtype=bool)
-        shaped = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,)
-        if not shaped or mask.dtype != np.bool_ or not mask.any():
+        if (
+            not isinstance(mask, np.ndarray)
+            or mask.shape != (self.num_envs,)
+            or mask.dtype != np.bool_
+            or not mask.any()
+        ):
             raise ValueError(
                 f"`options['reset_mask']` (={mask!r}) must be a boolean array "
                 f"({self.num_envs},) with at least one True"
@@ -290,25 +332,25 @@ class AutoExposureVectorEnv(
 
 
 def _entries(value: Any) -> list[Any] | None:
-    """One for each environment, of anything that has a length and an order; None for one of all."""
+    """The entries of any ordered collection, one per environment; None for a single value."""
     if isinstance(value, Mapping | Set) or not hasattr(value, "__len__"):
         return None
     return plain_list(value)
 
 
-def _taken(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
-    """Copies of `rows` of columns, which may be grouped."""
+def _rows_of(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
+    """Copies of `rows` of columns, which may be nested dictionaries."""
     return {
-        name: _taken(values, rows) if isinstance(values, dict) else values[rows]
+        name: _rows_of(values, rows) if isinstance(values, dict) else values[rows]
         for name, values in columns.items()
     }
 
 
-def _put(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None:
-    """Writes `new` to `rows` of columns, which may be grouped."""
+def _assign_rows(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None:
+    """Writes `new` to `rows` of columns, which may be nested dictionaries."""
     for name, values in columns.items():
         if isinstance(values, dict):
-            _put(values, new[name], rows)
+            _assign_rows(values, new[name], rows)
         else:
             values[rows] = new[name]
 

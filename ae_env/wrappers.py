@@ -6,7 +6,12 @@
 | `RelativeActions` | `MultiDiscrete([3, 3, 3])` | down, stay or up, for all controls at once |
 | `ContinuousActions` | `Box(-1, 1, (3,))` | Av, Tv, Sv between the grid's extremes |
 
-The twins for vector environments are called `VectorControlActions` and so on.
+The counterparts for vector environments are called `VectorControlActions` and so on.
+
+`action_masks()` of the first two has one mask per control, one after the other, which is how
+`MaskablePPO` takes a `MultiDiscrete`. A position is allowed where some allowed state has it: the
+union over the other controls. So where a scene forbids states (`Scene.allowed`), a combination of
+allowed positions may still be a forbidden state; the environment photographs it all the same.
 """
 
 from __future__ import annotations
@@ -21,11 +26,20 @@ from gymnasium.vector.utils import batch_space
 from ae_env.grid import ExposureGrid
 from ae_env.utils.checks import check_actions
 
-#: Distances in stops are compared to this many decimals, so that ties do not hang on rounding.
+__all__ = [
+    "ContinuousActions",
+    "ControlActions",
+    "RelativeActions",
+    "VectorContinuousActions",
+    "VectorControlActions",
+    "VectorRelativeActions",
+]
+
+#: Decimals to which distances in stops are compared, so that rounding decides no tie.
 _DISTANCE_DECIMALS = 9
 
 
-# -- what the actions mean, for (N, 3) actions ----------------------------------------------------
+# -- from actions (..., 3) to states, and from allowed states to masks ----------------------------
 
 
 def _check_steps(actions: Any, sizes: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
@@ -37,15 +51,19 @@ def _check_steps(actions: Any, sizes: tuple[int, ...], shape: tuple[int, ...]) -
 
 
 def _states_of_controls(grid: ExposureGrid, controls: np.ndarray) -> np.ndarray:
-    return np.ravel_multi_index(tuple(np.moveaxis(controls, -1, 0)), grid.shape).astype(np.int64)
+    """States at the positions `controls` in the grid's three lists."""
+    states = np.ravel_multi_index(tuple(np.moveaxis(controls, -1, 0)), grid.shape)
+    return np.asarray(states, np.int64)
 
 
 def _states_of_steps(grid: ExposureGrid, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """States that `steps` (0 down, 1 stay, 2 up) lead to from `states`."""
     last = np.array(grid.shape) - 1
     return _states_of_controls(grid, np.clip(grid.controls(states) + steps - 1, 0, last))
 
 
 def _check_apex(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """`actions` as float64 of `shape`, clipped to [-1, 1]."""
     try:
         values = np.asarray(actions)
     except ValueError:  # rows of different lengths
@@ -54,7 +72,8 @@ def _check_apex(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     values = values.astype(np.float64) if numbers else values
     if not numbers or not np.isfinite(values).all():
         raise ValueError(f"`action` (={actions!r}) must be finite numbers of shape {shape}")
-    return np.clip(values, -1.0, 1.0)
+    clipped: np.ndarray = np.clip(values, -1.0, 1.0)
+    return clipped
 
 
 def _apex_of(grid: ExposureGrid) -> np.ndarray:
@@ -63,15 +82,16 @@ def _apex_of(grid: ExposureGrid) -> np.ndarray:
 
 
 def _states_of_apex(apex: np.ndarray, actions: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """Nearest allowed state, ties to the lower index; actions (..., 3), allowed (..., S)."""
+    """Nearest allowed state of each action, ties to the lower index; allowed (..., S)."""
     low, high = apex.min(axis=0), apex.max(axis=0)
     wanted = low + 0.5 * (actions + 1.0) * (high - low)
     distance = ((wanted[..., None, :] - apex) ** 2).sum(axis=-1).round(_DISTANCE_DECIMALS)
-    return np.argmin(np.where(allowed, distance, np.inf), axis=-1).astype(np.int64)
+    nearest: np.ndarray = np.argmin(np.where(allowed, distance, np.inf), axis=-1)
+    return nearest.astype(np.int64)
 
 
 def _control_masks(grid: ExposureGrid, allowed: np.ndarray) -> np.ndarray:
-    """(..., I + T + N): values of each control that some allowed state (..., S) has."""
+    """(..., I + T + N): positions of each control that some allowed state (..., S) has."""
     cube = allowed.reshape(*allowed.shape[:-1], *grid.shape)
     return np.concatenate(
         [cube.any(axis=(-2, -1)), cube.any(axis=(-3, -1)), cube.any(axis=(-3, -2))], axis=-1
@@ -79,7 +99,7 @@ def _control_masks(grid: ExposureGrid, allowed: np.ndarray) -> np.ndarray:
 
 
 def _step_masks(grid: ExposureGrid, states: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """(..., 9): steps of each control whose value some allowed state has."""
+    """(..., 9): steps of each control that lead to a position which some allowed state has."""
     by_value = np.split(_control_masks(grid, allowed), np.cumsum(grid.shape)[:-1], axis=-1)
     controls = grid.controls(states)
     masks = []
@@ -90,6 +110,7 @@ def _step_masks(grid: ExposureGrid, states: np.ndarray, allowed: np.ndarray) -> 
 
 
 def _checked_grid(env: Any) -> ExposureGrid:
+    """The grid of an environment whose actions are its states; raises a `ValueError` for others."""
     for name in ("grid", "action_masks"):
         if not hasattr(env.unwrapped, name):
             raise ValueError(
@@ -98,14 +119,15 @@ def _checked_grid(env: Any) -> ExposureGrid:
             )
     if not isinstance(getattr(env, "single_action_space", env.action_space), gym.spaces.Discrete):
         raise ValueError(f"`env` (={env}) must have Discrete actions: it is wrapped already")
-    return env.unwrapped.grid
+    grid: ExposureGrid = env.unwrapped.grid
+    return grid
 
 
 # -- one environment ------------------------------------------------------------------------------
 
 
-class _GridActions(gym.ActionWrapper, RecordConstructorArgs):
-    def __init__(self, env: gym.Env) -> None:
+class _GridActions(gym.ActionWrapper[Any, Any, Any], RecordConstructorArgs):
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.ActionWrapper.__init__(self, env)
         self._inner: Any = env.unwrapped
@@ -127,7 +149,7 @@ class ControlActions(_GridActions):
     (MultiDiscrete([4 4 4]), 'ISO 400, 1/15 s, f/11')
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         self.action_space = gym.spaces.MultiDiscrete(list(self._grid.shape))
 
@@ -155,7 +177,7 @@ class RelativeActions(_GridActions):
         ValueError: If `env` has no grid.
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         self.action_space = gym.spaces.MultiDiscrete([3, 3, 3])
 
@@ -165,7 +187,7 @@ class RelativeActions(_GridActions):
         return np.int64(_states_of_steps(self._grid, np.asarray(self._inner.state), steps))
 
     def action_masks(self) -> np.ndarray:
-        """(9,) bool: steps of each control whose value some allowed state has."""
+        """(9,) bool: steps of each control to a position that some allowed state has."""
         return _step_masks(self._grid, np.asarray(self._inner.state), self._inner.action_masks())
 
 
@@ -182,7 +204,7 @@ class ContinuousActions(_GridActions):
         ValueError: If `env` has no grid.
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (3,), np.float32)
         self._apex = _apex_of(self._grid)
@@ -197,7 +219,9 @@ class ContinuousActions(_GridActions):
 
 
 class _VectorGridActions(gym.vector.VectorActionWrapper, RecordConstructorArgs):
-    def __init__(self, env: gym.vector.VectorEnv, single_action_space: gym.Space) -> None:
+    def __init__(
+        self, env: gym.vector.VectorEnv[Any, Any, Any], single_action_space: gym.Space[Any]
+    ) -> None:
         RecordConstructorArgs.__init__(self)
         gym.vector.VectorActionWrapper.__init__(self, env)
         self.single_action_space = single_action_space
@@ -213,7 +237,7 @@ class VectorControlActions(_VectorGridActions):
         env: An `ae_env/AutoExposure-v0` from `gymnasium.make_vec`, wrapped or not.
     """
 
-    def __init__(self, env: gym.vector.VectorEnv) -> None:
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
         grid = _checked_grid(env)
         super().__init__(env, gym.spaces.MultiDiscrete(list(grid.shape)))
 
@@ -234,7 +258,7 @@ class VectorRelativeActions(_VectorGridActions):
         env: An `ae_env/AutoExposure-v0` from `gymnasium.make_vec`, wrapped or not.
     """
 
-    def __init__(self, env: gym.vector.VectorEnv) -> None:
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
         _checked_grid(env)
         super().__init__(env, gym.spaces.MultiDiscrete([3, 3, 3]))
 
@@ -244,7 +268,7 @@ class VectorRelativeActions(_VectorGridActions):
         return _states_of_steps(self._grid, self._inner.states, steps)
 
     def action_masks(self) -> np.ndarray:
-        """(N, 9) bool: steps of each control whose value some allowed state has."""
+        """(N, 9) bool: steps of each control to a position that some allowed state has."""
         return _step_masks(self._grid, self._inner.states, self._inner.action_masks())
 
 
@@ -255,7 +279,7 @@ class VectorContinuousActions(_VectorGridActions):
         env: An `ae_env/AutoExposure-v0` from `gymnasium.make_vec`, wrapped or not.
     """
 
-    def __init__(self, env: gym.vector.VectorEnv) -> None:
+    def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
         _checked_grid(env)
         super().__init__(env, gym.spaces.Box(-1.0, 1.0, (3,), np.float32))
         self._apex = _apex_of(self._grid)

@@ -130,8 +130,7 @@ class PolicyContext:
     def from_envs(cls, envs: gym.vector.VectorEnv) -> PolicyContext:
         """The context of the environments that `envs` runs."""
         base: Any = envs.unwrapped
-        delay = int(base.core.options.delay)
-        return cls(base.grid, base.camera, base.single_observation_space, delay=delay)
+        return cls(base.grid, base.camera, base.single_observation_space, delay=base.delay)
 
     @property
     def has_sensors(self) -> bool:

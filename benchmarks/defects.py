@@ -266,8 +266,8 @@ def _same(maps: dict[str, list[list[float]]]) -> bool:
 def print_knots(maps: dict[str, list[list[float]]]) -> None:
     """Prints the maps as the scorers' source has them."""
     for name, knots in maps.items():
-        pairs = ", ".join(f"({x!r}, {y!r})" for x, y in knots)
-        console.print(f'"{name}": ({pairs}),', soft_wrap=True, highlight=False, markup=False)
+        columns = ", ".join(repr(column) for column in zip(*knots, strict=True))
+        console.print(f'"{name}": ({columns}),', soft_wrap=True, highlight=False, markup=False)
 
 
 def markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ae_env.episodes.draws import Draws
+from ae_env.episodes.draws import Draws, allowed_states
 from ae_env.episodes.light import FrameLight
 from ae_env.episodes.recorder import Recorder
 from ae_env.episodes.scores import PartScores
@@ -63,6 +63,7 @@ class EpisodeCore:
         self.options = options
         self.grid = options.make_grid()
         self.camera = options.make_camera()
+        self.delay = int(options.delay)
         self.scorer = options.make_scorer()
         self.lighting = options.make_lighting()
         self.scenes = options.load_scenes()
@@ -73,9 +74,10 @@ class EpisodeCore:
             noise=bool(options.noise),
             tolerance=options.tolerance,
         )
-        self.episodes = Episodes(num_envs, int(options.delay))
+        self.episodes = Episodes(num_envs, self.delay)
         # First and last frame of the sequence that each scene is a frame of.
         self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
+        self._allowed = np.stack([allowed_states(scene, len(self.grid)) for scene in self.scenes])
         self._draws = Draws(options, self.first_scenes, len(self.grid))
         self._scene_ids = np.array([scene.scene_id for scene in self.scenes], object)
         states = self.grid.states
@@ -123,9 +125,10 @@ class EpisodeCore:
             spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         return gym.spaces.Dict(spaces)
 
-    def action_masks(self) -> np.ndarray:
-        """(S,) bool: states that may be chosen. Every aperture is exact here, so all of them."""
-        return np.ones(len(self.grid), dtype=bool)
+    def action_masks(self, env_indices: np.ndarray) -> np.ndarray:
+        """(B, S) bool: states that the scenes shown allow; all of them before the first reset."""
+        episodes = self.episodes
+        return self._allowed[episodes.scene[env_indices]] | ~episodes.begun[env_indices, None]
 
     @property
     def first_scenes(self) -> list[Scene]:
@@ -136,39 +139,35 @@ class EpisodeCore:
 
     # -- life of an episode -------------------------------------------------------------------
 
-    def start(self, place: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
-        """Begins an episode at `place`; see `Draws.draw`."""
-        self.begin(np.array([place]), [rng], [options])
-
     def begin(
         self,
-        places: np.ndarray,
+        env_indices: np.ndarray,
         rngs: Sequence[np.random.Generator],
         options: Sequence[Mapping[str, Any]] | None = None,
     ) -> None:
-        """Draws episodes for `places` (K,), where others may end; see `Draws.draw`."""
+        """Draws episodes for `env_indices` (K,), where others may end; see `Draws.draw`."""
         drawn = self._draws.draw(rngs, options)
         if self._sequence is not None:
             first = np.unique(self._sequence[0])[drawn["scene"]]
             drawn["scene"] = self._shown_at(first, drawn["frame"])
-        self._forget(places)
-        slots = self._slots(places, drawn["scene"], drawn["speed"], drawn["defocus"])
-        self.episodes.begin(places, drawn, slots)
+        self._forget(env_indices)
+        slots = self._slots(env_indices, drawn["scene"], drawn["speed"], drawn["defocus"])
+        self.episodes.begin(env_indices, drawn, slots)
 
-    def _forget(self, places: np.ndarray) -> None:
-        """Lets go of what was worked out for the scenes that are shown at `places`."""
-        self.recorder.end(places)
-        self._part_scores.forget(len(self.scenes) + places)
-        for place in places.tolist():
-            self._tables[place] = None
+    def _forget(self, env_indices: np.ndarray) -> None:
+        """Lets go of what was worked out for the scenes that are shown at `env_indices`."""
+        self.recorder.end(env_indices)
+        self._part_scores.forget(len(self.scenes) + env_indices)
+        for env_index in env_indices.tolist():
+            self._tables[env_index] = None
 
     def _slots(
-        self, places: np.ndarray, scenes: np.ndarray, speed: np.ndarray, defocus: np.ndarray
+        self, env_indices: np.ndarray, scenes: np.ndarray, speed: np.ndarray, defocus: np.ndarray
     ) -> np.ndarray:
         """(K,) slots, see `Episodes`."""
         # At rest, its light and its scores are those of every episode that shows its scene.
         moves = (speed > 0.0) | (defocus > 0.0)
-        return np.where(~moves & self._shareable[scenes], scenes, len(self.scenes) + places)
+        return np.where(~moves & self._shareable[scenes], scenes, len(self.scenes) + env_indices)
 
     def _shown_at(self, scenes: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Scenes that the sequences of `scenes` show in `frames`; the last one stays."""
@@ -176,57 +175,61 @@ class EpisodeCore:
         first, last = self._sequence
         return np.minimum(first[scenes] + frames, last[scenes])
 
-    def _show_next(self, places: np.ndarray) -> None:
-        """Shows the scene of the current frame at each of `places`."""
+    def _show_next(self, env_indices: np.ndarray) -> None:
+        """Shows the scene of the current frame at each of `env_indices`."""
         episodes = self.episodes
-        now = self._shown_at(episodes.scene[places], episodes.frame[places])
-        changes = now != episodes.scene[places]
-        places, now = places[changes], now[changes]
-        self._forget(places)
-        episodes.scene[places] = now
-        speed, defocus = episodes.speed[places], episodes.defocus[places]
-        episodes.slot[places] = self._slots(places, now, speed, defocus)
+        now = self._shown_at(episodes.scene[env_indices], episodes.frame[env_indices])
+        changes = now != episodes.scene[env_indices]
+        env_indices, now = env_indices[changes], now[changes]
+        self._forget(env_indices)
+        episodes.scene[env_indices] = now
+        speed, defocus = episodes.speed[env_indices], episodes.defocus[env_indices]
+        episodes.slot[env_indices] = self._slots(env_indices, now, speed, defocus)
 
-    def episode(self, place: int) -> Episode:
-        """The episode at `place` as it is now."""
-        self._check_begun(place)
-        return self.episodes[place]
+    def episode(self, env_index: int) -> Episode:
+        """The episode at `env_index` as it is now."""
+        self._check_begun(env_index)
+        return self.episodes[env_index]
 
-    def _check_begun(self, places: np.ndarray | int) -> None:
-        if not self.episodes.begun[places].all():
+    def scene(self, env_index: int) -> Scene:
+        """The scene that environment `env_index` photographs now."""
+        return self.scenes[self.episode(env_index).scene]
+
+    def _check_begun(self, env_indices: np.ndarray | int) -> None:
+        if not self.episodes.begun[env_indices].all():
             raise gym.error.ResetNeeded("call reset() before step(), render() or scores")
 
-    def act(self, places: np.ndarray, actions: np.ndarray) -> None:
-        """Lets the episodes at `places` (K,) go on by one frame.
+    def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> None:
+        """Lets the episodes at `env_indices` (K,) go on by one frame.
 
         Args:
-            places: Whose turn it is.
+            env_indices: Whose turn it is.
             actions: (K,) their actions, integers; applied after the delay.
 
         Raises:
             ValueError: If an action is not a state of the grid; no episode goes on then.
         """
-        self._check_begun(places)
+        self._check_begun(env_indices)
         wrong = (actions < 0) | (actions >= len(self.grid))
         if wrong.any():
             raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {len(self.grid)})")
-        self.episodes.act(places, actions)
+        self.episodes.act(env_indices, actions)
         if self._sequence is not None:
-            self._show_next(places)
+            self._show_next(env_indices)
 
-    def expected_scores(self, place: int) -> ScoreTable:
-        """Scores of all states in the current frame of the episode at `place`."""
-        episode = self.episode(place)
+    def score_table(self, env_index: int) -> ScoreTable:
+        """Scores of all states in the current frame of the episode at `env_index`."""
+        episode = self.episode(env_index)
         gain: float | np.ndarray = 1.0
         rows = None
         if self.lighting.within_frame:
             key: float = episode.frame
         else:
-            key = gain = self._light.of(place, 0.0)[0]
-        known = self._tables[place]
+            key = gain = self._light.of(env_index, 0.0)[0]
+        known = self._tables[env_index]
         if known is None or known[0] != key:
             if self.lighting.within_frame:
-                gain, rows = self._light.of_states(place, self._bounds[1])
+                gain, rows = self._light.of_states(env_index, self._bounds[1])
             table = self.tables.table(
                 self.scenes[episode.scene],
                 speed=episode.speed,
@@ -234,79 +237,79 @@ class EpisodeCore:
                 gain=gain,
                 row_gain=rows,
             )
-            known = self._tables[place] = (key, table)
+            known = self._tables[env_index] = (key, table)
         return known[1]
 
     # -- what the camera records --------------------------------------------------------------
 
-    def observe(self, places: np.ndarray) -> Frames:
-        """Photographs the episodes at `places` (B,), each in its current state."""
-        raw, columns = self._capture_all(places)
+    def observe(self, env_indices: np.ndarray) -> Frames:
+        """Photographs the episodes at `env_indices` (B,), each in its current state."""
+        raw, columns = self._capture_all(env_indices)
         episodes = self.episodes
-        scenes, states = episodes.scene[places], episodes.state[places]
+        scenes, states = episodes.scene[env_indices], episodes.state[env_indices]
         observation = {"raw": raw, "settings": self._settings[states]}
         if self.options.sensors:
             observation["sensors"] = encode_sensors(
-                episodes.speed[places], episodes.focus_drive[places], columns.pop("sensor_noise")
+                episodes.speed[env_indices], episodes.focus_drive[env_indices], columns.pop("sensor_noise")
             )
         rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
-        rewards["score"] = self._totals(rewards, places)
+        rewards["score"] = self._totals(rewards, env_indices)
         reward = rewards["score"].copy()
-        for name, cost in self._costs(places, columns.pop("image_mean", None)).items():
+        for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
             rewards[name] = cost
             reward -= self.options.costs[name] * cost
         info = {"scene_id": self._scene_ids[scenes], "state": states}
         info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
         info |= columns | {"rewards": rewards}
         if self.options.with_oracle:
-            tables = [self.expected_scores(place) for place in places.tolist()]
+            tables = [self.score_table(env_index) for env_index in env_indices.tolist()]
             best = np.array([t.mean[t.oracle] for t in tables])
             info["oracle_state"] = np.array([t.oracle for t in tables])
             info["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
         return Frames(observation, info, reward)
 
-    def _totals(self, parts: dict[str, np.ndarray], places: np.ndarray) -> np.ndarray:
+    def _totals(self, parts: dict[str, np.ndarray], env_indices: np.ndarray) -> np.ndarray:
         """(B,) float64 scores before costs."""
         # A closed form is its own expectation, and needs no table of all states.
         if self.options.reward == "expected" and not self.scorer.closed_form:
-            pairs = zip(places.tolist(), self.episodes.state[places].tolist(), strict=True)
-            return np.array([self.expected_scores(place).mean[state] for place, state in pairs])
-        return self._part_scores.totals(parts, places)
+            pairs = zip(env_indices.tolist(), self.episodes.state[env_indices].tolist(), strict=True)
+            return np.array([self.score_table(env_index).mean[state] for env_index, state in pairs])
+        return self._part_scores.totals(parts, env_indices)
 
-    def _capture_all(self, places: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def _capture_all(self, env_indices: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Observations of `raw` and the info columns, worked out chunk by chunk."""
         size = self.options.resolution
-        raw = np.empty((len(places), 4, size, size), _RAW_DTYPES[self.options.observation])
-        gains, rows = np.ones(len(places)), None
+        raw = np.empty((len(env_indices), 4, size, size), _RAW_DTYPES[self.options.observation])
+        gains, rows = np.ones(len(env_indices)), None
         if not self._static:
-            gains, rows = self._light.of_each(places, self._bounds[1, self.episodes.state[places]])
-        self.recorder.prepare(places, gains)
+            gains, rows = self._light.of_each(env_indices, self._bounds[1, self.episodes.state[env_indices]])
+        self.recorder.prepare(env_indices, gains)
         # Only where no part of the score needs it is no float of every sample made.
         few = self._part_scores.reads_pixels or rows is not None
-        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(places)
-        if step >= len(places):
-            return raw, self._capture(places, gains, rows, raw)
+        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(env_indices)
+        if step >= len(env_indices):
+            return raw, self._capture(env_indices, gains, rows, raw)
         chunks = []
-        for start in range(0, len(places), step):
+        for start in range(0, len(env_indices), step):
             part = slice(start, start + step)
             some = None if rows is None else rows[part]
-            chunks.append(self._capture(places[part], gains[part], some, raw[part]))
+            chunks.append(self._capture(env_indices[part], gains[part], some, raw[part]))
         return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
 
     def _capture(
-        self, places: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
+        self, env_indices: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Info columns of the episodes at `places`; their observations are written to `raw`."""
+        """Info columns of the episodes at `env_indices`; their observations are written to `raw`."""
         outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
         if self._part_scores.reads_images:
             outputs.setdefault("signals", np.empty(raw.shape, np.float32))
         if "flicker" in self.options.costs:
             outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
-        columns = self.recorder.record(places, row_gain=rows, **outputs)
+        columns = self.recorder.record(env_indices, row_gain=rows, **outputs)
         key = columns.pop("noise_key")
         if self.options.sensors:
             columns["sensor_noise"] = single_normals(key, 2)
-        columns |= self._part_scores.of(places, outputs.get("signals"), gains, rows)
+        columns |= self._part_scores.of(env_indices, outputs.get("signals"), gains, rows)
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         if "flicker" in self.options.costs:
@@ -314,19 +317,20 @@ class EpisodeCore:
             columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
         return columns
 
-    def _costs(self, places: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
+    def _costs(self, env_indices: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
         """(B,) each; 0 in the first frame of an episode."""
         if not self.options.costs:
             return {}
         episodes = self.episodes
-        first = episodes.previous[places] < 0
-        costs = {name: np.zeros(len(places)) for name in COSTS if name in self.options.costs}
+        first = episodes.previous[env_indices] < 0
+        costs = {name: np.zeros(len(env_indices)) for name in COSTS if name in self.options.costs}
         if means is not None:
-            change = np.abs(means - episodes.image_mean[places])
+            change = np.abs(means - episodes.image_mean[env_indices])
             costs["flicker"] = np.where(first, 0.0, change)
-            episodes.image_mean[places] = means
+            episodes.image_mean[env_indices] = means
         if "switch" in costs:
-            now = self.grid.controls(episodes.state[places])
-            before = self.grid.controls(np.where(first, 0, episodes.previous[places]))
+            now = self.grid.controls(episodes.state[env_indices])
+            before = self.grid.controls(np.where(first, 0, episodes.previous[env_indices]))
             costs["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
         return costs
+

@@ -44,6 +44,10 @@ class Draws:
             self._index |= {scene.group: i for i, scene in enumerate(scenes)}
         self._ids = [scene.scene_id for scene in scenes]
         self._speeds = np.array([scene.median_speed for scene in scenes])
+        # States that a scene allows come first in its row, in order.
+        allowed = np.stack([allowed_states(scene, num_states) for scene in scenes])
+        self._starts = np.argsort(~allowed, axis=1, kind="stable")
+        self._num_starts = allowed.sum(axis=1)
         self._own_blur = np.array([s.own_blur(4.0) * 64.0 / options.resolution for s in scenes])
 
     def draw(
@@ -67,14 +71,15 @@ class Draws:
         """
         given = [self._chosen(options) for options in chosen or ()]  # refused before any draw
         uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
-        place, start, moving, speed, defocus, phase, seed = uniforms
-        scene = (place * len(self._ids)).astype(np.int64)
-        state = (start * self._num_states).astype(np.int64)
+        which, start, moving, speed, defocus, phase, seed = uniforms
+        scene = (which * len(self._ids)).astype(np.int64)
         frame = np.zeros(len(rngs), np.int64)
-        for i, wanted in enumerate(given):
-            for column, value in zip((scene, state, frame), wanted, strict=True):
-                if value is not None:
-                    column[i] = value
+        for i, (wanted_scene, _, wanted_frame) in enumerate(given):
+            scene[i] = scene[i] if wanted_scene is None else wanted_scene
+            frame[i] = frame[i] if wanted_frame is None else wanted_frame
+        state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
+        for i, (_, wanted_state, _) in enumerate(given):
+            state[i] = state[i] if wanted_state is None else wanted_state
         speeds = (moving >= STATIC_SHARE) * np.exp(SPEED_SIGMA * ndtri(speed)) * self._speeds[scene]
         discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
         discs = _fixed_or_drawn(
@@ -106,6 +111,22 @@ class Draws:
         hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
         rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
         return check_integer(_OPTION[0], wanted, 0, len(self._ids) - 1, more=rule)
+
+
+def allowed_states(scene: Scene, num_states: int) -> np.ndarray:
+    """(S,) bool: the states that `scene` allows.
+
+    Raises:
+        ValueError: If the scene was made for another number of states.
+    """
+    if scene.allowed is None:
+        return np.ones(num_states, bool)
+    if len(scene.allowed) != num_states:
+        raise ValueError(
+            f"`allowed` of scene {scene.scene_id!r} (length {len(scene.allowed)}) must have one "
+            f"entry for each of the {num_states} states of `grid`"
+        )
+    return scene.allowed
 
 
 def check_options(options: Any, *more: str) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""How the light of a scene changes during an episode.
+"""The change of a scene's light during an episode.
 
 A lighting gives, for each frame, the factor by which the scene's light differs from its own; where
 it changes within a frame (`FlickerLighting`), one for each row.
 """
 
-from ae_env.lighting.base import MAX_STOPS, Lighting, RollingShutter
+from ae_env.lighting.base import KINDS, MAX_STOPS, Lighting, RollingShutter, make_lighting
 from ae_env.lighting.changes import (
     LensCapLighting,
     RampLighting,
@@ -13,7 +13,6 @@ from ae_env.lighting.changes import (
     TunnelLighting,
 )
 from ae_env.lighting.flicker import FlickerLighting
-from ae_env.lighting.making import KINDS, make_lighting
 from ae_env.lighting.schedule import ScheduleLighting
 
 __all__ = [

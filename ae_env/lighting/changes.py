@@ -19,7 +19,7 @@ class StepLighting(Lighting):
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
-        return 2.0**self.stops if frame >= self.at else 1.0
+        return float(2.0**self.stops) if frame >= self.at else 1.0
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class RampLighting(Lighting):
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
         change = min(abs(self.stops), self.stops_per_frame * frame)
-        return 2.0 ** math.copysign(change, self.stops)
+        return float(2.0 ** math.copysign(change, self.stops))
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,16 @@ class SineLighting(Lighting):
 
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
-        return 2.0 ** (self.stops * math.sin(2.0 * math.pi * (frame / self.period + phase)))
+        turn = frame / self.period + phase
+        return float(2.0 ** (self.stops * math.sin(2.0 * math.pi * turn)))
 
 
 @dataclass(frozen=True)
 class TunnelLighting(Lighting):
     """Into a tunnel `stops` darker from frame `enter` on, over `edge` frames, and out at `leave`.
 
-    Frame ``enter`` is the last one of the light outside: ``enter + k`` has k / `edge` of the
-    change. With `edge` 0 all of it is in frame ``enter``. Likewise with `leave`.
+    Frame ``enter`` is the last one with the light outside; frame ``enter + k`` has k / `edge` of
+    the change. With `edge` 0 frame ``enter`` has all of it. `leave` works likewise.
     """
 
     name: ClassVar[str] = "tunnel"
@@ -70,10 +71,10 @@ class TunnelLighting(Lighting):
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
         inside, outside = self._share(frame - self.enter), self._share(frame - self.leave)
-        return 2.0 ** (self.stops * (inside - outside))
+        return float(2.0 ** (self.stops * (inside - outside)))
 
     def _share(self, frames: int) -> float:
-        """Share of a change that is there `frames` after it began."""
+        """Share of a change that has happened `frames` after its start."""
         if self.edge == 0:
             return 1.0 if frames >= 0 else 0.0
         return min(max(frames / self.edge, 0.0), 1.0)

@@ -14,12 +14,12 @@ from simulator.optics.lamps import Lamp, MainsLamp, PulsedLamp
 
 #: Depth of a lamp on the mains, where none is given.
 MAINS_DEPTH = 0.8
-#: Light of a row is known to this, relative to the lamp's long-term mean: what differs by less is
-#: the rounding of float64.
+#: Precision of the light of a row, relative to the lamp's long-term mean: smaller differences are
+#: rounding errors of float64.
 _RESOLUTION = 1e-12
-#: A row that no light falls on still has so little that its logarithm is finite.
+#: Least light of a row: its logarithm must be finite.
 _DARKEST = 2.0**-MAX_STOPS
-#: The lamp's clock begins anew after this long [s]: beyond, float64 no longer resolves a period.
+#: The lamp's clock restarts after this time [s]: beyond it, float64 does not resolve a period.
 _CLOCK = 1e8
 #: Least and greatest value of each option.
 _RANGES = {
@@ -34,8 +34,8 @@ _RANGES = {
 class FlickerLighting(Lighting):
     """Light that flickers much faster than frames follow each other, around the scene's own.
 
-    It is integrated in closed form over the exposure time of each row (`simulator.optics.lamps`). Rows
-    begin one after the other: unless the exposure lasts whole periods, the frame has bands.
+    It is integrated in closed form over the exposure time of each row (`simulator.optics.lamps`).
+    Rows begin one after the other, so unless the exposure lasts whole periods, the frame has bands.
 
     Args:
         frequency: Of the light [Hz]: twice that of the mains, or of the pulses. 0.001 to 1e6.

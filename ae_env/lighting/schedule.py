@@ -1,4 +1,4 @@
-"""Light that follows a list of one's own, frame by frame."""
+"""Light that follows a list of the user's, frame by frame."""
 
 from __future__ import annotations
 
@@ -56,19 +56,23 @@ class ScheduleLighting(Lighting):
     def gain(self, frame: int, exposure_time: float, phase: float) -> float:
         """See `Lighting.gain`."""
         assert self.ev is not None
-        return 2.0 ** self.ev[min(frame, len(self.ev) - 1)]
+        return float(2.0 ** self.ev[min(frame, len(self.ev) - 1)])
 
 
 def _numbers(ev: Any) -> list[Any]:
     if isinstance(ev, np.ndarray) and ev.ndim == 1:
-        return ev.tolist()
+        return list(ev)
     if isinstance(ev, Sequence) and not isinstance(ev, str | bytes):
         return list(ev)
     raise ValueError(f"`lighting['ev']` (={ev!r}) must be a list of numbers, one per frame")
 
 
 def _read(file: Any) -> list[float]:
-    """The numbers of a file, checked to be numbers."""
+    """The numbers of a file.
+
+    Raises:
+        ValueError: If it cannot be read, or a row holds no finite number.
+    """
     rule = f"`lighting['file']` (={str(file)!r})"
     if not isinstance(file, str | Path):
         raise ValueError(f"{rule} must be a path")

@@ -1,8 +1,15 @@
-"""What the camera looks at: bundled scenes, folders of raws and of radiance maps."""
+"""Scenes, which the camera photographs: bundled ones, folders of raws and of radiance maps."""
 
 from __future__ import annotations
 
-from ae_env.scenes.loading import load_scenes
+from ae_env.scenes.loading import SceneSpec, load_scenes
 from ae_env.scenes.scene import MEAN_SIGNAL, WHITE_SIGNAL, Scene, reference_settings
 
-__all__ = ["MEAN_SIGNAL", "WHITE_SIGNAL", "Scene", "load_scenes", "reference_settings"]
+__all__ = [
+    "MEAN_SIGNAL",
+    "WHITE_SIGNAL",
+    "Scene",
+    "SceneSpec",
+    "load_scenes",
+    "reference_settings",
+]

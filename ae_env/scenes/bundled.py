@@ -6,22 +6,24 @@ import json
 import logging
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
-import safetensors
-import safetensors.torch
 import torch
 
 from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
-from ae_env.scenes.procedural import GENERATOR_VERSION, HARD_KINDS, MOTION_SPEED, draw
+from ae_env.scenes.procedural import (
+    GENERATOR_VERSION,
+    HARD_KINDS,
+    MOTION_SPEED,
+    NATIVE_SIZE,
+    draw,
+)
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
 from simulator.camera import CameraProfile, NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.cache import cache_dir, cache_key
-from simulator.utils.files import write_atomically
+from simulator.utils.cache import DiskCache, cache_key
 
 logger = logging.getLogger(__name__)
 
@@ -50,13 +52,6 @@ KINDS = (*GROUPS_PER_KIND, "photograph")
 HARD = "hard"
 
 
-@dataclass(frozen=True)
-class _Entry:
-    kind: str
-    index: int  # within the kind, over both splits
-    split: str
-
-
 def bundled_scenes(
     split: Split,
     camera: CameraProfile,
@@ -79,12 +74,14 @@ def bundled_scenes(
     """
     kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
     scenes: list[Scene] = []
+    cache = DiskCache()
     for name in ["train", "test"] if split == "all" else [split]:
-        path = _cache_path(name, camera, resolution, crop, size, part)
-        loaded = _read_cache(path, camera)
+        key = _cache_key(name, camera, resolution, crop, size, part)
+        loaded = _from_tensors(cache.get("scenes", key), camera, resolution)
         if loaded is None:
             loaded = [_rounded(s) for s in _make(name, camera, resolution, crop, size, kinds)]
-            _write_cache(path, loaded)
+            if loaded:
+                cache.put("scenes", key, _to_tensors(loaded))
         scenes += loaded
     return scenes
 
@@ -98,16 +95,17 @@ def _make(
     kinds: Sequence[str],
 ) -> Iterator[Scene]:
     logger.info("making the bundled scenes of split %r for camera %s", split, camera.name)
-    for entry in _entries(split, size):
-        if entry.kind in kinds:
-            yield _procedural_scene(entry, camera).resized(resolution, crop)
+    for kind, index in _procedural(split, size):
+        if kind in kinds:
+            yield _procedural_scene(kind, index, camera).resized(resolution, crop)
     photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
         for scene in photograph_scenes(photograph, camera):
             yield scene.resized(resolution, crop)
 
 
-def _entries(split: str, size: Size) -> Iterator[_Entry]:
+def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
+    """Kind of each procedural group, and its index within the kind over both splits."""
     for kind, (train, test) in GROUPS_PER_KIND.items():
         first, count = (0, train) if split == "train" else (FIRST_TEST_INDEX, test)
         if size == "small":
@@ -115,13 +113,13 @@ def _entries(split: str, size: Size) -> Iterator[_Entry]:
         elif size == "large" and split == "train":
             count *= LARGE_FACTOR
         for index in range(first, first + count):
-            yield _Entry(kind, index, split)
+            yield kind, index
 
 
-def _procedural_scene(entry: _Entry, camera: CameraProfile) -> Scene:
-    rng = np.random.default_rng([zlib.crc32(entry.kind.encode()), entry.index])
-    drawing = draw(entry.kind, rng)
-    name = f"{entry.kind}-{entry.index:03d}"
+def _procedural_scene(kind: str, index: int, camera: CameraProfile) -> Scene:
+    rng = np.random.default_rng([zlib.crc32(kind.encode()), index])
+    drawing = draw(kind, rng)
+    name = f"{kind}-{index:03d}"
     return Scene.from_radiance(
         drawing.light,
         camera,
@@ -129,19 +127,19 @@ def _procedural_scene(entry: _Entry, camera: CameraProfile) -> Scene:
         group=name,
         illuminance=drawing.illuminance,
         illuminant=drawing.illuminant,
-        kind=entry.kind,
-        hard=entry.kind in HARD_KINDS,
-        median_speed=MOTION_SPEED if entry.kind == "motion" else DEFAULT_SPEED,
+        kind=kind,
+        hard=kind in HARD_KINDS,
+        median_speed=MOTION_SPEED if kind == "motion" else DEFAULT_SPEED,
         source="procedural, ae-env (MIT)",
     )
 
 
 def _rounded(scene: Scene) -> Scene:
-    """The scene with its light as the cache keeps it, so that a cached run equals a fresh one."""
+    """The scene with its light rounded as in the cache, so that a cached run equals a fresh one."""
     return replace(scene, light=scene.light.clamp(max=65504.0).half().float())
 
 
-# -- the cache: float16 light and the other fields as JSON, in one safetensors file --------------
+# -- the cache: float16 light, and the other fields as JSON in a tensor of bytes ------------------
 
 _FIELDS = (
     *("scene_id", "group", "illuminance", "white_balance", "kind", "hard", "median_speed"),
@@ -149,18 +147,18 @@ _FIELDS = (
 )
 
 
-def _cache_path(
+def _cache_key(
     split: str,
     camera: CameraProfile,
     resolution: int | None,
     crop: str,
     size: Size,
     part: str | None,
-) -> Path:
-    key = cache_key(
+) -> str:
+    return cache_key(
         {
             "generator": GENERATOR_VERSION,
-            "format": 2,
+            "format": 3,
             "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,
@@ -169,65 +167,45 @@ def _cache_path(
             "resolution": resolution,
             "crop": crop,
             "size": size if split == "train" or size == "small" else "normal",
+            "part": part,
         }
-        | ({} if part is None else {"part": part})
     )
-    return cache_dir() / "scenes" / f"bundled-{split}-{resolution}-{key}.safetensors"
 
 
-def _write_cache(path: Path, scenes: list[Scene]) -> None:
-    tensors = {f"{i:05d}": scene.light.half() for i, scene in enumerate(scenes)}
-    rows: list[dict[str, Any]] = []
+def _to_tensors(scenes: list[Scene]) -> dict[str, torch.Tensor]:
+    rows = []
     for scene in scenes:
-        row: dict[str, Any] = {name: getattr(scene, name) for name in _FIELDS}
+        row = {name: getattr(scene, name) for name in _FIELDS}
         reference = scene.reference
-        row["reference"] = (reference.iso, reference.exposure_time, reference.f_number)
-        rows.append(row)
-    text = json.dumps(rows)
-    metadata = {"scenes": text, "checksum": _checksum(tensors, text)}
-    try:
-        write_atomically(path, safetensors.torch.save(tensors, metadata))
-    except OSError as error:  # a full or read-only disk must not stop the run
-        logger.warning("the bundled scenes could not be cached in %s: %s", path, error)
+        rows.append(
+            row | {"reference": (reference.iso, reference.exposure_time, reference.f_number)}
+        )
+    text = np.frombuffer(json.dumps(rows).encode(), np.uint8)
+    light = torch.stack([scene.light for scene in scenes]).half()
+    return {"light": light, "rows": torch.from_numpy(text.copy())}
 
 
-def _read_cache(path: Path, camera: CameraProfile) -> list[Scene] | None:
-    """The scenes in `path`; None if there is no such file or it is damaged."""
-    try:
-        if not path.is_file():
-            return None
-        with safetensors.safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
-        if metadata.get("checksum") != _checksum(tensors, metadata["scenes"]):
-            raise ValueError("its checksum does not match its content")
-        rows = json.loads(metadata["scenes"])
-        if len(rows) != len(tensors):
-            raise ValueError(f"it describes {len(rows)} scenes and holds {len(tensors)}")
-        return [
-            _scene_of(row, tensor, camera)
-            for row, tensor in zip(rows, tensors.values(), strict=True)
-        ]
-    except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        logger.warning("cached scenes %s are damaged (%s) and are made again", path, error)
+def _from_tensors(
+    tensors: dict[str, torch.Tensor] | None, camera: CameraProfile, resolution: int | None
+) -> list[Scene] | None:
+    """The scenes of `_to_tensors`; None if there are none, or they cannot be those asked for."""
+    if tensors is None:
         return None
-
-
-def _scene_of(row: dict[str, Any], light: torch.Tensor, camera: CameraProfile) -> Scene:
-    fields = {name: row[name] for name in _FIELDS}
-    fields["white_balance"] = tuple(fields["white_balance"])
-    reference = CameraSettings(*row["reference"])
-    return Scene(
-        light=light.float(),
-        reference=reference,
-        camera=camera,
-        nlf=NoiseLevelFunction.zero(),
-        **fields,
-    )
-
-
-def _checksum(tensors: dict[str, torch.Tensor], text: str) -> str:
-    value = zlib.crc32(text.encode())
-    for name in sorted(tensors):
-        value = zlib.crc32(tensors[name].contiguous().numpy().tobytes(), value)
-    return f"{value:08x}"
+    try:
+        rows, light = json.loads(tensors["rows"].numpy().tobytes()), tensors["light"]
+        side = NATIVE_SIZE if resolution is None else resolution
+        if light.shape != (len(rows), 4, side, side):
+            raise ValueError(f"{len(rows)} scenes of {side} x {side} have light {light.shape}")
+        return [  # `Scene` checks the values
+            Scene(
+                light=own.float(),
+                reference=CameraSettings(*row.pop("reference")),
+                camera=camera,
+                nlf=NoiseLevelFunction.zero(),
+                **row,
+            )
+            for row, own in zip(rows, light, strict=True)
+        ]
+    except (ValueError, KeyError, TypeError) as error:
+        logger.warning("the cached bundled scenes are damaged (%s) and are made again", error)
+        return None

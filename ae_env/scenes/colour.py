@@ -1,4 +1,4 @@
-"""From linear sRGB light to a camera's raw colours."""
+"""Colours: from linear sRGB light to a camera's raw colours."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Times that the leaves cover the frame; what they leave open shows the ground.
+#: Number of times that the leaves cover the frame; gaps show the ground.
 _COVERAGE = 3.0
 #: A square of this half side has about the area of the unit disc.
 _SQUARE_HALF_SIDE = 0.886
@@ -21,7 +21,7 @@ _CHUNK = 16_384
 
 @dataclass(frozen=True)
 class LeafStyle:
-    """What dead leaves look like.
+    """Appearance of dead leaves.
 
     Args:
         smallest: Smallest radius [pixels].
@@ -50,7 +50,7 @@ def fractal_noise(rng: np.random.Generator, size: int, slope: float = 1.0) -> np
     radius = np.hypot(fy, fx)
     radius[0, 0] = np.inf
     field = np.fft.irfft2(white / radius**slope, s=(size, size))
-    return (field / field.std()).astype(np.float32)
+    return np.asarray((field / field.std()).astype(np.float32))
 
 
 def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = None) -> np.ndarray:
@@ -59,7 +59,7 @@ def dead_leaves(rng: np.random.Generator, size: int, style: LeafStyle | None = N
     Args:
         rng: Source of all randomness.
         size: Height and width [pixels].
-        style: What the leaves look like.
+        style: Appearance of the leaves.
 
     Returns:
         (3, size, size) float32 reflectance in linear sRGB, in [0.005, 0.97].
@@ -91,7 +91,7 @@ def scale_to_mean(reflectance: np.ndarray, mean: float) -> np.ndarray:
         bright = np.maximum(scaled - 0.5, 0.0)
         pressed = np.minimum(scaled, 0.5) + 0.47 * bright / (0.47 + bright)
         scaled *= np.float32(mean / pressed[1].mean())
-    return np.clip(pressed, 0.005, 0.97).astype(np.float32)
+    return np.asarray(np.clip(pressed, 0.005, 0.97).astype(np.float32))
 
 
 def _draw_leaves(
@@ -180,7 +180,7 @@ def _texture(
     strength = (style.texture * rng.random(number) ** 2).astype(np.float32)
     shift = rng.integers(0, size * size, number)
     position = np.arange(size * size).reshape(size, size)
-    return strength[label] * field.ravel()[(position + shift[label]) % (size * size)]
+    return np.asarray(strength[label] * field.ravel()[(position + shift[label]) % (size * size)])
 
 
 def _shading(
@@ -201,4 +201,4 @@ def _shading(
     axis = np.arange(size, dtype=np.float32)
     dy = axis[:, None] - centre[0][label]
     dx = axis[None, :] - centre[1][label]
-    return slope[0][label] * dy + slope[1][label] * dx
+    return np.asarray(slope[0][label] * dy + slope[1][label] * dx)

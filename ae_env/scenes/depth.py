@@ -10,7 +10,6 @@ such a scene can teach about defocus, and then converted to metres for a lens of
 
 from __future__ import annotations
 
-import difflib
 import math
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ import numpy as np
 from ae_env.scenes.colour import temperature_tint
 from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise, paint_leaves
 from ae_env.scenes.procedural import Drawing
+from ae_env.utils.checks import check_integer, check_word
 
 #: The lens that procedural scenes are drawn for [m], and the f-number of the stated blur.
 FOCAL_LENGTH = 0.05
@@ -27,7 +27,7 @@ F_NUMBER = 11.0
 LARGEST_BLUR = 7.0
 #: The same where everything is in focus.
 LARGEST_BLUR_IN_FOCUS = 0.3
-#: What is in focus: everything, the nearest thing, the background, or something between.
+#: Kinds of focus: on everything, the nearest thing, the background, or something between.
 FOCUSES = ("everything", "front", "back", "middle")
 #: Range that the largest blur of a picture with defocus is drawn from [packed pixels].
 _LARGEST_RANGE = (1.0, 7.0)
@@ -41,8 +41,8 @@ class DepthDrawing:
         drawing: Light and illuminance.
         blur: (H, W) float32 signed circle of confusion at `F_NUMBER` [packed pixels], above 0
             behind the plane of focus; its size is at most `LARGEST_BLUR`.
-        far: Inverse distance [1/m] of what would have the largest `blur` of this picture.
-        surface: (H, W) int, which thing each pixel shows: 0 is the background.
+        far: Inverse distance [1/m] of a thing with the largest `blur` of this picture.
+        surface: (H, W) int, number of the thing that each pixel shows: 0 is the background.
     """
 
     drawing: Drawing
@@ -62,12 +62,8 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     Raises:
         ValueError: If an argument is invalid; the message proposes the nearest name.
     """
-    if focus not in FOCUSES:
-        near = difflib.get_close_matches(str(focus), FOCUSES, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"`focus` (={focus!r}) must be one of {list(FOCUSES)}{hint}")
-    if size < 16:
-        raise ValueError(f"`size` (={size}) must be at least 16 packed pixels")
+    check_word("focus", focus, FOCUSES)
+    check_integer("size", size, 16, more=" packed pixels")
     levels = _levels(rng, int(rng.integers(1, 6)), focus)
     picture, blur = _background(rng, size, levels[0], levels[0] - levels[-1])
     surface = np.zeros((size, size), np.int32)
@@ -86,14 +82,14 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
 
 
 def lens_and_depth(blur: np.ndarray, far: float, pixel_pitch: float) -> tuple[float, np.ndarray]:
-    """Where the lens is focused, and the depth that has `blur` then.
+    """Focus distance and depth at which a scene has `blur`.
 
     Solves the thin-lens relation ``c = f**2 / (N (s - f)) * (z - s) / z`` (c signed, on the sensor)
     for the focus distance s and the depths z, at `FOCAL_LENGTH` and `F_NUMBER`.
 
     Args:
         blur: (H, W) signed circle of confusion [packed pixels].
-        far: Inverse distance [1/m] of what has the largest `blur`.
+        far: Inverse distance [1/m] where `blur` is largest.
         pixel_pitch: Distance between packed pixels [m].
 
     Returns:
@@ -123,13 +119,13 @@ def _plane(rng: np.random.Generator, side: int, level: float, slant: float) -> n
     axis = np.linspace(-0.5, 0.5, side, dtype=np.float32)
     rise = rng.uniform(0.0, slant)
     plane = level + rise * (np.sin(angle) * axis[:, None] + np.cos(angle) * axis[None, :])
-    return plane.astype(np.float32)
+    return np.asarray(plane.astype(np.float32))
 
 
 def _background(
     rng: np.random.Generator, size: int, level: float, span: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Picture and blur of what is behind everything: a wall, frontal or slanted, or the ground.
+    """Picture and blur of the background: a wall, frontal or slanted, or the ground.
 
     The ground comes nearer towards the lower edge, by at most the `span` of all levels.
     """
@@ -151,7 +147,7 @@ def _put_thing(
     number: int,
     level: float,
 ) -> None:
-    """Put one thing in front of what is there, in place: seen where it is the nearest."""
+    """Adds one thing to `picture`, `blur` and `surface`, wherever it is the nearest."""
     size = blur.shape[0]
     side = int(rng.uniform(0.25, 0.75) * size)
     top, left = (int(rng.integers(-side // 3, size - 2 * side // 3)) for _ in range(2))
@@ -231,11 +227,11 @@ def _leaves(rng: np.random.Generator, size: int) -> np.ndarray:
     light = dead_leaves(rng, size, style)
     strength = rng.uniform(0.0, 0.6) if rng.random() < 0.8 else 0.0
     grain = np.exp(np.float32(strength) * fractal_noise(rng, size, rng.uniform(0.6, 1.3)))
-    return np.clip(light * grain, 0.003, 0.97).astype(np.float32)
+    return np.asarray(np.clip(light * grain, 0.003, 0.97).astype(np.float32))
 
 
 def _add_highlights(rng: np.random.Generator, light: np.ndarray, surface: np.ndarray) -> None:
-    """Add small discs of 5 to 100 times white in place, each on one thing only, at its depth."""
+    """Adds small discs of 5 to 100 times white to `light`, each on one thing only, at its depth."""
     size = surface.shape[0]
     for _ in range(int(rng.integers(3, 30))):
         radius, value = rng.uniform(0.5, 3.0), math.exp(rng.uniform(math.log(5.0), math.log(100.0)))
@@ -252,11 +248,11 @@ def _add_highlights(rng: np.random.Generator, light: np.ndarray, surface: np.nda
 
 
 def _soften(light: np.ndarray, weight: float) -> np.ndarray:
-    """What a good lens in focus does: the kernel (w, 1 - 2 w, w) along both axes.
+    """The softness of a good lens in focus: the kernel (w, 1 - 2 w, w) along both axes.
 
-    It varies little from scene to scene: softness has to mean defocus, but not to the digit.
+    It varies a little from scene to scene, so that no fixed softness means "in focus".
     """
     padded = np.pad(light, ((0, 0), (1, 1), (1, 1)), mode="edge")
     rows = weight * (padded[:, :-2] + padded[:, 2:]) + (1.0 - 2.0 * weight) * padded[:, 1:-1]
     both = weight * (rows[..., :-2] + rows[..., 2:]) + (1.0 - 2.0 * weight) * rows[..., 1:-1]
-    return both.astype(np.float32)
+    return np.asarray(both.astype(np.float32))

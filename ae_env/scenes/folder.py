@@ -1,4 +1,7 @@
-"""A user's own files as scenes: raws and radiance maps in a folder, by a glob, or one by one."""
+"""Scenes from a user's own files: raws and radiance maps in a folder, by a glob, or one by one.
+
+A sequence is a folder of raws that are the frames of one scene over time.
+"""
 
 from __future__ import annotations
 
@@ -14,115 +17,36 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ae_env.scenes.grouping import (
+from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
+from ae_env.scenes.scene import Scene, SceneRequest
+from ae_env.scenes.split import (
     FEWEST_GROUPS_TO_SPLIT,
     Shot,
     describe,
     group_shots,
     log_groups,
     named_groups,
-    split_groups,
+    scenes_of_split,
+    too_few_groups,
 )
-from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
-from ae_env.scenes.scene import Crop, Resize, Scene
 from ae_env.utils.checks import check_flag, check_number, check_word
-from simulator.camera import CameraProfile
 from simulator.raw.read import read_raw
 from simulator.utils.files import RAW_SUFFIXES
 
-
-# Recorded sequences as scenes: raws in the order of their names are the frames of an episode.
-def sequence_scenes(
-    spec: str | Path,
-    split: str,
-    camera: CameraProfile,
-    resolution: int | None = 64,
-    crop: Crop = "box",
-    options: FolderOptions | None = None,
-    resize: Resize = Scene.resized,
-) -> list[Scene]:
-    """The frames of every sequence of `split`, one sequence after the other.
-
-    The raws of one folder, in the natural order of their names, are one sequence and one source
-    group; its name is the folder's below `spec`. Each raw's light is known through its own
-    settings: it may change from frame to frame. Raws in `spec` itself are named after it, or ``.``
-    where a folder below has that name.
-
-    Args:
-        spec: A folder, searched with its sub-folders, or a glob.
-        split: ``"train"``, ``"test"`` or ``"all"``; of fewer than 15 sequences all are for test.
-        camera: Not used by raws, which bring their own; as of `folder_scenes`.
-        resolution: Packed pixels a side; None keeps each raw's own size.
-        crop: See `Scene.resized`.
-        options: What the caller knows about the files; `on_error` must be ``"stop"``.
-        resize: Brings each scene to `resolution`, before the next file is read.
-
-    Raises:
-        ValueError: If there are no raws, one cannot be read, there are no sequences of `split`, or
-            unreadable raws were to be skipped: all later frames would come too early.
-    """
-    options = FolderOptions() if options is None else options
-    if options.on_error == "skip":
-        raise ValueError(
-            "`on_error` (='skip') must be 'stop' for a sequence: without a raw all later ones "
-            "would come a frame too early; cut the recording there, into two folders"
-        )
-    base, found = find_files(spec)
-    by_folder: dict[Path, list[Path]] = {}
-    for path in found:
-        if path.suffix.lower() in RAW_SUFFIXES:
-            by_folder.setdefault(path.parent, []).append(path)
-    if not by_folder:
-        raise ValueError(
-            f"`scenes` (={{'sequence': {str(spec)!r}}}) must hold raws "
-            f"({', '.join(RAW_SUFFIXES[:8])} ...): radiance maps have no settings of their own"
-        )
-    if split == "train" and len(by_folder) < FEWEST_GROUPS_TO_SPLIT:
-        raise too_few_groups(spec, str(len(by_folder)))  # before any time is spent on reading
-    files = [path for paths in by_folder.values() for path in paths]
-    names = scene_names(base, files)
-    sequences = _sequence_names(base, list(by_folder))
-    groups = {names[path]: sequences[path.parent] for path in files}
-    reader = Reader(base, names, {}, options, camera, resolution, crop, resize)
-    scenes, _ = read_all(spec, files, reader, hint="")
-    scenes = [replace(scene, group=groups[scene.scene_id]) for scene in scenes]
-    log_groups(str(spec), {scene.scene_id: scene.group for scene in scenes})
-    return of_split(spec, scenes, split)
-
-
-def _sequence_names(base: Path, folders: list[Path]) -> dict[Path, str]:
-    names = {folder: folder.relative_to(base).as_posix() for folder in folders}
-    own = base.resolve().name
-    if base in names and own and own not in names.values():
-        names[base] = own  # else "."
-    return names
-
-
-def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
-    """First and last frame, (F,) int64 each, of the sequence that each of F frames belongs to.
-
-    Args:
-        scenes: As `sequence_scenes` returns them: those of one group follow each other.
-    """
-    groups = [scene.group for scene in scenes]
-    begins = [i for i, group in enumerate(groups) if i == 0 or groups[i - 1] != group]
-    lengths = np.diff([*begins, len(groups)])
-    first = np.repeat(begins, lengths)
-    return first, first + np.repeat(lengths, lengths) - 1
-
-
 logger = logging.getLogger(__name__)
 
-
 OnError = Literal["stop", "skip"]
-#: Seconds between two log lines about how far the reading is, and names in one about what is bad.
-_PROGRESS_SECONDS, _NAMES = 10.0, 5
+#: Seconds between two log lines about the progress of reading.
+_PROGRESS_SECONDS = 10.0
+#: Most file names in a log line about files that were skipped.
+_MOST_NAMES = 5
 _HOW_TO_SKIP = "; in Python or YAML, {'path': ..., 'on_error': 'skip'} leaves it out"
+_RAW_ENDINGS = f"{', '.join(RAW_SUFFIXES[:8])} ..."
 
 
 @dataclass(frozen=True)
 class FolderOptions:
-    """What the caller knows about the files.
+    """Facts about the files that the caller knows, and the rule for files that cannot be read.
 
     Args:
         illuminance: Light on the subject [lux] of every file, or by file name.
@@ -130,7 +54,7 @@ class FolderOptions:
         hard: Whether they count as hard.
         median_speed: Median image speed of a moving episode [frame heights / s].
         ev100: EV100 of the radiance maps, in place of the assumed one.
-        on_error: What a file does that cannot be read, or is black without `illuminance`:
+        on_error: What happens where a file cannot be read, or is black without `illuminance`:
             ``"stop"`` raises an error that names it, so that nothing goes missing unseen;
             ``"skip"`` leaves it out, and a warning in the log says how many were and why; not
             for sequences.
@@ -158,16 +82,119 @@ class FolderOptions:
         if self.ev100 is not None:
             check_number("ev100", self.ev100, -20.0, 40.0)
 
-    def fields(self, path: Path, raw: bool) -> dict[str, Any]:
-        """Keyword arguments for the scenes of `path`."""
+    def fields(self, path: Path) -> dict[str, Any]:
+        """Keyword arguments for the scenes of `path`, a raw or a radiance map."""
         lux = self.illuminance
         if isinstance(lux, Mapping):
             lux = lux.get(path.name)
         given = {"kind": self.kind, "hard": self.hard, "median_speed": self.median_speed}
         given["illuminance"] = lux
-        if not raw:
+        if not _is_raw(path):
             given["ev100"] = self.ev100
         return {name: value for name, value in given.items() if value is not None}
+
+
+# -- scenes ---------------------------------------------------------------------------------------
+
+
+def folder_scenes(
+    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
+) -> list[Scene]:
+    """The scenes of `split` among the user's files.
+
+    The source group of a file is, in this order: the one that ``groups.csv`` beside it names; its
+    sub-folder under `spec`; for a radiance map the file itself; for a raw the one that
+    `group_shots` finds.
+
+    Args:
+        spec: See `find_files`.
+        request: Split, camera and size. Each scene is resized before the next file is read.
+        options: Facts about the files that the caller knows.
+
+    Raises:
+        ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
+            if no file can), or `split` is ``"train"`` and there are too few groups to hold any out.
+    """
+    base, files = find_files(spec)
+    named = named_groups(sorted({base, *(p.parent for p in files)}))
+    if request.split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
+        raise too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
+    groups = {p: named[p.resolve()] for p in files if p.resolve() in named}
+    reader = _Reader(base, _scene_names(base, files), groups, options or FolderOptions(), request)
+    scenes, shots = _read_all(spec, files, reader, _HOW_TO_SKIP)
+    found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
+    scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
+    log_groups(str(spec), scenes)
+    return scenes_of_split(spec, scenes, request.split)
+
+
+def sequence_scenes(
+    spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
+) -> list[Scene]:
+    """The frames of every sequence of `split`, one sequence after the other.
+
+    The raws of one folder, in the natural order of their names, are one sequence and one source
+    group; its name is the folder's below `spec`. Each raw's light is known through its own
+    settings: it may change from frame to frame. Raws in `spec` itself are named after it, or ``.``
+    where a folder below has that name.
+
+    Args:
+        spec: A folder, searched with its sub-folders, or a glob.
+        request: Split and size; fewer than 15 sequences are all for test.
+        options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
+
+    Raises:
+        ValueError: If there are no raws, one cannot be read, there are no sequences of `split`, or
+            unreadable raws were to be skipped: all later frames would come too early.
+    """
+    options = options or FolderOptions()
+    if options.on_error == "skip":
+        raise ValueError(
+            "`on_error` (='skip') must be 'stop' for a sequence: without a raw all later ones "
+            "would come a frame too early; cut the recording there, into two folders"
+        )
+    base, found = find_files(spec)
+    by_folder: dict[Path, list[Path]] = {}
+    for path in filter(_is_raw, found):
+        by_folder.setdefault(path.parent, []).append(path)
+    if not by_folder:
+        raise ValueError(
+            f"`scenes` (={{'sequence': {str(spec)!r}}}) must hold raws ({_RAW_ENDINGS}): radiance "
+            "maps have no settings of their own"
+        )
+    if request.split == "train" and len(by_folder) < FEWEST_GROUPS_TO_SPLIT:
+        raise too_few_groups(spec, str(len(by_folder)))  # before any time is spent on reading
+    files = [path for paths in by_folder.values() for path in paths]
+    sequences = _sequence_names(base, list(by_folder))
+    groups = {path: sequences[path.parent] for path in files}
+    reader = _Reader(base, _scene_names(base, files), groups, options, request)
+    scenes, _ = _read_all(spec, files, reader, "")
+    log_groups(str(spec), scenes)
+    return scenes_of_split(spec, scenes, request.split)
+
+
+def _sequence_names(base: Path, folders: list[Path]) -> dict[Path, str]:
+    names = {folder: folder.relative_to(base).as_posix() for folder in folders}
+    own = base.resolve().name
+    if base in names and own and own not in names.values():
+        names[base] = own  # else "."
+    return names
+
+
+def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
+    """First and last frame, (F,) int64 each, of the sequence that each of F frames belongs to.
+
+    Args:
+        scenes: As `sequence_scenes` returns them: those of one group follow each other.
+    """
+    groups = [scene.group for scene in scenes]
+    begins = [i for i, group in enumerate(groups) if i == 0 or groups[i - 1] != group]
+    lengths = np.diff([*begins, len(groups)])
+    first = np.repeat(begins, lengths)
+    return first, first + np.repeat(lengths, lengths) - 1
+
+
+# -- files ----------------------------------------------------------------------------------------
 
 
 def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
@@ -182,11 +209,11 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
     """
-    known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     try:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
         raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
+    known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     files = [
         p
         for p in found
@@ -197,7 +224,7 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         endings = sorted({p.suffix.lower() or "(none)" for p in found})
         raise ValueError(
             f"`scenes` (={str(spec)!r}, files ending in {endings}) must hold raws "
-            f"({', '.join(RAW_SUFFIXES[:8])} ...) or radiance maps ({', '.join(RADIANCE_SUFFIXES)})"
+            f"({_RAW_ENDINGS}) or radiance maps ({', '.join(RADIANCE_SUFFIXES)})"
         )
     return base, sorted(files, key=_natural)
 
@@ -216,85 +243,71 @@ def _listed(spec: str | Path) -> tuple[Path, list[Path]]:
     return Path(*path.parts[:first]), [p for p in matches if p.is_file()]
 
 
-def folder_scenes(
-    spec: str | Path,
-    split: str,
-    camera: CameraProfile,
-    resolution: int | None = 64,
-    crop: Crop = "box",
-    options: FolderOptions | None = None,
-    resize: Resize = Scene.resized,
-) -> list[Scene]:
-    """The scenes of `split` among the user's files.
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key in which numbers count as numbers."""
+    parts = re.split(r"(\d+)", path.as_posix().lower())
+    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
 
-    The source group of a file is, in this order: what ``groups.csv`` beside it says; its sub-folder
-    under `spec`; for a radiance map the file itself; for a raw what `group_shots` finds.
 
-    Args:
-        spec: See `find_files`.
-        split: ``"train"``, ``"test"`` or ``"all"``.
-        camera: Whose colours the light of radiance maps is taken to.
-        resolution: Packed pixels a side; None keeps each scene's own size.
-        crop: See `Scene.resized`.
-        options: What the caller knows about the files.
-        resize: Brings each scene to `resolution`, before the next file is read.
+def _is_raw(path: Path) -> bool:
+    return path.suffix.lower() in RAW_SUFFIXES
 
-    Raises:
-        ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
-            if no file can), or `split` is ``"train"`` and there are too few groups to hold any out.
-    """
-    options = FolderOptions() if options is None else options
-    base, files = find_files(spec)
-    named = named_groups(sorted({base, *(p.parent for p in files)}))
-    names = scene_names(base, files)
-    if split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
-        raise too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    reader = Reader(base, names, named, options, camera, resolution, crop, resize)
-    scenes, shots = read_all(spec, files, reader)
-    found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
-    scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
-    log_groups(str(spec), {s.scene_id: s.group for s in scenes})
-    return of_split(spec, scenes, split)
+
+def _scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
+    """Scene ids: the path below `base` without its ending, with it where two would be equal."""
+    stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
+    times = Counter(stems)
+    return {
+        p: stem if times[stem] == 1 else p.relative_to(base).as_posix()
+        for p, stem in zip(files, stems, strict=True)
+    }
+
+
+# -- reading --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Reader:
-    """Makes scenes of one file after the other; see `folder_scenes`."""
+class _Reader:
+    """Makes the scenes of one file after the other.
+
+    Args:
+        base: Folder that the files are under.
+        names: Scene id of each file.
+        groups: Source group of the files whose group is known by name.
+        options: See `folder_scenes`.
+        request: See `folder_scenes`.
+    """
 
     base: Path
     names: Mapping[Path, str]
-    named: Mapping[Path, str]
+    groups: Mapping[Path, str]
     options: FolderOptions
-    camera: CameraProfile
-    resolution: int | None
-    crop: Crop
-    resize: Resize
+    request: SceneRequest
 
-    def __call__(self, path: Path) -> tuple[list[Scene], Shot | None]:
-        """The scenes of a file, and what tells the group of a raw that none is named for."""
-        scenes, shot = self._read(path)
-        for scene in scenes:
-            _ = scene.ev100  # refuses what is black in unknown light
-        return scenes, shot
-
-    def _read(self, path: Path) -> tuple[list[Scene], Shot | None]:
-        name, group = self.names[path], self.named.get(path.resolve())
+    def read(self, path: Path) -> tuple[list[Scene], Shot | None]:
+        """The scenes of a file; with a `Shot` where that has to tell the group of a raw."""
+        name, group = self.names[path], self.groups.get(path)
         grouped = group is not None or path.parent != self.base
         if group is None:
             group = path.parent.relative_to(self.base).as_posix() if grouped else name
-        raw_file = path.suffix.lower() in RAW_SUFFIXES
-        fields = self.options.fields(path, raw_file)
-        if raw_file:
-            scene, shot = _raw_scene(path, name, group, fields)
-            return [self.resize(scene, self.resolution, self.crop)], None if grouped else shot
-        fields |= {"resolution": self.resolution, "crop": self.crop, "resize": self.resize}
-        return list(radiance_scenes(path, self.camera, name=name, group=group, **fields)), None
+        fields, shot = self.options.fields(path), None
+        if _is_raw(path):
+            raw = read_raw(path)
+            source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
+            scene = Scene.from_raw(raw, scene_id=name, group=group, source=source, **fields)
+            shot = None if grouped else describe(raw)
+            scenes = [self.request.sized(scene)]
+        else:
+            scenes = list(radiance_scenes(path, self.request, name=name, group=group, **fields))
+        for scene in scenes:
+            _ = scene.ev100  # raises where a frame is black and its light unknown
+        return scenes, shot
 
 
-def read_all(
-    spec: str | Path, files: list[Path], reader: Reader, hint: str = _HOW_TO_SKIP
+def _read_all(
+    spec: str | Path, files: list[Path], reader: _Reader, hint: str
 ) -> tuple[list[Scene], dict[str, Shot]]:
-    """The scenes of all `files`, and what tells the groups of those that none is named for.
+    """The scenes of all `files`, and the shots of those raws whose group is still to be found.
 
     `hint` ends the error of a file that cannot be read, where there are others.
     """
@@ -303,7 +316,7 @@ def read_all(
     skipped: dict[Path, Exception] = {}
     for path in _with_progress(spec, files):
         try:
-            own, shot = reader(path)
+            own, shot = reader.read(path)
         except (ValueError, OSError) as error:  # it may also have vanished since it was listed
             if reader.options.on_error == "stop":
                 more = hint if len(files) > 1 else ""
@@ -329,61 +342,16 @@ def _with_progress(spec: str | Path, files: list[Path]) -> Iterator[Path]:
 
 
 def _report_skipped(spec: str | Path, skipped: Mapping[Path, Exception], total: int) -> None:
-    """Log what was left out; an error if nothing is left."""
+    """Logs the files that were left out; raises where none was read."""
     if not skipped:
         return
-    reasons = [f"{path.name}: {error}" for path, error in list(skipped.items())[:_NAMES]]
-    more = f"; and {len(skipped) - _NAMES} more" if len(skipped) > _NAMES else ""
+    reasons = [f"{path.name}: {error}" for path, error in list(skipped.items())[:_MOST_NAMES]]
+    if len(skipped) > _MOST_NAMES:
+        reasons.append(f"and {len(skipped) - _MOST_NAMES} more")
+    text = "; ".join(reasons)
     if len(skipped) == total:
         raise ValueError(
             f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all {total} were "
-            f"skipped ({'; '.join(reasons)}{more})"
+            f"skipped ({text})"
         )
-    logger.warning(
-        "%s: %d of %d scene files skipped (%s%s)",
-        *(spec, len(skipped), total, "; ".join(reasons), more),
-    )
-
-
-def of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
-    """Those of `scenes` whose source group is in `split`."""
-    if split == "all":
-        return scenes
-    parts = split_groups([scene.group for scene in scenes])
-    if split == "train" and "train" not in parts.values():
-        raise too_few_groups(spec, str(len(parts)))
-    return [scene for scene in scenes if parts[scene.group] == split]
-
-
-def too_few_groups(spec: str | Path, number: str) -> ValueError:
-    """What to raise where `spec` has only `number` source groups to train on."""
-    return ValueError(
-        f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that some "
-        f"can be held out; {str(spec)!r} has {number}. Train on scenes='bundled' and use these "
-        "with split='test' (zero-shot) or split='all'; if files are grouped wrongly, name the "
-        "groups in a groups.csv (columns file, group) beside them"
-    )
-
-
-def _raw_scene(path: Path, name: str, group: str, fields: dict[str, Any]) -> tuple[Scene, Shot]:
-    raw = read_raw(path)
-    noise = raw.metadata.get("nlf_source", "unknown")
-    source = f"{path.name}; noise: {noise}"
-    scene = Scene.from_raw(raw, scene_id=name, group=group, source=source, **fields)
-    return scene, describe(raw)
-
-
-def scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
-    """Scene ids: the path below `base` without its ending, with it where two would be equal."""
-    stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
-    times = Counter(stems)
-    return {
-        p: stem if times[stem] == 1 else p.relative_to(base).as_posix()
-        for p, stem in zip(files, stems, strict=True)
-    }
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key in which numbers count as numbers."""
-    parts = re.split(r"(\d+)", path.as_posix().lower())
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
+    logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)

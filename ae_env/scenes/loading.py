@@ -1,9 +1,7 @@
-"""`load_scenes`: from what a user names to a list of scenes."""
+"""`load_scenes`: from a name, a path or a list to scenes; and the networks that prepare them."""
 
 from __future__ import annotations
 
-import difflib
-import importlib
 import inspect
 import logging
 import os
@@ -18,122 +16,16 @@ import torch
 
 from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
-from ae_env.scenes.scene import Crop, Resize, Scene
+from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest
+from ae_env.utils.checks import did_you_mean
+from ae_env.utils.user_code import load_attribute
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import CameraSimulator
 from simulator.networks.aperture_module import DEAD_ZONE
 from simulator.networks.network_cache import NetworkCache
 from simulator.utils.files import sibling
 
-# What the trained networks find out about scenes, once, before any episode.
 logger = logging.getLogger(__name__)
-
-#: The weights that come with the package.
-DEFAULT_SIMULATOR = "compact"
-#: Bumped when the way that defocus maps are found changes.
-MAP_VERSION = 2
-#: Pixels around a crop that the networks see, too: at least as far as they look.
-_MARGIN = 112
-
-
-def check_weights(name: str) -> None:
-    """Raises a `ValueError` unless `name` is that of weights or the path of some; reads none."""
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"`simulator` (={name!r}) must be None, or the name or path of weights")
-    if name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file():
-        return
-    from simulator.networks.weights import list_pretrained
-
-    known = sorted({DEFAULT_SIMULATOR, *list_pretrained()})
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(
-            f"`simulator` (={name!r}) must be None, one of {known} or the path of a .safetensors "
-            f"file{hint}"
-        )
-
-
-class SceneNetworks:
-    """Trained networks, loaded when a scene first needs them.
-
-    Args:
-        name: Name or path of the weights.
-        cache: Whether what they find is kept in the cache folder, and looked for there.
-    """
-
-    def __init__(self, name: str, *, cache: bool = True) -> None:
-        self.name = name
-        # In memory are the scenes themselves.
-        self._results = NetworkCache("disk" if cache else None, max_bytes=0)
-
-    @cached_property
-    def _simulator(self) -> CameraSimulator:
-        return CameraSimulator.from_pretrained(self.name, device="cpu", cache=None)
-
-    def denoised(self, scene: Scene) -> Scene:
-        """The scene with `Scene.denoised`; a noise-free one as it is."""
-        if scene.noise_free or scene.denoised is not None:
-            return scene
-
-        def make() -> torch.Tensor:  # leaving nothing out: it serves every tolerance
-            return self._simulator.denoise(replace(scene.prepared, tolerance=0.0))
-
-        return replace(
-            scene,
-            denoised=self._kept("denoised", scene, make, everywhere=True),
-        )
-
-    def resized(self, scene: Scene, resolution: int | None, crop: Crop = "box") -> Scene:
-        """As `Scene.resized`, with `Scene.defocus_map` estimated before any pixels are averaged.
-
-        Averaging hides small blur: the map is found at the finest resolution there is.
-
-        Args:
-            scene: At its finest resolution; its own map is kept if it has one.
-            resolution: See `Scene.resized`.
-            crop: See `Scene.resized`.
-        """
-        small = scene.resized(resolution, crop)
-        if small.defocus_map is not None:
-            return small
-
-        def make() -> torch.Tensor:
-            logger.info("finding what is out of focus in scene %s", scene.scene_id)
-            return self._small_map(scene, resolution, crop)
-
-        numbers = {"map": [MAP_VERSION, DEAD_ZONE], "resolution": resolution, "crop": crop}
-        return replace(small, defocus_map=self._kept("defocus_maps", scene, make, **numbers))
-
-    def _small_map(self, scene: Scene, resolution: int | None, crop: Crop) -> torch.Tensor:
-        shorter = min(scene.light.shape[1:])
-        factor = 1 if resolution is None or crop == "native" else shorter // resolution
-        used = None if resolution is None else factor * resolution
-        if used is not None and used + 2 * _MARGIN < shorter:
-            scene = scene.resized(used + 2 * _MARGIN, "native")
-        # Denoises where there is noise; leaves nothing out, as scorers ask for the blur of it all.
-        prepared = self._simulator.prepare(scene.prepared, tolerance=0.0)
-        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(prepared))
-        found = fine.resized(used, "native").resized(resolution, crop).defocus_map
-        assert found is not None
-        return found
-
-    def _kept(
-        self, kind: str, scene: Scene, make: Callable[[], torch.Tensor], **numbers: Any
-    ) -> torch.Tensor:
-        """What `make` finds out about `scene`, or found when everything was the same."""
-        modules = [m for m in (self._simulator.noise, self._simulator.aperture) if m is not None]
-        inputs = {"light": scene.light, "denoised": scene.denoised}
-        nlf = [scene.nlf.shot, scene.nlf.read]
-        return self._results.result(kind, modules, inputs, make, nlf=nlf, **numbers)
-
-
-def without_noise(scene: Scene) -> Scene:
-    """The scene with its denoised light for light, where it has one."""
-    if scene.denoised is None:
-        return scene
-    return replace(scene, light=scene.denoised, nlf=scene.nlf.zero(), denoised=None)
-
 
 #: Names of the scenes that come with the package.
 BUNDLED: dict[str, Size] = {
@@ -143,11 +35,13 @@ BUNDLED: dict[str, Size] = {
 }
 #: Those of one kind, or of the hard part.
 BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
+#: Ways to name scenes, see `load_scenes`.
+SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any]
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
 def load_scenes(
-    spec: str | Path | Sequence[Scene] | Mapping[str, Any],
+    spec: SceneSpec,
     split: Split = "train",
     *,
     camera: CameraProfile,
@@ -190,21 +84,28 @@ def load_scenes(
     """
     if split not in get_args(Split):
         raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
+    request = SceneRequest(split, camera, resolution, crop, resize)
     if isinstance(spec, Mapping):
         load = sequence_scenes if is_sequence(spec) else folder_scenes
         path, options = _options(spec)
-        scenes = load(path, split, camera, resolution, crop, options, resize)
+        scenes = load(path, request, options)
     elif isinstance(spec, Path):
-        scenes = folder_scenes(spec, split, camera, resolution, crop, resize=resize)
+        scenes = folder_scenes(spec, request)
     elif isinstance(spec, str):
-        scenes = _by_name(spec, split, camera, resolution, crop, resize)
+        scenes = _by_name(spec, split, request)
     elif isinstance(spec, Sequence):
-        scenes = [resize(s, resolution, crop) for s in _checked(spec, "scenes")]
+        scenes = [request.sized(scene) for scene in _checked(spec, "scenes")]
     else:
         raise ValueError(
             f"`scenes` (={spec!r}) must be a name, a path, a mapping or a list of Scene"
         )
-    _check_result(scenes, spec, split)
+    if not scenes:
+        raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
+    seen: set[str] = set()
+    for scene in scenes:
+        if scene.scene_id in seen:
+            raise ValueError(f"`scene_id` (={scene.scene_id!r}) must be unique, but occurs twice")
+        seen.add(scene.scene_id)
     return scenes
 
 
@@ -213,34 +114,30 @@ def is_sequence(spec: object) -> bool:
     return isinstance(spec, Mapping) and "sequence" in spec
 
 
-def _by_name(
-    spec: str,
-    split: Split,
-    camera: CameraProfile,
-    resolution: int | None,
-    crop: Crop,
-    resize: Resize,
-) -> list[Scene]:
+def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
+    camera, resolution = request.camera, request.resolution
     if spec in BUNDLED or spec in BUNDLED_PARTS:
         size, part = BUNDLED.get(spec, "normal"), BUNDLED_PARTS.get(spec)
-        if resize is Scene.resized:
-            return bundled_scenes(split, camera, resolution, crop, size=size, part=part)
+        if request.resize is Scene.resized:
+            return bundled_scenes(split, camera, resolution, request.crop, size=size, part=part)
         finest = bundled_scenes(split, camera, None, size=size, part=part)
-        return [resize(scene, resolution, crop) for scene in finest]
+        return [request.sized(scene) for scene in finest]
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
-            known = {"split": split, "camera": camera, "resolution": resolution}
-            found = _checked(_attribute(spec, known), spec)
-            return [resize(scene, resolution, crop) for scene in found]
-        known_names = [*BUNDLED, *BUNDLED_PARTS]
-        near = difflib.get_close_matches(spec, known_names, n=1, cutoff=0.7)
-        if near or spec.startswith("bundled:"):
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
+            if callable(found):
+                known = {"split": split, "camera": camera, "resolution": resolution}
+                names = inspect.signature(found).parameters
+                found = found(**{name: given for name, given in known.items() if name in names})
+            return [request.sized(scene) for scene in _checked(found, spec)]
+        bundled = [*BUNDLED, *BUNDLED_PARTS]
+        hint = did_you_mean(spec, bundled, cutoff=0.7)
+        if hint or spec.startswith("bundled:"):
             raise ValueError(
-                f"`scenes` (={spec!r}) must be one of {known_names}, an existing file, folder or "
-                f"glob, or 'pkg.mod:attr'{hint}"
+                f"`scenes` (={spec!r}) must be one of {bundled}, an existing file, folder or glob, "
+                f"or 'pkg.mod:attr'{hint}"
             )
-    return folder_scenes(spec, split, camera, resolution, crop, resize=resize)
+    return folder_scenes(spec, request)
 
 
 def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
@@ -253,8 +150,7 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
         )
     for name in spec:
         if name != where and name not in known:
-            near = difflib.get_close_matches(str(name), known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(name, known)
             raise ValueError(f"`scenes` field {name!r} must be one of {[where, *known]}{hint}")
     if spec[where] in (*BUNDLED, *BUNDLED_PARTS):
         raise ValueError(
@@ -262,25 +158,6 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
             f"{spec[where]!r} itself for the bundled scenes"
         )
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
-
-
-def _attribute(spec: str, known: Mapping[str, Any]) -> Any:
-    """What ``"pkg.mod:attr"`` names; called if it can be."""
-    module_name, _, attribute = spec.partition(":")
-    try:
-        value: Any = importlib.import_module(module_name)
-    except Exception as error:  # a user's module may raise anything
-        raise ValueError(f"`scenes` (={spec!r}): cannot import: {error}") from error
-    for name in attribute.split("."):
-        if not hasattr(value, name):
-            near = difflib.get_close_matches(name, dir(value), n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"`scenes` (={spec!r}): {module_name} has no attribute {name!r}{hint}")
-        value = getattr(value, name)
-    if not callable(value):
-        return value
-    parameters = inspect.signature(value).parameters
-    return value(**{name: given for name, given in known.items() if name in parameters})
 
 
 def _checked(spec: Any, name: str) -> Sequence[Scene]:
@@ -294,11 +171,105 @@ def _checked(spec: Any, name: str) -> Sequence[Scene]:
     return spec
 
 
-def _check_result(scenes: Sequence[Scene], spec: object, split: str) -> None:
-    if not scenes:
-        raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
-    seen: set[str] = set()
-    for scene in scenes:
-        if scene.scene_id in seen:
-            raise ValueError(f"`scene_id` (={scene.scene_id!r}) must be unique, but occurs twice")
-        seen.add(scene.scene_id)
+# -- networks: noise and defocus of scenes, estimated once, before any episode --------------------
+
+#: The weights that come with the package.
+DEFAULT_SIMULATOR = "compact"
+#: Raised when the estimation of defocus maps changes.
+MAP_VERSION = 2
+#: Pixels around a crop that the networks see, too: at least their field of view.
+_MARGIN = 112
+
+
+def check_weights(name: str) -> None:
+    """Raises a `ValueError` unless `name` is that of weights or the path of some; reads none."""
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"`simulator` (={name!r}) must be None, or the name or path of weights")
+    if name == DEFAULT_SIMULATOR or sibling(name, ".safetensors").is_file():
+        return
+    from simulator.networks.weights import list_pretrained
+
+    known = sorted({DEFAULT_SIMULATOR, *list_pretrained()})
+    if name not in known:
+        raise ValueError(
+            f"`simulator` (={name!r}) must be None, one of {known} or the path of a .safetensors "
+            f"file{did_you_mean(name, known)}"
+        )
+
+
+class SceneNetworks:
+    """Trained networks, loaded when a scene first needs them.
+
+    Args:
+        name: Name or path of the weights.
+        cache: Whether to use the cache folder for their results.
+    """
+
+    def __init__(self, name: str, *, cache: bool = True) -> None:
+        self.name = name
+        # On disk only: in memory are the scenes themselves.
+        self._results = NetworkCache("disk" if cache else None, max_bytes=0)
+
+    @cached_property
+    def _simulator(self) -> CameraSimulator:
+        return CameraSimulator.from_pretrained(self.name, device="cpu", cache=None)
+
+    def denoised(self, scene: Scene) -> Scene:
+        """The scene with `Scene.denoised`; a noise-free one as it is."""
+        if scene.noise_free or scene.denoised is not None:
+            return scene
+
+        def make() -> torch.Tensor:  # at tolerance 0, so that it serves every tolerance
+            return self._simulator.denoise(replace(scene.prepared, tolerance=0.0))
+
+        return replace(scene, denoised=self._cached("denoised", scene, make, everywhere=True))
+
+    def resized(self, scene: Scene, resolution: int | None, crop: Crop = "box") -> Scene:
+        """As `Scene.resized`, with `Scene.defocus_map` estimated before any pixels are averaged.
+
+        Averaging hides small blur, so the map is estimated at the finest resolution.
+
+        Args:
+            scene: At its finest resolution; a map that it has already stays.
+            resolution: See `Scene.resized`.
+            crop: See `Scene.resized`.
+        """
+        small = scene.resized(resolution, crop)
+        if small.defocus_map is not None:
+            return small
+
+        def make() -> torch.Tensor:
+            logger.info("estimating the defocus of scene %s", scene.scene_id)
+            return self._small_map(scene, resolution, crop)
+
+        numbers = {"map": [MAP_VERSION, DEAD_ZONE], "resolution": resolution, "crop": crop}
+        return replace(small, defocus_map=self._cached("defocus_maps", scene, make, **numbers))
+
+    def _small_map(self, scene: Scene, resolution: int | None, crop: Crop) -> torch.Tensor:
+        shorter = min(scene.light.shape[1:])
+        factor = 1 if resolution is None or crop == "native" else shorter // resolution
+        used = None if resolution is None else factor * resolution
+        if used is not None and used + 2 * _MARGIN < shorter:
+            scene = scene.resized(used + 2 * _MARGIN, "native")
+        # Denoises where there is noise; at tolerance 0, as scorers ask for all of the blur.
+        prepared = self._simulator.prepare(scene.prepared, tolerance=0.0)
+        fine = replace(scene, defocus_map=self._simulator.estimate_defocus(prepared))
+        found = fine.resized(used, "native").resized(resolution, crop).defocus_map
+        assert found is not None
+        return found
+
+    def _cached(
+        self, kind: str, scene: Scene, make: Callable[[], torch.Tensor], **numbers: Any
+    ) -> torch.Tensor:
+        """The result of `make` for `scene`, from the cache where its inputs were the same."""
+        modules = [m for m in (self._simulator.noise, self._simulator.aperture) if m is not None]
+        inputs = {"light": scene.light, "denoised": scene.denoised}
+        nlf = [scene.nlf.shot, scene.nlf.read]
+        return self._results.result(kind, modules, inputs, make, nlf=nlf, **numbers)
+
+
+def without_noise(scene: Scene) -> Scene:
+    """The scene with its denoised light in place of its light, where it has one."""
+    if scene.denoised is None:
+        return scene
+    return replace(scene, light=scene.denoised, nlf=scene.nlf.zero(), denoised=None)

@@ -33,7 +33,7 @@ class Photograph:
         name: Its name there, and the name of its source group.
         file: File name in ``skimage/data``.
         split: ``"train"`` or ``"test"``; fixed.
-        illuminance: Range of the light that it is put under [lux].
+        illuminance: Range of the light assumed for it [lux].
         tint: Range of the light's colour, see `temperature_tint`.
         credit: Photographer or institution and licence, as scikit-image states them.
     """
@@ -122,7 +122,7 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     linear = np.where(flat <= 0.04045, flat / 12.92, ((flat + 0.055) / 1.055) ** 2.4)
     peak = shown.max(axis=0)
     blown = np.clip((peak - _CLIPPED) / (1.0 - _CLIPPED), 0.0, 1.0) ** 2
-    return (linear * np.exp2(blown * rng.uniform(0.0, 2.5))).astype(np.float32)
+    return np.asarray((linear * np.exp2(blown * rng.uniform(0.0, 2.5))).astype(np.float32))
 
 
 def _read(name: str) -> np.ndarray:

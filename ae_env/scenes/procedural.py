@@ -8,16 +8,16 @@ docstring of each kind says where that is.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ae_env.scenes.colour import temperature_tint
-from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise, scale_to_mean
+from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
+from ae_env.utils.checks import did_you_mean
 
-#: Part of every cache key: raise it with any change of what is drawn.
+#: Part of every cache key: raise it with any change of the drawings.
 GENERATOR_VERSION = 1
 #: Packed pixels a side at which procedural scenes are drawn.
 NATIVE_SIZE = 256
@@ -54,8 +54,7 @@ def draw(kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE) -> Drawin
         ValueError: If there is no such kind; the message proposes the nearest name.
     """
     if kind not in _KINDS:
-        near = difflib.get_close_matches(str(kind), _KINDS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(kind, _KINDS)
         raise ValueError(f"`kind` (={kind!r}) must be one of {list_kinds()}{hint}")
     drawing = _KINDS[kind](rng, size)
     return Drawing(_lens(drawing.light), drawing.illuminance, drawing.illuminant)
@@ -228,7 +227,7 @@ def _shadows(rng: np.random.Generator, size: int, share: float, depth: float) ->
     field = fractal_noise(rng, size, 1.6)
     edge = np.quantile(field, share)
     lit = 1.0 / (1.0 + np.exp(-np.clip((field - edge) / 0.06, -60, 60)))
-    return (depth + (1.0 - depth) * lit).astype(np.float32)
+    return np.asarray((depth + (1.0 - depth) * lit).astype(np.float32))
 
 
 def _falloff(rng: np.random.Generator, size: int, stops: float) -> np.ndarray:
@@ -237,7 +236,7 @@ def _falloff(rng: np.random.Generator, size: int, stops: float) -> np.ndarray:
     axis = np.linspace(-0.5, 0.5, size, dtype=np.float32)
     ramp = np.sin(angle) * axis[:, None] + np.cos(angle) * axis[None, :]
     field = stops * ramp + 0.1 * stops * fractal_noise(rng, size, 2.0)
-    return np.exp2(field - np.median(field)).astype(np.float32)
+    return np.asarray(np.exp2(field - np.median(field)).astype(np.float32))
 
 
 def _scatter(rng: np.random.Generator, size: int, share: float) -> np.ndarray:
@@ -273,7 +272,7 @@ def _sky_above_skyline(rng: np.random.Generator, size: int) -> np.ndarray:
     ridge = np.cumsum(rng.standard_normal(size))
     ridge = (ridge - np.linspace(ridge[0], ridge[-1], size)) / (np.abs(ridge).max() + 1e-6)
     skyline = rng.uniform(0.3, 0.65) + rng.uniform(0.02, 0.1) * ridge
-    return np.linspace(0.0, 1.0, size)[:, None] < skyline[None, :]
+    return np.asarray(np.linspace(0.0, 1.0, size)[:, None] < skyline[None, :])
 
 
 def _windows(rng: np.random.Generator, size: int) -> np.ndarray:
@@ -332,7 +331,7 @@ def _warm(rng: np.random.Generator) -> np.ndarray:
 def _neon_colour(rng: np.random.Generator) -> np.ndarray:
     colour = np.array([0.08, 0.08, 0.08])
     colour[rng.integers(0, 3)] = 1.0
-    return np.maximum(colour, rng.uniform(0.0, 0.6, 3)).astype(np.float32)
+    return np.asarray(np.maximum(colour, rng.uniform(0.0, 0.6, 3)).astype(np.float32))
 
 
 def _add_lit_windows(rng: np.random.Generator, light: np.ndarray) -> None:
@@ -361,15 +360,3 @@ def _add_neon(rng: np.random.Generator, light: np.ndarray) -> None:
         tube = np.exp(-(((ring - radius) / 0.0025) ** 2))
         value = np.exp(rng.uniform(np.log(20.0), np.log(80.0)))
         light += (_neon_colour(rng)[:, None, None] * np.float32(value) * tube).astype(np.float32)
-
-
-__all__ = [
-    "GENERATOR_VERSION",
-    "HARD_KINDS",
-    "MOTION_SPEED",
-    "NATIVE_SIZE",
-    "Drawing",
-    "draw",
-    "list_kinds",
-    "scale_to_mean",
-]

@@ -20,7 +20,7 @@ import torch
 
 from ae_env.scenes.colour import camera_from_srgb
 from ae_env.scenes.procedural import NATIVE_SIZE
-from ae_env.scenes.scene import Crop, Resize, Scene, mean_anchor
+from ae_env.scenes.scene import Scene, SceneRequest, mean_anchor
 from simulator.camera import CameraProfile
 from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
@@ -53,9 +53,8 @@ def read_radiance(path: str | Path) -> np.ndarray:
     Raises:
         FileNotFoundError: If there is no such file.
         ImportError: If the extra ``hdr`` is not installed.
-        ValueError: If the file cannot be read, is empty of light or is neither kind, or claims more
-            pixels than `simulator.utils.files.MAX_PIXELS`, or `MAX_RADIANCE_PIXELS_PER_BYTE` of them for
-            each byte of the file.
+        ValueError: If the file cannot be read, holds no light or is neither kind, or claims more
+            pixels than `simulator.utils.files` allows for a file of its length.
     """
     path = as_path(path)
     if not path.is_file():
@@ -74,14 +73,11 @@ def read_radiance(path: str | Path) -> np.ndarray:
 
 def radiance_scenes(
     path: str | Path,
-    camera: CameraProfile,
+    request: SceneRequest,
     *,
     name: str,
     group: str,
-    resolution: int | None = 64,
-    crop: Crop = "box",
     ev100: float | None = None,
-    resize: Resize = Scene.resized,
     **fields: Any,
 ) -> Iterator[Scene]:
     """The scenes of one radiance map, all in one source group.
@@ -92,14 +88,11 @@ def radiance_scenes(
 
     Args:
         path: The file.
-        camera: Whose colours the light is taken to.
+        request: Camera and size; without a resolution the views have 256 packed pixels a side.
         name: Prefix of the scene ids.
         group: Source group.
-        resolution: Packed pixels a side; None keeps 256.
-        crop: See `Scene.resized`.
         ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
             their relative brightness), if known; see `assumed_ev100`.
-        resize: Brings each view to `resolution`.
         **fields: Further arguments of `Scene.from_radiance`.
     """
     image = read_radiance(path)
@@ -111,23 +104,25 @@ def radiance_scenes(
         fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
     fields.setdefault("source", Path(path).name)
     if abs(width / height - 2.0) <= 0.01:
-        size = native_size(resolution)
+        size = native_size(request.resolution)
         views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
     else:
-        size = native_size(resolution, min(height, width))
+        size = native_size(request.resolution, min(height, width))
         views = [(name, _central_square(image, size, Path(path).name))]
     try:
-        levels = [_log2_level(view, camera) for _, view in views]
+        levels = [_log2_level(view, request.camera) for _, view in views]
     except ValueError as error:
         raise ValueError(f"radiance map {str(path)!r}: {error}") from error
     for (scene_id, view), level in zip(views, levels, strict=True):
         if ev100 is not None:  # one scale for the whole map: a darker view stays darker
             fields["ev100"] = ev100 + level - float(np.mean(levels))
         try:
-            scene = Scene.from_radiance(view, camera, scene_id=scene_id, group=group, **fields)
+            scene = Scene.from_radiance(
+                view, request.camera, scene_id=scene_id, group=group, **fields
+            )
         except ValueError as error:
             raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
-        yield resize(scene, resolution, crop)
+        yield request.sized(scene)
 
 
 def _near_one(image: np.ndarray) -> np.ndarray:
@@ -136,11 +131,11 @@ def _near_one(image: np.ndarray) -> np.ndarray:
     if abs(exponent) <= _USUAL_EXPONENT:
         return image
     with np.errstate(over="ignore", under="ignore"):
-        return np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100))
+        return np.asarray(np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100)))
 
 
 def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
-    """log2 of the exposure that a view asks for: its mean, clipped at white, against 0.12."""
+    """log2 of the mean of a view's green, clipped at white, relative to 0.12."""
     matrix, _ = camera_from_srgb(camera)
     green = torch.from_numpy(np.tensordot(matrix[1], view, axes=1))
     return -math.log2(mean_anchor(green))
@@ -199,7 +194,9 @@ def perspective(
     column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
     row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
     view = _bilinear(panorama, row, np.broadcast_to(column, row.shape))
-    return view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
+    return np.asarray(
+        view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
+    )
 
 
 def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -212,7 +209,7 @@ def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     x0 = x0 % width
     above = (1.0 - fx) * image[:, y0, x0] + fx * image[:, y0, x1]
     below = (1.0 - fx) * image[:, y1, x0] + fx * image[:, y1, x1]
-    return (1.0 - fy) * above + fy * below
+    return np.asarray((1.0 - fy) * above + fy * below)
 
 
 def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
@@ -225,7 +222,7 @@ def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
         )
     top, left = (height - k * size) // 2, (width - k * size) // 2
     square = image[:, top : top + k * size, left : left + k * size]
-    return square.reshape(3, size, k, size, k).mean(axis=(2, 4))
+    return np.asarray(square.reshape(3, size, k, size, k).mean(axis=(2, 4)))
 
 
 def _read_hdr(path: Path) -> np.ndarray:
@@ -235,7 +232,7 @@ def _read_hdr(path: Path) -> np.ndarray:
         raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
     content = path.read_bytes()
     _refuse_lies(path, *_hdr_size(content), len(content))
-    level = cv2.utils.logging.setLogLevel(0)  # what is wrong is said below, and only there
+    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
     try:
         flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
         image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None

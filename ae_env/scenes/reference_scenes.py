@@ -1,7 +1,7 @@
-"""Scenes for the reference camera: what the simulator is trained, validated and tested on.
+"""Scenes for the reference camera, on which the simulator is trained, validated and tested.
 
-Split by source group, fixed: procedural groups by their index, photographs and radiance maps by
-name. A group has all its views in one split, and a split stays what it is when `number` grows.
+The split by source group is fixed: procedural groups by their index, photographs and radiance maps
+by name. A group has all its views in one split, and the scenes of a split stay when `number` grows.
 """
 
 from __future__ import annotations
@@ -33,50 +33,11 @@ from ae_env.scenes.radiance import (
     read_radiance,
 )
 from ae_env.scenes.scene import Scene, reference_settings
+from ae_env.utils.checks import check_integer, check_word
 from simulator.camera import CameraProfile
-from simulator.reference.reference_camera import DRAPED, Lens, ReferenceScene
+from simulator.optics.thin_lens import Lens
+from simulator.reference.reference_camera import DRAPED, ReferenceScene
 from simulator.settings import incident_ev100
-
-
-# Real and procedural pictures draped over procedural depth.
-#
-# Dead leaves have texture everywhere; real pictures also have smooth surfaces with sharp edges, and a
-# map of defocus that was trained on leaves alone takes the smooth ones for blurred. A picture that is
-# in focus throughout, laid over a depth of its own, shows what defocus does to such surfaces.
-def draped_scenes(
-    scenes: Iterable[ReferenceScene], camera: CameraProfile, *, copies: int = 2, seed: int = 0
-) -> Iterator[ReferenceScene]:
-    """`copies` of each scene without depth, each over another depth, in its source group.
-
-    Photographs are left out: they have defocus of their own, and nobody knows how much.
-
-    Args:
-        scenes: What to drape; those with depth, and photographs, are passed over.
-        camera: Whose pixels blur is stated in.
-        copies: Depths per scene; every third has everything in focus.
-        seed: Of the depths.
-    """
-    number = 0
-    for given in scenes:
-        if given.depth is not None or given.kind == "photograph":
-            continue
-        scene = sharpened(given)
-        for copy in range(copies):
-            focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
-            number += 1
-            rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed, copy])
-            height, width = scene.light.shape[1:]
-            drawn = draw_depth(rng, max(height, width), focus)
-            blur = drawn.blur[:height, :width]
-            distance, depth = lens_and_depth(blur, drawn.far, packed_pitch(camera))
-            yield replace(
-                scene,
-                scene_id=f"{scene.scene_id}-draped-{copy}",
-                kind=DRAPED,
-                depth=torch.from_numpy(depth),
-                lens=Lens(FOCAL_LENGTH, distance),
-            )
-
 
 logger = logging.getLogger(__name__)
 
@@ -87,10 +48,11 @@ FIRST_INDEX = {"train": 0, "validation": 100_000, "test": 200_000}
 MOST_GROUPS = 100_000
 #: Every fourth procedural group has no depth: one of the bundled kinds, for noise and exposure.
 _FLAT_EVERY = 4
-#: What is in focus in the groups with depth, in turn: everything in a third of them.
+#: Focus of the groups with depth, in turn: a third of them have everything in focus.
 FOCUS_CYCLE = (
-    *("everything", "front", "back", "everything", "middle", "front", "everything", "back"),
-    "middle",
+    *("everything", "front", "back"),
+    *("everything", "middle", "front"),
+    *("everything", "back", "middle"),
 )
 #: The photograph of the bundled training split that validates.
 VALIDATION_PHOTOGRAPH = "coffee"
@@ -119,32 +81,28 @@ def reference_scenes(
     radiance: Path | None = None,
     seed: int = 0,
 ) -> list[ReferenceScene]:
-    """The scenes of `split`: procedural ones, photographs, views into radiance maps.
+    """The scenes of `split`: procedural ones, photographs, and views into radiance maps.
 
     Of the procedural groups three quarters have depth (`ae_env.scenes.depth`), a third of these
     with everything in focus; the rest are the bundled kinds, in turn. Nothing else has depth.
 
     Args:
         split: ``"train"``, ``"validation"`` or ``"test"``.
-        camera: Whose colours the light is taken to, and whose pixels blur is stated in.
+        camera: Camera in whose colours light is stated, and in whose pixels blur is.
         number: Procedural groups, one scene each, at most `MOST_GROUPS`; the first are the same
             whatever `number` is.
         size: Height and width [packed pixels]; photographs and views have at most 256.
         radiance: Folder under which the maps of `RADIANCE_MAPS` lie; those missing are left out,
             which is logged. None leaves all out.
-        seed: Of the procedural groups; part of their names.
+        seed: Seed of the procedural groups; part of their names.
 
     Raises:
         ValueError: If an argument is invalid.
     """
-    if split not in FIRST_INDEX:
-        raise ValueError(f"`split` (={split!r}) must be one of {list(FIRST_INDEX)}")
-    if not 0 <= number <= MOST_GROUPS:
-        raise ValueError(f"`number` (={number}) must be in [0, {MOST_GROUPS}]")
-    if size < 16:
-        raise ValueError(f"`size` (={size}) must be at least 16 packed pixels")
-    if seed < 0:
-        raise ValueError(f"`seed` (={seed}) must be at least 0")
+    check_word("split", split, tuple(FIRST_INDEX))
+    check_integer("number", number, 0, MOST_GROUPS)
+    check_integer("size", size, 16, more=" packed pixels")
+    check_integer("seed", seed, 0)
     scenes = [_procedural(camera, FIRST_INDEX[split], i, size, seed) for i in range(number)]
     for photograph in PHOTOGRAPHS:
         validates = photograph.name == VALIDATION_PHOTOGRAPH
@@ -154,19 +112,17 @@ def reference_scenes(
     if radiance is not None:
         for path in _maps(Path(radiance), RADIANCE_MAPS[split]):
             scenes += _radiance_views(path, camera, min(size, LARGEST_VIEW))
-    return [_as_tested(scene) for scene in scenes] if split == "test" else scenes
-
-
-def _as_tested(scene: ReferenceScene) -> ReferenceScene:
-    return scene if scene.depth is not None or scene.kind == "photograph" else sharpened(scene)
+    if split != "test":
+        return scenes
+    return [sharpened(s) if s.depth is None and s.kind != "photograph" else s for s in scenes]
 
 
 def sharpened(scene: ReferenceScene) -> ReferenceScene:
     """A scene without depth at half its size, box-averaged: sharp to the pixel.
 
     Radiance maps and the bundled kinds are softer than a lens in focus. Wherever defocus matters,
-    in tests and under `ae_env.scenes.reference_scenes`, "in focus" must mean sharp; elsewhere all pixels are
-    of use.
+    in the test split and in `draped_scenes`, "in focus" must mean sharp; elsewhere all pixels are
+    used.
     """
     height, width = (n // 2 * 2 for n in scene.light.shape[1:])
     tiles = scene.light[:, :height, :width].reshape(4, height // 2, 2, width // 2, 2)
@@ -177,8 +133,8 @@ def _procedural(
     camera: CameraProfile, first: int, position: int, size: int, seed: int
 ) -> ReferenceScene:
     """The scene at `position` of the split that begins at index `first`."""
-    block, place = divmod(position, _FLAT_EVERY)
-    flat = place == _FLAT_EVERY - 1
+    block, within = divmod(position, _FLAT_EVERY)
+    flat = within == _FLAT_EVERY - 1
     kinds = list_kinds()
     kind = kinds[block % len(kinds)] if flat else "depth"
     rng = np.random.default_rng([zlib.crc32(b"reference"), seed, first + position])
@@ -186,7 +142,7 @@ def _procedural(
     if flat:
         drawing = draw(kind, rng, 2 * size)  # halved below: as sharp as the scenes with depth
     else:
-        focus = FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + place) % len(FOCUS_CYCLE)]
+        focus = FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
         drawn = draw_depth(rng, size, focus)
         drawing = drawn.drawing
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
@@ -249,6 +205,47 @@ def packed_pitch(camera: CameraProfile) -> float:
             f"`pixel_pitch_um` (=None) of camera {camera.name!r} must be known where there is depth"
         )
     return 2e-6 * camera.pixel_pitch_um
+
+
+# -- pictures draped over depth -------------------------------------------------------------------
+
+
+def draped_scenes(
+    scenes: Iterable[ReferenceScene], camera: CameraProfile, *, copies: int = 2, seed: int = 0
+) -> Iterator[ReferenceScene]:
+    """Scenes without depth laid over procedural depth, `copies` of each, in its source group.
+
+    Dead leaves have texture everywhere; real pictures also have smooth surfaces with sharp edges,
+    and a network that learns the map of defocus from leaves alone takes the smooth ones for
+    blurred. A picture that is in focus throughout, laid over depth, shows what defocus does to such
+    surfaces. Photographs are left out, because they have an unknown defocus already.
+
+    Args:
+        scenes: Scenes to drape; those with depth, and photographs, are passed over.
+        camera: Camera in whose pixels blur is stated.
+        copies: Depths per scene; every third has everything in focus.
+        seed: Seed of the depths.
+    """
+    number = 0
+    for given in scenes:
+        if given.depth is not None or given.kind == "photograph":
+            continue
+        scene = sharpened(given)
+        for copy in range(copies):
+            focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
+            number += 1
+            rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed, copy])
+            height, width = scene.light.shape[1:]
+            drawn = draw_depth(rng, max(height, width), focus)
+            blur = drawn.blur[:height, :width]
+            distance, depth = lens_and_depth(blur, drawn.far, packed_pitch(camera))
+            yield replace(
+                scene,
+                scene_id=f"{scene.scene_id}-draped-{copy}",
+                kind=DRAPED,
+                depth=torch.from_numpy(depth),
+                lens=Lens(FOCAL_LENGTH, distance),
+            )
 
 
 # -- radiance maps --------------------------------------------------------------------------------
@@ -332,7 +329,7 @@ def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> lis
     6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is the larger).
 
     Args:
-        camera: Whose colours the light is taken to, and whose pixels blur is stated in.
+        camera: Camera in whose colours light is stated, and in whose pixels blur is.
         data: Folder that holds ``depth_cones``; without it only ``stereo_motorcycle``, which is
             inside scikit-image's wheel.
     """
@@ -351,8 +348,13 @@ def _motorcycle() -> _DepthPhotograph:
         disparity = arrays["arr_0"]
     # Calibration as scikit-image states it: z = baseline * focal length / (disparity + offset).
     return _DepthPhotograph(
-        *("motorcycle", image, disparity, 1.0 / (0.193001 * 994.978), 31.086, 500.0),
-        "scikit-image stereo_motorcycle (Middlebury 2014); 500 lux assumed",
+        name="motorcycle",
+        image=image,
+        disparity=disparity,
+        dioptres_per_pixel=1.0 / (0.193001 * 994.978),
+        offset=31.086,
+        illuminance=500.0,
+        source="scikit-image stereo_motorcycle (Middlebury 2014); 500 lux assumed",
     )
 
 
@@ -362,9 +364,13 @@ def _cones(folder: Path) -> _DepthPhotograph:
     # 0 is "no data". The 2003 sets come without calibration: that of Middlebury's 2006 sets (focal
     # length 3740 pixels at full size, baseline 0.16 m) is assumed, at a quarter of the size.
     return _DepthPhotograph(
-        *("cones", image, np.where(disparity > 0, disparity, np.nan)),
-        *(1.0 / (0.16 * 3740.0 / 4.0), 0.0, 500.0),
-        "Middlebury 2003 Cones; calibration of the 2006 set and 500 lux assumed",
+        name="cones",
+        image=image,
+        disparity=np.where(disparity > 0, disparity, np.nan),
+        dioptres_per_pixel=1.0 / (0.16 * 3740.0 / 4.0),
+        offset=0.0,
+        illuminance=500.0,
+        source="Middlebury 2003 Cones; calibration of the 2006 set and 500 lux assumed",
     )
 
 
@@ -406,7 +412,7 @@ def fill_from_nearest(values: np.ndarray) -> np.ndarray:
     if not known.any():
         raise ValueError("`values` must have a finite value")
     indices = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return values[tuple(indices)]
+    return np.asarray(values[tuple(indices)])
 
 
 def _tiles(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A scene: light at known settings, the noise left in it, and what is known about it."""
+"""`Scene`: light at known settings, the noise left in it, and facts such as the illuminance."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from simulator.raw.image import RawImage, check_packed
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
 
-# The scale that a scene's light is on, and the settings that it belongs to.
+# -- the scale of a scene's light -----------------------------------------------------------------
+
 #: Signal of a perfectly white diffuse surface at the incident-light exposure, ``x = 0.663 * R``.
 #: Luminance R E / pi in ISO 12232's ``x = 100 L t / (120 N^2)`` with ``E = 2.5 * 2**EV100``.
 WHITE_SIGNAL = 100.0 * LUX_AT_EV0 / (SATURATION_CONSTANT * math.pi)
 #: Mean of green, clipped at white, that a scene of unknown light is anchored to.
 MEAN_SIGNAL = 0.12
-#: f-number and ISO of the reference settings made here; the exposure time carries the EV.
+#: ISO and f-number of the reference settings made here; the exposure time follows from the EV.
 _REFERENCE_ISO, _REFERENCE_F_NUMBER = 100.0, 4.0
 
 
@@ -47,19 +48,20 @@ def mean_anchor(green: torch.Tensor) -> float:
     Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
     """
     values = green.double().clamp(min=0.0).flatten()
-    if float((values > 0).double().mean()) <= MEAN_SIGNAL:
+    lit = float((values > 0).double().mean())
+    if lit <= MEAN_SIGNAL:
         raise ValueError(
-            f"`light` is 0 in all but {float((values > 0).double().mean()):.1%} of its pixels: no "
-            f"exposure brings its mean to {MEAN_SIGNAL}; give `illuminance`"
+            f"`light` is 0 in all but {lit:.1%} of its pixels: no exposure brings its mean to "
+            f"{MEAN_SIGNAL}; give `illuminance`"
         )
-    low, high = -40.0, 40.0  # log2 of the factor
+    low, high = -40.0, 40.0  # log2 of the factor, found by bisection
     for _ in range(60):
         middle = 0.5 * (low + high)
         if float((values * 2.0**middle).clamp_(max=1.0).mean()) < MEAN_SIGNAL:
             low = middle
         else:
             high = middle
-    return 2.0 ** (0.5 * (low + high))
+    return float(2.0 ** (0.5 * (low + high)))
 
 
 #: EV100 of a radiance map of unknown scale, unless the caller knows better.
@@ -74,7 +76,7 @@ Resize = Callable[["Scene", int | None, Crop], "Scene"]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a camera looks at, as the raw it would record at reference settings without clipping.
+    """The light before a camera, as the raw it would record at reference settings, not clipped.
 
     Args:
         scene_id: Unique and stable, such as ``"snow-012"``.
@@ -84,12 +86,12 @@ class Scene:
             white; not clipped, so lamps exceed 1. At least 0 where noise-free.
         reference: Settings at which `light` is. With `illuminance` known, an 18 % grey card under
             it has 0.119 of white in green there.
-        camera: In whose colour space `light` is.
+        camera: Camera in whose colour space `light` is.
         nlf: Noise left in `light` at `reference`, per pixel of `light`; zero if noise-free.
-        illuminance: Light that falls on the subject [lux], what an incident-light meter held at
-            the subject reads; None where unknown.
+        illuminance: Light that falls on the subject [lux], as an incident-light meter reads it
+            there; None where unknown.
         white_balance: Gains of R, G, B that make a grey card grey.
-        kind: What sort of scene, such as ``"snow"``.
+        kind: Sort of scene, such as ``"snow"``.
         hard: Whether it belongs to the hard part (back light, snow, night, spot light, motion).
         median_speed: Median image speed of a moving episode [frame heights / s].
         box_factor: Sensor pixels averaged per side into one pixel of `light`.
@@ -99,7 +101,9 @@ class Scene:
         denoised: (4, H, W) `light` with its noise removed by a noise module; None where there is
             no noise, or no such module.
         defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
-            scene whose own defocus is to grow as the aperture opens; None takes it as far.
+            scene whose own defocus is to grow as the aperture opens; None where all is far.
+        allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
+            them; None for every state of any grid.
 
     Raises:
         ValueError: If a value has the wrong shape or lies outside its range.
@@ -121,6 +125,7 @@ class Scene:
     saturated: torch.Tensor | None = None
     denoised: torch.Tensor | None = None
     defocus_map: torch.Tensor | None = None
+    allowed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("scene_id", "group", "kind"):
@@ -128,7 +133,7 @@ class Scene:
                 raise ValueError(f"`{name}` (={getattr(self, name)!r}) must be a non-empty string")
         object.__setattr__(self, "light", check_packed("light", self.light).contiguous())
         if self.illuminance is not None:
-            incident_ev100(self.illuminance)  # refuses what is not positive and finite
+            incident_ev100(self.illuminance)  # raises unless it is positive and finite
         gains = tuple(float(gain) for gain in self.white_balance)
         if len(gains) != 3 or not all(math.isfinite(gain) and gain > 0 for gain in gains):
             raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
@@ -139,6 +144,14 @@ class Scene:
             raise ValueError(f"`box_factor` (={self.box_factor}) must be at least 1")
         self._check_saturated()
         self._check_networks()
+        if self.allowed is not None:
+            allowed = np.asarray(self.allowed)
+            if allowed.dtype != np.bool_ or allowed.ndim != 1 or not allowed.any():
+                raise ValueError(
+                    f"`allowed` ({allowed.dtype}, shape {allowed.shape}) must be bool of shape "
+                    "(S,) with at least one state that is allowed"
+                )
+            object.__setattr__(self, "allowed", allowed)
 
     def _check_saturated(self) -> None:
         mask = self.saturated
@@ -201,14 +214,13 @@ class Scene:
 
     @cached_property
     def content(self) -> str:
-        """Digest of the scene's light and of what networks found out about it."""
-        found = {"denoised": self.denoised, "defocus_map": self.defocus_map}
-        given = {name: tensor for name, tensor in found.items() if tensor is not None}
-        return content_digest({"light": self.light, **given})
+        """Digest of the light, and of the networks' results for it."""
+        tensors = {"light": self.light, "denoised": self.denoised, "defocus_map": self.defocus_map}
+        return content_digest({name: t for name, t in tensors.items() if t is not None})
 
     @cached_property
     def _statistics(self) -> LightStatistics:
-        return LightStatistics(self.light)  # computes nothing before it is asked
+        return LightStatistics(self.light)  # computes each value when it is first asked for
 
     def own_blur(self, f_number: float) -> float:
         """Root mean square of the scene's own circle of confusion at `f_number` [pixel].
@@ -254,18 +266,18 @@ class Scene:
         kind: str = "array",
         **fields: Any,
     ) -> Scene:
-        """A scene from a packed raw of one's own.
+        """A scene from a packed raw in an array.
 
         Args:
             packed: (4, H, W) float, planes R, G1, G2, B; 1.0 at sensor white, may exceed it.
             reference: Settings at which `packed` is.
-            camera: In whose colour space it is.
+            camera: Camera in whose colour space it is.
             scene_id: Unique name.
             group: Source group; `scene_id` by default.
             nlf: Noise left in `packed`; none by default.
             illuminance: Light on the subject [lux], if known.
             white_balance: Gains of R, G, B.
-            kind: What sort of scene.
+            kind: Sort of scene.
             **fields: Further fields of `Scene`.
         """
         return cls(
@@ -299,7 +311,7 @@ class Scene:
             scene_id: Unique name.
             group: Source group; `scene_id` by default.
             illuminance: Light on the subject [lux], if it was measured.
-            kind: What sort of scene.
+            kind: Sort of scene.
             **fields: Further fields of `Scene`.
 
         Raises:
@@ -348,7 +360,7 @@ class Scene:
                 at white, is set to 0.12.
             illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`; decides the white
                 balance.
-            kind: What sort of scene.
+            kind: Sort of scene.
             **fields: Further fields of `Scene`.
         """
         image = check_rgb(rgb)
@@ -430,3 +442,26 @@ class Scene:
         _, height, width = self.light.shape
         light = "unknown light" if self.illuminance is None else f"{self.illuminance:.4g} lux"
         return f"Scene({self.scene_id!r}, {self.kind}, {height} x {width} packed, {light})"
+
+
+@dataclass(frozen=True)
+class SceneRequest:
+    """The split, the camera and the size that scenes are loaded for.
+
+    Args:
+        split: ``"train"``, ``"test"`` or ``"all"``.
+        camera: Camera in whose colours light is stated, unless a raw brings its own.
+        resolution: Packed pixels a side; None keeps each scene's own size.
+        crop: See `Scene.resized`.
+        resize: Brings each scene to `resolution`, as `Scene.resized` does.
+    """
+
+    split: str
+    camera: CameraProfile
+    resolution: int | None = 64
+    crop: Crop = "box"
+    resize: Resize = Scene.resized
+
+    def sized(self, scene: Scene) -> Scene:
+        """`scene` at the resolution asked for."""
+        return self.resize(scene, self.resolution, self.crop)

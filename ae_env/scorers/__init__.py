@@ -1,4 +1,4 @@
-"""Image-quality scorers: what a capture is worth."""
+"""Image-quality scorers, which rate captures between 0 and 1."""
 
 from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.protocol import Captures, Scorer

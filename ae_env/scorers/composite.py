@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
@@ -19,118 +18,20 @@ from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpne
 from ae_env.utils.checks import UserCodeError
 from simulator.raw.develop import develop
 
-# Calling one scorer, which may be the user's own: it may raise, return rubbish, or hang.
 logger = logging.getLogger(__name__)
 
-#: A scorer that takes longer than this for one batch is told of, once [s].
+#: A user's scorer that takes longer than this for one batch is named in the log, once [s].
 SLOW_SECONDS = 5.0
 #: Scores may be this far outside [0, 1] by rounding.
 ROUNDING = 1e-6
-#: Names of the scorers that have been called in this process, and of those found to be slow.
-_called: set[str] = set()
+#: Names of the scorers that were found to be slow in this process.
 _slow: set[str] = set()
 
 
-def scores_of(
-    name: str, scorer: Scorer, images: torch.Tensor | None, captures: Captures
-) -> torch.Tensor:
-    """Scores (B,) float64 in [0, 1] of one scorer.
-
-    Args:
-        name: What errors call it.
-        scorer: The scorer.
-        images: (B, C, H, W), or None where it has a closed form.
-        captures: What they come from, B of them.
-
-    Raises:
-        UserCodeError: If it raises (the cause is chained), returns something else than B numbers in
-            [0, 1], or changes `captures`.
-    """
-    if not is_own(scorer):
-        return _checked(name, scorer(images, captures), len(captures))
-    before = _versions(captures)
-    try:
-        scores: Any = _watched(name, scorer, images, captures)
-    except Exception as error:
-        raise UserCodeError(f"scorer {name!r} raised {type(error).__name__}: {error}") from error
-    if _versions(captures) != before:
-        raise UserCodeError(
-            f"scorer {name!r} changed its `captures` in place: it must work on copies, as others "
-            "are scored from them, too"
-        )
-    return _checked(name, scores, len(captures))
-
-
-def is_own(scorer: Any) -> bool:
-    """Whether `scorer`, or a part of it, comes from outside of this package."""
-    if not type(scorer).__module__.startswith("ae_env."):
-        return True
-    return any(is_own(part) for part in getattr(scorer, "parts", {}).values())
-
-
-def describe_range(values: Any) -> str:
-    """For messages, what was returned that is not all in [0, 1].
-
-    Args:
-        values: An array or a tensor.
-    """
-    if bool((values != values).any()):
-        return "NaN"
-    return f"scores from {float(values.min())} to {float(values.max())}"
-
-
-def _versions(captures: Captures) -> dict[str, int]:
-    """Numbers that torch counts up as tensors are written to, views of them included.
-
-    By name of the field or property; those that are 0 are left out, as are properties that nobody
-    has asked for yet.
-    """
-    tensors = {name: value for name, value in vars(captures).items() if torch.is_tensor(value)}
-    counted = {name: t._version for name, t in tensors.items() if not t.is_inference()}
-    return {name: version for name, version in counted.items() if version}
-
-
-def _watched(
-    name: str, scorer: Scorer, images: torch.Tensor | None, captures: Captures
-) -> torch.Tensor:
-    """Calls `scorer`; says, once, if it is slow: in its first batch while it runs."""
-    if name not in _called:
-        _called.add(name)
-        timer = threading.Timer(SLOW_SECONDS, _tell, (name,))
-        timer.daemon = True
-        timer.start()
-        try:
-            return scorer(images, captures)
-        finally:
-            timer.cancel()
-    begin = time.perf_counter()
-    scores = scorer(images, captures)
-    if time.perf_counter() - begin > SLOW_SECONDS:
-        _tell(name)
-    return scores
-
-
-def _tell(name: str) -> None:
-    if name not in _slow:
-        _slow.add(name)
-        logger.warning("scorer %r takes more than %g s for one batch", name, SLOW_SECONDS)
-
-
-def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
-    if not isinstance(scores, torch.Tensor) or scores.shape != (count,) or scores.is_complex():
-        what = type(scores).__name__
-        if isinstance(scores, torch.Tensor):
-            what = f"{tuple(scores.shape)} {scores.dtype}"
-        raise UserCodeError(f"scorer {name!r} returned {what}: it must return a tensor ({count},)")
-    scores = scores.detach().to("cpu", torch.float64)
-    if not bool(((scores >= -ROUNDING) & (scores <= 1 + ROUNDING)).all()):
-        raise UserCodeError(f"scorer {name!r} returned {describe_range(scores)}: rule is [0, 1]")
-    return scores.clamp(0.0, 1.0)
-
-
 def depends_on(scorer: Scorer) -> DependsOn:
-    """What `scorer` varies with; ``"image"`` unless it says otherwise."""
-    return getattr(scorer, "depends_on", "image")
+    """The `DependsOn` of `scorer`; ``"image"`` unless it says otherwise."""
+    found: DependsOn = getattr(scorer, "depends_on", "image")
+    return found
 
 
 class CompositeScorer:
@@ -168,7 +69,7 @@ class CompositeScorer:
 
     @property
     def depends_on(self) -> DependsOn:
-        """What the whole varies with, as a part of another scorer."""
+        """The `DependsOn` of the whole, as a part of another scorer."""
         if not self.closed_form:
             return "image"
         return "blur" if self.names("blur") else "light"
@@ -184,7 +85,8 @@ class CompositeScorer:
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,) of raw `images` (B, 4, H, W) in [0, 1]."""
-        return self.combine(self.score_parts(images, captures))
+        scores: torch.Tensor = self.combine(self.score_parts(images, captures))
+        return scores
 
     def score_parts(
         self,
@@ -210,28 +112,26 @@ class CompositeScorer:
                         gains, matrices = captures.white_balance, captures.colour_matrices
                         srgb = developed(images, gains, matrices)
                     view = srgb
-                if (
-                    len(self.names("image")) > 1
-                ):  # what one does to its images is not seen by the others
-                    view = view.clone()
+                if len(self.names("image")) > 1:
+                    view = view.clone()  # a part may write to its images
             scores[name] = scores_of(name, part, view, captures)
         return scores
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
         total: Any = sum(weight * scores[name] for name, weight in self.weights.items())
-        # Rounding.
+        # Rounding may leave [0, 1].
         return total.clip(0.0, 1.0) if torch.is_tensor(total) else np.clip(total, 0.0, 1.0)
 
     def totals(self, scores: Mapping[str, np.ndarray]) -> np.ndarray:
-        """`combine` of arrays of any one shape, checked: a class of the user's own may override it.
+        """`combine` of arrays of any one shape, checked, because a user's class may override it.
 
         Raises:
             UserCodeError: If a total is not in [0, 1].
         """
         totals = np.asarray(self.combine(scores), np.float64)
         if not ((totals >= -ROUNDING) & (totals <= 1.0 + ROUNDING)).all():
-            found = describe_range(totals)
+            found = _describe_range(totals)
             raise UserCodeError(
                 f"scorer {type(self).__name__!r}: `combine` returned {found}: rule is [0, 1]"
             )
@@ -247,27 +147,23 @@ class Balanced(CompositeScorer):
     """
 
     def __init__(self) -> None:
-        parts: dict[str, Scorer] = {
-            "brightness": Brightness(),
-            "highlights": Highlights(),
-            "shadows": Shadows(),
-            "noise": Noise(),
-            "sharpness": Sharpness(),
+        weighted: dict[str, tuple[Scorer, float]] = {
+            "brightness": (Brightness(), 0.30),
+            "highlights": (Highlights(), 0.15),
+            "shadows": (Shadows(), 0.10),
+            "noise": (Noise(), 0.20),
+            "sharpness": (Sharpness(), 0.25),
         }
-        weights = {
-            "brightness": 0.30,
-            "highlights": 0.15,
-            "shadows": 0.10,
-            "noise": 0.20,
-            "sharpness": 0.25,
-        }
-        super().__init__(parts, weights)
+        super().__init__(
+            {name: part for name, (part, _) in weighted.items()},
+            {name: weight for name, (_, weight) in weighted.items()},
+        )
 
     def combine(self, scores: Mapping[str, Any]) -> Any:
         """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
         blown = -Highlights.scale * _log(scores["highlights"])
         blocked = -Shadows.scale * _log(scores["shadows"])
-        # A share of 1 may be rounded up.
+        # Rounding may leave a share above 1.
         score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
         for name, weight in self.weights.items():
             score = score * scores[name] ** weight
@@ -291,7 +187,7 @@ def developed(
 
 
 def _log(values: Any) -> Any:
-    """Of arrays by numpy: torch may use threads for it, which a forked process does not have."""
+    """Natural logarithm; of arrays by NumPy, as torch's threads do not survive a fork."""
     return values.log() if torch.is_tensor(values) else np.log(values)
 
 
@@ -307,3 +203,76 @@ def _check_part(name: str, part: Any) -> None:
             *others, last = map(repr, known)
             rule = f"{', '.join(others)} or {last}"
             raise ValueError(f"scorer {name!r} has `{attribute}` (={value!r}); it must be {rule}")
+
+
+# -- calling one scorer, which may be the user's own ----------------------------------------------
+
+
+def scores_of(
+    name: str, scorer: Scorer, images: torch.Tensor | None, captures: Captures
+) -> torch.Tensor:
+    """Scores (B,) float64 in [0, 1] of one scorer.
+
+    Args:
+        name: Name of the scorer in errors.
+        scorer: The scorer.
+        images: (B, C, H, W), or None where it has a closed form.
+        captures: The B captures that the images come from.
+
+    Raises:
+        UserCodeError: If it raises (the cause is chained), returns anything but B numbers in
+            [0, 1], or changes `captures`.
+    """
+    if not is_own(scorer):
+        return _checked(name, scorer(images, captures), len(captures))
+    before, begin = _versions(captures), time.perf_counter()
+    try:
+        scores = scorer(images, captures)
+    except Exception as error:
+        raise UserCodeError(f"scorer {name!r} raised {type(error).__name__}: {error}") from error
+    if time.perf_counter() - begin > SLOW_SECONDS and name not in _slow:
+        _slow.add(name)
+        logger.warning("scorer %r takes more than %g s for one batch", name, SLOW_SECONDS)
+    if _versions(captures) != before:
+        raise UserCodeError(
+            f"scorer {name!r} changed its `captures` in place: it must work on copies, because "
+            "other scorers get the same ones"
+        )
+    return _checked(name, scores, len(captures))
+
+
+def is_own(scorer: Any) -> bool:
+    """Whether `scorer`, or a part of it, comes from outside of this package."""
+    if not type(scorer).__module__.startswith("ae_env."):
+        return True
+    return any(is_own(part) for part in getattr(scorer, "parts", {}).values())
+
+
+def _versions(captures: Captures) -> dict[str, int]:
+    """The counts of writes that torch keeps for each tensor of `captures`, views included.
+
+    Zero counts are left out, as are properties that have not been computed yet.
+    """
+    tensors = {name: value for name, value in vars(captures).items() if torch.is_tensor(value)}
+    counted = {name: t._version for name, t in tensors.items() if not t.is_inference()}
+    return {name: version for name, version in counted.items() if version}
+
+
+def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
+    """`scores` on the CPU as float64, clipped to [0, 1] where rounding left it."""
+    if not isinstance(scores, torch.Tensor) or scores.shape != (count,) or scores.is_complex():
+        found = type(scores).__name__
+        if isinstance(scores, torch.Tensor):
+            found = f"{tuple(scores.shape)} {scores.dtype}"
+        raise UserCodeError(f"scorer {name!r} returned {found}: it must return a tensor ({count},)")
+    found64: torch.Tensor = scores.detach().to("cpu", torch.float64)
+    if not bool(((found64 >= -ROUNDING) & (found64 <= 1 + ROUNDING)).all()):
+        raise UserCodeError(f"scorer {name!r} returned {_describe_range(found64)}: rule is [0, 1]")
+    return found64.clamp(0.0, 1.0)
+
+
+def _describe_range(values: Any) -> str:
+    """The range of an array or a tensor, for messages."""
+    if bool((values != values).any()):
+        return "NaN"
+    return f"scores from {float(values.min())} to {float(values.max())}"

@@ -3,8 +3,8 @@
 The defects, and that saturation has a sign, are those of N. Yu, X. Shen, Z. Lin, R. Mech and
 C. Barnes, "Learning to detect multiple photographic defects", WACV 2018 (without bad composition),
 who trained a network on people's labels. These measures are no such network: each is one number of
-the picture (`ae_env.scorers.defects`) and a monotone map to the severity that was rendered,
-fitted on bundled training scenes. How far to trust them: docs/results/defects.md.
+the picture, its sign, and a monotone map from the sign to the severity that was rendered, fitted on
+bundled training scenes. How far to trust them: docs/results/defects.md.
 """
 
 from __future__ import annotations
@@ -15,16 +15,15 @@ from typing import Any
 import torch
 from torch.nn.functional import avg_pool2d, pad
 
-from ae_env.scorers import defects as defect_signs
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.detail import immerkaer_sigma
 from ae_env.scorers.luma import by_parts, luma_of, luminance_of, srgb_decode
 from ae_env.scorers.protocol import Captures, Domain
 
-# What photographic defects leave in a picture: one number each, before it becomes a severity.
-#
-# All take gamma-encoded sRGB pictures (B, 3, H, W) in [0, 1] and return (B,) float64. Each grows with
-# its defect, but also differs from scene to scene.
+# -- signs: one number of the picture for each defect ---------------------------------------------
+# All take gamma-encoded sRGB pictures (B, 3, H, W) in [0, 1] and return (B,) float64. Each grows
+# with its defect, but also differs from scene to scene.
+
 #: Luma above this is white.
 WHITE = 0.98
 #: Linear light below this has no colour worth the name.
@@ -84,8 +83,8 @@ def colourfulness(images: torch.Tensor) -> torch.Tensor:
 def veil(images: torch.Tensor) -> torch.Tensor:
     """Light in the darkest pixels relative to the mean: the 2nd percentile of min(R, G, B) over Y.
 
-    Linear light. Without haze a picture has some pixels that are dark in one of the channels; what
-    they show is airlight.
+    Linear light. Without haze a picture has some pixels that are dark in one of the channels; their
+    light is airlight.
 
     Source: the dark channel prior of K. He, J. Sun, X. Tang, "Single image haze removal using dark
     channel prior", CVPR 2009, without patches.
@@ -114,9 +113,8 @@ def _row_blur(luma: torch.Tensor) -> torch.Tensor:
         return luma.new_zeros(len(luma), dtype=torch.float64)
 
     def sums(part: torch.Tensor) -> torch.Tensor:
-        wide = avg_pool2d(pad(part[:, None], (4, 4, 0, 0), mode="replicate"), (1, 9), stride=1)[
-            :, 0
-        ]
+        padded = pad(part[:, None], (4, 4, 0, 0), mode="replicate")
+        wide = avg_pool2d(padded, (1, 9), stride=1)[:, 0]
         sharp, blurred = part.diff(dim=2).abs_(), wide.diff(dim=2).abs_()
         lost = (sharp - blurred).clamp_(min=0.0)
         total = [x.sum(dim=(1, 2), dtype=torch.float64) for x in (lost, sharp)]
@@ -132,98 +130,58 @@ def percentile(rows: torch.Tensor, share: float) -> torch.Tensor:
     return rows.kthvalue(rank, dim=1).values.double()
 
 
-#: Knots (sign, severity) of the fitted maps, straight in between and constant beyond. Written by
+# -- severities: signs mapped to [0, 1] -----------------------------------------------------------
+
+#: Fitted maps: signs, and the severity at each; linear in between, constant beyond. Fitted by
 #: ``ae-env bench defects``, which prints them, on 128 x 128 renderings of bundled training scenes.
-KNOTS: dict[str, tuple[tuple[float, float], ...]] = {
+_MAPS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "over_exposure": (
-        (0.0, 0.0111),
-        (0.0004, 0.0392),
-        (0.0031, 0.0392),
-        (0.0127, 0.4866),
-        (0.1282, 0.4902),
-        (0.518, 0.5205),
-        (1.0, 0.8544),
+        (0.0, 0.0004, 0.0031, 0.0127, 0.1282, 0.518, 1.0),
+        (0.0111, 0.0392, 0.0392, 0.4866, 0.4902, 0.5205, 0.8544),
     ),
     "under_exposure": (
-        (0.0, 0.027),
-        (0.1727, 0.1067),
-        (0.3547, 0.1899),
-        (0.5365, 0.415),
-        (0.6893, 0.7127),
-        (0.932, 1.0),
+        (0.0, 0.1727, 0.3547, 0.5365, 0.6893, 0.932),
+        (0.027, 0.1067, 0.1899, 0.415, 0.7127, 1.0),
     ),
     "noise": (
-        (0.451, 0.0),
-        (3.1809, 0.0839),
-        (5.0546, 0.2325),
-        (7.2884, 0.4034),
-        (9.3885, 0.5752),
-        (11.5756, 0.6436),
-        (14.3352, 0.7442),
-        (17.5641, 0.8384),
-        (24.4357, 1.0),
+        (0.451, 3.1809, 5.0546, 7.2884, 9.3885, 11.5756, 14.3352, 17.5641, 24.4357),
+        (0.0, 0.0839, 0.2325, 0.4034, 0.5752, 0.6436, 0.7442, 0.8384, 1.0),
     ),
     "white_balance": (
-        (0.0, 0.1062),
-        (0.2147, 0.1062),
-        (0.4682, 0.2175),
-        (0.7693, 0.3704),
-        (1.0715, 0.521),
-        (1.425, 0.6421),
-        (1.8064, 0.764),
-        (2.3707, 0.8735),
-        (7.4135, 1.0),
+        (0.0, 0.2147, 0.4682, 0.7693, 1.0715, 1.425, 1.8064, 2.3707, 7.4135),
+        (0.1062, 0.1062, 0.2175, 0.3704, 0.521, 0.6421, 0.764, 0.8735, 1.0),
     ),
     "saturation": (
-        (0.0, -0.7655),
-        (1.7307, -0.7491),
-        (4.3428, -0.3677),
-        (6.9906, -0.0639),
-        (10.0612, 0.1381),
-        (13.9106, 0.2304),
-        (19.5304, 0.3291),
-        (28.9142, 0.5512),
-        (125.7316, 1.0),
+        (0.0, 1.7307, 4.3428, 6.9906, 10.0612, 13.9106, 19.5304, 28.9142, 125.7316),
+        (-0.7655, -0.7491, -0.3677, -0.0639, 0.1381, 0.2304, 0.3291, 0.5512, 1.0),
     ),
     "haze": (
-        (0.0003, 0.0),
-        (0.2808, 0.0866),
-        (0.4464, 0.2576),
-        (0.5758, 0.3879),
-        (0.6847, 0.5399),
-        (0.767, 0.6529),
-        (0.8346, 0.7574),
-        (0.8989, 0.8592),
-        (0.9882, 0.9136),
+        (0.0003, 0.2808, 0.4464, 0.5758, 0.6847, 0.767, 0.8346, 0.8989, 0.9882),
+        (0.0, 0.0866, 0.2576, 0.3879, 0.5399, 0.6529, 0.7574, 0.8592, 0.9136),
     ),
     "blur": (
-        (0.1892, 0.0074),
-        (0.2799, 0.1337),
-        (0.3263, 0.2171),
-        (0.3758, 0.3505),
-        (0.432, 0.5291),
-        (0.4878, 0.6752),
-        (0.5444, 0.7796),
-        (0.6124, 0.8314),
-        (0.8107, 0.9583),
+        (0.1892, 0.2799, 0.3263, 0.3758, 0.432, 0.4878, 0.5444, 0.6124, 0.8107),
+        (0.0074, 0.1337, 0.2171, 0.3505, 0.5291, 0.6752, 0.7796, 0.8314, 0.9583),
     ),
 }
-#: What each map is of.
+#: Knots (sign, severity) of each map.
+KNOTS = {name: tuple(zip(*values, strict=True)) for name, values in _MAPS.items()}
+#: Sign that each map takes.
 SIGNS: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
-    "over_exposure": defect_signs.white_share,
-    "under_exposure": defect_signs.missing_highlights,
-    "noise": defect_signs.noise_sigma,
-    "white_balance": defect_signs.colour_cast,
-    "saturation": defect_signs.colourfulness,
-    "haze": defect_signs.veil,
-    "blur": defect_signs.blur_effect,
+    "over_exposure": white_share,
+    "under_exposure": missing_highlights,
+    "noise": noise_sigma,
+    "white_balance": colour_cast,
+    "saturation": colourfulness,
+    "haze": veil,
+    "blur": blur_effect,
 }
 #: The defects whose severity is estimated.
 DEFECTS = ("exposure", "noise", "white_balance", "saturation", "haze", "blur")
 
 
 def severity(defect: str, images: torch.Tensor) -> torch.Tensor:
-    """Estimated severity (B,) float64 of a defect; what 1 stands for is in each scorer's docstring.
+    """Estimated severity (B,) float64 of a defect; each scorer's docstring says what 1 stands for.
 
     Args:
         defect: One of `DEFECTS`.
@@ -241,95 +199,84 @@ def severity(defect: str, images: torch.Tensor) -> torch.Tensor:
 
 def mapped(name: str, sign: torch.Tensor) -> torch.Tensor:
     """Severity (B,) float64 by the map `name` of `KNOTS`, of signs (B,)."""
-    x, y = (torch.tensor(v, dtype=torch.float64) for v in zip(*KNOTS[name], strict=True))
-    x, y = x.to(sign.device), y.to(sign.device)
+    x, y = (torch.tensor(v, dtype=torch.float64, device=sign.device) for v in _MAPS[name])
     sign = sign.double().clamp(x[0], x[-1])
     right = torch.bucketize(sign, x).clamp_(1, len(x) - 1)
     share = (sign - x[right - 1]) / (x[right] - x[right - 1])
     return y[right - 1] + share * (y[right] - y[right - 1])
 
 
-class AnalyticExposure:
-    """1 - severity of wrong exposure, told from white pixels or missing highlights.
+# -- scorers --------------------------------------------------------------------------------------
+
+
+class _Analytic:
+    """1 - |severity| of one defect."""
+
+    domain: Domain = "srgb"
+    defect: str
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 - severity(self.defect, images).abs_()
+
+
+class AnalyticExposure(_Analytic):
+    """1 - severity of wrong exposure, from white pixels or missing highlights.
 
     The larger of two maps: of the share of the pixels whose luma is above 0.98, and of 1 minus the
     99th percentile of the luma. 1 stands for 4 EV too much or too little. Night without lamps looks
     under-exposed to it, snow and lamps over-exposed: `brightness` knows the light, this does not.
     """
 
-    domain: Domain = "srgb"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 - severity("exposure", images)
+    defect = "exposure"
 
 
-class AnalyticNoise:
-    """1 - severity of noise, told from Immerkaer's estimate on the luma.
+class AnalyticNoise(_Analytic):
+    """1 - severity of noise, from Immerkaer's estimate on the luma.
 
     1 stands for photon noise of half the signal of an 18 % card (4 photons a pixel). Fine texture
     counts as noise, blur hides it.
     """
 
-    domain: Domain = "srgb"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 - severity("noise", images)
+    defect = "noise"
 
 
-class AnalyticWhiteBalance:
-    """1 - severity of a wrong white balance, told from the median colour ratios.
+class AnalyticWhiteBalance(_Analytic):
+    """1 - severity of a wrong white balance, from the median colour ratios.
 
     1 stands for gains of red and blue that are each a stop off. A scene of one colour (grass, a
     sunset) looks off balance to it.
     """
 
-    domain: Domain = "srgb"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 - severity("white_balance", images)
+    defect = "white_balance"
 
 
-class AnalyticSaturation:
-    """1 - |severity| of weak or strong colours, told from Hasler and Suesstrunk's colourfulness.
+class AnalyticSaturation(_Analytic):
+    """1 - |severity| of weak or strong colours, from Hasler and Suesstrunk's colourfulness.
 
     -1 stands for a grey picture, 1 for twice the distance of every pixel from its luma.
     """
 
-    domain: Domain = "srgb"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 - severity("saturation", images).abs_()
+    defect = "saturation"
 
 
-class AnalyticHaze:
-    """1 - severity of haze, told from the light in the darkest pixels (dark channel).
+class AnalyticHaze(_Analytic):
+    """1 - severity of haze, from the light in the darkest pixels (dark channel).
 
     1 stands for a picture that is 80 % airlight. Pictures without dark pixels (snow, an even
     surface, over-exposure) look hazy to it.
     """
 
-    domain: Domain = "srgb"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 - severity("haze", images)
+    defect = "haze"
 
 
-class AnalyticBlur:
-    """1 - severity of blur, told from Crete's blur effect on the luma.
+class AnalyticBlur(_Analytic):
+    """1 - severity of blur, from Crete's blur effect on the luma.
 
     1 stands for a disc of 8 pixels of the frame. Noise hides blur; smooth scenes look blurred.
     """
 
-    domain: Domain = "srgb"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 - severity("blur", images)
+    defect = "blur"
 
 
 class Defects(CompositeScorer):

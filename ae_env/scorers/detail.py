@@ -1,4 +1,4 @@
-"""How much a picture shows: histogram entropy and the gradient metrics of auto-exposure papers.
+"""Detail and noise of a picture: entropy, the gradient metrics of auto-exposure papers, noise.
 
 The functions take luma (B, H, W) in [0, 1], gamma-encoded as in an 8-bit picture, and return (B,)
 float64 in the units of the papers, which are those of 8-bit grey levels. They read noise as detail:
@@ -16,78 +16,9 @@ from torch.nn.functional import adaptive_avg_pool2d, pad
 from ae_env.scorers.luma import SCHARR, SOBEL, check_luma, luma_of, squared_gradient
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
 
+# -- detail ---------------------------------------------------------------------------------------
 
-# How noisy a capture is: from its noise level function, and estimated from its picture.
-def immerkaer_response(luma: torch.Tensor) -> torch.Tensor:
-    """|I * N| (B, H, W), N = [1 -2 1; -2 4 -2; 1 -2 1], borders repeated; in units of `luma`.
-
-    Flat areas, straight slopes and edges along rows or columns give 0.
-    """
-    padded = pad(luma[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
-    across = (padded[:, :, :-2] + padded[:, :, 2:]).sub_(padded[:, :, 1:-1], alpha=2.0)
-    return (across[:, :-2] + across[:, 2:]).sub_(across[:, 1:-1], alpha=2.0).abs_()
-
-
-def immerkaer_sigma(luma: torch.Tensor) -> torch.Tensor:
-    """Standard deviation of the noise [grey levels of 255], estimated from one picture.
-
-    ``sqrt(pi / 2) / (6 (W - 2) (H - 2))`` times the sum of `immerkaer_response` over the pixels
-    that have all eight neighbours; 0 where there are none. Fine texture is read as noise.
-
-    Args:
-        luma: (B, H, W) in [0, 1].
-
-    Returns:
-        (B,) float64.
-
-    Source: J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding
-    64(2), 1996.
-    """
-    if min(check_luma(luma).shape[1:]) < 3:
-        return luma.new_zeros(len(luma), dtype=torch.float64)
-    inner = immerkaer_response(luma)[:, 1:-1, 1:-1].mean(dim=(1, 2), dtype=torch.float64)
-    return inner * (255.0 * math.sqrt(0.5 * math.pi) / 6.0)
-
-
-class SignalToNoise:
-    """Signal-to-noise ratio of native pixels by the noise level function, in dB.
-
-    Mean over pixels and planes of ``10 log10(min(x, 1)^2 / (shot x + read))``, each held to 0 to
-    50 dB, over 50 dB; x is the noise-free signal before blur and clip. The noise is that of the
-    sensor's own pixels, not of the box-averaged frame. 50 dB is about what a full-frame sensor
-    reaches at white at ISO 100 (Nikon Z6: 51.3 dB).
-    """
-
-    domain: Domain = "raw"
-    depends_on: DependsOn = "light"
-    ceiling_db = 50.0
-
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        shot = torch.tensor([n.shot for n in captures.nlf])[:, :, None, None]
-        read = torch.tensor([n.read for n in captures.nlf])[:, :, None, None]
-        light = captures.light.clamp(min=0.0)
-        variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
-        power = light.clamp_(max=1.0).square_().div_(variance)
-        decibels = power.clamp_(min=1.0).log10_().mul_(10.0).clamp_(max=self.ceiling_db)
-        return decibels.mean(dim=(1, 2, 3), dtype=torch.float64) / self.ceiling_db
-
-
-class BlindNoise:
-    """Noise estimated from the developed picture alone (Immerkaer 1996): less is better.
-
-    ``1 / (1 + sigma / 10)``, sigma from `immerkaer_sigma` of the luma in grey levels of 255: 0.5
-    where it is 10. Fine texture lowers it, too, and blur and clipping raise it.
-    """
-
-    domain: Domain = "srgb"
-    half = 10.0
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        """Scores (B,)."""
-        return 1.0 / (1.0 + immerkaer_sigma(luma_of(images)) / self.half)
-
-
+#: Grey levels of the histogram.
 LEVELS = 256
 #: Largest squared Sobel gradient that Shim's metric assumes, of luma in [0, 1]: 4^2 + 4^2.
 _LARGEST_SOBEL = 32.0
@@ -114,7 +45,8 @@ def histogram_entropy(luma: torch.Tensor) -> torch.Tensor:
     codes += LEVELS * torch.arange(count, device=luma.device)[:, None]
     bins = torch.bincount(codes.flatten(), minlength=LEVELS * count).reshape(count, LEVELS)
     shares = bins.double() / codes.shape[1]
-    return torch.special.entr(shares).sum(dim=1).div_(math.log(2.0)).clamp_(min=0.0)
+    bits: torch.Tensor = torch.special.entr(shares).sum(dim=1).div_(math.log(2.0))
+    return bits.clamp_(min=0.0)
 
 
 def shim_response(
@@ -126,8 +58,8 @@ def shim_response(
     `slope`: ``log(lambda (m - delta) + 1) / log(lambda (1 - delta) + 1)`` where m >= delta, else 0.
     """
     gradient = squared_gradient(check_luma(luma), SOBEL).mul_(1.0 / _LARGEST_SOBEL).sqrt_()
-    excess = gradient.sub_(threshold).clamp_(min=0.0).mul_(slope)
-    return excess.log1p_().mul_(1.0 / math.log1p(slope * (1.0 - threshold)))
+    above = gradient.sub_(threshold).clamp_(min=0.0).mul_(slope)
+    return above.log1p_().mul_(1.0 / math.log1p(slope * (1.0 - threshold)))
 
 
 def shim_gradient(
@@ -192,6 +124,40 @@ def _percentile_weights(samples: int, p: float, k: float) -> torch.Tensor:
     return weights / weights.sum().clamp(min=1e-300)
 
 
+# -- noise, and the metric that weighs detail against it ------------------------------------------
+
+
+def immerkaer_response(luma: torch.Tensor) -> torch.Tensor:
+    """|I * N| (B, H, W), N = [1 -2 1; -2 4 -2; 1 -2 1], borders repeated; in units of `luma`.
+
+    Flat areas, straight slopes and edges along rows or columns give 0.
+    """
+    padded = pad(luma[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    across = (padded[:, :, :-2] + padded[:, :, 2:]).sub_(padded[:, :, 1:-1], alpha=2.0)
+    return (across[:, :-2] + across[:, 2:]).sub_(across[:, 1:-1], alpha=2.0).abs_()
+
+
+def immerkaer_sigma(luma: torch.Tensor) -> torch.Tensor:
+    """Standard deviation of the noise [grey levels of 255], estimated from one picture.
+
+    ``sqrt(pi / 2) / (6 (W - 2) (H - 2))`` times the sum of `immerkaer_response` over the pixels
+    that have all eight neighbours; 0 where there are none. Fine texture is read as noise.
+
+    Args:
+        luma: (B, H, W) in [0, 1].
+
+    Returns:
+        (B,) float64.
+
+    Source: J. Immerkaer, "Fast noise variance estimation", Computer Vision and Image Understanding
+    64(2), 1996.
+    """
+    if min(check_luma(luma).shape[1:]) < 3:
+        return luma.new_zeros(len(luma), dtype=torch.float64)
+    inner = immerkaer_response(luma)[:, 1:-1, 1:-1].mean(dim=(1, 2), dtype=torch.float64)
+    return inner * (255.0 * math.sqrt(0.5 * math.pi) / 6.0)
+
+
 def shin_metric(
     luma: torch.Tensor,
     *,
@@ -246,6 +212,9 @@ def shin_noise(luma: torch.Tensor) -> torch.Tensor:
     return torch.where(number < 1e-4 * samples, immerkaer_sigma(luma), masked)
 
 
+# -- scorers --------------------------------------------------------------------------------------
+
+
 class Shim:
     """Shim's gradient information (2014), weak gradients included: higher with more detail.
 
@@ -287,3 +256,42 @@ class Shin:
         """Scores (B,)."""
         metric = shin_metric(luma_of(images))
         return 0.5 + 0.5 * metric / (1.0 + metric.abs())
+
+
+class SignalToNoise:
+    """Signal-to-noise ratio of native pixels by the noise level function, in dB.
+
+    Mean over pixels and planes of ``10 log10(min(x, 1)^2 / (shot x + read))``, each held to 0 to
+    50 dB, over 50 dB; x is the noise-free signal before blur and clip. The noise is that of the
+    sensor's own pixels, not of the box-averaged frame. 50 dB is about what a full-frame sensor
+    reaches at white at ISO 100 (Nikon Z6: 51.3 dB).
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+    ceiling_db = 50.0
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        shot = torch.tensor([n.shot for n in captures.nlf])[:, :, None, None]
+        read = torch.tensor([n.read for n in captures.nlf])[:, :, None, None]
+        light = captures.light.clamp(min=0.0)
+        variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
+        power = light.clamp_(max=1.0).square_().div_(variance)
+        decibels = power.clamp_(min=1.0).log10_().mul_(10.0).clamp_(max=self.ceiling_db)
+        return decibels.mean(dim=(1, 2, 3), dtype=torch.float64) / self.ceiling_db
+
+
+class BlindNoise:
+    """Noise estimated from the developed picture alone (Immerkaer 1996): less is better.
+
+    ``1 / (1 + sigma / 10)``, sigma from `immerkaer_sigma` of the luma in grey levels of 255: 0.5
+    where it is 10. Fine texture lowers it, too, and blur and clipping raise it.
+    """
+
+    domain: Domain = "srgb"
+    half = 10.0
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return 1.0 / (1.0 + immerkaer_sigma(luma_of(images)) / self.half)

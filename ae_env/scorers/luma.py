@@ -1,4 +1,4 @@
-"""Luma, luminance and gradients of developed pictures: what several scorers start from."""
+"""Luma, luminance and gradients of developed pictures, which several scorers share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ LUMINANCE_SHARES = (0.2126, 0.7152, 0.0722)
 #: Weight of the middle and of each side in one direction of a gradient filter, and of all together.
 SOBEL = (2.0, 1.0)
 SCHARR = (10.0, 3.0)
-_PART = 2**18  # samples
+#: Samples that `by_parts` gives to a function at a time.
+_PART = 2**18
 
 
 def luma_of(images: torch.Tensor) -> torch.Tensor:
@@ -60,7 +61,7 @@ def by_parts(
     step = len(images)
     if images.device.type == "cpu":
         step = max(1, _PART // max(1, images[0].numel()))
-    return torch.cat([function(part) for part in images.split(step)])
+    return torch.cat([function(part) for part in images.split(step)])  # type: ignore[no-untyped-call]
 
 
 def squared_gradient(luma: torch.Tensor, weights: tuple[float, float]) -> torch.Tensor:

@@ -21,10 +21,106 @@ from ae_env.scorers.protocol import Captures, DependsOn, Domain
 from ae_env.utils.model_files import find_model_file
 from simulator.utils.files import as_path, write_atomically
 
-# NIMA's published weights: from Keras' HDF5 to safetensors, without Keras.
-#
+# -- the network: MobileNet v1 with ten ratings as its output -------------------------------------
+
+#: Ratings are from 1 to this.
+RATINGS = 10
+#: Added to the variance in Keras' MobileNet.
+_EPS = 1e-3
+#: Output channels and stride of the 13 depthwise separable blocks.
+_BLOCKS = (
+    *((64, 1), (128, 2), (128, 1), (256, 2), (256, 1), (512, 2)),
+    *((512, 1), (512, 1), (512, 1), (512, 1), (512, 1), (1024, 2), (1024, 1)),
+)
+
+
+class ConvNormReLU6(nn.Sequential):
+    """Convolution without bias, batch normalisation and ReLU6, padded as Keras' MobileNet is.
+
+    With stride 2 only the right and the lower edge are padded, by one pixel.
+
+    Args:
+        inputs: Channels.
+        outputs: Channels.
+        kernel: 1 or 3.
+        stride: 1 or 2.
+        groups: Of the convolution; `inputs` makes it depthwise.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1):
+        padding = (kernel - 1) // 2 if stride == 1 else 0
+        convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
+        super().__init__(
+            nn.ZeroPad2d((0, 1, 0, 1)) if stride == 2 else nn.Identity(),
+            convolution,
+            nn.BatchNorm2d(outputs, eps=_EPS),
+            nn.ReLU6(),
+        )
+
+    def fuse(self) -> None:
+        """Takes the normalisation into the convolution, for inference only."""
+        convolution, normalisation = self[1], self[2]
+        assert isinstance(convolution, nn.Conv2d)
+        assert isinstance(normalisation, nn.BatchNorm2d)
+        self[1] = fuse_conv_bn_eval(convolution, normalisation)
+        self[2] = nn.Identity()
+
+
+class NimaMobileNet(nn.Module):
+    """MobileNet v1 (width 1) with ten ratings as its output: 3,239,114 numbers.
+
+    Source: Howard et al., MobileNets, 2017; Talebi and Milanfar, NIMA: Neural Image Assessment,
+    IEEE Transactions on Image Processing 27(8), 2018, with the head of the published weights:
+    global mean, then one dense layer.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [ConvNormReLU6(3, 32, 3, 2)]
+        inputs = 32
+        for outputs, stride in _BLOCKS:
+            layers.append(ConvNormReLU6(inputs, inputs, 3, stride, groups=inputs))
+            layers.append(ConvNormReLU6(inputs, outputs, 1, 1))
+            inputs = outputs
+        self.features = nn.Sequential(*layers)
+        self.head = nn.Linear(inputs, RATINGS)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Share of each rating.
+
+        Args:
+            pictures: (B, 3, 224, 224) in [-1, 1].
+
+        Returns:
+            (B, 10), each row sums to 1.
+        """
+        features = self.features(pictures).mean(dim=(2, 3))
+        ratings: Tensor = self.head(features).softmax(dim=1)
+        return ratings
+
+
+def nima_network(weights: dict[str, Tensor]) -> NimaMobileNet:
+    """The network with these weights, ready for inference.
+
+    Args:
+        weights: Its state, as `ae_env.scorers.nima.read_weights` gives it.
+    """
+    network = NimaMobileNet()
+    # The counters of training batches are not among the published numbers.
+    counts = {k: v for k, v in network.state_dict().items() if k.endswith("num_batches_tracked")}
+    network.load_state_dict({**counts, **weights})
+    network.eval().requires_grad_(False)
+    for layer in network.features:
+        assert isinstance(layer, ConvNormReLU6)
+        layer.fuse()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network
+
+
+# -- the published weights: from Keras' HDF5 to safetensors, without Keras ------------------------
 # Keras stores a convolution as (height, width, inputs, outputs), a depthwise one as (height, width,
-# channels, 1) and a dense layer as (inputs, outputs); torch wants outputs first.
+# channels, 1) and a dense layer as (inputs, outputs); torch has outputs first.
+
 #: Git blob ids of the published Keras files, by the scorer that they make.
 PUBLISHED = {
     "nima_aesthetic": "003fb321ce92445e41d708144a3656589f9214e7",
@@ -46,7 +142,7 @@ _POINTWISE, _DEPTHWISE = (3, 2, 0, 1), (2, 3, 0, 1)
 
 
 def git_blob_id(content: bytes) -> str:
-    """What git calls a file of this content: the SHA-1 of a short head and the content.
+    """Git's id of a file with this content: the SHA-1 of a short head and the content.
 
     >>> git_blob_id(b"hello\\n")
     'ce013625030ba8dba906f756967f9e9ca394464a'
@@ -121,7 +217,7 @@ def weights_from_keras(content: bytes, name: str) -> dict[str, Tensor]:
 
     Args:
         content: The file.
-        name: What errors call it.
+        name: Name of the file in errors.
 
     Raises:
         ValueError: If it is no HDF5, or not of this network.
@@ -131,7 +227,7 @@ def weights_from_keras(content: bytes, name: str) -> dict[str, Tensor]:
         import h5py
     except ImportError:
         raise ImportError(f"reading {name!r} needs h5py: pip install 'ae-env[nima]'") from None
-    places = _places()
+    layout = _layout()
     found: dict[str, Tensor] = {}
 
     def visit(path: str, item: Any) -> None:
@@ -139,10 +235,10 @@ def weights_from_keras(content: bytes, name: str) -> dict[str, Tensor]:
         if not isinstance(item, h5py.Dataset) or "optimizer_weights" in groups:
             return
         leaf = leaf.removesuffix(":0")
-        layer = next((g for g in reversed(groups) if (g, leaf) in places), "dense")
-        if (layer, leaf) not in places:
+        layer = next((g for g in reversed(groups) if (g, leaf) in layout), "dense")
+        if (layer, leaf) not in layout:
             return
-        target, order, shape = places[layer, leaf]
+        target, order, shape = layout[layer, leaf]
         if tuple(item.shape) != shape:
             raise ValueError(
                 f"`file` (={name!r}): {path} (={tuple(item.shape)}) must have the shape {shape}"
@@ -169,15 +265,15 @@ def _read(path: Path) -> bytes:
         raise ValueError(f"`file` (={str(path)!r}) cannot be read: {error.strerror}") from error
 
 
-def _places() -> dict[tuple[str, str], tuple[str, tuple[int, ...], tuple[int, ...]]]:
-    """Of a layer's array in Keras: its name in torch, the order of its axes, its Keras shape."""
+def _layout() -> dict[tuple[str, str], tuple[str, tuple[int, ...], tuple[int, ...]]]:
+    """For a layer's array in Keras: its name in torch, the order of its axes, its Keras shape."""
     shapes = _shapes()
     names = ["conv1", *(f"conv_{kind}_{i}" for i in range(1, 14) for kind in ("dw", "pw"))]
-    places: dict[tuple[str, str], tuple[str, tuple[int, ...], tuple[int, ...]]] = {}
+    layout: dict[tuple[str, str], tuple[str, tuple[int, ...], tuple[int, ...]]] = {}
 
     def add(layer: str, array: str, target: str, order: tuple[int, ...]) -> None:
         shape = shapes[target]  # torch's axis i is Keras' axis order[i]
-        places[layer, array] = (
+        layout[layer, array] = (
             target,
             order,
             tuple(shape[order.index(i)] for i in range(len(order))),
@@ -193,11 +289,11 @@ def _places() -> dict[tuple[str, str], tuple[str, tuple[int, ...], tuple[int, ..
             add(f"{layer}_bn", array, f"features.{i}.2.{target}", (0,))
     add("dense", "kernel", "head.weight", (1, 0))
     add("dense", "bias", "head.bias", (0,))
-    return places
+    return layout
 
 
 def _shapes() -> dict[str, tuple[int, ...]]:
-
+    """Shape of each array of the network in torch."""
     with torch.device("meta"):
         state = NimaMobileNet().state_dict()
     return {k: tuple(v.shape) for k, v in state.items() if "num_batches" not in k}
@@ -222,98 +318,7 @@ def _check(weights: Mapping[str, Tensor], name: str) -> None:
             raise ValueError(f"`file` (={name!r}): {key} must be finite")
 
 
-# The network of NIMA: MobileNet v1 with ten ratings as its output.
-#: Ratings are from 1 to this.
-RATINGS = 10
-#: Added to the variance in Keras' MobileNet.
-_EPS = 1e-3
-#: Output channels and stride of the 13 depthwise separable blocks.
-_BLOCKS = (
-    *((64, 1), (128, 2), (128, 1), (256, 2), (256, 1), (512, 2)),
-    *((512, 1), (512, 1), (512, 1), (512, 1), (512, 1), (1024, 2), (1024, 1)),
-)
-
-
-class ConvNormReLU6(nn.Sequential):
-    """Convolution without bias, batch normalisation and ReLU6, padded as Keras' MobileNet is.
-
-    With stride 2 only the right and the lower edge are padded, by one pixel.
-
-    Args:
-        inputs: Channels.
-        outputs: Channels.
-        kernel: 1 or 3.
-        stride: 1 or 2.
-        groups: Of the convolution; `inputs` makes it depthwise.
-    """
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1):
-        padding = (kernel - 1) // 2 if stride == 1 else 0
-        convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
-        super().__init__(
-            nn.ZeroPad2d((0, 1, 0, 1)) if stride == 2 else nn.Identity(),
-            convolution,
-            nn.BatchNorm2d(outputs, eps=_EPS),
-            nn.ReLU6(),
-        )
-
-    def fuse(self) -> None:
-        """Takes the normalisation into the convolution, for inference only."""
-        convolution, normalisation = self[1], self[2]
-        assert isinstance(convolution, nn.Conv2d)
-        assert isinstance(normalisation, nn.BatchNorm2d)
-        self[1] = fuse_conv_bn_eval(convolution, normalisation)
-        self[2] = nn.Identity()
-
-
-class NimaMobileNet(nn.Module):
-    """MobileNet v1 (width 1) with ten ratings as its output: 3,239,114 numbers.
-
-    Source: Howard et al., MobileNets, 2017; Talebi and Milanfar, NIMA: Neural Image Assessment,
-    IEEE Transactions on Image Processing 27(8), 2018, with the head of the published weights:
-    global mean, then one dense layer.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        layers: list[nn.Module] = [ConvNormReLU6(3, 32, 3, 2)]
-        inputs = 32
-        for outputs, stride in _BLOCKS:
-            layers.append(ConvNormReLU6(inputs, inputs, 3, stride, groups=inputs))
-            layers.append(ConvNormReLU6(inputs, outputs, 1, 1))
-            inputs = outputs
-        self.features = nn.Sequential(*layers)
-        self.head = nn.Linear(inputs, RATINGS)
-
-    def forward(self, pictures: Tensor) -> Tensor:
-        """Share of each rating.
-
-        Args:
-            pictures: (B, 3, 224, 224) in [-1, 1].
-
-        Returns:
-            (B, 10), each row sums to 1.
-        """
-        features = self.features(pictures).mean(dim=(2, 3))
-        return self.head(features).softmax(dim=1)
-
-
-def nima_network(weights: dict[str, Tensor]) -> NimaMobileNet:
-    """The network with these weights, ready for inference.
-
-    Args:
-        weights: Its state, as `ae_env.scorers.nima.read_weights` gives it.
-    """
-    network = NimaMobileNet()
-    # What counts the batches of a training is not among the published numbers.
-    counts = {k: v for k, v in network.state_dict().items() if k.endswith("num_batches_tracked")}
-    network.load_state_dict({**counts, **weights})
-    network.eval().requires_grad_(False)
-    for layer in network.features:
-        assert isinstance(layer, ConvNormReLU6)
-        layer.fuse()
-    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
+# -- scorers --------------------------------------------------------------------------------------
 
 #: Side of the pictures that the network was trained on [pixel].
 INPUT_SIZE = 224
@@ -332,7 +337,7 @@ def mean_rating(network: nn.Module, images: Tensor) -> Tensor:
     ratings = torch.arange(1.0, RATINGS + 1.0, dtype=torch.float64)
     means = []
     with torch.no_grad():
-        for part in images.split(_CHUNK):
+        for part in images.split(_CHUNK):  # type: ignore[no-untyped-call]
             if part.shape[2:] != size:
                 part = functional.interpolate(part, size, mode="bilinear", antialias=True)
             part = (2.0 * part.clamp(0.0, 1.0) - 1.0).to(memory_format=torch.channels_last)
@@ -364,7 +369,7 @@ class Nima:
     depends_on: DependsOn = "image"
     needs = "weights"
     version = 1
-    #: What the weights are called.
+    #: Name of the scorer and of its weights.
     name = ""
 
     def __init__(self, file: str | os.PathLike[str] | None = None) -> None:
@@ -381,7 +386,7 @@ class Nima:
         self.file = str(found.resolve())
         #: SHA-256 of the file: other weights under the same name give other scores.
         self.digest = hashlib.sha256(found.read_bytes()).hexdigest()
-        _network(self.file, self.digest)  # what is wrong with it is said now
+        _network(self.file, self.digest)  # raises now, not at the first score
 
     def __call__(self, images: Tensor | None, captures: Captures) -> Tensor:
         """Scores (B,) of sRGB `images` (B, 3, H, W)."""

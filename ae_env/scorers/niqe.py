@@ -22,13 +22,13 @@ from ae_env.scorers.protocol import Captures, DependsOn, Domain
 from ae_env.utils.model_files import find_model_file
 from simulator.utils.files import as_path, write_atomically
 
-# Statistics of natural pictures: what NIQE compares.
-#
+# -- statistics of natural pictures ---------------------------------------------------------------
 # A natural picture's locally normalised luma is close to a generalised normal distribution, and the
 # products of its neighbours to an asymmetric one; noise, blur and clipping change their shapes.
 #
 # Source: Mittal, Soundararajan and Bovik, Making a "Completely Blind" Image Quality Analyzer, IEEE
 # Signal Processing Letters 20(3), 2013; the asymmetric fit: Lasmar, Stitou and Berthoumieu, 2009.
+
 #: Numbers of one scale, and of the two together.
 FEATURES_PER_SCALE, SCALES = 18, 2
 FEATURES = FEATURES_PER_SCALE * SCALES
@@ -139,8 +139,8 @@ def _blocks(values: Tensor, side: int) -> Tensor:
 
 
 def _blur(values: Tensor) -> Tensor:
-    place = torch.arange(_WINDOW, dtype=values.dtype, device=values.device) - _WINDOW // 2
-    weights = torch.exp(-place.square() / (2.0 * _WINDOW_SIGMA**2))
+    offset = torch.arange(_WINDOW, dtype=values.dtype, device=values.device) - _WINDOW // 2
+    weights = torch.exp(-offset.square() / (2.0 * _WINDOW_SIGMA**2))
     weights = weights / weights.sum()
     edge = _WINDOW // 2
     padded = functional.pad(values[:, None], (edge, edge, edge, edge), mode="replicate")
@@ -157,6 +157,9 @@ def _shape_table(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     return shapes.to(dtype), torch.exp(log - torch.lgamma(3.0 / shapes)).to(dtype)
 
 
+# -- the model of pristine pictures, and the distance from it -------------------------------------
+
+#: Environment variable that names the model file.
 VARIABLE = "AE_ENV_NIQE"
 #: Side of a block [pixel]; smaller pictures are one block.
 BLOCK = 96
@@ -196,7 +199,7 @@ class NiqeModel:
 
 
 def fit_niqe_model(pictures: Iterable[Tensor], block: int = BLOCK) -> NiqeModel:
-    """A model of pristine pictures of one's own, from their sharp blocks.
+    """A model from the sharp blocks of the caller's own pristine pictures.
 
     Args:
         pictures: sRGB (3, H, W) in [0, 1] each, sharp and without noise, H and W at least `block`.
@@ -275,7 +278,8 @@ def niqe_distance(images: Tensor, model: NiqeModel, block: int = BLOCK) -> Tenso
     inverse = torch.linalg.pinv((covariance + pristine) / 2.0, hermitian=True)
     difference = mean - torch.from_numpy(model.mean)
     squared = (difference[:, None] @ inverse @ difference[..., None]).flatten()
-    return squared.clamp(min=0.0).sqrt()
+    distance: Tensor = squared.clamp(min=0.0).sqrt()
+    return distance
 
 
 class Niqe:

@@ -1,4 +1,4 @@
-"""What a scorer is, and what it is told about the images that it scores."""
+"""The interface of a scorer, and `Captures`: the facts about the images that it scores."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from simulator.settings import CameraSettings
 
 ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
-#: What a score varies with: the recorded image (noise and all); the noise-free light on the sensor;
-#: or also (or only) the extent of the blur, which changes from episode to episode. The last two
-#: have a closed form, without noise seeds, and ``"light"`` is worked out once per scene and state.
+#: Input that decides a score: ``"image"``, the recorded image with its noise; ``"light"``, the
+#: noise-free light on the sensor; ``"blur"``, also (or only) the extent of the blur, which changes
+#: from episode to episode. The last two have a closed form and need no noise seeds; ``"light"`` is
+#: computed once per scene and state.
 DependsOn = Literal["image", "light", "blur"]
 
 
@@ -41,12 +42,12 @@ def reads_pixels(scorer: Scorer) -> bool:
 
     Those with ``reads_pixels = False`` see the settings, the exposure and the blur only.
     """
-    return getattr(scorer, "reads_pixels", True)
+    return bool(getattr(scorer, "reads_pixels", True))
 
 
 @dataclass(frozen=True, eq=False)
 class Captures:
-    """What is known about a batch of B captures besides their pixels.
+    """The facts about a batch of B captures besides their pixels.
 
     Args:
         settings: Settings of each capture, B long.

@@ -1,16 +1,30 @@
-"""Scorers by name: the registry, entry points, and composition."""
+"""Scorers by name: the registry, entry points, and composition.
+
+| file | scorers |
+|---|---|
+| `composite.py` | `balanced`, weighted means |
+| `terms.py` | `brightness`, `highlights`, `shadows`, `noise`, `sharpness`, `banding` |
+| `exposure_measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy` |
+| `detail.py` | `shim`, `zhang`, `shin`, `snr`, `blind_noise` |
+| `defects.py` | `defects`, `analytic_*` |
+| `nima.py`, `niqe.py` | `nima_aesthetic`, `nima_technical`; `niqe` |
+| `opencv.py` | `brisque`, `keypoints`, `matches` |
+| `registry.py` | ``pyiqa:METRIC`` |
+"""
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import inspect
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
+
+import torch
 
 from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.defects import (
@@ -30,98 +44,13 @@ from ae_env.scorers.exposure_measures import (
     MidGrey,
     WellExposedness,
 )
-from ae_env.scorers.external import Brisque, PyiqaMetric
-from ae_env.scorers.keypoints import Keypoints, Matches
 from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
 from ae_env.scorers.niqe import Niqe
-from ae_env.scorers.protocol import Scorer
+from ae_env.scorers.opencv import Brisque, Keypoints, Matches
+from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
 from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
 from ae_env.utils.checks import did_you_mean
-from ae_env.utils.user_code import load_from_file, split_file_name
-
-
-# What is known about each scorer: the rows of ``ae-env scorers``.
-@dataclass(frozen=True)
-class ScorerRow:
-    """One scorer.
-
-    Args:
-        name: What `ae_env.scorers.make_scorer` takes.
-        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``; empty where it is
-            not known.
-        depends_on: ``"image"``, ``"light"`` or ``"blur"``; empty where it is not known.
-        needs: What does not come with this package; empty where that is nothing.
-        summary: First line of its docstring.
-        package: The package that it comes from.
-        error: Why it cannot be loaded; empty where it can, or where only what it needs is missing.
-    """
-
-    name: str
-    domain: str = ""
-    depends_on: str = ""
-    needs: str = ""
-    summary: str = ""
-    package: str = "ae-env"
-    error: str = ""
-
-
-def describe_scorers() -> list[ScorerRow]:
-    """A row for each known scorer, in order of name; one that is broken does not hide others."""
-    points = {point.name: point for point in reversed(scorer_entry_points())}
-    rows = []
-    for name in list_scorers():
-        factory = registered_scorer(name)
-        package = _package(points[name]) if factory is None else _origin(factory)
-        needs = getattr(factory, "needs", "")
-        try:
-            # Where a file may be missing, its class says all that is asked for.
-            found = factory if needs else _made(name)
-            rows.append(_row(name, found, package))
-        except (Exception, SystemExit) as error:
-            rows.append(ScorerRow(name, package=package, error=_cause(error)))
-    return rows
-
-
-def _made(name: str) -> Any:
-    """The scorer of that name, out of the composite that stands around a single one."""
-    scorer = make_scorer(name)
-    parts = list(scorer.parts.values())
-    return parts[0] if len(parts) == 1 and list(scorer.parts) == [name] else scorer
-
-
-def _row(name: str, found: Any, package: str) -> ScorerRow:
-    text = found if inspect.isclass(found) or inspect.isfunction(found) else type(found)
-    return ScorerRow(
-        name,
-        domain=", ".join(sorted(_domains(found))),
-        depends_on=getattr(found, "depends_on", "image"),
-        needs=str(getattr(found, "needs", "")),
-        summary=(inspect.getdoc(text) or "").partition("\n")[0].replace("``", ""),
-        package=package,
-    )
-
-
-def _domains(found: Any) -> set[str]:
-    """What a scorer sees; of one that is made of others, what they do."""
-    parts = getattr(found, "parts", {}).values()
-    return set().union(*map(_domains, parts)) if parts else {found.domain}
-
-
-def _package(point: Any) -> str:
-    return point.dist.name if point.dist is not None else point.module.partition(".")[0]
-
-
-def _origin(factory: Callable[[], Any]) -> str:
-    package = factory.__module__.partition(".")[0]
-    return "ae-env" if package == "ae_env" else package
-
-
-def _cause(error: BaseException) -> str:
-    """The first error of a chain, in one line: the last one repeats the name of the row."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return " ".join(f"{type(error).__name__}: {error}".split())
-
+from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
 
 ENTRY_POINT_GROUP = "ae_env.scorers"
 #: ``pyiqa:NAME`` is the metric NAME of the package pyiqa.
@@ -136,7 +65,6 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "noise": Noise,
     "sharpness": Sharpness,
     "banding": Banding,
-    # What follows needs files or packages of the user's own.
     "brisque": Brisque,
     "keypoints": Keypoints,
     "matches": Matches,
@@ -214,28 +142,25 @@ def registered_scorer(name: str) -> Callable[[], Any] | None:
     return _REGISTRY.get(name)
 
 
-def _find_scorer(name: str) -> Scorer:
+def _find_scorer(name: str) -> Any:
+    """The scorer of a name; `CompositeScorer` checks that it is one."""
     factory = _REGISTRY.get(name)
     if factory is not None:
-        # Those of this package say themselves what is missing.
+        # The errors of this package's own scorers are clear already.
         own = factory.__module__.startswith("ae_env.scorers.")
         return factory() if own else _loaded(name, factory)
     for point in scorer_entry_points():
         if point.name == name:
             return _instantiate(name, _loaded(name, point.load))
+    rule = f"`scorer` (={name!r})"
     in_file = split_file_name(name)
     if in_file is not None:
-        found = load_from_file(*in_file, f"`scorer` (={name!r})", example="MyScore")
-        return _instantiate(name, found)
+        return _instantiate(name, load_from_file(*in_file, rule, example="MyScore"))
     module_name, _, attribute = name.partition(":")
     if attribute and module_name == PYIQA:
         return PyiqaMetric(attribute)
     if attribute:
-
-        def load() -> Any:
-            return getattr(importlib.import_module(module_name), attribute)
-
-        return _instantiate(name, _loaded(name, load))
+        return _instantiate(name, load_attribute(name, rule))
     known = list_scorers()
     hint = did_you_mean(name, known)
     raise ValueError(
@@ -245,7 +170,7 @@ def _find_scorer(name: str) -> Scorer:
 
 
 def _loaded(name: str, load: Callable[[], Any]) -> Any:
-    """What `load` returns; it runs code of the user's own, or of another package."""
+    """The result of `load`, which runs code of the user or of another package."""
     try:
         return load()
     except (Exception, SystemExit) as error:
@@ -310,10 +235,10 @@ def _short(name: str) -> str:
 
 
 def scorer_fingerprint(scorer: CompositeScorer) -> str | None:
-    """A hash of everything that decides the scores of `scorer`, or None where that is not known.
+    """A hash of everything that decides the scores of `scorer`, or None where that is unknown.
 
-    What a scorer of one's own calls or closes over cannot be seen from its class, so its scores are
-    kept on disk only if it has a ``version`` (a string or number that its author changes with it).
+    A user's class may call anything, so its scores are stored on disk only if it has a ``version``
+    (a string or number that its author changes with the class).
     """
     digest = hashlib.sha256()
     for path, part in _nested(scorer):
@@ -321,11 +246,7 @@ def scorer_fingerprint(scorer: CompositeScorer) -> str | None:
         version = getattr(part, "version", None)
         if not kind.__module__.startswith("ae_env.") and not isinstance(version, str | int | float):
             return None
-        try:
-            source = inspect.getsource(kind)
-        except (OSError, TypeError):
-            return None
-        digest.update(f"{path}\0{version}\0{source}\0".encode())
+        digest.update(f"{path}\0{version}\0{kind.__module__}\0{kind.__qualname__}\0".encode())
         for key, value in sorted(getattr(part, "__dict__", {}).items()):
             if key == "closed_form" or (key == "parts" and isinstance(value, Mapping)):
                 continue
@@ -342,3 +263,153 @@ def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
     if isinstance(parts, Mapping):
         for name, part in parts.items():
             yield from _nested(part, (*path, name))
+
+
+# -- metrics of the package pyiqa, named ``pyiqa:musiq`` ------------------------------------------
+# It has a non-commercial licence and is large, so it is no dependency of this package and imported
+# only where one of its metrics is asked for.
+
+_NUMBER = re.compile(r"[-+]?(?:inf|\d+\.?\d*(?:e[-+]?\d+)?)", re.IGNORECASE)
+
+
+class PyiqaMetric:
+    """A no-reference metric of pyiqa, its stated range mapped to [0, 1], higher better.
+
+    Score = (value - low) / (high - low), clipped, or 1 minus that where lower is better. The range
+    is the metric's own ``score_range``, which pyiqa calls a rough estimate.
+
+    Args:
+        metric: Its name, as ``pyiqa.create_metric`` takes it.
+
+    Raises:
+        ImportError: If pyiqa is not installed.
+        ValueError: If pyiqa has no such metric, it needs a reference picture, or it states no
+            finite range.
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = "pip install pyiqa"
+
+    def __init__(self, metric: str) -> None:
+        rule = f"`scorer` (='pyiqa:{metric}')"
+        try:
+            import pyiqa
+        except ImportError as error:
+            raise ImportError(
+                f"{rule} needs pyiqa, which is non-commercial and no extra of this package: "
+                f"pip install pyiqa ({error})"
+            ) from error
+        try:
+            self._metric: Any = pyiqa.create_metric(metric, device=torch.device("cpu"))
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{rule} cannot be made by pyiqa.create_metric: {what}") from error
+        if getattr(self._metric, "metric_mode", "NR") != "NR":
+            raise ValueError(f"{rule} must be a metric that needs no reference picture")
+        self.metric = metric
+        self.low, self.high = _range(getattr(self._metric, "score_range", None), rule)
+        self.lower_better = bool(getattr(self._metric, "lower_better", False))
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        assert images is not None
+        with torch.no_grad():
+            values = torch.as_tensor(self._metric(images)).double().reshape(len(images))
+        share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
+        return 1.0 - share if self.lower_better else share
+
+
+def _range(stated: Any, rule: str) -> tuple[float, float]:
+    """Two finite numbers from such as ``"~0, ~100"``."""
+    numbers = [float(n) for n in _NUMBER.findall(str(stated))]
+    if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or numbers[0] >= numbers[1]:
+        raise ValueError(
+            f"{rule} states the score range {stated!r}, which must be two finite numbers to be "
+            "mapped to [0, 1]: wrap the metric in a scorer of your own"
+        )
+    return numbers[0], numbers[1]
+
+
+# -- the rows of ``ae-env scorers`` ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ScorerRow:
+    """One scorer.
+
+    Args:
+        name: The name that `make_scorer` takes.
+        domain: ``"raw"``, ``"srgb"`` or, of parts that differ, ``"raw, srgb"``; empty if unknown.
+        depends_on: ``"image"``, ``"light"`` or ``"blur"``; empty if unknown.
+        needs: File or package that does not come with this one; empty if it needs none.
+        summary: First line of its docstring.
+        package: The package that it comes from.
+        error: Why it cannot be loaded; empty if it can, or if only what it needs is missing.
+    """
+
+    name: str
+    domain: str = ""
+    depends_on: str = ""
+    needs: str = ""
+    summary: str = ""
+    package: str = "ae-env"
+    error: str = ""
+
+
+def describe_scorers() -> list[ScorerRow]:
+    """A row for each known scorer, in order of name; one that is broken does not hide others."""
+    points = {point.name: point for point in reversed(scorer_entry_points())}
+    rows = []
+    for name in list_scorers():
+        factory = registered_scorer(name)
+        package = _package(points[name]) if factory is None else _origin(factory)
+        needs = getattr(factory, "needs", "")
+        try:
+            # Where a file may be missing, the class says everything.
+            found = factory if needs else _made(name)
+            rows.append(_row(name, found, package))
+        except (Exception, SystemExit) as error:
+            rows.append(ScorerRow(name, package=package, error=_cause(error)))
+    return rows
+
+
+def _made(name: str) -> Any:
+    """The scorer of that name, without the composite that `make_scorer` puts around one."""
+    scorer = make_scorer(name)
+    parts = list(scorer.parts.values())
+    return parts[0] if len(parts) == 1 and list(scorer.parts) == [name] else scorer
+
+
+def _row(name: str, found: Any, package: str) -> ScorerRow:
+    text = found if inspect.isclass(found) or inspect.isfunction(found) else type(found)
+    return ScorerRow(
+        name,
+        domain=", ".join(sorted(_domains(found))),
+        depends_on=getattr(found, "depends_on", "image"),
+        needs=str(getattr(found, "needs", "")),
+        summary=(inspect.getdoc(text) or "").partition("\n")[0].replace("``", ""),
+        package=package,
+    )
+
+
+def _domains(found: Any) -> set[str]:
+    """Domains of a scorer, or of all parts of a composite."""
+    parts = getattr(found, "parts", {}).values()
+    return set().union(*map(_domains, parts)) if parts else {found.domain}
+
+
+def _package(point: Any) -> str:
+    return str(point.dist.name if point.dist is not None else point.module.partition(".")[0])
+
+
+def _origin(factory: Callable[[], Any]) -> str:
+    package = factory.__module__.partition(".")[0]
+    return "ae-env" if package == "ae_env" else package
+
+
+def _cause(error: BaseException) -> str:
+    """The first error of a chain, in one line: the last one only repeats the scorer's name."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return " ".join(f"{type(error).__name__}: {error}".split())

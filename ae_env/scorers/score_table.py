@@ -52,20 +52,23 @@ class ScoreTable:
         mean: (S,) float64, q of each state.
         standard_error: (S,) float64, 0 where the closed form was used.
         parts: (S,) float64 of each part of the scorer.
+        allowed: (S,) bool, states that the scene allows; None for all of them.
     """
 
     mean: np.ndarray
     standard_error: np.ndarray
     parts: dict[str, np.ndarray]
+    allowed: np.ndarray | None = None
 
     @cached_property
     def oracle(self) -> int:
-        """The best state; ties go to the lower index, that is the lower ISO.
+        """The best state that is allowed; ties go to the lower index, that is the lower ISO.
 
         States of equal exposure score alike but for the rounding of their settings: a tie is
         whatever comes within `TIE` of the best.
         """
-        return int(np.argmax(self.mean >= self.mean.max() - TIE))
+        mean = self.mean if self.allowed is None else np.where(self.allowed, self.mean, -np.inf)
+        return int(np.argmax(mean >= mean.max() - TIE))
 
 
 def prepare_scene(
@@ -159,7 +162,7 @@ class ScoreTables:
         if self.scorer.closed_form:
             parts = {name: parts[name] for name in self.scorer.parts}
             mean = self.scorer.totals(parts)
-            return ScoreTable(mean, np.zeros(len(self.grid)), parts)
+            return ScoreTable(mean, np.zeros(len(self.grid)), parts, scene.allowed)
         samples = self._samples(scene, speed, defocus, gain, row_gain)
         totals = self.scorer.totals({**parts, **samples})  # (seeds, S)
         if not self.noise:
@@ -169,9 +172,8 @@ class ScoreTables:
         else:
             error = np.full(len(self.grid), np.nan)  # one sample has no standard error
         parts |= {name: values.mean(axis=0) for name, values in samples.items()}
-        return ScoreTable(
-            totals.mean(axis=0), error, {name: parts[name] for name in self.scorer.parts}
-        )
+        parts = {name: parts[name] for name in self.scorer.parts}
+        return ScoreTable(totals.mean(axis=0), error, parts, scene.allowed)
 
     def closed_parts(
         self,

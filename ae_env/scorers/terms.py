@@ -120,7 +120,8 @@ class Noise:
         light = captures.light.clamp(min=0.0)
         variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
         power = (light.clamp_(max=1.0).square_() / variance).pow_(0.75)  # SNR**1.5
-        return (power / (power + self.half_snr**1.5)).mean(dim=(1, 2, 3), dtype=torch.float64)
+        share: torch.Tensor = power / (power + self.half_snr**1.5)
+        return share.mean(dim=(1, 2, 3), dtype=torch.float64)
 
 
 class Sharpness:

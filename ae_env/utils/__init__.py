@@ -1,1 +1,1 @@
-"""Checks, presets and code of the user."""
+"""Helpers: checks of arguments, presets, user code and model files."""

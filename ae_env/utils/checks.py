@@ -12,16 +12,22 @@ import numpy as np
 
 
 class UserCodeError(ValueError):
-    """A scorer or a policy of the user's own raised, or returned what it must not return."""
+    """A user's scorer or policy raised an error, or returned an invalid value."""
 
 
-def did_you_mean(name: Any, known: Iterable[str], mark: str = "'") -> str:
-    """The nearest of `known` to a misspelt `name`, as the end of a message; empty if none is near.
+def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
+    """End of a message that proposes the nearest of `known` to a misspelt `name`; empty if none is.
+
+    Args:
+        name: The unknown name.
+        known: The names there are.
+        mark: Quotation mark around the proposal.
+        cutoff: Similarity from which a name is near, see `difflib.get_close_matches`.
 
     >>> did_you_mean("scorrer", ["scenes", "scorer"])
     "; did you mean 'scorer'?"
     """
-    near = difflib.get_close_matches(str(name), list(known), n=1)
+    near = difflib.get_close_matches(str(name), list(known), n=1, cutoff=cutoff)
     return f"; did you mean {mark}{near[0]}{mark}?" if near else ""
 
 

@@ -1,4 +1,4 @@
-"""Where the model files lie that some scorers need and that do not come with the package."""
+"""The search for model files that some scorers need and that do not come with the package."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def find_model_file(
 ) -> Path:
     """The model file of a scorer.
 
-    Looked for as `given`; else as what the environment variable names; else in the cache folder.
+    It is `given`, or else the one that the environment variable names, or else in the cache folder.
 
     Args:
         scorer: Name of the scorer, for errors.
         given: A file, or None.
         variable: Environment variable that may name one.
-        names: File names in the cache folder, the first that is there is taken.
-        how: How to come by the file: the end of the message where there is none.
+        names: File names in the cache folder; the first that exists is taken.
+        how: How to get the file: the end of the message where there is none.
 
     Raises:
         ValueError: If there is none; the message says where to put it.

@@ -6,11 +6,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ae_env.utils.checks import did_you_mean
 
-#: In a clone the folder beside the packages, in an installed package a part of this one.
+#: In an installed package a folder of this one, in a clone the one beside the packages.
 _FOLDERS = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "configs")
 
 
@@ -27,7 +25,7 @@ def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
     """The YAML file of a preset.
 
     Args:
-        name: That of a preset, or the path of a ``.yaml`` file of one's own.
+        name: Name of a preset, or the path of a ``.yaml`` file.
         kind: Folder of ``configs/``, such as ``"env"``.
 
     Raises:
@@ -50,20 +48,21 @@ def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
     """Arguments of the environment from a preset of ``configs/env``.
 
     Args:
-        name: Such as ``"tunnel"``, or the path of a ``.yaml`` file of one's own.
+        name: Such as ``"tunnel"``, or the path of a ``.yaml`` file.
 
     Returns:
         Keyword arguments of ``gymnasium.make("ae_env/AutoExposure-v0", ...)``,
         ``max_episode_steps`` among them.
 
     Raises:
-        ValueError: If there is no such preset, or it is not a mapping.
+        ValueError: If there is no such preset, or it cannot be read, is too large or no mapping.
     """
     file = find_preset(name)
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file}: not YAML: {error}") from None
+    from simulator.utils.config_file import read_yaml
+
+    content = read_yaml(file, name="preset")
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise ValueError(f"{file}: must map arguments of the environment to values")
+        raise ValueError(
+            f"`preset` (={str(file)!r}) must map arguments of the environment to values"
+        )
     return content

@@ -1,26 +1,25 @@
-"""Classes and functions in a Python file of the user's own, named ``path/to/file.py:Name``."""
+"""A user's own classes and functions: ``path/to/file.py:Name`` and ``package.module:name``."""
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import traceback
+from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from ae_env.utils.checks import did_you_mean
 
-#: Modules that the files run so far have imported from their own folders.
+#: Modules beside the file that was run last, which another folder may have under the same name.
 _helpers: set[str] = set()
 
 
 def split_file_name(name: str) -> tuple[str, str] | None:
-    """The file and what of it is meant, or None where `name` is not that of a Python file.
+    """The file and the name in it, or None where `name` is not that of a Python file.
 
     >>> split_file_name("~/mine.py:MyScore"), split_file_name("mine.py"), split_file_name("noise")
     (('~/mine.py', 'MyScore'), ('mine.py', ''), None)
@@ -31,21 +30,46 @@ def split_file_name(name: str) -> tuple[str, str] | None:
     return (name, "") if name.endswith(".py") else None
 
 
-def load_from_file(path: str, name: str, argument: str, example: str = "MyClass") -> Any:
-    """What a Python file calls `name`.
+def load_attribute(name: str, argument: str) -> Any:
+    """The object that ``"package.module:name"`` names; ``name`` may have dots.
 
-    The file is run once, and again only after it has changed. At its top it may import modules
-    beside it, as a script may; files in different folders may have helpers of the same name.
+    Args:
+        name: The module and the name in it.
+        argument: How errors begin, such as ``"`scenes` (='my.module:scenes')"``.
+
+    Raises:
+        ValueError: If the module cannot be imported (the cause is chained), or lacks the name.
+    """
+    module_name, _, attribute = name.partition(":")
+    try:
+        value: Any = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:  # a user's module may raise anything
+        raise ValueError(f"{argument} cannot be loaded: {_cause(error)}") from error
+    for part in attribute.split("."):
+        if not hasattr(value, part):
+            hint = did_you_mean(part, dir(value))
+            raise ValueError(
+                f"{argument} cannot be loaded: {module_name} has no attribute {part!r}{hint}"
+            )
+        value = getattr(value, part)
+    return value
+
+
+def load_from_file(path: str, name: str, argument: str, example: str = "MyClass") -> Any:
+    """The object that a Python file calls `name`.
+
+    The file is run once, and again after it has changed. It may import modules beside it, as a
+    script may; files in different folders may have helpers of the same name.
 
     Args:
         path: The file; a relative one is looked for in the current folder, ``~`` is the home.
         name: A class, or a function.
-        argument: What errors call it, such as ``"`scorer` (='my_scorer.py:MyScore')"``.
+        argument: How errors begin, such as ``"`scorer` (='my_scorer.py:MyScore')"``.
         example: A name that the error proposes where there is none.
 
     Raises:
-        ValueError: If there is no such file, it cannot be loaded (the cause is chained), or it has
-            nothing of that name.
+        ValueError: If there is no such file, it cannot be loaded (the message says in which line,
+            the cause is chained), or it has nothing of that name.
     """
     if not name:
         raise ValueError(f"{argument} must name a class of the file: '{path}:{example}'")
@@ -57,7 +81,7 @@ def load_from_file(path: str, name: str, argument: str, example: str = "MyClass"
 
 
 def find_attribute(module: ModuleType, name: str, argument: str) -> Any:
-    """What `module` calls `name`.
+    """The object that `module` calls `name`.
 
     Raises:
         ValueError: If there is nothing of that name; the message lists the module's own classes.
@@ -76,62 +100,64 @@ def find_attribute(module: ModuleType, name: str, argument: str) -> Any:
 
 
 def _module(path: str, file: Path, argument: str) -> ModuleType:
+    """The module of a file, under a name that belongs to its path; run again where it changed."""
     try:
         content = file.read_bytes()
     except OSError as error:
         raise ValueError(f"{argument}: {path} cannot be read: {error.strerror}") from error
-    digest = hashlib.sha256(content).hexdigest()
-    place = hashlib.sha256(str(file).encode()).hexdigest()[:12]
-    stem = "".join(c if c.isalnum() else "_" for c in file.stem)
-    key = f"ae_env_user_{stem}_{place}"
-    known = sys.modules.get(key)
-    if known is not None and getattr(known, "_ae_env_content", None) == digest:
+    name = f"ae_env_user_{file.stem}_{sha256(str(file).encode()).hexdigest()[:12]}"
+    digest = sha256(content).hexdigest()
+    known = sys.modules.get(name)
+    if known is not None and vars(known).get("_ae_env_content") == digest:
         return known
-    spec = importlib.util.spec_from_file_location(key, file)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{argument}: {path!r} cannot be loaded as Python")
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None  # its name ends in .py
     module = importlib.util.module_from_spec(spec)
-    sys.modules[key] = module  # dataclasses look their module up while it loads
+    sys.modules[name] = module  # dataclasses look their module up while it loads
     try:
-        # Not through the loader, whose bytecode of a second ago may be that of other content.
-        with _importing_from(file.parent):
-            exec(compile(content, str(file), "exec", dont_inherit=True), module.__dict__)
+        # Compiled here: the loader's cached bytecode tells files apart by size and second only.
+        _run(compile(content, str(file), "exec", dont_inherit=True), module, file.parent)
     except (Exception, SystemExit) as error:  # a script, for example, ends the program
-        sys.modules.pop(key, None)
-        raise ValueError(
-            f"{argument}: {path} cannot be loaded: {type(error).__name__}: {error}"
-        ) from error
-    module.__dict__["_ae_env_content"] = digest
+        del sys.modules[name]
+        raise ValueError(f"{argument}: {path} cannot be loaded: {_cause(error, file)}") from error
+    vars(module)["_ae_env_content"] = digest
     return module
 
 
-@contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
-    """Modules in `folder` can be imported; those of earlier files, from theirs, are forgotten."""
+def _run(code: Any, module: ModuleType, folder: Path) -> None:
+    """Runs a file's code; modules in its folder can be imported meanwhile, as by a script."""
     for name in [n for n in sys.modules if n.partition(".")[0] in _helpers]:
         del sys.modules[name]
     _helpers.clear()
-    before = {name.partition(".")[0] for name in sys.modules}
+    before = set(sys.modules)
     sys.path.insert(0, str(folder))
     importlib.invalidate_caches()
     try:
-        yield
+        exec(code, vars(module))
     finally:
-        if str(folder) in sys.path:  # what was run may have changed it
+        if str(folder) in sys.path:  # the code may have changed it
             sys.path.remove(str(folder))
-        new = {name.partition(".")[0] for name in sys.modules} - before
-        _helpers.update(name for name in new if _is_only_in(folder, name))
+        new = {name.partition(".")[0] for name in set(sys.modules) - before}
+        _helpers.update(name for name in new if name in sys.modules and _is_only_in(folder, name))
 
 
 def _is_only_in(folder: Path, name: str) -> bool:
-    """Whether the module `name` came from `folder`, and would not be found without it."""
-    module = sys.modules.get(name)
-    place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", [])), None)
-    if module is None or place is None or not Path(place).is_relative_to(folder):
+    """Whether the module `name` came from `folder`, and could not be imported without it."""
+    module = sys.modules[name]
+    file = getattr(module, "__file__", None)
+    origin = file or next(iter(getattr(module, "__path__", [])), None)
+    if origin is None or not Path(origin).is_relative_to(folder):
         return False
-    del sys.modules[name]
+    del sys.modules[name]  # where `find_spec` would look first
     try:
         spec = importlib.util.find_spec(name)
     finally:
         sys.modules[name] = module
-    return spec is None or spec.origin != getattr(module, "__file__", None)
+    return spec is None or spec.origin != file
+
+
+def _cause(error: BaseException, file: Path | None = None) -> str:
+    """Type and text of an error, with the line of `file` that it came from, where there is one."""
+    lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == str(file)]
+    where = f" (line {lines[-1]})" if lines else ""  # a SyntaxError says so itself
+    return f"{type(error).__name__}: {error}{where}"

@@ -194,7 +194,7 @@ def _contact_sheet(
             observations, *_ = envs.step(np.asarray(actions))
             states.append(int(base.states[0]))
         paths[name] = states
-    episode = base.core.episode(0)
+    episode = base.episode(0)
     picture = contact_sheet(
         scene, camera=base.camera, speed=episode.speed, defocus=episode.defocus, path=paths
     )

@@ -171,7 +171,7 @@ class PlanRun:
                     tables.append(base.expected_scores())
                     report(float(batch.valid.sum()))
                 parts.append(np.stack(tables, axis=1)[batch.valid])
-                drawn += [base.core.episode(i) for i in np.flatnonzero(batch.valid)]
+                drawn += [base.episode(i) for i in np.flatnonzero(batch.valid)]
         finally:
             envs.close()
         arrays = {

@@ -48,8 +48,8 @@ def rows(core: EpisodeCore, seed: int) -> list[dict[str, Any]]:
     names = list(make_scorer("balanced").parts)
     samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for i in range(len(core.scenes)):
-        core.start(0, np.random.default_rng([seed, i]), {"scene": i})
-        episode, table = core.episode(0), core.expected_scores(0)
+        core.begin(np.array([0]), [np.random.default_rng([seed, i])], [{"scene": i}])
+        episode, table = core.episode(0), core.score_table(0)
         scores = {name: table.parts[name] for name in names} | {"balanced": table.mean}
         closeness = _closeness(core, core.scenes[i], episode.speed, episode.defocus, seed + i)
         for scorer in SCORERS:

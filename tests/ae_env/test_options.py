@@ -1,78 +1,248 @@
-"""The environment's arguments: every mistake is named before any work is done."""
+"""The arguments of the environments, of `reset` and of `step`: odd values are refused by name."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
 import ae_env  # noqa: F401  (registers the environment)
+from ae_env import AutoExposureEnv, AutoExposureVectorEnv
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
 from simulator import CameraSettings, get_camera
 
-STATE = CameraSettings(100.0, 1 / 64, 4.0)
+SMALL: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
+NAN, INF, HUGE, ARRAY = math.nan, math.inf, 10**30, np.array([1, 2])
+ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], [0.5], ARRAY]
+#: Values of `ODD` that an argument takes.
+TAKES: dict[str, list[Any]] = {
+    "split": [],
+    "grid": [],
+    "scorer": [],
+    "costs": [None, {}],
+    "observation": [],
+    "sensors": [True],
+    "resolution": [],
+    "crop": [],
+    "motion": [1.5],
+    "depth": [1.5],
+    "lighting": [],
+    "delay": [],
+    "camera": [],
+    "simulator": [None],
+    "noise": [True],
+    "tolerance": [1.5, HUGE],
+    "reward": [],
+    "with_oracle": [True],
+    "render_mode": [None],
+}
+TAKES_VECTOR: dict[str, list[Any]] = {
+    "num_envs": [],
+    "max_episode_steps": [None, HUGE],
+    "autoreset_mode": [],
+}
 
 
+def _takes(known: list[Any], value: Any) -> bool:
+    return any(type(k) is type(value) and k == value for k in known)
+
+
+def _cases(table: dict[str, list[Any]], taken: bool) -> list[Any]:
+    return [
+        pytest.param(name, value, id=f"{name}-{i}")
+        for name, known in table.items()
+        for i, value in enumerate(ODD)
+        if _takes(known, value) == taken
+    ]
+
+
+class Work(Exception):
+    """Scenes were loaded."""
+
+
+@pytest.fixture
+def idle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(self: EnvOptions) -> None:
+        raise Work
+
+    monkeypatch.setattr(EnvOptions, "load_scenes", load)
+
+
+def test_the_tables_have_every_argument() -> None:
+    assert {"scenes", *TAKES} == {*EnvOptions.__dataclass_fields__, "render_mode"}
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(("name", "value"), _cases(TAKES, False))
+def test_odd_values(name: str, value: Any) -> None:
+    for make in (AutoExposureEnv, AutoExposureVectorEnv):
+        with pytest.raises(ValueError, match=f"`{name}"):
+            make(**{**SMALL, name: value})
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(("name", "value"), _cases(TAKES_VECTOR, False))
+def test_odd_values_of_many_environments(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"`{name}"):
+        AutoExposureVectorEnv(**{**SMALL, name: value})
+
+
+@pytest.mark.usefixtures("idle")
+@pytest.mark.parametrize(("name", "value"), _cases({**TAKES, **TAKES_VECTOR}, True))
+def test_values_that_are_fine(name: str, value: Any) -> None:
+    with pytest.raises(Work):
+        AutoExposureVectorEnv(**{**SMALL, name: value})
+
+
+@pytest.mark.parametrize("value", ODD)
+def test_odd_scenes(value: Any) -> None:
+    with pytest.raises(ValueError, match="scenes"):
+        AutoExposureEnv(scenes=value)
+
+
+GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
+
+
+@pytest.mark.usefixtures("idle")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"scorrer": "noise"}, "did you mean `scorer`"),
-        ({"split": "tset"}, "did you mean 'test'"),
-        ({"observation": "float"}, "`observation`"),
-        ({"crop": "centre"}, "`crop`"),
-        ({"reward": "score"}, "`reward`"),
-        ({"resolution": 35}, r"\[36, 4096\]"),
-        ({"resolution": 64.0}, "integer"),
-        ({"resolution": True}, "integer"),
-        ({"motion": "far"}, "`motion`"),
-        ({"motion": -0.5}, "`motion`"),
-        ({"motion": float("nan")}, "`motion`"),
-        ({"depth": "none"}, "did you mean|must be one of"),
-        ({"delay": -1}, "`delay`"),
-        ({"delay": 17}, "`delay`"),
-        ({"noise": "bnak"}, "did you mean 'bank'"),
-        ({"noise": 1}, "`noise`"),
-        ({"tolerance": -0.1}, "`tolerance`"),
-        ({"tolerance": float("inf")}, "`tolerance`"),
+        *(
+            ({"costs": {"flicker": value}}, r"`costs\['flicker'\]` \(=.*number in \[0, 1e\+06\]")
+            for value in (None, True, "x", -1, NAN, INF, [], [1.0])
+        ),
         ({"costs": {"flicer": 1.0}}, "did you mean 'flicker'"),
-        ({"costs": {"switch": -1.0}}, "costs"),
-    ],
-)
-def test_mistakes_are_named(arguments: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        EnvOptions.from_kwargs(arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"scenes": "bundeld"}, "`scenes`"),
+        ({"costs": {3: 1.0}}, r"`costs` \(=3\)"),
+        *(
+            ({"grid": {**GRID, "isos": value}}, r"`grid`: `isos` \(=.*ascending list of numbers")
+            for value in (None, "100", [], [100, "x"], [True, 200], [NAN, 1], [2, 1], [1, 1], 100)
+        ),
+        ({"grid": {**GRID, "isos": [100, INF]}}, r"`grid`: `iso` \(=inf\)"),
+        ({"grid": {**GRID, "f_numbers": [8, 45]}}, r"`grid\['f_numbers'\]` \(=45\) .*\[1, 32\]"),
+        ({"grid": {**GRID, "exposure_times": [60]}}, r"`grid\['exposure_times'\]` \(=60\)"),
+        ({"grid": {**GRID, "isos": [25]}}, r"`grid\['isos'\]` \(=25\) must be in \[50, 409600\]"),
+        ({"grid": {**GRID, "f_numbers": [0.1]}}, r"`grid`: `f_number` \(=0.1\)"),
+        ({"grid": {"iso": [100]}}, "`grid`.*did you mean 'isos'"),
+        ({"split": "tset"}, "did you mean 'test'"),
         ({"camera": "nikon_z7"}, "did you mean 'nikon_z6'"),
-        ({"scorer": "balanc"}, "did you mean 'balanced'"),
-        ({"grid": "third"}, "`grid`"),
         ({"lighting": "tunel"}, "did you mean 'tunnel'"),
+        ({"simulator": "compcat"}, "did you mean 'compact'"),
+        ({"depth": "unknwon"}, "did you mean 'unknown'"),
+        ({"depth": "unknown", "simulator": None}, r"`depth` \(='unknown'\) needs.*`simulator`"),
+        ({"grid": "third_stops"}, "did you mean 'third_stop'"),
+        *(
+            ({"scorer": {"noise": value}}, "`scorer`.*must map names to weights")
+            for value in (None, True, "x", 0, -1, NAN, INF, [1])
+        ),
+        ({"scorer": {}}, "`scorer` .*must map one name or more"),
+        ({"scorer": {3: 1.0}}, "`scorer` .*must map one name or more"),
+        ({"scorer": {"niose": 1.0}}, "did you mean 'noise'"),
+        ({"scorer": {"noise": 1.0, "mine:noise": 1.0}}, "differ behind the colon"),
+        ({"lighting": {"kind": "sine", "period": 0}}, r"`lighting\['period'\]`"),
+        ({"noise": "bnak"}, "one of True, False, 'bank', 'exact'; did you mean 'bank'"),
+        ({"noise": ["bank"]}, r"`noise` \(=\['bank'\]\) must be one of True, False"),
+        ({"render_mode": "human"}, "`render_mode`"),
+        ({"autoreset_mode": "NEXT"}, "did you mean 'NEXT_STEP'"),
+        ({"num_envs": 2**16 + 1}, r"`num_envs` \(=65537\) .*\[1, 65536\]"),
+        ({"num_envs": 0}, "`num_envs`"),
+        ({"max_episode_steps": 0}, ">= 1, or None for never"),
+        ({"delay": 17}, r"in \[0, 16\] frames"),
+        ({"resolution": 35}, r"\[36, 4096\]"),
+        ({"motion": 1e3 + 1}, r"`motion` \(=1001.0\) .*or one of \['random', 'none'\]"),
     ],
 )
-def test_unknown_names_are_refused_by_make(arguments: dict[str, Any], message: str) -> None:
+def test_errors_name_value_and_rule(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        gym.make("ae_env/AutoExposure-v0", **{"scenes": "bundled:small", **arguments})
+        AutoExposureVectorEnv(**{**SMALL, **arguments})
 
 
-def test_defaults_are_the_documented_ones() -> None:
-    options = EnvOptions()
-    assert (options.scenes, options.split, options.scorer) == ("bundled", "train", "balanced")
-    assert (options.observation, options.resolution, options.reward) == ("uint8", 64, "capture")
-    assert (options.sensors, options.noise, options.with_oracle, options.delay) == (
-        *(True, True, False),
-        0,
-    )
-    assert options.tolerance == 0.1
-    assert len(options.make_grid()) == 64
-    assert options.make_camera() == get_camera("nikon_z6")
+@pytest.fixture(scope="module")
+def env() -> AutoExposureEnv:
+    return AutoExposureEnv(**SMALL)
+
+
+@pytest.fixture(scope="module")
+def envs() -> AutoExposureVectorEnv:
+    return AutoExposureVectorEnv(num_envs=3, **SMALL)
+
+
+BAD_SEEDS = [True, "x", 1.5, -1, NAN, {}, object(), b"x", np.array(3.0)]
+BAD_OPTIONS = [True, "x", 1.5, [], object(), ["state"], {"stat": 1}, {1: 1}]
+BAD_CHOICES = [True, 1.5, -1, NAN, {}, object(), HUGE, "x", b"x"]
+
+
+def _refused_resets(for_many: bool) -> list[tuple[dict[str, Any], str]]:
+    lists = [[0, 1], [0, 1, True], [0, 1, "x"], ARRAY, np.zeros(3)] if for_many else [[], [1, 2]]
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"seed": seed}, "`seed") for seed in [*BAD_SEEDS, *lists]
+    ]
+    refused += [({"options": options}, "`options`") for options in BAD_OPTIONS]
+    for name in ("scene", "state", "frame"):
+        match = rf"`options\['{name}'\]`"
+        refused += [({"options": {name: v}}, match) for v in [*BAD_CHOICES, *lists]]
+    masks = (True, [True] * 3, np.ones(2, bool), np.zeros(3, bool), np.ones(3)) if for_many else ()
+    refused += [({"options": {"reset_mask": mask}}, "reset_mask") for mask in masks]
+    return refused
+
+
+BAD_ACTIONS = [None, True, "x", 1.5, 2.0, -1, 64, NAN, [], {}, object(), HUGE, 2**63, [[1], [2, 3]]]
+
+
+def test_refused_resets_and_steps_change_nothing(env: AutoExposureEnv) -> None:
+    """The twin is asked nothing odd; the episode and the one after it must be the same."""
+    twin = AutoExposureEnv(**SMALL)
+    for one in (env, twin):
+        one.reset(seed=7)
+    for arguments, match in _refused_resets(False):
+        with pytest.raises(ValueError, match=match):
+            env.reset(**arguments)
+    for action in [*BAD_ACTIONS, [1], np.zeros(1, int), np.True_]:
+        with pytest.raises(ValueError, match="`action`"):
+            env.step(action)
+    for result, expected in ((env.step(5), twin.step(5)), (env.reset(), twin.reset())):
+        np.testing.assert_array_equal(result[0]["raw"], expected[0]["raw"])
+        assert result[-1] == expected[-1]
+
+
+def test_refused_resets_and_steps_of_many_change_nothing(envs: AutoExposureVectorEnv) -> None:
+    twin = AutoExposureVectorEnv(num_envs=3, **SMALL)
+    for one in (envs, twin):
+        one.reset(seed=7)
+    for arguments, match in _refused_resets(True):
+        with pytest.raises(ValueError, match=match):
+            envs.reset(**arguments)
+    rows = [[0, 1, action] for action in BAD_ACTIONS if action is not True]  # numpy makes it 1
+    for actions in [*BAD_ACTIONS, *rows, [0, 1], [[0, 1, 2]], np.ones(3, bool)]:
+        with pytest.raises(ValueError, match=r"`actions?`"):
+            envs.step(actions)
+    pairs = ((envs.step([5] * 3), twin.step([5] * 3)), (envs.reset(), twin.reset()))
+    for result, expected in pairs:
+        np.testing.assert_array_equal(result[0]["raw"], expected[0]["raw"])
+        np.testing.assert_array_equal(result[-1]["scene_id"], expected[-1]["scene_id"])
+
+
+def test_seeds_of_numpy_and_of_any_size(env: AutoExposureEnv, envs: AutoExposureVectorEnv) -> None:
+    """Gymnasium's own seeds have 128 bits."""
+    for seed in (np.int64(11), 2**64, 2**100):
+        single, _ = env.reset(seed=seed)
+        many, _ = envs.reset(seed=[0, seed, None])
+        np.testing.assert_array_equal(single["raw"], many["raw"][1])
+    first, _ = envs.reset(seed=np.array([11, 12, 13]))
+    second, _ = envs.reset(seed=11)
+    np.testing.assert_array_equal(first["raw"], second["raw"])
+
+
+def test_a_mapping_with_an_unknown_entry_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"unknown argument `scorrer`.*did you mean `scorer`"):
+        EnvOptions.from_kwargs({"scorrer": "noise"})
+
+
+STATE = CameraSettings(100.0, 1 / 64, 4.0)
 
 
 def test_scenes_are_loaded_once_and_splits_are_disjoint() -> None:
@@ -98,14 +268,6 @@ def test_cameras_of_one_name_have_scenes_of_their_own() -> None:
         for c in (camera, other)
     )
     assert (first.camera, second.camera) == (camera, other)
-
-
-def test_scenes_of_ones_own_and_another_camera() -> None:
-    scenes = EnvOptions(scenes="bundled:small", resolution=64).load_scenes()[:2]
-    env = gym.make("ae_env/AutoExposure-v0", scenes=scenes, resolution=64, camera="canon_70d")
-    env.reset(seed=0)
-    assert env.unwrapped.camera.name == "canon_70d"
-    assert len(env.unwrapped.scenes) == 2
 
 
 def test_a_black_scene_in_unknown_light_is_refused_by_name() -> None:

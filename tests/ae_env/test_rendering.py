@@ -1,8 +1,7 @@
-"""Pictures: what a frame shows, and where the contact sheet puts what."""
+"""Pictures: the rendered frame, and the layout of the contact sheet."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,11 +14,11 @@ from PIL import Image
 from ae_env import contact_sheet
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
-from ae_env.rendering import _averaged, _Sheet, _visits
+from ae_env.rendering import _Sheet
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from simulator import NoiseLevelFunction, develop, get_camera
+from simulator import develop, get_camera
 
 CAMERA = get_camera("nikon_z6")
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
@@ -60,27 +59,6 @@ def test_frame_is_the_developed_capture_enlarged(kind: str) -> None:
     assert np.abs(difference).max() <= 1
 
 
-def test_frame_is_at_least_256_pixels_and_captioned() -> None:
-    env = _env(resolution=40)
-    env.reset(seed=1, options={"state": 0})
-    first = env.render()
-    assert first.shape == (280, 280, 3)  # seven times 40
-    env.reset(seed=1, options={"state": 3})
-    band = slice(-20, None)
-    assert (first[band] != env.render()[band]).any()
-    assert first[band].max() > 200  # the ink
-    first[:] = 0  # the caller's own
-    assert env.render().max() > 0
-
-
-def test_sheet_of_the_default_grid_is_a_readable_picture() -> None:
-    sheet = contact_sheet(_scene(), speed=0.1, defocus=1.0, path=[0, 21, 21, 37])
-    assert isinstance(sheet, Image.Image)
-    assert sheet.mode == "RGB"
-    assert 800 < sheet.width < 1600
-    assert 800 < sheet.height < 1600
-
-
 def _layout(grid: ExposureGrid, paths: dict[str, list[int]] | None = None) -> _Sheet:
     scores = np.linspace(0, 1, len(grid))
     table = ScoreTable(scores, np.zeros(len(grid)), {})
@@ -101,30 +79,6 @@ def test_time_grows_to_the_right_and_f_number_downwards_in_a_panel_per_iso() -> 
     assert (apart | np.eye(64, dtype=bool)).all()  # no picture covers another
 
 
-def test_border_has_the_colour_of_the_score() -> None:
-    scene = _scene()
-    sheet = np.asarray(contact_sheet(scene, grid=SMALL))
-    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced"), use_cache=False).table(scene)
-    layout = _layout(SMALL)
-    for state in range(8):
-        if state == table.oracle:
-            continue
-        x, y = layout.corner(state)
-        expected = colormaps["viridis"](table.mean[state] / table.mean.max(), bytes=True)[:3]
-        assert sheet[y + 2, x + 40].tolist() == [int(v) for v in expected]
-
-
-def test_oracle_is_framed_in_white() -> None:
-    scene = _scene()
-    sheet = np.asarray(contact_sheet(scene, grid=SMALL))
-    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced"), use_cache=False).table(scene)
-    layout = _layout(SMALL)
-    framed = [
-        sheet[layout.corner(s)[1] - 1, layout.corner(s)[0] + 40].min() > 200 for s in range(8)
-    ]
-    assert framed == [state == table.oracle for state in range(8)]
-
-
 def test_paths_are_drawn_in_their_own_colours() -> None:
     plain = np.asarray(contact_sheet(_scene(), grid=SMALL))
     drawn = contact_sheet(_scene(), grid=SMALL, path={"first": [0, 7], "second": [3, 3, 4]})
@@ -132,44 +86,6 @@ def test_paths_are_drawn_in_their_own_colours() -> None:
     found = {tuple(c) for c in np.asarray(drawn).reshape(-1, 3).tolist()}
     assert colours <= found
     assert not colours & {tuple(c) for c in plain.reshape(-1, 3).tolist()}
-
-
-def test_frames_of_a_state_are_numbered_in_runs() -> None:
-    assert _visits([5, 9, 9, 9, 5, 5]) == {5: "0,4-5", 9: "1-3"}
-    assert _visits([2]) == {2: "0"}
-
-
-def test_same_seed_same_sheet() -> None:
-    first, second = (np.asarray(contact_sheet(_scene(), grid=SMALL, seed=3)) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    assert (first != np.asarray(contact_sheet(_scene(), grid=SMALL, seed=4))).any()
-
-
-@pytest.mark.parametrize(
-    "grid",
-    [
-        ExposureGrid((100,), (0.01,), (4,)),
-        ExposureGrid((100, 200, 400), (1 / 60,), (2, 4, 8)),
-        ExposureGrid((100,), tuple(2.0**-i for i in range(8, 0, -1)), (4, 8)),
-    ],
-)
-def test_other_grids_and_shapes(grid: ExposureGrid) -> None:
-    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    wide = _scene(60, 90, nlf=nlf)
-    sheet = contact_sheet(replace(wide, illuminance=None), grid=grid, path=[0], camera=CAMERA)
-    assert min(sheet.size) > 100
-
-
-def test_large_scenes_are_averaged_as_a_whole() -> None:
-    nlf = NoiseLevelFunction((9e-4,) * 4, (9e-6,) * 4)
-    scene = _scene(600, 800, nlf=nlf)
-    small = _averaged(scene, 192)
-    assert small.light.shape == (4, 200, 266)
-    assert small.box_factor == 3
-    np.testing.assert_allclose(small.nlf.shot, 1e-4)
-    mean = scene.light[2, 3:6, 6:9].double().mean()
-    assert float(small.light[2, 1, 2]) == pytest.approx(float(mean), rel=1e-6)
-    assert _averaged(_scene(), 192) is not None
 
 
 @pytest.mark.parametrize(
@@ -185,3 +101,38 @@ def test_large_scenes_are_averaged_as_a_whole() -> None:
 def test_bad_arguments_are_refused(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         contact_sheet(_scene(), **arguments)
+
+
+def test_caption_and_size_of_a_frame(caplog: pytest.LogCaptureFixture) -> None:
+    env = _env(resolution=40)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.render()
+    env.reset(seed=1, options={"state": 0})
+    first = env.render()
+    assert first.shape == (280, 280, 3)  # seven times 40
+    env.reset(seed=1, options={"state": 3})
+    band = slice(-20, None)
+    assert (first[band] != env.render()[band]).any()
+    assert first[band].max() > 200  # the ink
+    first[:] = 0  # the caller may write to it
+    assert env.render().max() > 0
+    without = gym.make("ae_env/AutoExposure-v0", scenes="bundled:small").unwrapped
+    without.reset(seed=0)
+    assert without.render() is None
+    assert "render_mode='rgb_array'" in caplog.text
+
+
+def test_border_shows_the_score_and_the_oracle_is_framed() -> None:
+    scene = _scene()
+    image = contact_sheet(scene, grid=SMALL, seed=3)
+    sheet = np.asarray(image)
+    assert image.mode == "RGB"
+    np.testing.assert_array_equal(sheet, np.asarray(contact_sheet(scene, grid=SMALL, seed=3)))
+    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced"), use_cache=False).table(scene)
+    layout = _layout(SMALL)
+    for state in range(8):
+        x, y = layout.corner(state)
+        assert (sheet[y - 1, x + 40].min() > 200) == (state == table.oracle)
+        if state != table.oracle:
+            expected = colormaps["viridis"](table.mean[state] / table.mean.max(), bytes=True)[:3]
+            assert sheet[y + 2, x + 40].tolist() == [int(v) for v in expected]

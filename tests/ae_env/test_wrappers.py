@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from hypothesis import given
 
 import ae_env  # noqa: F401  (registers the environment)
 from ae_env import wrappers
+from ae_env.grid import ExposureGrid
 from ae_env.wrappers import (
     ContinuousActions,
     ControlActions,
@@ -17,6 +24,7 @@ from ae_env.wrappers import (
     VectorControlActions,
     VectorRelativeActions,
 )
+from tests.strategies import SEEDS, grids
 
 ID = "ae_env/AutoExposure-v0"
 ARGUMENTS = {"scenes": "bundled:small", "resolution": 36}
@@ -28,7 +36,7 @@ PAIRS = [
 
 
 def _make(**arguments: object) -> gym.Env:
-    return gym.make(ID, **ARGUMENTS, **arguments)
+    return gym.make(ID, **{**ARGUMENTS, **arguments})
 
 
 def test_control_actions_are_positions_in_the_lists() -> None:
@@ -40,24 +48,6 @@ def test_control_actions_are_positions_in_the_lists() -> None:
     assert info["exposure_time"] == pytest.approx(1 / 125)
     assert env.action_masks().shape == (12,)
     assert env.action_masks().all()
-
-
-@pytest.mark.parametrize(
-    ("start", "steps", "expected"),
-    [
-        ((1, 1, 1), (2, 0, 1), (2, 0, 1)),
-        ((0, 3, 2), (0, 2, 2), (0, 3, 3)),  # the first two stay at the ends of their lists
-        ((3, 0, 0), (1, 1, 1), (3, 0, 0)),
-    ],
-)
-def test_relative_actions_step_every_control_and_stop_at_the_ends(
-    start: tuple[int, ...], steps: tuple[int, ...], expected: tuple[int, ...]
-) -> None:
-    env = RelativeActions(_make())
-    grid = env.unwrapped.grid
-    env.reset(seed=0, options={"state": grid.index(*start)})
-    _, _, _, _, info = env.step(np.array(steps))
-    assert info["state"] == grid.index(*expected)
 
 
 def test_continuous_actions_take_the_nearest_apex_values() -> None:
@@ -78,41 +68,6 @@ def test_continuous_actions_take_the_nearest_apex_values() -> None:
     assert (settings.iso, settings.f_number) == (400, 5.6)
     assert settings.exposure_time == pytest.approx(1 / 15)
     assert env.action(np.full(3, 9.0)) == env.action(np.ones(3))  # clipped
-
-
-def test_continuous_ties_go_to_the_lower_iso() -> None:
-    grid = {"isos": [100, 400], "exposure_times": [0.01], "f_numbers": [4]}
-    env = ContinuousActions(_make(grid=grid))
-    assert env.action(np.zeros(3)) == 0
-    assert env.action(np.array([0.3, -0.7, 0.01])) == 1  # one value of time and aperture: ignored
-
-
-def test_every_state_is_reached_by_its_own_apex_values() -> None:
-    env = ContinuousActions(_make())
-    apex = np.array(
-        [
-            [2 * np.log2(s.f_number), -np.log2(s.exposure_time), np.log2(s.iso)]
-            for s in env.unwrapped.grid
-        ]
-    )
-    actions = 2 * (apex - apex.min(0)) / (apex.max(0) - apex.min(0)) - 1
-    assert [env.action(action) for action in actions] == list(range(64))
-
-
-def test_masked_states_are_avoided(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = _make()
-    grid = base.unwrapped.grid
-    allowed = np.array([s.f_number > 4 for s in grid])  # as for a scene whose depth is known
-    monkeypatch.setattr(base.unwrapped, "action_masks", lambda: allowed)
-    wide_open = np.array([-1.0, -1.0, -1.0])
-    assert grid[int(ContinuousActions(base).action(wide_open))].f_number == 5.6
-    np.testing.assert_array_equal(
-        ControlActions(base).action_masks(), [True] * 8 + [False, True, True, True]
-    )
-    base.reset(seed=0, options={"state": grid.index(0, 3, 1)})
-    np.testing.assert_array_equal(
-        RelativeActions(base).action_masks(), [True] * 6 + [False, True, True]
-    )
 
 
 @pytest.mark.parametrize(("single", "vector"), PAIRS)
@@ -153,13 +108,31 @@ def test_wrapped_spec_round_trips_through_json(single: type) -> None:
     assert env.step(action)[1] == again.step(action)[1]
 
 
+def test_masks_are_the_union_per_control() -> None:
+    """Allowed: two states that differ in every control, whose mixtures are forbidden."""
+    grid = {"isos": [100, 200], "exposure_times": [0.01, 0.02, 0.04], "f_numbers": [4, 8]}
+    base = _make(grid=grid)
+    inner = base.unwrapped
+    allowed = np.zeros(12, bool)
+    allowed[[inner.grid.index(0, 0, 1), inner.grid.index(1, 2, 0)]] = True
+    scenes = [replace(inner.scenes[0], allowed=allowed)]
+    env = _make(grid=grid, scenes=scenes, simulator=None)
+    env.reset(seed=0, options={"state": inner.grid.index(1, 1, 0)})
+    controls = [True, True, True, False, True, True, True]
+    np.testing.assert_array_equal(ControlActions(env).action_masks(), controls)
+    # From ISO 200, 0.02 s, f/4: any ISO, not the same time, any aperture; down stays at the end.
+    steps = [True, True, True, True, False, True, True, True, True]
+    np.testing.assert_array_equal(RelativeActions(env).action_masks(), steps)
+    nearest = ContinuousActions(env).action(np.array([1.0, 1.0, 1.0]))  # f/8, 0.01 s, ISO 200
+    assert nearest == inner.grid.index(0, 0, 1)
+    envs = gym.make_vec(ID, num_envs=2, **{**ARGUMENTS, "grid": grid, "scenes": scenes})
+    envs.reset(seed=0, options={"state": [inner.grid.index(1, 1, 0), 0]})
+    np.testing.assert_array_equal(VectorControlActions(envs).action_masks(), [controls] * 2)
+    np.testing.assert_array_equal(VectorRelativeActions(envs).action_masks()[0], steps)
+
+
 @pytest.mark.parametrize(("single", "vector"), PAIRS)
-def test_bad_actions_and_environments_are_refused(single: type, vector: type) -> None:
-    env = single(_make())
-    env.reset(seed=0)
-    for action in (np.array([0, 1]), np.array([np.nan, 0.0, 0.0]), 3):
-        with pytest.raises(ValueError, match="`action`"):
-            env.action(action)
+def test_other_environments_are_refused(single: type, vector: type) -> None:
     with pytest.raises(ValueError, match="`env`"):
         single(gym.make("CartPole-v1"))
     with pytest.raises(ValueError, match="wrapped already"):
@@ -168,17 +141,74 @@ def test_bad_actions_and_environments_are_refused(single: type, vector: type) ->
         vector(gym.make_vec("CartPole-v1", num_envs=1, vectorization_mode="sync"))
 
 
-def test_out_of_range_positions_are_refused() -> None:
-    env = ControlActions(_make())
-    with pytest.raises(ValueError, match=r"\[0, \[4, 4, 4\]\)"):
-        env.action(np.array([0, 4, 0]))
+@pytest.mark.parametrize("name", ["ControlActions", "RelativeActions", "ContinuousActions"])
+def test_odd_actions_are_refused(name: str) -> None:
+    env, envs = _make(), gym.make_vec(ID, num_envs=3, **ARGUMENTS)
+    env.reset(seed=0)
+    envs.reset(seed=0)
+    single, many = getattr(wrappers, name)(env), getattr(wrappers, f"Vector{name}")(envs)
+    odd = [
+        None,
+        True,
+        "x",
+        {},
+        object(),
+        b"x",
+        1,
+        [1, 1],
+        [1, 1, math.nan],
+        [1, 1, "x"],
+        [1, 1, None],
+    ]
+    odd += [[1, 1, math.inf], [[1], [1, 1]], np.ones(3, bool), np.ones(3, complex)]
+    if name != "ContinuousActions":
+        odd += [[0, 0, -1], [0, 0, 4], [0, 0, 10**30], np.ones(3)]
+    for action in odd:
+        with pytest.raises(ValueError, match="`action`"):
+            single.action(action)
+        rows = [[1, 1, 1], [1, 1, 1], action]
+        with pytest.raises(ValueError, match="`action`"):
+            many.actions(rows if not isinstance(action, np.ndarray) else np.stack([action] * 3))
+    if isinstance(single.action_space, gym.spaces.MultiDiscrete):
+        masks = np.split(single.action_masks(), np.cumsum(single.action_space.nvec)[:-1])
+        for column, mask in enumerate(masks):
+            for value in np.flatnonzero(mask):
+                action = np.zeros(3, np.int64)
+                action[column] = value
+                assert 0 <= single.action(action) < 64
 
 
-def test_wrappers_follow_gymnasium() -> None:
-    for single, vector in PAIRS:
-        assert issubclass(single, gym.ActionWrapper)
-        assert issubclass(vector, gym.vector.VectorActionWrapper)
-        for wrapper in (single, vector):
-            assert issubclass(wrapper, gym.utils.RecordConstructorArgs)
-            assert wrapper.__doc__
-            assert getattr(wrappers, wrapper.__name__) is wrapper
+def _spec(grid: ExposureGrid) -> dict[str, list[float]]:
+    """The grid as an environment's argument, by way of JSON."""
+    lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
+    return json.loads(json.dumps(lists))
+
+
+def _env(grid: ExposureGrid, **arguments: Any) -> gym.Env:
+    return gym.make(ID, scenes="bundled:small", resolution=36, grid=_spec(grid), **arguments)
+
+
+@given(grids(), SEEDS)
+def test_other_ways_to_act_reach_every_state(grid: ExposureGrid, seed: int) -> None:
+    env = _env(grid)
+    rng = np.random.default_rng(seed)
+    controls, steps, apex = ControlActions(env), RelativeActions(env), ContinuousActions(env)
+    values = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid])
+    low, span = values.min(axis=0), np.ptp(values, axis=0)
+    for state in rng.permutation(len(grid))[:16].tolist():
+        position = grid.controls(state)
+        assert controls.action(position) == state
+        unit = np.where(span > 0, 2 * (values[state] - low) / np.where(span > 0, span, 1) - 1, 0)
+        found = values[apex.action(unit)]
+        np.testing.assert_allclose(found, values[state], atol=1e-4)
+        env.reset(seed=seed, options={"state": state})
+        move = rng.integers(-1, 2, 3)
+        moved = grid.controls(int(steps.action(move + 1)))
+        np.testing.assert_array_equal(moved, np.clip(position + move, 0, np.array(grid.shape) - 1))
+        assert steps.action(np.ones(3, int)) == state
+    wanted = rng.uniform(-1, 1, 3)
+    distance = np.square(low + (wanted + 1) / 2 * span - values).sum(axis=1)
+    assert distance[apex.action(wanted)] <= distance.min() + 1e-8
+    for wrapper in (controls, steps, apex):
+        if wrapper is not apex:
+            assert wrapper.action_masks().all()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -77,18 +76,6 @@ def test_frames_are_at_their_place_in_the_period() -> None:
     gains = [lighting.gain(frame, 1e-6, 0.0) for frame in range(4)]
     wanted = [1.0 + 0.8 * math.cos(2.0 * math.pi * frame / 3.0) for frame in range(4)]
     assert gains == pytest.approx(wanted, abs=1e-3)
-
-
-def test_dark_between_pulses_has_a_logarithm() -> None:
-    lighting = make_lighting({"kind": "flicker", "frequency": 1, "duty": 0.01})
-    gain, rows = lighting.rows(0, 1e-4, 0.5, SHUTTER)
-    assert (gain, rows) == (2.0**-64, None)
-
-
-def test_options_are_checked() -> None:
-    assert make_lighting(json.loads('{"kind": "flicker", "duty": null}')) == FlickerLighting()
-    assert FlickerLighting(depth=0) == FlickerLighting(depth=0.0)
-    assert make_lighting({"kind": "flicker", "depth": 0}).rows(1, 0.001, 0.2, SHUTTER)[1] is None
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Light that follows a list of one's own."""
+"""Light that follows a list or a file."""
 
 from __future__ import annotations
 

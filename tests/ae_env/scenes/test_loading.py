@@ -1,27 +1,33 @@
-"""load_scenes: users' folders, groups, splits, errors."""
+"""load_scenes by name, list and attribute; and the environment with trained networks."""
 
+from __future__ import annotations
+
+import json
 import logging
-from datetime import datetime, timedelta
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.registration import EnvSpec
 
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.folder import find_files
-from ae_env.scenes.grouping import Shot, group_shots, split_groups
-from simulator.camera import get_camera
-from simulator.settings import CameraSettings
+from ae_env.scenes.loading import SceneNetworks
+from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTables
+from simulator import CameraSettings, get_camera
+from simulator.networks.aperture_module import DEAD_ZONE
+from simulator.networks.weights import build_modules, save_modules
+from tests.ae_env.scene_files import write_hdr
 
 CAMERA = get_camera("nikon_z6")
-
-
-def write_hdr(path: Path, seed: int = 0, height: int = 20, width: int = 24) -> None:
-    cv2 = pytest.importorskip("cv2")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    image = np.random.default_rng(seed).uniform(0.1, 4.0, (height, width, 3)).astype(np.float32)
-    path.write_bytes(cv2.imencode(".hdr", image)[1].tobytes())
 
 
 def my_scenes(split: str, camera: object) -> list[Scene]:
@@ -58,98 +64,13 @@ def test_small_folder_is_zero_shot(tmp_path: Path) -> None:
         load(tmp_path, "train")
 
 
-def test_large_folder_is_split_by_group(tmp_path: Path) -> None:
-    for i in range(14):
-        for name in ("a", "b"):
-            write_hdr(tmp_path / f"subject{i}" / f"{name}.hdr", i)
-    with pytest.raises(ValueError, match=r"at least 15 source groups.*has 14"):
-        load(tmp_path, "train")
-    for name in ("a", "b"):
-        write_hdr(tmp_path / "subject14" / f"{name}.hdr", 14)
-    train, test = (
-        {s.scene_id: s.group for s in load(tmp_path, split)} for split in ("train", "test")
-    )
-    assert not set(train.values()) & set(test.values())
-    assert {*train, *test} == {s.scene_id for s in load(tmp_path)}
-    assert len(train) + len(test) == 30
-    assert train
-    assert test
-    assert next(iter(train)).endswith(("/a", "/b"))
-
-
-def test_groups_file_names_the_groups(tmp_path: Path) -> None:
-    for name in ("a", "b", "c"):
-        write_hdr(tmp_path / f"{name}.hdr")
-    (tmp_path / "groups.csv").write_text("file,group\na.hdr,first\nb.hdr,first\n")
-    assert [s.group for s in load(tmp_path)] == ["first", "first", "c"]
-    for text, words in (
-        ("name,group\na.hdr,x\n", "columns"),
-        ("file,group\nz.hdr,x\n", "line 2"),
-        ("file,group\na.hdr,\n", "line 2"),
-    ):
-        (tmp_path / "groups.csv").write_text(text)
-        with pytest.raises(ValueError, match=words):
-            load(tmp_path)
-
-
-def test_options_reach_the_scenes(tmp_path: Path) -> None:
-    write_hdr(tmp_path / "a.hdr", 0)
-    write_hdr(tmp_path / "b.hdr", 1)
-    options = {"path": str(tmp_path), "illuminance": {"a.hdr": 250.0}, "kind": "mine", "hard": True}
-    a, b = load(options | {"median_speed": 0.5})
-    assert (a.illuminance, b.illuminance) == (250.0, None)
-    assert {(s.kind, s.hard, s.median_speed) for s in (a, b)} == {("mine", True, 0.5)}
-    (only,) = load({"path": tmp_path / "b.hdr", "ev100": 8.0})
-    assert only.ev100 == pytest.approx(8.0, abs=0.05)
-
-
-def test_split_of_groups_is_stable_and_needs_fifteen() -> None:
-    names = [f"g{i}" for i in range(200)]
-    split = split_groups(names)
-    assert 0.6 < np.mean([split[n] == "train" for n in names]) < 0.8
-    more = split_groups([*names, "new"])
-    assert all(more[n] == split[n] for n in names)
-    assert set(split_groups(names[:14]).values()) == {"test"}
-    for start in range(180):
-        assert set(split_groups(names[start : start + 15]).values()) == {"train", "test"}
-
-
-def shot(seconds: float | None, look: int, camera: str = "A") -> Shot:
-    histogram = np.zeros(4)
-    histogram[look] = 1.0
-    start = datetime(2024, 1, 1)
-    time = None if seconds is None else start + timedelta(seconds=seconds)
-    return Shot(camera, time, histogram)
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "same"),
-    [
-        (shot(0, 0), shot(30, 1), True),  # a burst
-        (shot(0, 0), shot(31, 1), False),
-        (shot(0, 0), shot(300, 0), True),  # the same look within five minutes
-        (shot(0, 0), shot(301, 0), False),
-        (shot(None, 0), shot(None, 0), True),
-        (shot(None, 0), shot(None, 1), False),
-        (shot(0, 0), shot(0, 0, "B"), False),
-    ],
-)
-def test_grouping_of_two_shots(first: Shot, second: Shot, same: bool) -> None:
-    assert group_shots(["x", "y"], [first, second]) == (["x", "x"] if same else ["x", "y"])
-
-
-def test_shots_are_grouped_in_the_order_of_their_times() -> None:
-    shots = [shot(1000, 0), shot(0, 1), shot(1010, 2), shot(20, 3)]
-    assert group_shots(["a", "b", "c", "d"], shots) == ["a", "b", "a", "b"]
-
-
 @pytest.mark.parametrize(
     ("spec", "words"),
     [
         ("bundeld", r"did you mean 'bundled'"),
         ("bundled:smal", r"did you mean 'bundled:small'"),
         ("no/such/folder", r"`scenes` \(='no/such/folder'\) must name an existing file"),
-        ("no_such_module:scenes", "cannot import"),
+        ("no_such_module:scenes", "cannot be loaded: ModuleNotFound"),
         (f"{__name__}:MINES", "did you mean 'MINE'"),
         ("math:pi", "must give a list of Scene, not float"),
         ([1], r"scenes\[0\] \(=int\) must be a Scene"),
@@ -166,54 +87,271 @@ def test_errors_name_the_value_and_the_rule(spec: object, words: str) -> None:
         load(spec)
 
 
-def test_unknown_split_and_too_small_scenes() -> None:
-    with pytest.raises(ValueError, match=r"`split` \(='val'\)"):
-        load(MINE, "val")
-    with pytest.raises(ValueError, match=r"`resolution` \(=17\)"):
-        load(MINE, resolution=17)
-    with pytest.raises(ValueError, match=r"dead_leaves-1000.*`resolution` \(=512\)"):
-        load("bundled", "test", resolution=512)
+ID = "ae_env/AutoExposure-v0"
+#: Circle of confusion that the networks of these tests find everywhere [pixel].
+FOUND = 4.0
+#: What is left of it after the dead zone.
+DIAMETER = math.sqrt(FOUND**2 - DEAD_ZONE**2)
+NOISY = CameraSettings(6400, 1 / 1024, 8)
 
 
-def test_unreadable_files_are_named(tmp_path: Path) -> None:
-    (tmp_path / "readme.txt").write_text("no scenes here")
-    with pytest.raises(ValueError, match=r"\.txt.*must hold raws"):
-        load(tmp_path)
-    (tmp_path / "broken.dng").write_bytes(b"II*\0 not a raw")
-    with pytest.raises(ValueError, match=r"scene file .*broken\.dng"):
-        load(tmp_path)
-    (tmp_path / "broken.dng").unlink()
-    pytest.importorskip("cv2")
-    (tmp_path / "broken.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 9 +X 9\n")
-    with pytest.raises(ValueError, match=r"broken\.hdr"):
-        load(tmp_path)
-    write_hdr(tmp_path / "broken.hdr", height=12, width=20)
-    with pytest.raises(ValueError, match=r"broken\.hdr.*at least 16"):
-        load(tmp_path)
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An untrained denoiser, and a defocus map that is the same everywhere."""
+    torch.manual_seed(0)
+    modules = build_modules("compact")
+    tail: Any = modules["aperture"].network.tail
+    with torch.no_grad():
+        tail.weight.zero_()
+        tail.bias.fill_(math.log(FOUND + 0.3))
+    path = tmp_path_factory.mktemp("weights") / "tiny"
+    save_modules(path, modules, "compact", {})
+    return str(path.with_suffix(".safetensors"))
 
 
-def test_hidden_files_are_left_out(tmp_path: Path) -> None:
-    write_hdr(tmp_path / "a.hdr")
-    write_hdr(tmp_path / ".trash" / "b.hdr")
-    write_hdr(tmp_path / "._a.hdr")
-    assert [p.name for p in find_files(tmp_path)[1]] == ["a.hdr"]
+def noisy_scenes(resolution: int = 40, count: int = 2) -> list[Scene]:
+    """Photographs at ISO 6400, twice as many pixels a side as wanted."""
+    rng = np.random.default_rng(0)
+    nlf = CAMERA.nlf(NOISY.iso)
+    scenes = []
+    for i in range(count):
+        light = 0.1 + 0.3 * rng.random((4, 2 * resolution, 2 * resolution))
+        light += rng.normal(size=light.shape) * np.sqrt(nlf.read[0] + nlf.shot[0] * light)
+        data = torch.from_numpy(light.astype(np.float32))
+        scenes.append(Scene.from_array(data, NOISY, CAMERA, scene_id=f"noisy-{i}", nlf=nlf))
+    return scenes
 
 
-@pytest.mark.real_data
-def test_real_raws_are_three_subjects(data_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "ae_env.scenes")
-    scenes = load(data_dir / "canon_crw_cc0", "test", 64)
-    groups = {s.scene_id[-4:]: s.group for s in scenes}
-    assert len(scenes) == 8
-    assert len(set(groups.values())) == 3
-    for members in (("0101", "0104", "0105"), ("0112", "0113"), ("0117", "0118", "0119")):
-        assert len({groups[m] for m in members}) == 1
-    assert "3 source groups" in caplog.text
-    for scene in scenes:
-        assert scene.light.shape == (4, 64, 64)
-        assert scene.box_factor == 13
-        assert not scene.noise_free
-        assert scene.illuminance is None
-        assert scene.camera.model.endswith("S40")
-    with pytest.raises(ValueError, match="at most 8"):
-        load(data_dir / "canon_crw_cc0", "train")
+NOISY_SCENES = noisy_scenes()
+NAMED = f"{__name__}:NOISY_SCENES"
+
+
+def flat_scene(light: float, denoised: float | None = None, **fields: Any) -> Scene:
+    given = {"nlf": CAMERA.nlf(NOISY.iso)} if denoised is not None else {}
+    if denoised is not None:
+        fields["denoised"] = torch.full((4, 40, 40), denoised)
+    return Scene.from_array(
+        torch.full((4, 40, 40), light), NOISY, CAMERA, scene_id="flat", **given, **fields
+    )
+
+
+def _make(**arguments: Any) -> gym.Env:
+    return gym.make(ID, **{"scenes": NOISY_SCENES, "resolution": 40, **arguments})
+
+
+def _state(env: gym.Env, iso: float, time: float, f_number: float) -> int:
+    grid: Any = env.unwrapped.grid  # type: ignore[attr-defined]
+    wanted = (iso, time, f_number)
+    return next(i for i, s in enumerate(grid) if (s.iso, s.exposure_time, s.f_number) == wanted)
+
+
+def _rollout(
+    make: Callable[[], gym.Env], seed: int = 1, actions: Sequence[int] | None = None
+) -> list[np.ndarray]:
+    env, frames = make(), []
+    rng = np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    for action in rng.integers(64, size=6) if actions is None else actions:
+        numbers = [info[k] for k in ("clipped_high", "clipped_low", "excess_noise")]
+        frames += [*observation.values(), np.array([*numbers, info["rewards"]["score"]])]
+        observation, _, _, _, info = env.step(action)
+    return frames
+
+
+def _assert_equal(first: list[np.ndarray], second: list[np.ndarray]) -> None:
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
+    """The weights named here cannot be read: whoever loads them fails."""
+    damaged = tmp_path / "damaged.safetensors"
+    damaged.write_bytes(b"no weights")
+    damaged.with_suffix(".json").write_text("{}")
+    arguments = {"scenes": "bundled:small", "resolution": 36, "with_oracle": True}
+    without = _rollout(lambda: _make(**arguments, simulator=None))
+    _assert_equal(_rollout(lambda: _make(**arguments, simulator=str(damaged))), without)
+    _assert_equal(_rollout(lambda: _make(**arguments)), without)
+    with pytest.raises(ValueError, match="damaged"):
+        _make(simulator=str(damaged))
+
+
+def test_states_cleaner_than_the_source_are_denoised(weights: str) -> None:
+    for simulator, denoised in ((weights, True), (None, False)):
+        env = _make(simulator=simulator, motion="none", depth="far")
+        state = _state(env, 100, 1 / 15, 8)
+        _, info = env.reset(seed=0, options={"state": state})
+        assert ("noise_reduction" in info["modules"].split("+")) == denoised
+        # 68 times the light at a 64th of the ISO: nearly all noise is the source's.
+        assert (info["excess_noise"] < 0.01) == denoised
+        assert info["excess_noise"] > 1.0 or denoised
+
+
+def test_capture_of_denoised_light_has_the_cameras_noise(weights: str) -> None:
+    scene = replace(flat_scene(0.2, denoised=0.2), box_factor=2)
+    noise = torch.randn((4, 40, 40), generator=torch.Generator().manual_seed(1))
+    sigma = (scene.nlf.read[0] + scene.nlf.shot[0] * 0.2) ** 0.5
+    scene = replace(scene, light=scene.light + sigma * noise)
+    env = _make(scenes=[scene], simulator=weights, motion="none", depth="far", observation="linear")
+    observation, info = env.reset(seed=0, options={"state": _state(env, 100, 1 / 125, 4)})
+    assert "noise_reduction" in info["modules"]
+    signal = 0.2 * (1024 / 125) * (100 / 6400) * 4  # f/4 for f/8
+    nlf = CAMERA.nlf(100)
+    wanted = (nlf.read[1] + nlf.shot[1] * signal) / 4 + (1 / CAMERA.span[1]) ** 2 / 12
+    assert observation["raw"][1].var() == pytest.approx(wanted, rel=0.15)  # 1600 samples: 3.5 %
+    assert observation["raw"].mean() == pytest.approx(signal, rel=1e-3)
+
+
+def test_closed_forms_are_those_of_the_denoised_light(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    noisy = flat_scene(0.2, denoised=0.1, illuminance=640.0)
+    tables = ScoreTables(EnvOptions().make_grid(), CAMERA, make_scorer("balanced"))
+    without, found = tables.table(flat_scene(0.1, illuminance=640.0)), tables.table(noisy)
+    np.testing.assert_array_equal(found.mean, without.mean)
+    raw = tables.table(replace(noisy, denoised=None))
+    assert np.abs(raw.mean - found.mean).max() > 0.01
+    mapped = replace(noisy, denoised=None, defocus_map=torch.ones(40, 40))
+    assert tables.table(mapped).parts["sharpness"][0] < raw.parts["sharpness"][0]
+    files = list((tmp_path / "score_tables").glob("*"))
+    assert len(files) == 4  # one each: none is taken for another
+
+
+def point_scene(size: int = 80, f_number: float = 8.0) -> Scene:
+    """A point of light, without noise, taken at `f_number`."""
+    light = torch.zeros(4, size, size)
+    light[:, size // 2 : size // 2 + 2, size // 2 : size // 2 + 2] = 0.9
+    reference = CameraSettings(100, 1 / 125, f_number)
+    return Scene.from_array(light, reference, CAMERA, scene_id="point", illuminance=640.0)
+
+
+def _spread(raw: np.ndarray) -> float:
+    """Variance along the columns of the light in (H, W) [pixel^2]."""
+    weights, columns = raw.sum(axis=0), np.arange(raw.shape[1])
+    mean = (weights * columns).sum() / weights.sum()
+    return float((weights * (columns - mean) ** 2).sum() / weights.sum())
+
+
+def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
+    """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
+    env = _make(
+        scenes=[point_scene()],
+        simulator=weights,
+        depth="unknown",
+        motion="none",
+        noise=False,
+        observation="linear",
+    )
+    spread, modules, raw = {}, {}, {}
+    for f_number in (4, 5.6, 8, 11):
+        state = _state(env, 100, 1 / 125, f_number)
+        observation, info = env.reset(seed=0, options={"state": state})
+        raw[f_number] = observation["raw"][0].astype(np.float64)
+        spread[f_number], modules[f_number] = _spread(raw[f_number]), info["modules"]
+    working = DIAMETER / 2.0
+    for f_number, growth in ((4, 4.0 - 1.0), (5.6, 2.0 - 1.0)):
+        assert spread[f_number] == pytest.approx(working**2 * growth / 16.0, rel=0.03)
+        assert modules[f_number] == "exposure+aperture"
+    for f_number in (8, 11):  # closing leaves the blur: not a digital number differs
+        sharp = np.zeros((40, 40))
+        sharp[20, 20] = 0.9 * 8.0 ** (2 * (f_number < 8)) / (1 if f_number == 8 else 2)
+        np.testing.assert_allclose(raw[f_number], sharp, atol=1 / CAMERA.span[0])
+        assert modules[f_number] == "exposure"
+
+
+def test_vector_environment_equals_single_ones(weights: str) -> None:
+    arguments = {"scenes": NOISY_SCENES, "resolution": 40, "simulator": weights}
+    arguments["depth"] = "unknown"
+    envs = gym.make_vec(ID, num_envs=3, **arguments)
+    singles = [gym.make(ID, **arguments) for _ in range(3)]
+    observations, infos = envs.reset(seed=5)
+    rows = [env.reset(seed=5 + i) for i, env in enumerate(singles)]
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        for i, row in enumerate(rows):
+            for name, value in row[0].items():
+                np.testing.assert_array_equal(observations[name][i], value)
+            assert infos["modules"][i] == row[-1]["modules"]
+            assert infos["excess_noise"][i] == row[-1]["excess_noise"]
+        actions = rng.integers(64, size=3)
+        observations, _, _, _, infos = envs.step(actions)
+        rows = [env.step(a) for env, a in zip(singles, actions, strict=True)]
+
+
+def test_spec_survives_json(weights: str) -> None:
+    env = gym.make(ID, scenes=NAMED, resolution=40, simulator=weights, depth="unknown")
+    text = env.unwrapped.spec.to_json()  # type: ignore[union-attr]
+    assert json.loads(text)["kwargs"]["simulator"] == weights
+    again = gym.make(EnvSpec.from_json(text))
+    _assert_equal(_rollout(lambda: env), _rollout(lambda: again))
+
+
+def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:
+    """Only the middle of a large frame is looked at, with what the networks see around it."""
+    torch.manual_seed(3)
+    modules = build_modules("compact")
+    tail: Any = modules["aperture"].network.tail
+    with torch.no_grad():
+        tail.bias.fill_(math.log(FOUND + 0.3))  # beyond the dead zone
+    save_modules(tmp_path / "random", modules, "compact", {})
+    networks = SceneNetworks(str(tmp_path / "random.safetensors"))
+    light = 0.3 * torch.rand((4, 252, 244), generator=torch.Generator().manual_seed(1))
+    scene = Scene.from_array(light, CameraSettings(100, 0.01, 8), CAMERA, scene_id="large")
+    with torch.no_grad():
+        whole = modules.eval()["aperture"].defocus(light[None], torch.zeros_like(light)[None])[0]
+    native = networks.resized(scene, 16, "native")
+    torch.testing.assert_close(native.defocus_map, whole[118:134, 114:130], rtol=1e-3, atol=1e-4)
+    assert float(whole.std()) > 1e-3
+    corner = replace(scene, light=light[:, :40, :46])
+    box = networks.resized(corner, 20)
+    with torch.no_grad():
+        image = corner.light[None]
+        fine = modules["aperture"].defocus(image, torch.zeros_like(image))[0]
+    middle = fine[:, 3:43].square().reshape(20, 2, 20, 2).mean(dim=(1, 3)).sqrt() / 2.0
+    torch.testing.assert_close(box.defocus_map, middle, rtol=1e-3, atol=1e-4)
+    assert torch.equal(box.light, corner.resized(20).light)
+
+
+def test_maps_are_kept_and_made_again_where_damaged(
+    weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    scene = NOISY_SCENES[0]
+    first = SceneNetworks(weights).resized(scene, 40)
+    assert first.defocus_map is not None
+    with caplog.at_level(logging.INFO, logger="ae_env"):
+        second = SceneNetworks(weights).resized(scene, 40)
+    assert not caplog.records
+    assert torch.equal(second.defocus_map, first.defocus_map)  # type: ignore[arg-type]
+    (file,) = (tmp_path / "defocus_maps").iterdir()
+    file.write_bytes(b"damaged")
+    with caplog.at_level(logging.WARNING, logger="ae_env"):
+        third = SceneNetworks(weights).resized(scene, 40)
+    assert "damaged" in caplog.text
+    assert torch.equal(third.defocus_map, first.defocus_map)  # type: ignore[arg-type]
+    SceneNetworks(weights).resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
+    assert len(list((tmp_path / "defocus_maps").iterdir())) == 2
+
+
+def test_every_source_of_scenes_is_seen_at_its_finest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    image = np.random.default_rng(0).uniform(0.1, 4.0, (96, 100, 3)).astype(np.float32)
+    (tmp_path / "map.hdr").write_bytes(cv2.imencode(".hdr", image)[1].tobytes())
+    bundled = [point_scene(256)]
+    monkeypatch.setattr(
+        "ae_env.scenes.loading.bundled_scenes",
+        lambda split, camera, resolution, **size: bundled if resolution is None else [],
+    )
+    seen = []
+
+    def resize(scene: Scene, resolution: int | None, crop: Any) -> Scene:
+        seen.append(scene.light.shape[-1])
+        return scene.resized(resolution, crop)
+
+    for spec in (tmp_path, str(tmp_path), {"path": str(tmp_path)}, "bundled", NAMED, NOISY_SCENES):
+        scenes = load_scenes(spec, "test", camera=CAMERA, resolution=40, resize=resize)
+        assert {s.light.shape for s in scenes} == {(4, 40, 40)}
+    assert seen == [80, 80, 80, 256, 80, 80, 80, 80]

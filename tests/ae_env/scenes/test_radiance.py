@@ -1,14 +1,20 @@
-"""Radiance maps: reading, cleaning, perspective views."""
+"""Radiance maps: reading, cleaning, perspective views, lying files."""
+
+from __future__ import annotations
 
 import logging
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ae_env.scenes import load_scenes
 from ae_env.scenes.radiance import assumed_ev100, perspective, radiance_scenes, read_radiance
-from simulator.camera import get_camera
+from ae_env.scenes.scene import SceneRequest
+from simulator import get_camera
+from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")
 
@@ -48,18 +54,6 @@ def test_a_small_lamp_keeps_its_energy() -> None:
     assert coarse.mean() == pytest.approx(fine.mean(), rel=0.05)
 
 
-def test_invalid_field_of_view() -> None:
-    with pytest.raises(ValueError, match="`field_of_view`"):
-        perspective(np.ones((3, 4, 8), np.float32), 0.0, 4, 180.0)
-
-
-def write_exr(path: Path, image: np.ndarray) -> None:
-    openexr = pytest.importorskip("OpenEXR")
-    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
-    with openexr.File(header, {"RGB": image}) as file:
-        file.write(str(path))
-
-
 def test_exr_is_read_and_cleaned(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     image = np.random.default_rng(0).uniform(0.0, 5.0, (6, 8, 3)).astype(np.float32)
     write_exr(tmp_path / "a.exr", image)
@@ -89,20 +83,14 @@ def test_views_of_a_panorama_share_one_scale(tmp_path: Path) -> None:
     panorama = np.ones((64, 128, 3), np.float32)
     panorama[:, 48:80] = 4.0  # ahead (90 degrees wide) is four times as bright: 2 EV
     write_exr(tmp_path / "p.exr", panorama)
-    scenes = list(radiance_scenes(tmp_path / "p.exr", CAMERA, name="p", group="p", resolution=32))
+    request = SceneRequest("all", CAMERA, 32)
+    scenes = list(radiance_scenes(tmp_path / "p.exr", request, name="p", group="p"))
     assert [s.scene_id for s in scenes] == ["p-000", "p-090", "p-180", "p-270"]
     assert {s.group for s in scenes} == {"p"}
     ev = [s.ev100 for s in scenes]
     assert ev[0] - ev[1] == pytest.approx(2.0, abs=0.05)
     assert np.mean(ev) == pytest.approx(assumed_ev100("p"), abs=0.05)
     assert all(s.illuminance is None and s.noise_free and s.box_factor == 8 for s in scenes)
-
-
-def test_assumed_light_is_spread_over_its_range() -> None:
-    values = [assumed_ev100(f"map{i}") for i in range(300)]
-    assert 3.0 <= min(values) < 4.0
-    assert 13.0 < max(values) <= 14.0
-    assert np.mean(values) == pytest.approx(8.5, abs=0.6)
 
 
 def test_errors_name_the_file(tmp_path: Path) -> None:
@@ -124,16 +112,6 @@ def test_errors_name_the_file(tmp_path: Path) -> None:
         read_radiance(tmp_path / "b.exr")
 
 
-def test_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    for module, name in (("cv2", "a.hdr"), ("OpenEXR", "a.exr")):
-        monkeypatch.setitem(sys.modules, module, None)
-        (tmp_path / name).write_bytes(b"x")
-        with pytest.raises(ImportError, match=r"pip install ae-env\[hdr\]"):
-            read_radiance(tmp_path / name)
-
-
 @pytest.mark.real_data
 def test_real_maps_load(data_dir: Path) -> None:
     pytest.importorskip("cv2")
@@ -147,3 +125,61 @@ def test_real_maps_load(data_dir: Path) -> None:
         assert scene.light.shape == (4, 64, 64)
         assert scene.light[1].clamp(max=1.0).mean().item() == pytest.approx(0.12, rel=0.15)
         assert 1.0 < scene.ev100 < 15.0
+
+
+HDR_HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n"
+
+
+@pytest.mark.parametrize(
+    ("size", "words"),
+    [
+        (b"-Y 60000 +X 60000", "claims 60000 x 60000 pixels, where at most 268435456"),
+        (b"-Y 8000 +X 8000", "claims 8000 x 8000 pixels in .* bytes, where at most 8192 a byte"),
+        (b"-Y 99999999999 +X 4", "claims 99999999999 x 4"),
+        (b"-Y 17 +X 32", "complete"),
+        (b"-Y 0 +X 0", "complete"),
+        (b"", "complete"),
+    ],
+)
+def test_lying_radiance_files(tmp_path: Path, size: bytes, words: str) -> None:
+    pytest.importorskip("cv2")
+    path = tmp_path / "a.hdr"
+    path.write_bytes(HDR_HEAD + size + b"\n" + 16 * 32 * b"\x80\x80\x80\x80")
+    with pytest.raises(ValueError, match=rf"radiance map '.*a\.hdr' .*{words}"):
+        read_radiance(path)
+
+
+def test_lying_and_cut_exr_files(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, np.random.default_rng(0).random((32, 64)))
+    whole = path.read_bytes()
+    window = whole.index(b"dataWindow\0box2i\0") + 21
+    for corner, words in (((59_999, 59_999), "60000 x 60000"), ((19_999, 12_999), "8192 a byte")):
+        content = bytearray(whole)
+        struct.pack_into("<2i", content, window + 8, *corner)
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=rf"a\.exr' claims .*{words}"):
+            read_radiance(path)
+    for size in (0, 4, 100, 400, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match="must be a complete OpenEXR file"):
+            read_radiance(path)
+    for bad in (None, 3, b"a.exr"):
+        with pytest.raises(ValueError, match="must be a file's name"):
+            read_radiance(bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("scale", [2.0**-100, 2.0**110])
+def test_the_scale_of_a_map_does_not_matter(tmp_path: Path, scale: float) -> None:
+    # Nothing says how bright a radiance map is: any scale gives the same scene.
+    image = np.random.default_rng(0).uniform(0.1, 4.0, (32, 32))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    write_exr(tmp_path / "a" / "map.exr", image)
+    write_exr(tmp_path / "b" / "map.exr", image.astype(np.float32) * scale)
+    (first,), (second,) = (
+        load_scenes(tmp_path / "a", "all", camera=CAMERA, resolution=8),
+        load_scenes(tmp_path / "b", "all", camera=CAMERA, resolution=8),
+    )
+    assert second.ev100 == pytest.approx(first.ev100, abs=1e-6)
+    torch.testing.assert_close(second.light, first.light, rtol=1e-5, atol=0.0)

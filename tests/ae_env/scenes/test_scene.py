@@ -1,19 +1,24 @@
 """Scene: normalisation, colours, resizing."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from skimage.color import rgb2xyz
 
-from ae_env.scenes import Scene, reference_settings
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env.scenes import Scene
 from ae_env.scenes.colour import camera_from_srgb, temperature_tint
-from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
-from simulator.camera_simulator import CameraSimulator
+from simulator import CameraSettings, NoiseLevelFunction, get_camera
+from simulator.camera import CameraProfile
 from simulator.raw.image import RawImage
-from simulator.settings import CameraSettings
+from tests.strategies import SEEDS, lights
 
 CAMERA = get_camera("nikon_z6")
 PLAIN = CameraProfile("plain", "RGGB", 0, 1023, 10)
@@ -57,20 +62,6 @@ def test_colours_go_through_xyz_to_the_camera() -> None:
     np.testing.assert_allclose(white, raw_white / raw_white[1], rtol=2e-3)
 
 
-def test_camera_without_colour_matrix_keeps_the_colours() -> None:
-    rgb = np.random.default_rng(1).uniform(0.0, 2.0, (3, 6, 6)).astype(np.float32)
-    scene = radiance_scene(rgb, PLAIN, illuminance=100.0)
-    factor = 250 / (120 * math.pi)
-    np.testing.assert_allclose(scene.light[[0, 1, 3]], rgb * factor, rtol=1e-5)
-    assert scene.white_balance == (1.0, 1.0, 1.0)
-
-
-def test_colours_outside_the_gamut_stay_light() -> None:
-    red = np.zeros((3, 2, 2), np.float32)
-    red[2] = 1.0
-    assert radiance_scene(red, illuminance=10.0).light.min() >= 0
-
-
 def test_unknown_light_is_anchored_to_the_mean() -> None:
     rgb = np.random.default_rng(2).uniform(0.5, 1.5, (3, 8, 8)).astype(np.float32) * 1e5
     scene = radiance_scene(rgb, PLAIN, ev100=7.5)
@@ -85,27 +76,6 @@ def test_a_sun_does_not_decide_the_anchor() -> None:
     rgb[:, 0, 0] = 1e6  # one pixel in a hundred: clipped it counts 1, the others share 0.11
     scene = radiance_scene(rgb, PLAIN)
     assert scene.light[1, 5, 5].item() == pytest.approx((0.12 * 100 - 1) / 99, rel=1e-5)
-
-
-def test_resized_conserves_the_mean_and_divides_the_noise() -> None:
-    light = torch.rand(4, 24, 24, generator=torch.Generator().manual_seed(0))
-    nlf = NoiseLevelFunction((1e-4, 2e-4, 3e-4, 4e-4), (1e-6,) * 4)
-    small = array_scene(light, nlf=nlf, box_factor=2).resized(8)
-    torch.testing.assert_close(small.light.mean(dim=(1, 2)), light.mean(dim=(1, 2)))
-    torch.testing.assert_close(small.light[2, 1, 3], light[2, 3:6, 9:12].mean())
-    assert small.nlf.shot == pytest.approx([v / 9 for v in nlf.shot])
-    assert small.nlf.read == pytest.approx([v / 9 for v in nlf.read])
-    assert small.box_factor == 6
-
-
-def test_resized_takes_the_central_square() -> None:
-    light = torch.zeros(4, 10, 22)
-    light[:, 1:9, 7:15] = 1.0
-    assert array_scene(light).resized(4).light.min() == 1.0  # k = 2: 8 x 8 out of 10 x 22
-    native = array_scene(light).resized(4, crop="native")
-    assert native.light.shape == (4, 4, 4)
-    assert native.box_factor == 1
-    assert array_scene(light).resized(None).light.shape == (4, 10, 22)
 
 
 def test_saturated_pixels_survive_resizing() -> None:
@@ -153,30 +123,6 @@ def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
     assert scene.own_blur(2.0) == pytest.approx(10.0)
     assert scene.own_blur(4.0) == scene.own_blur(11.0) == pytest.approx(5.0)
     assert array_scene(torch.ones(4, 2, 2)).own_blur(2.0) == 0.0
-
-
-def test_a_scene_can_be_photographed_by_the_simulator() -> None:
-    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    fields = {"denoised": torch.full((4, 8, 8), 0.2), "defocus_map": torch.ones(8, 8)}
-    scene = array_scene(torch.full((4, 8, 8), 0.1), nlf=nlf, box_factor=3, **fields)
-    prepared = CameraSimulator(device="cpu").prepare(scene)
-    assert (prepared.camera, prepared.nlf, prepared.box_factor) == (PLAIN, nlf, 3)
-    assert prepared.denoised is not None
-    assert prepared.denoised.light is scene.denoised
-    assert prepared.aperture_blur is not None
-    assert prepared.aperture_blur.f_number == 4.0
-    assert array_scene(torch.ones(4, 8, 8)).prepared.aperture_blur is None
-
-
-def test_noise_free() -> None:
-    assert array_scene(torch.ones(4, 2, 2)).noise_free
-    nlf = NoiseLevelFunction((0.0,) * 4, (1e-9,) * 4)
-    assert not array_scene(torch.ones(4, 2, 2), nlf=nlf).noise_free
-
-
-def test_reference_settings_carry_the_ev() -> None:
-    for ev in (-1.3, 0.0, 15.3):
-        assert reference_settings(ev).log2_exposure == pytest.approx(-ev)
 
 
 @pytest.mark.parametrize(
@@ -230,3 +176,36 @@ def test_content_is_that_of_the_tensors() -> None:
         array_scene(light, defocus_map=light[0]),
     ]
     assert len({s.content for s in [scene, *others]}) == 1 + len(others)
+
+
+CAMERA_SETTINGS = CameraSettings(100, 0.01, 4)
+
+
+@given(lights(st.floats(-1.0, 100.0, width=32)), st.data(), SEEDS)
+def test_averaging_a_scene_down_keeps_its_mean(
+    light: torch.Tensor, data: st.DataObject, seed: int
+) -> None:
+    size = min(light.shape[1:])
+    resolution = data.draw(st.integers(1, size))
+    nlf = NoiseLevelFunction((1e-3,) * 4, (1e-6,) * 4)
+    marks = torch.from_numpy(np.random.default_rng(seed).random(light.shape[1:]) < 0.1)
+    scene = Scene.from_array(
+        light, CAMERA_SETTINGS, CAMERA, scene_id="any", nlf=nlf, saturated=marks
+    )
+    small = scene.resized(resolution)
+    k = small.box_factor
+    assert k == size // resolution
+    assert small.light.shape == (4, resolution, resolution)
+    top, left = ((n - k * resolution) // 2 for n in light.shape[1:])
+    window = slice(top, top + k * resolution), slice(left, left + k * resolution)
+    part = light[:, window[0], window[1]].double()
+    torch.testing.assert_close(
+        small.light.double().mean(dim=(1, 2)), part.mean(dim=(1, 2)), rtol=2e-7, atol=1e-5
+    )
+    assert small.nlf.shot[0] == pytest.approx(1e-3 / k**2)
+    assert (small.saturated is None) == (not bool(marks[window].any()))
+    native = scene.resized(resolution, "native")
+    top, left = ((n - resolution) // 2 for n in light.shape[1:])
+    cut = light[:, top : top + resolution, left : left + resolution]
+    assert torch.equal(native.light, cut)
+    assert native.box_factor == 1

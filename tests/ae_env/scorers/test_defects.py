@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,17 +11,15 @@ import skimage.data
 import torch
 from skimage.measure import blur_effect as skimage_blur_effect
 
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import defects as defect_signs
 from ae_env.scorers import make_scorer
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, Defects, mapped, severity
-from ae_env.scorers.luma import luma_of, srgb_decode
+from ae_env.scorers.luma import srgb_decode
 from benchmarks import defects as benchmark
 from simulator.raw.develop import srgb_encode
 from tests.ae_env.scorer_images import CAMERA, check_image_scorer, random_pictures
 
-#: Signal of an 18 % card at the exposure of the light that falls on it.
-CARD = 0.18 * 0.6635
 MEASURES = [f"analytic_{defect}" for defect in DEFECTS]
 
 
@@ -55,27 +49,6 @@ def test_severity_rises_with_the_defect(defect: str, rendered: dict[str, torch.T
     assert float(found[-1] - found[0]) > (0.35 if defect == "exposure" else 0.5)
     low, high = (-1.0, 1.0) if defect == "saturation" else (0.0, 1.0)
     assert low <= float(found.min()) <= float(found.max()) <= high
-
-
-def test_renderings_start_from_one_clean_picture(rendered: dict[str, torch.Tensor]) -> None:
-    clean = rendered["exposure"][0]
-    for defect in DEFECTS:
-        index = 10 if defect == "saturation" else 0
-        assert float((rendered[defect][index] - clean).abs().max()) < 1e-5
-    assert float(luma_of(rendered["saturation"][:1]).sub(rendered["saturation"][0]).abs().max()) < (
-        1e-5
-    )
-
-
-def test_both_sides_of_a_wrong_exposure_are_severe() -> None:
-    picture = torch.rand(3, 40, 40, generator=torch.Generator().manual_seed(0))
-    over = torch.ones(3, 40, 40)
-    under = picture * 0.1
-    middle = 0.05 + 0.9 * picture
-    found = severity("exposure", torch.stack([under, middle, over])).tolist()
-    assert found[0] > 0.8
-    assert found[1] < 0.15
-    assert found[2] > 0.8
 
 
 def test_white_share_and_missing_highlights_by_hand() -> None:
@@ -161,77 +134,3 @@ def test_the_defect_score_is_one_less_the_worst_and_the_mean() -> None:
     np.testing.assert_allclose(scorer.combine(scores), np.full((2, 3), expected))
     tensors = {name: torch.tensor([v]) for name, v in zip(MEASURES, values, strict=True)}
     assert scorer.combine(tensors).item() == pytest.approx(expected)
-
-
-def test_the_fit_finds_a_monotone_map() -> None:
-    rng = np.random.default_rng(0)
-    true = np.repeat(np.linspace(0.0, 1.0, 11), 60)
-    sign = 3.0 + 5.0 * true**2 + 0.01 * rng.normal(size=true.size)
-    knots = np.array(benchmark.fit_map(sign, true))
-    assert (np.diff(knots[:, 1]) >= 0).all()
-    inner = np.linspace(3.3, 7.7, 30)
-    expected = np.sqrt((inner - 3.0) / 5.0)
-    np.testing.assert_allclose(np.interp(inner, *knots.T), expected, atol=0.06)
-    # A sign that falls with the severity has no map but a constant: its mean.
-    flat = np.array(benchmark.fit_map(-true, true))
-    np.testing.assert_allclose(flat[:, 1], 0.5, atol=1e-3)
-
-
-def _linear(pictures: torch.Tensor) -> torch.Tensor:
-    """Light (L, 3, H, W) on the sensor, white is 1, of pictures of a grey scene."""
-    slope = 0.18 * (1 - CARD) / (CARD * (1 - 0.18))  # the tone curve's, undone
-    shown = srgb_decode(pictures.double())
-    return shown / (slope - (slope - 1.0) * shown)
-
-
-def test_every_rendering_has_random_numbers_of_its_own() -> None:
-    places = [(seed, i, d) for seed in (0, 1, 2) for i in (0, 1, 166, 167, 333) for d in DEFECTS]
-    drawn = {tuple(torch.randn(2, generator=benchmark.generator_of(*p)).tolist()) for p in places}
-    assert len(drawn) == len(places)
-    again = torch.randn(2, generator=benchmark.generator_of(*places[0]))
-    assert tuple(again.tolist()) in drawn
-
-
-def test_severity_1_is_what_the_benchmark_says() -> None:
-    """On a grey card with a bright stripe, seen by a camera whose colours are sRGB's."""
-    camera = replace(CAMERA, colour_matrix=None)
-    light = torch.full((4, 64, 64), CARD)
-    light[:, :8] = 0.5  # more than a tenth of it: the airlight
-    reference = reference_settings(10.0)
-    scene = Scene.from_array(light, reference, camera, scene_id="card", illuminance=2560.0)
-    generator = torch.Generator().manual_seed(0)
-    last = {name: _linear(benchmark.render(scene, name, generator)[-1:]) for name in DEFECTS}
-    card = {name: picture[0, :, 20:] for name, picture in last.items()}  # (3, 44, 64)
-    assert float(card["exposure"].mean()) in (
-        pytest.approx(CARD / 16, rel=1e-3),
-        pytest.approx(1.0, abs=1e-3),
-    )
-    noise = card["noise"]
-    assert float(noise[0].mean()) == pytest.approx(CARD, rel=0.03)  # a few are cut off at black
-    assert float(noise[0].std()) == pytest.approx(0.5 * CARD, rel=0.05)
-    assert float(noise[1].std()) == pytest.approx(0.5 * CARD / math.sqrt(2), rel=0.05)  # 2 samples
-    ratios = card["white_balance"].mean(dim=(1, 2)).log2()
-    stops = (ratios - ratios[1]).abs().tolist()
-    assert stops == pytest.approx([1.0, 0.0, 1.0], abs=1e-3)
-    assert float(card["haze"].mean()) == pytest.approx(0.2 * CARD + 0.8 * 0.5, rel=1e-3)
-    # Near the stripe's edge each pixel sees the segment of the disc that lies beyond it.
-    column = ((last["blur"][0, 0, :, 32] - CARD) / (0.5 - CARD))[3:13].tolist()
-    distance = [8 - (row + 0.5) for row in range(3, 13)]
-    inside = [max(-1.0, min(1.0, d / 4)) for d in distance]
-    beyond = [(math.acos(d) - d * math.sqrt(1 - d * d)) / math.pi for d in inside]
-    assert column == pytest.approx([1 - share for share in beyond], abs=0.02)
-
-
-def test_the_benchmark_writes_its_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def few(split: str, resolution: int, per_kind: int, quick: bool) -> list[Scene]:
-        scene = _photograph().resized(32)
-        return [scene, replace(scene, hard=True)]
-
-    monkeypatch.setattr(benchmark, "scenes_of", few)
-    benchmark.run(tmp_path, seed=1, quick=True)
-    result = json.loads((tmp_path / "defects.json").read_text())
-    kinds = [row["part"] for row in result["rows"]]
-    assert kinds.count("map") == 7
-    assert kinds.count("own") == 2 * 6 * 3
-    assert kinds.count("cross_talk") == 7 * 6
-    assert "| `analytic_haze` |" in (tmp_path / "defects.md").read_text()

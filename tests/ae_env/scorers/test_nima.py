@@ -1,7 +1,4 @@
-"""NIMA against Keras: the same network with the same random weights, from files that Keras wrote.
-
-Keras runs in a process of its own: it warns when it is imported.
-"""
+"""NIMA against Keras: one network with the same random weights, from files that Keras wrote."""
 
 from __future__ import annotations
 
@@ -22,10 +19,8 @@ from ae_env.scorers.nima import (
     PUBLISHED,
     NimaMobileNet,
     convert_nima,
-    git_blob_id,
     mean_rating,
     nima_network,
-    published_as,
     read_weights,
 )
 
@@ -113,16 +108,6 @@ def test_the_network_is_that_of_keras(keras_files: Path, name: str) -> None:
     np.testing.assert_allclose(mean_rating(network, pictures).numpy(), means, atol=1e-4)
 
 
-def test_axes_are_put_in_torchs_order(keras_files: Path) -> None:
-    weights = read_weights(keras_files / "weights.h5")
-    with h5py.File(keras_files / "whole.h5") as file:
-        stored = file["model_weights"]
-        depthwise = stored["conv_dw_3/conv_dw_3/kernel"][()]
-        pointwise = stored["conv_pw_3/conv_pw_3/kernel"][()]
-    assert weights["features.5.1.weight"][7, 0, 2, 1] == depthwise[2, 1, 7, 0]
-    assert weights["features.6.1.weight"][90, 7, 0, 0] == pointwise[0, 0, 7, 90]
-
-
 def test_a_scorer_from_the_converted_file(
     keras_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -178,20 +163,3 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_weights(tmp_path / "nothing.safetensors")
     with pytest.raises(ValueError, match=r"must end in .safetensors"):
         convert_nima(text, tmp_path / "out.h5")
-
-
-def test_h5py_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "weights.h5"
-    file.write_bytes(b"\x89HDF\r\n\x1a\n")
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(ImportError, match=r"pip install 'ae-env\[nima\]'"):
-        read_weights(file)
-
-
-def test_files_are_known_by_gits_blob_id(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The ids of git hash-object for an empty file and for one line.
-    assert git_blob_id(b"") == "e69de29bb2d1d6434b8b29ae775ad8c2e48c5391"
-    assert git_blob_id(b"hello\n") == "ce013625030ba8dba906f756967f9e9ca394464a"
-    assert published_as(b"hello\n") is None
-    monkeypatch.setitem(PUBLISHED, "nima_technical", git_blob_id(b"hello\n"))
-    assert published_as(b"hello\n") == "nima_technical"

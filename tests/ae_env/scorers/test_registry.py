@@ -1,4 +1,4 @@
-"""Scorers from files, from other packages and from pyiqa, and the list of them all."""
+"""Scorers by name, from files, from other packages and from pyiqa, and the list of them all."""
 
 from __future__ import annotations
 
@@ -9,13 +9,28 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-import ae_env  # noqa: F401, registers the environment
-from ae_env.scorers import list_scorers, make_scorer, registry
-from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.registry import ScorerRow, describe_scorers
+import ae_env  # noqa: F401, registers the environment  # noqa: F401  (registers the environment)
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scorers import (
+    CompositeScorer,
+    list_scorers,
+    make_scorer,
+    register_scorer,
+    registry,
+)
+from ae_env.scorers.protocol import Captures
+from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
+from ae_env.scorers.score_table import TIE, ScoreTables
+from ae_env.scorers.terms import Noise
+from simulator import NoiseLevelFunction, get_camera
+from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 ID = "ae_env/AutoExposure-v0"
 SMALL = {"scenes": "bundled:small", "split": "test", "resolution": 36}
@@ -92,17 +107,6 @@ def test_the_list_tells_of_each_scorer() -> None:
     sys.modules.pop("their_scores", None)
 
 
-def test_one_of_several_parts_sees_what_they_see(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Mixed(CompositeScorer):
-        """All of it."""
-
-        def __init__(self) -> None:
-            super().__init__({name: make_scorer(name) for name in ("entropy", "clipping", "snr")})
-
-    monkeypatch.setitem(registry._REGISTRY, "mixed", Mixed)
-    assert {row.name: row.domain for row in describe_scorers()}["mixed"] == "raw, srgb"
-
-
 def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> None:
     """As docs/scorers.md says of a scorer from a file, whose class no other process knows."""
     (tmp_path / "my_scorer.py").write_text(MINE)
@@ -113,15 +117,6 @@ def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> N
     other = gym.make(pickle.loads(content))
     rewards = [(e.reset(seed=0), e.step(5))[1][1] for e in (env, other)]
     assert rewards[0] == rewards[1] > 0.0
-
-
-def test_only_the_self_contained(monkeypatch: pytest.MonkeyPatch) -> None:
-    names = list_scorers(self_contained=True)
-    assert {"balanced", "noise"} <= set(names) < set(list_scorers())
-    needy = {"brisque", "keypoints", "matches", "nima_aesthetic", "nima_technical", "niqe"}
-    assert not needy & set(names)
-    for name in names:
-        make_scorer(name)
 
 
 def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,16 +138,6 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
         make_scorer({"no.py:Level": 1.0})
     with pytest.raises(ValueError, match=r"must be callable"):
         make_scorer("my_scorer.py:torch")
-
-
-def test_scores_of_a_file_are_kept_only_if_it_has_a_version(tmp_path: Path) -> None:
-    file = tmp_path / "my_scorer.py"
-    prints = []
-    for version in ("", "    version = 1\n", "    version = 2\n"):
-        file.write_text(MINE + version)
-        prints.append(registry.scorer_fingerprint(make_scorer(f"{file}:Level")))
-    assert prints[0] is None
-    assert prints[1] not in (None, prints[2])
 
 
 class FakeMetric:
@@ -203,7 +188,133 @@ def test_metrics_of_pyiqa_are_mapped_to_their_range() -> None:
             make_scorer(f"pyiqa:{name}")
 
 
+class Mean:
+    domain = "raw"
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        return images.mean(dim=(1, 2, 3))
+
+
+@pytest.fixture
+def clean_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
+
+
+@pytest.mark.usefixtures("clean_registry")
+def test_registered_scorers_work_by_name() -> None:
+    register_scorer("mean_signal")(Mean)
+    register_scorer("mean_signal")(Mean)  # a notebook cell run twice
+    assert "mean_signal" in list_scorers()
+    assert list(make_scorer("mean_signal").parts) == ["mean_signal"]
+    assert list(make_scorer({"mean_signal": 1, "noise": 1}).parts) == ["mean_signal", "noise"]
+    with pytest.raises(ValueError, match="built-in"):
+        register_scorer("noise")(Mean)
+    with pytest.raises(ValueError, match="identifier"):
+        register_scorer("my score")
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("balancd", "did you mean 'balanced'"),
+        ("no_such_module:Thing", "cannot be loaded: "),
+        ("ae_env.scorers.terms:Nothing", "cannot be loaded: "),
+        ("math:pi", "must be callable"),
+        ({}, "weights"),
+        ({"noise": 0.0}, "must all be > 0"),
+        ({"noise": float("nan")}, "must all be > 0"),
+        (lambda images, captures: None, "must be 'raw' or 'srgb'"),
+        (3, "name, a mapping of weights or a callable"),
+    ],
+)
+def test_bad_scorers_are_refused(spec: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_scorer(spec)
+
+
 def test_pyiqa_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyiqa", None)
     with pytest.raises(ImportError, match=r"pyiqa:musiq.*non-commercial.*pip install pyiqa"):
         make_scorer("pyiqa:musiq")
+
+
+# -- fingerprints, which tell the cached scores of scorers apart ----------------------------------
+
+
+CAMERA = get_camera("nikon_z6")
+GRID = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
+
+
+class Constant:
+    domain, depends_on = "raw", "light"
+
+    def __init__(self, value: float, version: int | None = None) -> None:
+        self.value = value
+        if version is not None:
+            self.version = version
+
+    def __call__(self, images: Any, captures: Captures) -> torch.Tensor:
+        return torch.full((len(captures),), self.value)
+
+
+def test_scorers_inside_of_others_enter_the_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nested(value: float, version: int | None = None, deeper: bool = False) -> CompositeScorer:
+        inner = CompositeScorer({"p": Constant(value, version)})
+        inner = CompositeScorer({"in": inner}) if deeper else inner
+        return CompositeScorer({"in": inner, "noise": Noise()})
+
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    scene = Scene.from_array(
+        torch.full((4, 40, 40), 0.2), reference_settings(8.0), CAMERA, scene_id="flat"
+    )
+    noise = ScoreTables(GRID, CAMERA, make_scorer("noise")).table(scene).mean
+    for value in (0.2, 0.8):
+        for version in (None, 1):  # neither finds the scores of the other value
+            table = ScoreTables(GRID, CAMERA, nested(value, version)).table(scene)
+            np.testing.assert_allclose(table.mean, (value + noise) / 2, atol=1e-6)
+    assert scorer_fingerprint(nested(0.2)) is scorer_fingerprint(nested(0.2, deeper=True)) is None
+    kinds = [(0.2, 1), (0.8, 1), (0.2, 2), (0.2, 1, True)]
+    assert len({scorer_fingerprint(nested(*kind)) for kind in kinds}) == 4
+    assert scorer_fingerprint(nested(0.2, 1)) == scorer_fingerprint(nested(0.2, 1))
+
+
+# -- properties that hold for every scorer ---------------------------------------------------------
+
+
+@given(
+    lights(LIGHT.map(abs)),
+    USUAL_SETTINGS,
+    grids(),
+    st.sampled_from([None, 1e-3, 640.0, 1e6]),
+    st.booleans(),
+    st.sampled_from([0.0, 1e-3, 1.0, 100.0]),
+    st.sampled_from([0.0, 1.0, 500.0]),
+    st.sampled_from([1.0, 2.0**-20, 2.0**20]),
+)
+def test_scores_are_shares_and_the_oracle_has_the_highest(
+    light: torch.Tensor,
+    reference: Any,
+    grid: ExposureGrid,
+    illuminance: float | None,
+    is_noisy: bool,
+    speed: float,
+    defocus: float,
+    gain: float,
+) -> None:
+    if float((light[1:3] > 0).double().mean()) <= 0.2:
+        illuminance = illuminance or 640.0  # no exposure is right for a black frame
+    nlf = CAMERA.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
+    scene = Scene.from_array(
+        light, reference, CAMERA, scene_id="any", nlf=nlf, illuminance=illuminance
+    )
+    for name in list_scorers(self_contained=True):
+        tables = ScoreTables(grid, CAMERA, make_scorer(name), use_cache=False)
+        table = tables.table(scene, speed=speed, defocus=defocus, gain=gain)
+        for values in (table.mean, *table.parts.values()):
+            assert values.shape == (len(grid),)
+            assert bool(((values >= 0.0) & (values <= 1.0)).all())
+        best = table.mean.max()
+        assert table.mean[table.oracle] >= best - TIE
+        assert bool((table.mean[: table.oracle] < best - TIE).all())

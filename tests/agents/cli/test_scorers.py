@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ae_env.scorers import list_scorers, make_scorer
-from ae_env.scorers.nima import PUBLISHED, _places, git_blob_id
+from ae_env.scorers.nima import PUBLISHED, _layout, git_blob_id
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def keras_file(tmp_path: Path) -> Path:
     """Random weights in the layout of the published files."""
     rng = np.random.default_rng(0)
     with h5py.File(tmp_path / "weights.hdf5", "w") as file:
-        for (layer, array), (_, _, shape) in _places().items():
+        for (layer, array), (_, _, shape) in _layout().items():
             if (layer.startswith("conv_dw") and array == "kernel") or "dense" in layer:
                 continue
             file[f"{layer}/{layer}/{array}:0"] = rng.uniform(0.1, 0.2, shape).astype(np.float32)

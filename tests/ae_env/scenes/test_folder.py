@@ -1,21 +1,119 @@
-"""Recorded sequences: raws in name order are the frames of an episode."""
+"""A user's files: folders of raws and maps with bad files in them, and recorded sequences."""
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 
 import ae_env  # noqa: F401  (registers the environment)
-from ae_env.scenes import load_scenes
+from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import sequence_bounds
 from simulator import CameraSettings, RawImage, get_camera, write_dng
+from tests.ae_env.scene_files import write_hdr
+
+CAMERA = get_camera("nikon_z6")
+
+
+def load(folder: Path, **options: Any) -> list[Scene]:
+    resize = options.pop("resize", Scene.resized)
+    spec = {"path": folder, **options}
+    return load_scenes(spec, "all", camera=CAMERA, resolution=8, resize=resize)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Four raws, ``good1.dng`` to ``good4.dng``."""
+    data = torch.rand(4, 16, 16, generator=torch.Generator().manual_seed(0))
+    for i in range(1, 5):
+        write_dng(tmp_path / f"good{i}.dng", RawImage(data, CameraSettings(100, 0.01, 4), CAMERA))
+    return tmp_path
+
+
+def ids(scenes: list[Scene]) -> list[str]:
+    return [scene.scene_id for scene in scenes]
+
+
+def test_bad_files_stop_or_are_skipped_with_a_reason(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "ae_env.scenes")
+    for i in range(7):
+        (folder / f"bad{i}.dng").write_bytes(b"" if i % 2 else b"some words")
+    (folder / "good1.hdr").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"scene file '.*bad0\.dng': .*text file.*'skip'"):
+        load(folder)
+    assert f"reading 12 scene files of {folder}" in caplog.text  # before it fails
+    scenes = load(folder, on_error="skip")
+    assert ids(scenes) == ["good1.dng", "good2", "good3", "good4"]
+    (line,) = (r.getMessage() for r in caplog.records if "skipped" in r.getMessage())
+    assert "8 of 12 scene files skipped" in line
+    assert "bad0.dng" in line
+    assert "an empty file" in line
+    assert line.endswith("and 3 more)")
+
+
+def test_nothing_left_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "a.dng").write_bytes(b"")
+    (tmp_path / "b.dng").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"all 2 were skipped \(a\.dng: .*empty file"):
+        load(tmp_path, on_error="skip")
+    with pytest.raises(ValueError, match="empty file") as caught:
+        load(tmp_path / "a.dng")
+    assert "skip" not in str(caught.value)  # which would not help with one file
+
+
+def test_a_black_frame_stops_or_is_skipped(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    settings = CameraSettings(100, 0.01, 4)
+    write_dng(folder / "black.dng", RawImage(torch.zeros(4, 64, 64), settings, CAMERA))
+    with pytest.raises(ValueError, match=r"scene file '.*black\.dng': `light` is 0 .*'skip'"):
+        load(folder)
+    assert ids(load(folder, on_error="skip")) == ["good1", "good2", "good3", "good4"]
+    assert "1 of 5 scene files skipped (black.dng: `light` is 0" in caplog.text
+    assert len(load(folder, illuminance=100.0)) == 5  # then its exposure is known
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"on_error": "skp"}, r"`on_error` \(='skp'\).*'stop', 'skip'; did you mean 'skip'"),
+        ({"on_error": None}, "`on_error`"),
+        ({"on_eror": "skip"}, "did you mean 'on_error'"),
+        ({"illuminance": -1.0}, r"`illuminance` \(=-1.0\)"),
+        ({"illuminance": {"good1.dng": float("nan")}}, "`illuminance`"),
+        ({"hard": 1}, "`hard`"),
+        ({"kind": 3}, "`kind`"),
+        ({"median_speed": float("inf")}, "`median_speed`"),
+        ({"ev100": "bright"}, "`ev100`"),
+    ],
+)
+def test_options_are_refused_before_anything_is_read(
+    options: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        load(tmp_path / "is not there", **options)
+
+
+def test_options_reach_the_scenes(tmp_path: Path) -> None:
+    write_hdr(tmp_path / "a.hdr", 0)
+    write_hdr(tmp_path / "b.hdr", 1)
+    options = {"illuminance": {"a.hdr": 250.0}, "kind": "mine", "hard": True}
+    a, b = load(tmp_path, median_speed=0.5, **options)
+    assert (a.illuminance, b.illuminance) == (250.0, None)
+    assert {(s.kind, s.hard, s.median_speed) for s in (a, b)} == {("mine", True, 0.5)}
+    (only,) = load(tmp_path / "b.hdr", ev100=8.0)
+    assert only.ev100 == pytest.approx(8.0, abs=0.05)
+
+
+# -- sequences: raws in name order are the frames of an episode ------------------------------------
+
 
 ID = "ae_env/AutoExposure-v0"
-CAMERA = get_camera("nikon_z6")
 #: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same
 #: in the first and the second, twice that in the third.
 FRAMES = ((0.1, 100, 1 / 64), (0.2, 200, 1 / 64), (0.2, 100, 1 / 64))
@@ -32,17 +130,17 @@ ARGUMENTS: dict[str, Any] = {
 }
 
 
-def _write(folder: Path, scale: float = 1.0) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+def _write(recorded: Path, scale: float = 1.0) -> None:
+    recorded.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     texture = 1.0 + 0.1 * rng.standard_normal((4, 36, 40)).astype(np.float32)
     for name, (signal, iso, time) in zip(NAMES, FRAMES, strict=True):
         raw = RawImage(scale * signal * texture, CameraSettings(iso, time, 8.0), CAMERA)
-        write_dng(folder / f"{name}.dng", raw)
+        write_dng(recorded / f"{name}.dng", raw)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     base = tmp_path_factory.mktemp("recorded")
     _write(base / "street")
     _write(base / "yard" / "day", scale=0.5)
@@ -58,8 +156,8 @@ def _signal(observation: dict[str, np.ndarray]) -> float:
     return float(observation["raw"].mean())
 
 
-def test_frame_t_shows_raw_t_and_the_last_one_stays(folder: Path) -> None:
-    env = _env(folder / "street", noise=False, observation="linear")
+def test_frame_t_shows_raw_t_and_the_last_one_stays(recorded: Path) -> None:
+    env = _env(recorded / "street", noise=False, observation="linear")
     observation, info = env.reset(seed=0, options={"state": 0})
     shown = [(info["scene_id"], _signal(observation))]
     for _ in range(4):
@@ -72,17 +170,17 @@ def test_frame_t_shows_raw_t_and_the_last_one_stays(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("frame", "name"), [(0, "IMG_2"), (1, "IMG_9"), (2, "IMG_10")])
-def test_an_episode_may_begin_later(folder: Path, frame: int, name: str) -> None:
-    env = _env(folder / "street")
+def test_an_episode_may_begin_later(recorded: Path, frame: int, name: str) -> None:
+    env = _env(recorded / "street")
     assert env.reset(seed=0, options={"frame": frame})[1]["scene_id"] == name
     assert env.reset(seed=0, options={"frame": 77})[1]["scene_id"] == "IMG_10"
 
 
-def test_folders_are_sequences_and_source_groups(folder: Path) -> None:
-    env = _env(folder)
+def test_folders_are_sequences_and_source_groups(recorded: Path) -> None:
+    env = _env(recorded)
     assert [s.scene_id for s in env.scenes] == ["street/IMG_2", "yard/day/IMG_2"]
     assert [s.group for s in env.scenes] == ["street", "yard/day"]
-    scenes = load_scenes({"sequence": folder}, "all", camera=CAMERA, resolution=36)
+    scenes = load_scenes({"sequence": recorded}, "all", camera=CAMERA, resolution=36)
     assert [s.group for s in scenes] == ["street"] * 3 + ["yard/day"] * 3
     first, last = sequence_bounds(scenes)
     assert first.tolist() == [0, 0, 0, 3, 3, 3]
@@ -109,8 +207,8 @@ def test_recordings_of_one_name_are_apart(
     tmp_path: Path, folders: tuple[str, str], groups: set[str]
 ) -> None:
     base = tmp_path / "rec"
-    for folder in folders:
-        _write(base / folder)
+    for recorded in folders:
+        _write(base / recorded)
     env = _env(base)
     assert {s.group for s in env.scenes} == groups
     for group in groups:
@@ -129,15 +227,9 @@ def test_a_broken_frame_is_an_error(tmp_path: Path) -> None:
     assert "skip" not in str(caught.value)
 
 
-def test_a_glob_names_the_frames(folder: Path) -> None:
-    env = _env(folder / "street" / "IMG_?.dng")
-    env.reset(seed=0)
-    assert [env.step(0)[4]["scene_id"] for _ in range(2)] == ["IMG_9", "IMG_9"]
-
-
-def test_scores_are_those_of_the_frame(folder: Path) -> None:
+def test_scores_are_those_of_the_frame(recorded: Path) -> None:
     """The third raw has twice the light: ISO 100 there scores what ISO 200 does before."""
-    env = _env(folder / "street", scorer="brightness", with_oracle=True)
+    env = _env(recorded / "street", scorer="brightness", with_oracle=True)
     env.reset(seed=0, options={"state": 0})
     before = env.expected_scores()
     after = [env.step(0) for _ in range(2)][-1]
@@ -154,13 +246,12 @@ def test_scores_are_those_of_the_frame(folder: Path) -> None:
 @pytest.mark.parametrize(
     "extra",
     [
-        {},
         {"motion": "random", "depth": "random", "with_oracle": True, "delay": 1},
         {"lighting": "flicker", "observation": "linear", "with_oracle": True},
     ],
 )
-def test_many_at_once_are_as_single_ones(folder: Path, extra: dict[str, Any]) -> None:
-    arguments = {"scenes": {"sequence": str(folder)}, **ARGUMENTS, **extra}
+def test_many_at_once_are_as_single_ones(recorded: Path, extra: dict[str, Any]) -> None:
+    arguments = {"scenes": {"sequence": str(recorded)}, **ARGUMENTS, **extra}
     envs = gym.make_vec(ID, num_envs=3, max_episode_steps=4, **arguments)
     singles = [gym.make(ID, **arguments) for _ in range(3)]
     shown, _ = envs.reset(seed=8)
@@ -191,14 +282,8 @@ def test_many_at_once_are_as_single_ones(folder: Path, extra: dict[str, Any]) ->
     ],
 )
 def test_bad_sequences_are_refused(
-    folder: Path, spec: dict[str, Any], split: Any, message: str
+    recorded: Path, spec: dict[str, Any], split: Any, message: str
 ) -> None:
-    named = {k: v.format(folder) if isinstance(v, str) else v for k, v in spec.items()}
+    named = {k: v.format(recorded) if isinstance(v, str) else v for k, v in spec.items()}
     with pytest.raises(ValueError, match=message):
         load_scenes(named, split, camera=CAMERA, resolution=36)
-
-
-def test_radiance_maps_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\n")
-    with pytest.raises(ValueError, match=r"must hold raws .*radiance maps have no settings"):
-        load_scenes({"sequence": tmp_path}, "test", camera=CAMERA)

@@ -1,4 +1,4 @@
-"""BRISQUE against OpenCV's own class, with a model that is trained here."""
+"""Keypoints and matches by hand, BRISQUE against OpenCV's own class with a model trained here."""
 
 from __future__ import annotations
 
@@ -11,11 +11,88 @@ import skimage.data
 import torch
 import torch.nn.functional as functional
 
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
-from ae_env.scorers.external import Brisque
-from ae_env.scorers.keypoints import luma_bytes
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.opencv import Brisque, luma_bytes, reference_pictures
+from ae_env.scorers.protocol import Captures
+from simulator import CameraSettings, get_camera, incident_ev100
 
 cv2 = pytest.importorskip("cv2")
+CAMERA = get_camera("nikon_z6")
+GRID = ExposureGrid.default()
+EV = incident_ev100(1000.0)
+
+
+def _scene(light: np.ndarray, name: str = "test") -> Scene:
+    packed = torch.from_numpy(np.repeat(light[None].astype(np.float32), 4, axis=0))
+    return Scene.from_array(
+        packed, reference_settings(EV), CAMERA, scene_id=name, illuminance=1000.0
+    )
+
+
+def _captures(scenes: list[Scene], states: list[CameraSettings]) -> Captures:
+    count = len(scenes)
+    zeros = np.zeros(count)
+    return describe_captures(
+        scenes, states, CAMERA, speed=zeros, defocus=zeros, gain=np.ones(count)
+    )
+
+
+def _camera_man(size: int = 128) -> np.ndarray:
+    return 0.6 * (skimage.data.camera()[: 4 * size : 4, : 4 * size : 4] / 255.0) ** 2.2
+
+
+def test_the_reference_is_the_right_exposure_without_noise() -> None:
+    """Whatever the state, and a grey card under incident light is 18 % grey in it."""
+    scene = _scene(np.full((40, 40), 0.18 * 0.6635))
+    captures = _captures([scene] * 3, [GRID[i] for i in (0, 30, 63)])
+    pictures = reference_pictures(captures, [0, 1, 2])
+    # sRGB of 18 %: 1.055 * 0.18 ** (1 / 2.4) - 0.055.
+    np.testing.assert_allclose(pictures.numpy(), 0.4614, atol=2e-3)
+
+
+def test_a_perfect_capture_finds_all_again() -> None:
+    scene = _scene(_camera_man())
+    captures = _captures([scene] * 4, [reference_settings(EV)] * 4)
+    light = captures.light.clamp(0.0, 1.0)
+    generator = torch.Generator().manual_seed(0)
+    noisy = (light + 0.05 * torch.randn(light.shape, generator=generator)).clamp(0.0, 1.0)
+    blurred = torch.nn.functional.avg_pool2d(light, 5, stride=1, padding=2)
+    shifted = light.roll(12, dims=3)  # all are found, none at its place
+    images = torch.stack([light[0], noisy[1], blurred[2], shifted[3]])
+    perfect, with_noise, with_blur, elsewhere = make_scorer("matches")(images, captures).tolist()
+    assert perfect == 1.0
+    assert 0.0 < with_noise < 0.9
+    assert 0.0 < with_blur < 0.9
+    assert elsewhere < 0.1
+    keypoints = make_scorer("keypoints")(images, captures)
+    assert keypoints[2] < keypoints[0] < keypoints[1]  # noise is taken for corners
+
+
+def test_each_capture_is_compared_with_its_own_scene() -> None:
+    first, second = _scene(_camera_man(), "a"), _scene(_camera_man()[::-1].copy(), "a")
+    scenes = [first, second, first, second]
+    captures = _captures(scenes, [reference_settings(EV)] * 4)
+    scores = make_scorer("matches")(captures.light.clamp(0.0, 1.0), captures)
+    assert scores.tolist() == [1.0] * 4  # though the two have one name
+    swapped = make_scorer("matches")(captures.light[[1, 0, 3, 2]].clamp(0.0, 1.0), captures)
+    assert float(swapped.max()) < 0.3
+
+
+@pytest.mark.parametrize("name", ["keypoints", "matches"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 31), (37, 64), (65, 41)])
+def test_any_frame_is_scored(name: str, size: tuple[int, int]) -> None:
+    light = np.full(size, 0.1)
+    captures = _captures([_scene(light)] * 3, [GRID[20]] * 3)
+    images = torch.zeros(3, 4, *size)
+    images[1] = 1.0
+    images[2] = torch.rand(4, *size)
+    scores = make_scorer(name)(images, captures)
+    assert scores[:2].tolist() == [0.0, 0.0]
+    assert 0.0 <= float(scores[2]) <= 1.0
+    assert torch.equal(scores, make_scorer(name)(images, captures))
 
 
 def _photographs(size: int) -> torch.Tensor:
@@ -66,13 +143,6 @@ def test_values_are_those_of_opencv(model: Path) -> None:
     scores = Brisque(model)(pictures, None)  # type: ignore[arg-type]
     np.testing.assert_allclose(scores.numpy(), 1.0 - np.array(values) / 100.0, atol=1e-5)
     assert scores[:3].mean() > scores[6:].mean() > scores[3:6].mean()
-
-
-def test_pictures_without_statistics_score_zero(model: Path) -> None:
-    scorer = Brisque(model)
-    pictures = torch.stack([torch.zeros(3, 64, 64), torch.ones(3, 64, 64)])
-    assert scorer(pictures, None).tolist() == [0.0, 0.0]  # type: ignore[arg-type]
-    assert scorer(torch.rand(2, 3, 1, 5), None).tolist() == [0.0, 0.0]  # type: ignore[arg-type]
 
 
 def test_the_model_is_asked_for(

@@ -1,6 +1,6 @@
-"""Which files show the same subject, and which groups are for training.
+"""Source groups, and the train/test split by source group.
 
-Groups are the unit of splitting and of resampling: two photographs of one subject in different
+A group is the unit of splitting and of resampling: two photographs of one subject in different
 splits, or counted as two independent ones, would make results look better and surer than they are.
 """
 
@@ -10,7 +10,7 @@ import csv
 import hashlib
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ae_env.scenes.scene import Scene
 from simulator.raw.image import RawImage
 
 logger = logging.getLogger(__name__)
@@ -36,7 +37,7 @@ ALIKE = 0.5
 
 @dataclass(frozen=True)
 class Shot:
-    """What grouping needs to know about a raw.
+    """The facts about a raw that decide its source group.
 
     Args:
         camera: Make and model.
@@ -50,7 +51,7 @@ class Shot:
 
 
 def describe(raw: RawImage) -> Shot:
-    """The `Shot` of a raw; exposure and white balance are divided out."""
+    """The `Shot` of a raw, with exposure and white balance divided out."""
     gains = torch.tensor(raw.white_balance, dtype=torch.float32)[:, None, None]
     planes = torch.stack([raw.data[0], raw.data[1:3].mean(dim=0), raw.data[3]])
     small = torch.nn.functional.adaptive_avg_pool2d(planes[None], (48, 64))[0]
@@ -74,7 +75,7 @@ def similarity(first: Shot, second: Shot) -> float:
 
 
 def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
-    """Source group of each raw, by when it was taken and what it looks like.
+    """Source group of each raw, found from its time and its colours.
 
     Shots of one camera are put in the order in which they were taken (by time where every file
     states it, else as given). A shot joins its predecessor's group
@@ -87,7 +88,7 @@ def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
 
     Args:
         names: Name of each shot.
-        shots: What is known about each.
+        shots: Time and colours of each.
 
     Returns:
         The group of each, in the order given.
@@ -174,10 +175,39 @@ def split_groups(groups: Sequence[str]) -> dict[str, str]:
     return split
 
 
-def log_groups(where: str, names: Mapping[str, str]) -> None:
-    """Say which files form which source group (`names`: scene id to group)."""
+def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
+    """The scenes whose source group is in `split`.
+
+    Args:
+        spec: Name of the scenes, for the error.
+        scenes: Scenes of all splits.
+        split: ``"train"``, ``"test"`` or ``"all"``.
+
+    Raises:
+        ValueError: If `split` is ``"train"`` and there are too few groups.
+    """
+    if split == "all":
+        return scenes
+    parts = split_groups([scene.group for scene in scenes])
+    if split == "train" and "train" not in parts.values():
+        raise too_few_groups(spec, str(len(parts)))
+    return [scene for scene in scenes if parts[scene.group] == split]
+
+
+def too_few_groups(spec: str | Path, number: str) -> ValueError:
+    """The error where `spec` has only `number` source groups, too few to train on."""
+    return ValueError(
+        f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that some "
+        f"can be held out; {str(spec)!r} has {number}. Train on scenes='bundled' and use these "
+        "with split='test' (zero-shot) or split='all'; if files are grouped wrongly, name the "
+        "groups in a groups.csv (columns file, group) beside them"
+    )
+
+
+def log_groups(where: str, scenes: Sequence[Scene]) -> None:
+    """Logs the scenes of each source group."""
     members: dict[str, list[str]] = {}
-    for name, group in names.items():
-        members.setdefault(group, []).append(name)
+    for scene in scenes:
+        members.setdefault(scene.group, []).append(scene.scene_id)
     text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
     logger.info("%s: %d source groups (%s)", where, len(members), text)

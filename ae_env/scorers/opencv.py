@@ -1,0 +1,271 @@
+"""Scorers by OpenCV: BRISQUE, ORB keypoints, and the matches of keypoints for tracking."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ae_env.scorers.composite import developed
+from ae_env.scorers.luma import luma_of
+from ae_env.scorers.protocol import Captures, DependsOn, Domain
+from ae_env.utils.model_files import find_model_file
+
+
+def opencv() -> Any:
+    """The module cv2, or an `ImportError` that names the extra."""
+    try:
+        import cv2
+    except ImportError:
+        raise ImportError(
+            "the scorers keypoints, matches and brisque need OpenCV: pip install 'ae-env[cv]'"
+        ) from None
+    return cv2
+
+
+def luma_bytes(images: torch.Tensor) -> np.ndarray:
+    """Luma (B, H, W) uint8 of sRGB pictures (B, 3, H, W) in [0, 1]."""
+    return luma_of(images).clamp(0.0, 1.0).mul(255.0).round().to("cpu", torch.uint8).numpy()
+
+
+# -- keypoints ------------------------------------------------------------------------------------
+
+#: Keypoints that ORB returns at most, per 1000 pixels inside its border.
+MOST_PER_1000 = 60.0
+#: Keypoints per 1000 pixels inside the border that score 1 - 1/e.
+TYPICAL_PER_1000 = 15.0
+#: Keypoints that are matched at most, the strongest ones: OpenCV's own limit.
+MOST_MATCHED = 500
+#: A matched pair lies at most this share of the picture's height apart.
+TOLERANCE = 1.0 / 64.0
+#: Side of ORB's descriptor patch, and of the border without keypoints [pixel]: half of OpenCV's
+#: own 31, which would leave nothing of a picture of 64 x 64.
+_PATCH = 15
+
+
+def _detector(height: int, width: int, most: float = math.inf) -> Any:
+    number = max(1, math.ceil(min(most, _inside(height, width) * MOST_PER_1000 / 1000.0)))
+    # Smaller levels than four patches find nothing and take time.
+    levels = max(1, min(8, 1 + math.floor(math.log(min(height, width) / (4 * _PATCH) + 1e-9, 1.2))))
+    return opencv().ORB_create(
+        nfeatures=number, nlevels=levels, edgeThreshold=_PATCH, patchSize=_PATCH
+    )
+
+
+def _inside(height: int, width: int) -> int:
+    """Pixels that may be keypoints."""
+    return max(1, height - 2 * _PATCH) * max(1, width - 2 * _PATCH)
+
+
+class Keypoints:
+    """Number of ORB keypoints: 1 - exp(-n / n0), n0 = 15 per 1000 pixels inside ORB's border.
+
+    Rublee et al., ORB: an efficient alternative to SIFT or SURF, ICCV 2011, in OpenCV with its FAST
+    threshold of 20 of 255, patches and a border of 15 pixels, and at most 60 keypoints per 1000
+    pixels. A frame of 30 pixels a side or less has none. ORB takes strong noise for corners: pair
+    it with ``noise``, or use ``matches``.
+
+    Raises:
+        ImportError: If OpenCV is not installed.
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = "extra cv"
+    version = 1
+
+    def __init__(self) -> None:
+        opencv()
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        assert images is not None
+        height, width = images.shape[2:]
+        orb = _detector(height, width)
+        counts = [len(orb.detect(picture, None)) for picture in luma_bytes(images)]
+        typical = _inside(height, width) * TYPICAL_PER_1000 / 1000.0
+        return 1.0 - torch.exp(-torch.tensor(counts, dtype=torch.float64) / typical)
+
+
+class Matches:
+    """Share of a well-exposed, noise-free reference's ORB keypoints that are found again.
+
+    The reference is the scene's light at the right exposure (``captures.proper_ev``), without noise
+    and blur, developed as the capture is. Of each picture the 500 strongest keypoints count.
+    Descriptors are matched by Hamming distance, each the other's nearest. Both pictures show the
+    scene from the same place, so a match is an inlier where its two ends lie within 1/64 of the
+    picture's height: the true transform is the identity and need not be estimated by RANSAC.
+    Without a keypoint in the reference the score is 0 in every state.
+
+    Raises:
+        ImportError: If OpenCV is not installed.
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = "extra cv"
+    version = 1
+
+    def __init__(self) -> None:
+        opencv()
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        assert images is not None
+        cv2 = opencv()
+        height, width = images.shape[2:]
+        orb = _detector(height, width, MOST_MATCHED)
+        matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+        first, which = _distinct_references(captures)
+        references = [
+            orb.detectAndCompute(picture, None)
+            for picture in luma_bytes(reference_pictures(captures, first))
+        ]
+        scores = []
+        for picture, reference in zip(luma_bytes(images), which, strict=True):
+            points, descriptors = orb.detectAndCompute(picture, None)
+            known, wanted = references[reference]
+            if descriptors is None or wanted is None:
+                scores.append(0.0)
+                continue
+            inliers = sum(
+                math.dist(known[m.queryIdx].pt, points[m.trainIdx].pt) <= TOLERANCE * height
+                for m in matcher.match(wanted, descriptors)
+            )
+            scores.append(inliers / len(known))
+        return torch.tensor(scores, dtype=torch.float64)
+
+
+def reference_pictures(captures: Captures, which: list[int]) -> torch.Tensor:
+    """sRGB (N, 3, H, W) of the captures' scenes at the right exposure, without noise and blur.
+
+    Args:
+        captures: The captures.
+        which: Indices of N of them.
+    """
+    ratio = captures.ratio * torch.exp2(captures.ev100 - captures.proper_ev)
+    light = captures.scene_light[which] * ratio[which].to(captures.scene_light)[:, None, None, None]
+    return developed(
+        light.clamp(0.0, 1.0),
+        captures.white_balance[which],
+        [captures.colour_matrices[i] for i in which],
+    )
+
+
+def _distinct_references(captures: Captures) -> tuple[list[int], list[int]]:
+    """The first capture of each distinct reference, and the index of each capture's reference."""
+    first: list[int] = []
+    which: list[int] = []
+    by_key: dict[tuple[str, float], int] = {}
+    exposure = captures.ratio * torch.exp2(captures.ev100 - captures.proper_ev)
+    light = captures.scene_light
+    for i, (scene, ratio) in enumerate(zip(captures.scene_ids, exposure.tolist(), strict=True)):
+        key = scene, round(math.log2(ratio), 6) if 0 < ratio < math.inf else ratio
+        known = by_key.get(key)
+        if known is None or not torch.equal(light[i], light[first[known]]):
+            known = by_key[key] = len(first)
+            first.append(i)
+        which.append(known)
+    return first, which
+
+
+# -- BRISQUE --------------------------------------------------------------------------------------
+
+#: Environment variable that names the model file.
+BRISQUE_VARIABLE = "AE_ENV_BRISQUE"
+MODEL, RANGE = "brisque_model_live.yml", "brisque_range_live.yml"
+#: Numbers that describe a picture.
+FEATURES = 36
+#: Value of the worst picture, and of one without statistics.
+WORST = 100.0
+#: Smaller pictures have no statistics [pixel].
+_LEAST_SIDE = 8
+
+
+class Brisque:
+    """Naturalness by BRISQUE: 1 - value / 100, the value in [0, 100], 0 for a pristine picture.
+
+    Mittal, Moorthy and Bovik, No-Reference Image Quality Assessment in the Spatial Domain, IEEE
+    Transactions on Image Processing 21(12), 2012, computed by OpenCV (`cv2.quality`) from the luma.
+    A constant picture is 100. Its two files come with opencv_contrib
+    (``modules/quality/samples``), not with this package.
+
+    Args:
+        file: ``brisque_model_live.yml``; ``brisque_range_live.yml`` must lie beside it.
+
+    Raises:
+        ImportError: If OpenCV with its contributed modules is not installed.
+        ValueError: If a file is not there or is not OpenCV's.
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = f"extra cv; model: {BRISQUE_VARIABLE}"
+    version = 1
+
+    def __init__(self, file: str | os.PathLike[str] | None = None) -> None:
+        cv2 = opencv()
+        if not (hasattr(cv2, "quality") and hasattr(cv2, "ml")):
+            raise ImportError(
+                "the scorer brisque needs OpenCV's contributed modules: pip uninstall "
+                "opencv-python-headless, then pip install 'ae-env[cv]'"
+            )
+        how = f"{MODEL} and, beside it, {RANGE} are in opencv_contrib's modules/quality/samples"
+        model = find_model_file("brisque", file, BRISQUE_VARIABLE, (MODEL,), how=how).resolve()
+        ranges = model.with_name(model.name.replace("model", "range"))
+        if ranges == model or not ranges.is_file():
+            raise ValueError(f"scorer 'brisque' needs {RANGE} beside {str(model)!r}; {how}")
+        self.model, self.range = str(model), str(ranges)
+        self.content = f"{_digest(model)} {_digest(ranges)}"
+        _brisque_model(self.model, self.range, self.content)
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        assert images is not None
+        machine, low, high = _brisque_model(self.model, self.range, self.content)
+        values = np.full(len(images), WORST)
+        if min(images.shape[2:]) >= _LEAST_SIDE:
+            compute = opencv().quality.QualityBRISQUE_computeFeatures
+            features = np.concatenate([compute(picture) for picture in luma_bytes(images)])
+            # A constant picture has no statistics, which OpenCV's own `compute` rates as pristine.
+            known = np.isfinite(features).all(axis=1)
+            scaled = -1.0 + 2.0 / (high - low) * (features[known] - low)
+            if known.any():
+                values[known] = machine.predict(scaled.astype(np.float32))[1][:, 0]
+        return torch.from_numpy(1.0 - np.clip(values / WORST, 0.0, 1.0))
+
+
+@lru_cache(maxsize=2)
+def _brisque_model(model: str, ranges: str, content: str) -> tuple[Any, np.ndarray, np.ndarray]:
+    """OpenCV's support vector machine, and the ranges (1, 36) of its training's features.
+
+    `content` is part of the cache's key: the files are read once per content.
+    """
+    cv2 = opencv()
+    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
+    try:
+        machine = cv2.ml.SVM_load(model)
+        storage = cv2.FileStorage(ranges, cv2.FILE_STORAGE_READ)
+        bounds = storage.getNode("range").mat()
+    except (cv2.error, SystemError) as error:
+        raise ValueError(f"`file` (={model!r}) must be OpenCV's BRISQUE model: {error}") from error
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if machine.getVarCount() != FEATURES or bounds is None or bounds.shape != (2, FEATURES):
+        raise ValueError(
+            f"`file` (={model!r}) and {Path(ranges).name} must be OpenCV's BRISQUE model, of "
+            f"{FEATURES} numbers"
+        )
+    if not bool((bounds[1] > bounds[0]).all()):  # False for NaN, too
+        raise ValueError(f"{ranges!r} must hold ranges: a least and a larger largest value each")
+    return machine, bounds[:1], bounds[1:]
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]

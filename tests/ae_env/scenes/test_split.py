@@ -1,0 +1,123 @@
+"""Source groups of raws, and the split by group."""
+
+from __future__ import annotations
+
+import logging
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.split import Shot, group_shots, split_groups
+from simulator.camera import get_camera
+from tests.ae_env.scene_files import write_hdr
+
+CAMERA = get_camera("nikon_z6")
+
+
+def load(spec: object, split: str = "all", resolution: int | None = 16) -> list[Scene]:
+    return load_scenes(spec, split, camera=CAMERA, resolution=resolution)  # type: ignore[arg-type]
+
+
+def test_large_folder_is_split_by_group(tmp_path: Path) -> None:
+    for i in range(14):
+        for name in ("a", "b"):
+            write_hdr(tmp_path / f"subject{i}" / f"{name}.hdr", i)
+    with pytest.raises(ValueError, match=r"at least 15 source groups.*has 14"):
+        load(tmp_path, "train")
+    for name in ("a", "b"):
+        write_hdr(tmp_path / "subject14" / f"{name}.hdr", 14)
+    train, test = (
+        {s.scene_id: s.group for s in load(tmp_path, split)} for split in ("train", "test")
+    )
+    assert not set(train.values()) & set(test.values())
+    assert {*train, *test} == {s.scene_id for s in load(tmp_path)}
+    assert len(train) + len(test) == 30
+    assert train
+    assert test
+    assert next(iter(train)).endswith(("/a", "/b"))
+
+
+def test_groups_file_names_the_groups(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_hdr(tmp_path / f"{name}.hdr")
+    (tmp_path / "groups.csv").write_text("file,group\na.hdr,first\nb.hdr,first\n")
+    assert [s.group for s in load(tmp_path)] == ["first", "first", "c"]
+    for text, words in (
+        ("name,group\na.hdr,x\n", "columns"),
+        ("file,group\nz.hdr,x\n", "line 2"),
+        ("file,group\na.hdr,\n", "line 2"),
+    ):
+        (tmp_path / "groups.csv").write_text(text)
+        with pytest.raises(ValueError, match=words):
+            load(tmp_path)
+
+
+def test_split_of_groups_is_stable_and_needs_fifteen() -> None:
+    names = [f"g{i}" for i in range(200)]
+    split = split_groups(names)
+    assert 0.6 < np.mean([split[n] == "train" for n in names]) < 0.8
+    more = split_groups([*names, "new"])
+    assert all(more[n] == split[n] for n in names)
+    assert set(split_groups(names[:14]).values()) == {"test"}
+    for start in range(180):
+        assert set(split_groups(names[start : start + 15]).values()) == {"train", "test"}
+
+
+def shot(seconds: float | None, look: int, camera: str = "A") -> Shot:
+    histogram = np.zeros(4)
+    histogram[look] = 1.0
+    start = datetime(2024, 1, 1)
+    time = None if seconds is None else start + timedelta(seconds=seconds)
+    return Shot(camera, time, histogram)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "same"),
+    [
+        (shot(0, 0), shot(30, 1), True),  # a burst
+        (shot(0, 0), shot(31, 1), False),
+        (shot(0, 0), shot(300, 0), True),  # the same look within five minutes
+        (shot(0, 0), shot(301, 0), False),
+        (shot(None, 0), shot(None, 0), True),
+        (shot(None, 0), shot(None, 1), False),
+        (shot(0, 0), shot(0, 0, "B"), False),
+    ],
+)
+def test_grouping_of_two_shots(first: Shot, second: Shot, same: bool) -> None:
+    assert group_shots(["x", "y"], [first, second]) == (["x", "x"] if same else ["x", "y"])
+
+
+def test_shots_are_grouped_in_the_order_of_their_times() -> None:
+    shots = [shot(1000, 0), shot(0, 1), shot(1010, 2), shot(20, 3)]
+    assert group_shots(["a", "b", "c", "d"], shots) == ["a", "b", "a", "b"]
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe\0", b'file,group\n"' + b"x" * 200_000])
+def test_groups_that_are_no_table(tmp_path: Path, content: bytes) -> None:
+    write_hdr(tmp_path / "a.hdr")
+    (tmp_path / "groups.csv").write_bytes(content)
+    with pytest.raises(ValueError, match=r"groups\.csv' must be a CSV file in UTF-8"):
+        load(tmp_path)
+
+
+@pytest.mark.real_data
+def test_real_raws_are_three_subjects(data_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "ae_env.scenes")
+    scenes = load(data_dir / "canon_crw_cc0", "test", 64)
+    groups = {s.scene_id[-4:]: s.group for s in scenes}
+    assert len(scenes) == 8
+    assert len(set(groups.values())) == 3
+    for members in (("0101", "0104", "0105"), ("0112", "0113"), ("0117", "0118", "0119")):
+        assert len({groups[m] for m in members}) == 1
+    assert "3 source groups" in caplog.text
+    for scene in scenes:
+        assert scene.light.shape == (4, 64, 64)
+        assert scene.box_factor == 13
+        assert not scene.noise_free
+        assert scene.illuminance is None
+        assert scene.camera.model.endswith("S40")
+    with pytest.raises(ValueError, match="at most 8"):
+        load(data_dir / "canon_crw_cc0", "train")
