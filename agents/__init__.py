@@ -1,4 +1,4 @@
-"""Exposure policies, from a spot meter to PPO, and the protocol that compares them."""
+"""Exposure policies, from a spot meter to PPO, and the evaluation that compares them."""
 
 from __future__ import annotations
 
@@ -8,34 +8,34 @@ from typing import TYPE_CHECKING, Any
 _EXPORTS = {
     "EvaluationPlan": "evaluation.evaluation_plan",
     "EvaluationResult": "evaluation.result",
-    "MeteringPolicy": "metering.programs",
+    "MeteringPolicy": "metering.metering_policy",
     "Policy": "policy",
     "PolicyContext": "policy",
-    "evaluate": "evaluation.protocol",
-    "fit_policies": "evaluation.protocol",
+    "evaluate": "evaluation.engine",
+    "fit_policies": "evaluation.running",
     "list_policies": "policy",
     "load_plan": "evaluation.evaluation_plan",
     "make_policy": "policy",
-    "result_rows": "evaluation.result_table",
-    "run_plan": "evaluation.plan_jobs",
-    "write_report": "report.of_evaluation",
+    "result_rows": "report.result_table",
+    "run_plan": "evaluation.plan_run",
+    "write_report": "report.evaluation_report",
 }
 __all__ = sorted(_EXPORTS)
 
 if TYPE_CHECKING:
+    from agents.evaluation.engine import evaluate as evaluate
     from agents.evaluation.evaluation_plan import EvaluationPlan as EvaluationPlan
     from agents.evaluation.evaluation_plan import load_plan as load_plan
-    from agents.evaluation.plan_jobs import run_plan as run_plan
-    from agents.evaluation.protocol import evaluate as evaluate
-    from agents.evaluation.protocol import fit_policies as fit_policies
+    from agents.evaluation.plan_run import run_plan as run_plan
     from agents.evaluation.result import EvaluationResult as EvaluationResult
-    from agents.evaluation.result_table import result_rows as result_rows
-    from agents.metering.programs import MeteringPolicy as MeteringPolicy
+    from agents.evaluation.running import fit_policies as fit_policies
+    from agents.metering.metering_policy import MeteringPolicy as MeteringPolicy
     from agents.policy import Policy as Policy
     from agents.policy import PolicyContext as PolicyContext
     from agents.policy import list_policies as list_policies
     from agents.policy import make_policy as make_policy
-    from agents.report.of_evaluation import write_report as write_report
+    from agents.report.evaluation_report import write_report as write_report
+    from agents.report.result_table import result_rows as result_rows
 
 
 def __getattr__(name: str) -> Any:
@@ -45,4 +45,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*__all__, *globals()]
+    return __all__

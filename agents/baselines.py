@@ -1,35 +1,102 @@
-"""Policies without eyes: the floor (random), the best constant, and the ceiling (oracle)."""
+"""Policies that look at no frame: random, the best constant state, the oracle, a recording."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.episodes import episode_batches
-from agents.policy import Observations, Policy, PolicyContext, masked_argmax
-
-if TYPE_CHECKING:
-    import gymnasium as gym
-import os
-from pathlib import Path
-
 from ae_env.scenes.folder import find_files
+from agents.episodes import Episodes, expected_scores, scenes_of
+from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
 from simulator.utils.files import RAW_SUFFIXES
 
+if TYPE_CHECKING:
+    import gymnasium as gym
 
-# The settings of a recorded sequence of raws, once more.
+#: Episodes per scene from which the best constant state is taken.
+FIT_EPISODES = 4
+
+
+class Random(Policy):
+    """A state drawn uniformly from the allowed ones, another at every frame."""
+
+    def __init__(self, context: PolicyContext) -> None:
+        super().__init__(context)
+        self.name = "random"
+        self._rng = np.random.default_rng(0)
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Begin new episodes; the same seed draws the same states."""
+        super().reset(num_envs, seed)
+        self._rng = np.random.default_rng(seed)
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Draw a state per camera."""
+        draws = self._rng.random((len(observations["raw"]), len(self.context.grid)))
+        return masked_argmax(draws, action_masks)
+
+
+class BestFixed(Policy):
+    """The one state with the best mean expected score on the training scenes."""
+
+    def __init__(self, context: PolicyContext) -> None:
+        super().__init__(context)
+        self.name = "best_fixed"
+        self.mean_scores: NDArray[np.float64] | None = None
+
+    def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
+        """Average the expected scores of all states over the scenes of `envs`."""
+        episodes = Episodes.of_each_scene(scenes_of(envs), count=FIT_EPISODES, seed=seed)
+        scores = [expected_scores(envs)[batch.valid] for batch in episodes.batches(envs)]
+        self.mean_scores = np.concatenate(scores).mean(axis=0)
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Always the best state, or the best allowed one."""
+        if self.mean_scores is None:
+            raise ValueError("policy 'best_fixed' learns from scenes first: call fit(envs)")
+        shape = (len(observations["raw"]), len(self.mean_scores))
+        return masked_argmax(np.broadcast_to(self.mean_scores, shape), action_masks)
+
+
+class Oracle(Policy):
+    """Knows the expected score of every state: the ceiling that regret is measured from."""
+
+    privileged = True
+
+    def __init__(self, context: PolicyContext) -> None:
+        super().__init__(context)
+        self.name = "oracle"
+
+    def act(
+        self,
+        observations: Observations,
+        action_masks: NDArray[np.bool_] | None = None,
+        info: Mapping[str, Any] | None = None,
+    ) -> NDArray[np.int64]:
+        """The best allowed state, which is ``info["oracle_state"]``."""
+        if info is None or "oracle_state" not in info:
+            raise ValueError("policy 'oracle' needs `info` of environments made with_oracle=True")
+        return np.asarray(info["oracle_state"], dtype=np.int64).copy()
+
+
 class Recorded(Policy):
-    """What a real camera did: frame k of an episode takes the settings of the k-th raw of a folder.
+    """The settings of a real camera: frame k of an episode takes those of the k-th raw of a folder.
 
-    Beside the same folder as a scene (``scenes={"sequence": FOLDER}``) that replays the recording.
+    With the same folder as a scene (``scenes={"sequence": FOLDER}``) it replays the recording.
     Frame 0 is the one that `reset` returns, at a state that no policy chooses; a delay is allowed
     for. The raws count in the natural order of their names, from 0; after the last one its settings
-    stay. Of the grid's states the nearest is taken: the squares of the differences in aperture,
+    stay. The nearest of the grid's states is taken: the squares of the differences in aperture,
     time, ISO and EV, in stops, add up.
 
     Args:
@@ -51,7 +118,7 @@ class Recorded(Policy):
         self._frame = self._first = 1 + context.delay  # that the first decision exposes
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Begin the sequence anew."""
+        """Restart the sequence."""
         super().reset(num_envs, seed)
         self._frame = self._first
 
@@ -87,72 +154,3 @@ def _coordinates(settings: tuple[CameraSettings, ...]) -> NDArray[np.float64]:
     return np.array(
         [(s.aperture_stop / 3.0, s.time_value, s.speed_value, s.log2_exposure) for s in settings]
     )
-
-
-#: Episodes per scene from which the best constant state is taken.
-FIT_EPISODES = 4
-
-
-class Random(Policy):
-    """A state drawn uniformly from the allowed ones, anew at every frame."""
-
-    def __init__(self, context: PolicyContext) -> None:
-        super().__init__(context)
-        self.name = "random"
-        self._rng = np.random.default_rng(0)
-
-    def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Begin new episodes; the same seed draws the same states."""
-        super().reset(num_envs, seed)
-        self._rng = np.random.default_rng(seed)
-
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
-        """Draw a state per camera."""
-        draws = self._rng.random((len(observations["raw"]), len(self.context.grid)))
-        return masked_argmax(draws, action_masks)
-
-
-class BestFixed(Policy):
-    """The one state with the best mean expected score on the training scenes."""
-
-    def __init__(self, context: PolicyContext) -> None:
-        super().__init__(context)
-        self.name = "best_fixed"
-        self.mean_scores: NDArray[np.float64] | None = None
-
-    def fit(self, envs: gym.vector.VectorEnv, seed: int = 0) -> None:
-        """Average the expected scores of all states over the scenes of `envs`."""
-        batches = episode_batches(envs, episodes_per_scene=FIT_EPISODES, seed=seed)
-        self.mean_scores = np.concatenate([b.scores[b.valid] for b in batches]).mean(axis=0)
-
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
-        """Always the best state, or the best allowed one."""
-        if self.mean_scores is None:
-            raise ValueError("policy 'best_fixed' learns from scenes first: call fit(envs)")
-        shape = (len(observations["raw"]), len(self.mean_scores))
-        return masked_argmax(np.broadcast_to(self.mean_scores, shape), action_masks)
-
-
-class Oracle(Policy):
-    """Knows the expected score of every state: the ceiling that regret is measured from."""
-
-    privileged = True
-
-    def __init__(self, context: PolicyContext) -> None:
-        super().__init__(context)
-        self.name = "oracle"
-
-    def act(
-        self,
-        observations: Observations,
-        action_masks: NDArray[np.bool_] | None = None,
-        info: Mapping[str, Any] | None = None,
-    ) -> NDArray[np.int64]:
-        """The best state, from ``info["oracle_state"]``."""
-        if info is None or "oracle_state" not in info:
-            raise ValueError("policy 'oracle' needs `info` of environments made with_oracle=True")
-        return np.asarray(info["oracle_state"], dtype=np.int64).copy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ae_env.scenes import Scene
 
 ENV_ID = "ae_env/AutoExposure-v0"
+#: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
+MIN_TRAINING_GROUPS = 15
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -23,7 +25,7 @@ Ints = NDArray[np.int64]
 
 def make_envs(
     env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
-) -> gym.vector.VectorEnv:
+) -> gym.vector.VectorEnv[Any, Any, Any]:
     """Environments for `evaluate` and `fit_policies`: no autoreset, episodes of `frames` and more.
 
     Args:
@@ -39,16 +41,38 @@ def make_envs(
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
 
 
-def scenes_of(envs: gym.vector.VectorEnv) -> list[Scene]:
+def training_scenes(scenes: str, resolution: int = 64) -> tuple[str, bool]:
+    """Scenes to train on for an evaluation on `scenes`, and whether they are others.
+
+    The others are the bundled ones, where `scenes` has too few source groups for a training split.
+    """
+    from ae_env.options import EnvOptions
+    from ae_env.scenes.loading import BUNDLED
+
+    if scenes not in BUNDLED:
+        options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
+        groups = {scene.group for scene in options.load_scenes()}
+        if len(groups) < MIN_TRAINING_GROUPS:
+            return "bundled", True
+    return scenes, False
+
+
+def scenes_of(envs: gym.vector.VectorEnv[Any, Any, Any]) -> list[Scene]:
     """The scenes that the episodes of `envs` draw from."""
     base: Any = envs.unwrapped
     return list(base.scenes)
 
 
-def expected_scores(envs: gym.vector.VectorEnv) -> Floats:
+def expected_scores(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Floats:
     """q of every state in the current frame of each episode, ``(N, S)``."""
     base: Any = envs.unwrapped
     return np.array(base.expected_scores(), dtype=np.float64)
+
+
+def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> NDArray[np.bool_]:
+    """States that the scene of each episode allows, ``(N, S)``."""
+    base: Any = envs.unwrapped
+    return np.array(base.action_masks(), dtype=np.bool_)
 
 
 @dataclass(frozen=True)
@@ -56,56 +80,72 @@ class EpisodeBatch:
     """One batch of freshly reset episodes.
 
     Args:
+        index: Numbers of the episodes, ``(N,)``.
         observations: Of the reset frame.
         info: Of the reset frame.
-        scores: q of every state, ``(N, S)``.
         action_masks: Allowed states, ``(N, S)`` bool.
-        scenes: Index of each episode's scene in ``envs.unwrapped.scenes``, ``(N,)``.
-        groups: Its source group.
+        groups: Source group of each episode's scene, ``(N,)``.
         valid: False for the copies that fill the last batch.
         seed: Seed of the batch's first episode.
     """
 
+    index: Ints
     observations: Observations
     info: Mapping[str, Any]
-    scores: Floats
     action_masks: NDArray[np.bool_]
-    scenes: Ints
     groups: NDArray[Any]
     valid: NDArray[np.bool_]
     seed: int
 
 
-def episode_batches(
-    envs: gym.vector.VectorEnv, *, episodes_per_scene: int, seed: int
-) -> Iterator[EpisodeBatch]:
-    """Run through all scenes of `envs`, `episodes_per_scene` times, batch by batch.
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes that are run one batch after the other.
 
-    Episode i begins with seed ``seed + i`` whatever the batch size, so its start state, motion,
-    defocus and noise are those of every other run with that seed.
+    The seed alone decides an episode's motion, defocus, noise and start, so that an episode is the
+    same in a batch of any size.
+
+    Args:
+        scenes: What is photographed.
+        seeds: Seed of each episode, length E.
+        scene: Index of each episode's scene, ``(E,)``.
+        starts: State in which each begins; None where the seed draws it.
     """
-    base: Any = envs.unwrapped
-    scenes = scenes_of(envs)
-    order = np.tile(np.arange(len(scenes)), episodes_per_scene)
-    for begin in range(0, len(order), envs.num_envs):
-        chosen = order[begin : begin + envs.num_envs]
-        valid = np.arange(envs.num_envs) < len(chosen)
-        chosen = np.concatenate([chosen, np.resize(chosen, envs.num_envs - len(chosen))])
-        options = {"scene": [scenes[i].scene_id for i in chosen]}
-        observations, info = envs.reset(seed=seed + begin, options=options)
-        scores = expected_scores(envs)
-        yield EpisodeBatch(
-            observations=observations,
-            info=info,
-            scores=scores,
-            action_masks=_action_masks(base, scores.shape),
-            scenes=chosen,
-            groups=np.array([scenes[i].group for i in chosen]),
-            valid=valid,
-            seed=seed + begin,
-        )
 
+    scenes: Sequence[Scene]
+    seeds: Sequence[int]
+    scene: Ints
+    starts: Sequence[int | None]
 
-def _action_masks(base: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    masks = getattr(base, "action_masks", None)
-    return np.ones(shape, bool) if masks is None else np.array(masks(), dtype=bool)
+    @classmethod
+    def of_each_scene(cls, scenes: Sequence[Scene], *, count: int, seed: int) -> Episodes:
+        """All scenes, `count` times in a row; episode i has the seed ``seed + i``."""
+        scene = np.tile(np.arange(len(scenes)), count)
+        seeds = range(seed, seed + len(scene))
+        return cls(scenes, seeds, scene, [None] * len(scene))
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    def batches(self, envs: gym.vector.VectorEnv[Any, Any, Any]) -> Iterator[EpisodeBatch]:
+        """Resets `envs` to each batch in turn; the last one repeats its episodes to be full."""
+        for begin in range(0, len(self), envs.num_envs):
+            index = np.arange(begin, min(begin + envs.num_envs, len(self)))
+            valid = np.arange(envs.num_envs) < len(index)
+            index = np.concatenate([index, np.resize(index, envs.num_envs - len(index))])
+            scenes = [self.scenes[i] for i in self.scene[index]]
+            options = {
+                "scene": [scene.scene_id for scene in scenes],
+                "state": [self.starts[int(i)] for i in index],
+            }
+            seeds: Any = [self.seeds[int(i)] for i in index]
+            observations, info = envs.unwrapped.reset(seed=seeds, options=options)
+            yield EpisodeBatch(
+                index=index,
+                observations=observations,
+                info=info,
+                action_masks=action_masks(envs),
+                groups=np.array([scene.group for scene in scenes]),
+                valid=valid,
+                seed=int(self.seeds[begin]),
+            )

@@ -1,16 +1,18 @@
-"""What a policy is, and how a name becomes one."""
+"""The interface of a policy, and how a name such as ``matrix:P?compensation=-1`` becomes one."""
 
 from __future__ import annotations
 
 import difflib
 import importlib
 import inspect
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from ae_env.utils.checks import did_you_mean
@@ -21,72 +23,6 @@ if TYPE_CHECKING:
 
     from ae_env.grid import ExposureGrid
     from simulator.camera import CameraProfile
-import re
-
-import yaml
-
-# Names of policies with options in them: ``centre_weighted:P?compensation=-1&damping=0.5``.
-#: Where options begin: a question mark before a slash of a path is a part of the path.
-_OPTIONS = re.compile(r"\?(?![^=]*/)")
-_FRACTION = re.compile(r"\s*([+-]?\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
-
-
-def split_name(name: str) -> tuple[str, dict[str, Any]]:
-    """A policy's name without its options, and the options.
-
-    Args:
-        name: A name, or a name, ``?`` and options ``key=value`` with ``&`` between them. Values are
-            YAML scalars; a fraction such as ``1/60`` is a number too.
-
-    Raises:
-        ValueError: If `name` is not a text, an option has no value or a value that is no scalar, or
-            one is given twice.
-
-    >>> split_name("centre_weighted:P?compensation=-1&shutter_cap=1/50")
-    ('centre_weighted:P', {'compensation': -1, 'shutter_cap': 0.02})
-    >>> split_name("ppo:runs/mine")
-    ('ppo:runs/mine', {})
-    """
-    if not isinstance(name, str):
-        raise ValueError(
-            f"`policy` (={name!r}) must be a name, such as 'matrix:P', not a {type(name).__name__}"
-        )
-    # A folder may have a question mark in its name, a class may not.
-    mark = _OPTIONS.search(name, max(name.find(".py:"), 0))
-    if mark is None:
-        return name, {}
-    start = mark.start()
-    options: dict[str, Any] = {}
-    for part in name[start + 1 :].split("&"):
-        key, equals, text = part.partition("=")
-        key = key.strip()
-        if not equals or not key.isidentifier():
-            raise ValueError(
-                f"`policy` (={name!r}): options are written name?key=value&key=value, not {part!r}"
-            )
-        if key in options:
-            raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
-        options[key] = _scalar(name, key, text)
-    return name[:start], options
-
-
-def _scalar(name: str, key: str, text: str) -> Any:
-    fraction = _FRACTION.fullmatch(text)
-    if fraction and float(fraction[2]) > 0:
-        return float(fraction[1]) / float(fraction[2])
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        value = {}
-    if isinstance(value, str):
-        try:  # YAML 1.1 takes 1e-3 for a text
-            value = float(value)
-        except ValueError:
-            return value
-    if not (value is None or isinstance(value, bool | int | float)):
-        raise ValueError(f"`policy` (={name!r}): option {key!r} (={text!r}) must be a YAML scalar")
-    return value
-
 
 Observations = Mapping[str, NDArray[Any]]
 
@@ -99,17 +35,29 @@ MANUAL_PROGRAMS = ("P", "A", "S", "M")
 PROGRAMS = (*MANUAL_PROGRAMS, "tuned", "tuned_blind")
 #: A controller with a meter of its own, modelled on a camera's.
 RPI_AGC = "rpi_agc"
-_RECORDED = "recorded"
-_SIMPLE = {"best_fixed": "BestFixed", "oracle": "Oracle", "random": "Random"}
 #: Agents that come with the package: the training seeds of ``ae-env bench agents``.
 PRETRAINED = Path(__file__).parent / "pretrained"
 PRETRAINED_SEEDS = (0, 1, 2)
-_TRAINED = {"ppo": "PPOPolicy", "regression": "RegressionPolicy"}
+
+_RECORDED = "recorded"
+#: Module and class by name; imported when the policy is made.
+_SIMPLE = {
+    "best_fixed": ("agents.baselines", "BestFixed"),
+    "oracle": ("agents.baselines", "Oracle"),
+    "random": ("agents.baselines", "Random"),
+}
+_LEARNT = {
+    "ppo": ("agents.learning.ppo", "PPOPolicy"),
+    "regression": ("agents.learning.regression", "RegressionPolicy"),
+}
+#: Where options begin: a question mark before a slash of a path is a part of the path.
+_OPTIONS = re.compile(r"\?(?![^=]*/)")
+_FRACTION = re.compile(r"\s*([+-]?\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
 
 
 @dataclass(frozen=True)
 class PolicyContext:
-    """What every policy is told about the camera it drives.
+    """The camera that a policy drives.
 
     Args:
         grid: The exposure states; an action is an index into it.
@@ -127,10 +75,10 @@ class PolicyContext:
     delay: int = 0
 
     @classmethod
-    def from_envs(cls, envs: gym.vector.VectorEnv) -> PolicyContext:
+    def from_envs(cls, envs: gym.vector.VectorEnv[Any, Any, Any]) -> PolicyContext:
         """The context of the environments that `envs` runs."""
         base: Any = envs.unwrapped
-        return cls(base.grid, base.camera, base.single_observation_space, delay=base.delay)
+        return cls(base.grid, base.camera, base.single_observation_space, delay=int(base.delay))
 
     @property
     def has_sensors(self) -> bool:
@@ -186,7 +134,7 @@ class Policy:
         """
         raise NotImplementedError(f"{type(self).__name__} must implement `act`")
 
-    def fit(self, envs: gym.vector.VectorEnv, seed: int = 0) -> None:
+    def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
         """Learn from the training scenes of `envs`; called once, before evaluation."""
 
 
@@ -200,13 +148,17 @@ def masked_argmax(
     """
     if action_masks is not None:
         utility = np.where(action_masks, utility, -np.inf)
-    return np.argmax(utility, axis=-1).astype(np.int64)
+    best: NDArray[np.int64] = np.argmax(utility, axis=-1).astype(np.int64)
+    return best
+
+
+# -- names ----------------------------------------------------------------------------------------
 
 
 def list_policies() -> list[str]:
     """Names of the built-in policies that need no file."""
     metering = [f"{m}:{p}" for m in METERS for p in PROGRAMS]
-    return sorted([*_SIMPLE, *_TRAINED, *metering, *(f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS)])
+    return sorted([*_SIMPLE, *_LEARNT, *metering, *(f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS)])
 
 
 def is_metering(name: str) -> bool:
@@ -215,7 +167,101 @@ def is_metering(name: str) -> bool:
     >>> is_metering("spot?compensation=1"), is_metering("rpi_agc:A"), is_metering("random")
     (True, True, False)
     """
-    return split_name(name)[0].partition(":")[0] in (*METERS, RPI_AGC)
+    return split_options(name)[0].partition(":")[0] in (*METERS, RPI_AGC)
+
+
+def training_seeds(name: str) -> list[str]:
+    """The names under which `make_policy` knows the training seeds of a learnt agent.
+
+    Args:
+        name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
+            ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself.
+
+    Raises:
+        ValueError: If no file matches a pattern.
+
+    >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
+    (['0', '1', '2'], ['spot:P'])
+    """
+    head, _, tail = str(name).partition(":")
+    if head not in _LEARNT or (tail and "*" not in tail):
+        return [name]
+    pattern = Path(tail or PRETRAINED / f"{head}-*").expanduser()
+    files = sorted(pattern.parent.glob(f"{pattern.name.removesuffix('.safetensors')}.safetensors"))
+    if not files:
+        raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {str(pattern)!r}")
+    return [f"{head}:{file.with_suffix('')}" for file in files]
+
+
+def split_class(base: str) -> tuple[str, str]:
+    """Head and tail of a policy's name without options: around the colon before a class.
+
+    >>> split_class("matrix:P"), split_class("C:/my.py:Mine"), split_class("random")
+    (('matrix', 'P'), ('C:/my.py', 'Mine'), ('random', ''))
+    """
+    head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
+    return head, tail
+
+
+def split_options(name: str) -> tuple[str, dict[str, Any]]:
+    """A policy's name without its options, and the options.
+
+    Args:
+        name: A name, or a name, ``?`` and options ``key=value`` with ``&`` between them. Values are
+            YAML scalars; a fraction such as ``1/60`` is a number too.
+
+    Raises:
+        ValueError: If `name` is not a text, an option has no value or a value that is no scalar, or
+            one is given twice.
+
+    >>> split_options("centre_weighted:P?compensation=-1&shutter_cap=1/50")
+    ('centre_weighted:P', {'compensation': -1, 'shutter_cap': 0.02})
+    >>> split_options("ppo:runs/mine")
+    ('ppo:runs/mine', {})
+    """
+    if not isinstance(name, str):
+        raise ValueError(
+            f"`policy` (={name!r}) must be a name, such as 'matrix:P', not a {type(name).__name__}"
+        )
+    # A folder may have a question mark in its name, a class may not.
+    mark = _OPTIONS.search(name, max(name.find(".py:"), 0))
+    if mark is None:
+        return name, {}
+    start = mark.start()
+    options: dict[str, Any] = {}
+    for part in name[start + 1 :].split("&"):
+        key, equals, text = part.partition("=")
+        key = key.strip()
+        if not equals or not key.isidentifier():
+            raise ValueError(
+                f"`policy` (={name!r}): options are written name?key=value&key=value, not {part!r}"
+            )
+        if key in options:
+            raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
+        options[key] = _scalar(name, key, text)
+    return name[:start], options
+
+
+def _scalar(name: str, key: str, text: str) -> Any:
+    fraction = _FRACTION.fullmatch(text)
+    if fraction and float(fraction[2]) > 0:
+        return float(fraction[1]) / float(fraction[2])
+    try:
+        # No alias can be in it: "&", which an anchor begins with, ends an option.
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        value = {}
+    if isinstance(value, str):
+        try:  # YAML 1.1 takes 1e-3 for a text
+            value = float(value)
+        except ValueError:
+            return value
+    if not (value is None or isinstance(value, bool | int | float)):
+        raise ValueError(f"`policy` (={name!r}): option {key!r} (={text!r}) must be a YAML scalar")
+    return value
+
+
+# -- from a name to a policy ----------------------------------------------------------------------
 
 
 def make_policy(
@@ -231,7 +277,7 @@ def make_policy(
             weights of one's own; ``"package.module:Class"`` or
             ``"path/to/file.py:Class"`` for a policy of one's own. Options may follow:
             ``"centre_weighted:P?compensation=-1&damping=0.5"``.
-        context: What the policy is told about the camera.
+        context: The camera.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
 
@@ -239,90 +285,56 @@ def make_policy(
         ValueError: If there is no such policy, its file cannot be loaded (the cause is chained),
             the class found is not a policy or does not take an option.
     """
-    base, named = split_name(name)
+    base, named = split_options(name)
     for key in options:
         if key in named:
             raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
-    policy = _make(base, name, context, device, {**options, **named})
+    options |= named
+    head, tail = split_class(base)
+    fixed: dict[str, Any] = {}  # arguments that the name itself gives
+    if head.endswith(".py"):
+        cls = load_from_file(head, tail, f"`policy` (={name!r})", example="MyPolicy")
+    elif head in _SIMPLE and not tail:
+        cls = _import(*_SIMPLE[head])
+    elif head in METERS and tail in ("", *PROGRAMS):
+        cls = _import("agents.metering.metering_policy", "MeteringPolicy")
+        fixed = {"meter": head, "program": tail or "P"}
+    elif head == RPI_AGC and tail in ("", *MANUAL_PROGRAMS):
+        cls = _import("agents.metering.rpi_agc", "RpiAgc")
+        fixed = {"program": tail or "P"}
+    elif head == _RECORDED:
+        cls = _import("agents.baselines", "Recorded")
+        fixed = {"path": tail}
+    elif head in _LEARNT:
+        cls = _import(*_LEARNT[head])
+        options = _with_weights(name, head, tail, device, options)
+    elif tail and head not in (*METERS, *_SIMPLE, RPI_AGC):
+        cls = _class_in_module(head, tail, name)
+    else:
+        raise ValueError(_unknown(base))
+    policy = _construct(cls, name, context, options, fixed)
     if named:
         policy.name = name
     return policy
 
 
-def _make(
-    base: str, name: str, context: PolicyContext, device: str, options: dict[str, Any]
-) -> Policy:
-    """The policy called `base`; `name`, with the options, is for the messages."""
-    head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
-    if not tail:
-        head = head or base
-    if head.endswith(".py"):
-        return _construct(_class_in_file(head, tail, name), name, context, options)
-    if head in _SIMPLE and not tail:
-        return _construct(_class_in("agents.baselines", _SIMPLE[head]), name, context, options)
-    if head in METERS and tail in ("", *PROGRAMS):
-        cls = _class_in("agents.metering.programs", "MeteringPolicy")
-        return _construct(cls, name, context, options, meter=head, program=tail or "P")
-    if head == RPI_AGC and tail in ("", *MANUAL_PROGRAMS):
-        cls = _class_in("agents.metering.rpi_agc", "RpiAgc")
-        return _construct(cls, name, context, options, program=tail or "P")
-    if head == _RECORDED:
-        cls = _class_in("agents.baselines", "Recorded")
-        return _construct(cls, name, context, options, path=tail)
-    if head in _TRAINED:
-        if "*" in tail:
-            raise ValueError(
-                f"`policy` (={name!r}) is a pattern, so several agents: it is for evaluations; "
-                "`training_seeds` lists the names of the single ones"
-            )
-        if "network" not in options:
-            weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
-            options = {"weights": weights, "device": device, **options}
-        module = f"agents.learning.{head}"
-        return _construct(_class_in(module, _TRAINED[head]), name, context, options)
-    if tail and head not in (*METERS, *_SIMPLE, RPI_AGC):
-        return _construct(_class_in_module(head, tail, name), name, context, options)
-    raise ValueError(_unknown(base))
-
-
-def training_seeds(name: str) -> list[str]:
-    """The names under which `make_policy` knows the training seeds of a learnt agent.
-
-    Args:
-        name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
-            ``"ppo:runs/ppo-*"`` for the files that fit; anything else stands for itself.
-
-    Raises:
-        ValueError: If no file fits a pattern.
-
-    >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
-    (['0', '1', '2'], ['spot:P'])
-    """
-    head, _, tail = str(name).partition(":")
-    if head not in _TRAINED or (tail and "*" not in tail):
-        return [name]
-    pattern = Path(tail or PRETRAINED / f"{head}-*").expanduser()
-    files = sorted(pattern.parent.glob(f"{pattern.name.removesuffix('.safetensors')}.safetensors"))
-    if not files:
-        raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {str(pattern)!r}")
-    return [f"{head}:{file.with_suffix('')}" for file in files]
-
-
-def _unknown(name: str) -> str:
-    known = [*METERS, RPI_AGC, *list_policies(), *(f"{t}:PATH" for t in (*_TRAINED, _RECORDED))]
-    near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
-    return (
-        f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
-        f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
-        f"{RPI_AGC}, alone or with {', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
-        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; "
-        f"package.module:Class or path.py:Class{hint}"
-    )
-
-
-def _class_in(module: str, name: str) -> Any:
+def _import(module: str, name: str) -> Any:
     return getattr(importlib.import_module(module), name)
+
+
+def _with_weights(
+    name: str, head: str, tail: str, device: str, options: dict[str, Any]
+) -> dict[str, Any]:
+    """`options` of a learnt agent with its weights, where no network is given."""
+    if "*" in tail:
+        raise ValueError(
+            f"`policy` (={name!r}) is a pattern, so several agents: it is for evaluations; "
+            "`training_seeds` lists the names of the single ones"
+        )
+    if "network" in options:
+        return options
+    weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
+    return {"weights": weights, "device": device, **options}
 
 
 def _class_in_module(module: str, name: str, policy: str) -> Any:
@@ -330,7 +342,7 @@ def _class_in_module(module: str, name: str, policy: str) -> Any:
         raise ValueError(_unknown(policy))
     try:
         loaded = importlib.import_module(module)
-    except Exception as error:
+    except Exception as error:  # the user's module runs, and may raise anything
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and (module == missing or module.startswith(f"{missing}.")):
             raise ValueError(f"{_unknown(policy)} (there is no module {missing!r})") from None
@@ -338,16 +350,8 @@ def _class_in_module(module: str, name: str, policy: str) -> Any:
     return find_attribute(loaded, name, f"`policy` (={policy!r})")
 
 
-def _broken(policy: str, what: str, error: BaseException) -> str:
-    return f"`policy` (={policy!r}): {what}: {type(error).__name__}: {error}"
-
-
-def _class_in_file(path: str, name: str, policy: str) -> Any:
-    return load_from_file(path, name, f"`policy` (={policy!r})", example="MyPolicy")
-
-
 def _construct(
-    cls: Any, name: str, context: PolicyContext, options: dict[str, Any], **fixed: Any
+    cls: Any, name: str, context: PolicyContext, options: dict[str, Any], fixed: dict[str, Any]
 ) -> Policy:
     """A `cls` with `options` of the caller's and those that the name has `fixed`."""
     if not inspect.isclass(cls):
@@ -371,13 +375,15 @@ def _construct(
             f"{''.join(f', {key}=' for key in options)}): {error}"
         ) from None
     try:
-        return cls(context, **options)
-    except Exception as error:
-        if cls.__module__.startswith("agents."):  # its own errors say what is wrong
-            if isinstance(error, ValueError) and "?" in name:
-                raise ValueError(f"`policy` (={name!r}): {error}") from error
-            raise
-        raise ValueError(_broken(name, f"{cls.__name__} cannot be made", error)) from error
+        policy: Policy = cls(context, **options)
+    except Exception as error:  # a user's constructor may raise anything
+        if not cls.__module__.startswith("agents."):
+            message = _broken(name, f"{cls.__name__} cannot be made", error)
+            raise ValueError(message) from error
+        if isinstance(error, ValueError) and "?" in name:
+            raise ValueError(f"`policy` (={name!r}): {error}") from error
+        raise  # our own errors say which argument is wrong
+    return policy
 
 
 def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str, Any]) -> None:
@@ -393,3 +399,20 @@ def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str
                 f"`policy` (={name!r}): {cls.__name__} does not take the option {option!r}; "
                 f"{takes}{did_you_mean(option, known)}"
             )
+
+
+def _unknown(name: str) -> str:
+    known = [*METERS, RPI_AGC, *list_policies(), *(f"{t}:PATH" for t in (*_LEARNT, _RECORDED))]
+    near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return (
+        f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
+        f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
+        f"{RPI_AGC}, alone or with {', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
+        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; "
+        f"package.module:Class or path.py:Class{hint}"
+    )
+
+
+def _broken(policy: str, what: str, error: BaseException) -> str:
+    return f"`policy` (={policy!r}): {what}: {type(error).__name__}: {error}"

@@ -13,12 +13,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from agents.cli.quickstart import prepare_tables
 from agents.episodes import make_envs
-from agents.evaluation.protocol import evaluate, fit_policies
+from agents.evaluation.engine import evaluate
+from agents.evaluation.running import cache_score_tables, fit_policies
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
 from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
-from agents.report.of_evaluation import write_report
+from agents.report.evaluation_report import write_report
 
 CONFIGS = {"regression": Path("configs/regression.yaml"), "ppo": Path("configs/ppo.yaml")}
 SEEDS = (0, 1, 2)
@@ -96,7 +96,7 @@ def _train(jobs: dict[str, list[TrainingJob]]) -> None:
     first = next(iter(jobs.values()))[0].config
     with Progress() as display:
         task = display.add_task("score tables")
-        prepare_tables(
+        cache_score_tables(
             first.environment,
             lambda done, total, note="": display.update(task, completed=done, total=total),
         )

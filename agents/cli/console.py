@@ -1,4 +1,4 @@
-"""What the commands share: the console, progress bars, and checks of what the user typed."""
+"""Shared by the commands: the console, progress bars, common options and their checks."""
 
 from __future__ import annotations
 
@@ -57,10 +57,15 @@ def progress_bars() -> Iterator[Any]:
         yield bar
 
 
+def print_line(text: str) -> None:
+    """Prints a line as it is: names in it are no markup, and it is not wrapped."""
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
 def print_files(files: Mapping[str, Path]) -> None:
-    """Says what was written where."""
+    """Prints the files that were written."""
     for name, path in files.items():
-        console.print(f"wrote {name}: {path}", highlight=False, soft_wrap=True, markup=False)
+        print_line(f"wrote {name}: {path}")
 
 
 def save_picture(path: Path, picture: Any) -> Path:
@@ -80,12 +85,12 @@ def parse_seconds(text: str) -> float:
 
 
 def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> None:
-    """Makes a folder for results before any time is spent on them.
+    """Makes a folder for results, before any work is done.
 
     Args:
         path: The folder.
-        name: The option that named it.
-        file: What the option named, where that is a file in the folder.
+        name: The option that names it.
+        file: The file in the folder that the option names, if it names one.
 
     Raises:
         ValueError: If nothing can be written there.
@@ -106,7 +111,7 @@ def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> N
 
 
 def torch_device(name: str) -> str:
-    """The torch device called `name`, checked before any work is done."""
+    """The torch device called `name`, checked."""
     import torch
 
     cuda = torch.cuda.is_available()
@@ -118,5 +123,5 @@ def torch_device(name: str) -> str:
 
 
 def command_line() -> str:
-    """What the user typed, for result files."""
+    """The command line that the user typed, for result files."""
     return shlex.join(["ae-env", *sys.argv[1:]])

@@ -1,4 +1,4 @@
-"""The main job: train two agents on simulated raws and show them beside a light meter."""
+"""``ae-env quickstart``: two agents trained and compared with light meters on unseen scenes."""
 
 from __future__ import annotations
 
@@ -7,31 +7,66 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
-import numpy as np
+import typer
 
-from agents.evaluation.protocol import evaluate, fit_policies
-from agents.evaluation.result import EvaluationResult
-from agents.learning.training import AgentConfig, TrainingJob, train_in_parallel
-from agents.policy import Policy, PolicyContext, make_policy
-from agents.report.of_evaluation import write_report
-from simulator.utils.files import write_atomically
+from agents.cli.console import (
+    Device,
+    Seed,
+    command_line,
+    console,
+    make_folder,
+    print_files,
+    print_line,
+    progress_bars,
+    torch_device,
+)
+from agents.cli.evaluate import print_scores
+
+if TYPE_CHECKING:
+    from agents.evaluation.result import EvaluationResult
+    from agents.policy import Policy
 
 #: Policies that need no training, in the order of the table.
 BASELINES = (
-    "random",
-    "best_fixed",
-    "average:P",
-    "centre_weighted:P",
-    "matrix:P",
-    "centre_weighted:tuned",
-    "matrix:tuned",
-    "oracle",
+    *("random", "best_fixed", "average:P", "centre_weighted:P", "matrix:P"),
+    *("centre_weighted:tuned", "matrix:tuned", "oracle"),
 )
 #: Frames that each agent sees: both trainings end within about three minutes on two cores.
 REGRESSION_FRAMES = 75_000
 PPO_FRAMES = 80_000
+#: Episodes per scene of the evaluation.
+EPISODES = 2
+
+Scenes = Annotated[
+    str, typer.Option(help="'bundled', or a folder or file of raws or .hdr/.exr radiance maps.")
+]
+
+
+def quickstart(
+    scenes: Scenes = "bundled",
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("quickstart"),
+    seed: Seed = 0,
+    device: Device = "cpu",
+) -> None:
+    """Train two agents, compare them with light meters on unseen scenes: about 5 minutes.
+
+    Example: `ae-env quickstart --scenes ~/my_raws --out my_raws_result`
+    """
+    make_folder(out)
+    device = torch_device(device)
+    with progress_bars() as progress:
+        done = run_quickstart(
+            scenes, out, seed=seed, progress=progress, command=command_line(), device=device
+        )
+    if done.zero_shot:
+        print_line(f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes")
+    print_scores(done.result)
+    print_files(done.files)
+    console.print("\nTry next:")
+    for line in next_commands(scenes, out, done.agents):
+        print_line(f"  {line}")
 
 
 class Task(Protocol):
@@ -47,7 +82,7 @@ Progress = Callable[[str], AbstractContextManager[Task]]
 
 @dataclass(frozen=True)
 class QuickstartResult:
-    """What a quickstart leaves.
+    """The evaluation, files and agents of a quickstart.
 
     Args:
         result: The evaluation.
@@ -76,60 +111,40 @@ def run_quickstart(
         command: The command line, for the report.
         device: Torch device of the agents' networks.
     """
+    from ae_env.utils.checks import check_integer
+    from agents.episodes import training_scenes
+    from agents.evaluation.engine import evaluate
+    from agents.evaluation.evaluation_plan import MAX_SEED
+    from agents.evaluation.running import cache_score_tables, fit_policies
+    from agents.report.evaluation_report import write_report
+
+    check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
     source, zero_shot = training_scenes(scenes)
     environment = {"scenes": source, "split": "train", "resolution": 64}
     with progress("scenes and score tables") as task:
-        prepare_tables(environment, task)
+        cache_score_tables(environment, task)
     agents = _train(environment, out, seed, progress, device)
-    evaluation = {"scenes": scenes, "split": "test", "resolution": 64}
-    policies = _policies(evaluation, agents, device)
+    unseen = {"scenes": scenes, "split": "test", "resolution": 64}
+    policies = _policies(unseen, agents, device)
     with progress("light meters learn their programs") as task:
         fit_policies(policies, environment, seed=seed, progress=task)
     with progress("evaluation on unseen scenes") as task:
-        result = evaluate(policies, evaluation, episodes_per_scene=2, seed=seed, progress=task)
+        result = evaluate(policies, unseen, episodes_per_scene=EPISODES, seed=seed, progress=task)
     files = write_report(
         result,
         out,
         command=command,
-        source=scenes,
-        split="test",
         next_commands=next_commands(scenes, out, agents),
         extra_meta={"trained_on": source, "zero_shot": zero_shot},
     )
-    with progress("contact sheet") as task:
-        sheet = _contact_sheet(evaluation, policies, out / "contact_sheet.png", seed)
-        task(1, 1)
-    return QuickstartResult(result, {**files, "contact_sheet.png": sheet}, agents, zero_shot)
-
-
-def training_scenes(scenes: str) -> tuple[str, bool]:
-    """Where agents for `scenes` are trained: there, or on the bundled ones if they are too few."""
-    from ae_env.options import EnvOptions
-    from ae_env.scenes.loading import BUNDLED
-
-    if scenes not in BUNDLED:
-        groups = {s.group for s in EnvOptions(scenes=scenes, split="all").load_scenes()}
-        if len(groups) < 15:
-            return "bundled", True
-    return scenes, False
-
-
-def prepare_tables(environment: Mapping[str, Any], task: Task) -> None:
-    """Works out the score tables of all scenes, so that they are cached for every process."""
-    from ae_env.options import EnvOptions
-    from ae_env.scorers.score_table import ScoreTables
-
-    options = EnvOptions.from_kwargs(environment)
-    scenes = options.load_scenes()
-    tables = ScoreTables(options.make_grid(), options.make_camera(), options.make_scorer())
-    for i, scene in enumerate(scenes):
-        tables.closed_parts(scene)
-        task(i + 1, len(scenes))
+    return QuickstartResult(result, files, agents, zero_shot)
 
 
 def _train(
     environment: dict[str, Any], out: Path, seed: int, progress: Progress, device: str
 ) -> dict[str, Path]:
+    from agents.learning.training import AgentConfig, TrainingJob, train_in_parallel
+
     settings: dict[str, dict[str, Any]] = {
         "regression": {"frames": REGRESSION_FRAMES, "seed": seed},
         "ppo": {"total_timesteps": PPO_FRAMES, "seed": seed},
@@ -156,52 +171,17 @@ def _train(
 
 
 def _policies(
-    evaluation: dict[str, Any], agents: Mapping[str, Path], device: str
+    environment: dict[str, Any], agents: Mapping[str, Path], device: str
 ) -> dict[str, Policy]:
     from agents.episodes import make_envs
+    from agents.policy import PolicyContext, make_policy
 
-    envs = make_envs(evaluation, num_envs=1, frames=1)
+    envs = make_envs(environment, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
     envs.close()
-    policies = {name: make_policy(name, context) for name in BASELINES}
-    learnt = {
-        name: make_policy(f"{name}:{path}", context, device=device) for name, path in agents.items()
-    }
-    oracle = policies.pop("oracle")
-    return {**policies, **learnt, "oracle": oracle}
-
-
-def _contact_sheet(
-    evaluation: dict[str, Any], policies: Mapping[str, Policy], path: Path, seed: int
-) -> Path:
-    """The states of one scene with the paths of a light meter and the two agents."""
-    import io
-
-    from ae_env.rendering import contact_sheet
-    from agents.episodes import make_envs
-
-    envs = make_envs(evaluation, num_envs=1, frames=8)
-    base: Any = envs.unwrapped
-    hard = [s for s in base.scenes if s.kind == "back_light"] or base.scenes
-    scene = hard[min(2, len(hard) - 1)]
-    paths = {}
-    for name in ("centre_weighted:P", "regression", "ppo"):
-        observations, _ = envs.reset(seed=seed, options={"scene": scene.scene_id, "state": 0})
-        policies[name].reset(1, seed=seed)
-        states = [int(base.states[0])]
-        for _ in range(4):
-            actions = policies[name].act(observations)
-            observations, *_ = envs.step(np.asarray(actions))
-            states.append(int(base.states[0]))
-        paths[name] = states
-    episode = base.episode(0)
-    picture = contact_sheet(
-        scene, camera=base.camera, speed=episode.speed, defocus=episode.defocus, path=paths
-    )
-    envs.close()
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return write_atomically(path, buffer.getvalue())
+    learnt = {name: f"{name}:{path}" for name, path in agents.items()}
+    names = {name: name for name in BASELINES[:-1]} | learnt | {"oracle": "oracle"}
+    return {name: make_policy(own, context, device=device) for name, own in names.items()}
 
 
 def next_commands(scenes: str, out: Path, agents: Mapping[str, Path]) -> Sequence[str]:

@@ -1,4 +1,4 @@
-"""The commands about scorers: which there are, and the weights that one of them needs."""
+"""``ae-env scorers`` and ``ae-env convert-nima``: all scorers, and the weights of one of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from agents.cli.console import console, make_folder, print_files
+from agents.cli.console import console, make_folder, print_files, print_line
 
 
 def scorers() -> None:
@@ -33,11 +33,7 @@ def scorers() -> None:
             what.append(f" From {row.package}.", "dim")
         table.add_row(Text(row.name), row.domain, row.depends_on, what)
     console.print(table)
-    console.print(
-        "and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC",
-        highlight=False,
-        soft_wrap=True,
-    )
+    print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")
 
 
 def convert_nima(
@@ -70,13 +66,8 @@ def convert_nima(
     make_folder(target.parent, file=target)
     convert_nima(file, target)
     text = f"the published weights of {kind}" if kind else "not one of the published files"
-    console.print(f"{file.name}: {text}", highlight=False, soft_wrap=True, markup=False)
+    print_line(f"{file.name}: {text}")
     print_files({"weights": target})
     name = kind or "nima_aesthetic"
     if out is not None:
-        console.print(
-            f"next: export AE_ENV_{name.upper()}={target.resolve()}",
-            soft_wrap=True,
-            highlight=False,
-            markup=False,
-        )
+        print_line(f"next: export AE_ENV_{name.upper()}={target.resolve()}")

@@ -1,51 +1,61 @@
-"""What an evaluation runs: scenes, conditions, starts, frames, seeds, policies; from YAML."""
+"""An evaluation's plan, from YAML: scenes, conditions, starts, frames, seeds, policies."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from ae_env.scenes.folder import sequence_bounds
 from ae_env.utils.checks import did_you_mean
+from agents.episodes import Episodes
 from simulator.utils.config_file import Configuration, load_yaml
 
 if TYPE_CHECKING:
+    from ae_env.grid import ExposureGrid
     from ae_env.options import EnvOptions
+    from ae_env.scenes import Scene
 
-#: Where an episode may begin; see `agents.evaluation.plan_episodes.start_state`.
+#: Where an episode may begin; see `start_state`.
 STARTS = ("dark", "middle", "bright", "random")
 #: Names of parts of the static condition, which no condition may have.
 _RESERVED = ("all", "hard", "rest")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+./-]*")
 MAX_FRAMES, MAX_SEED, MAX_SCENES = 10_000, 2**32 - 1, 100_000
+#: Seeds of two entries of a plan's `seeds` are this far apart: more than any plan has scenes.
+_SEED_STRIDE = 2**20
+#: Arguments of the environment that a condition has, and those that the evaluation itself sets.
+CONDITION_ARGUMENTS = ("lighting", "delay")
+_OWN_ARGUMENTS = ("with_oracle", "max_episode_steps", "autoreset_mode")
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
 _NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "hash")
 
 
 class Condition(Configuration):
-    """What differs from the base environment.
+    """The light and the delay of some episodes: the difference to the base environment.
 
     Args:
         lighting: As the environment's argument: a name, or a mapping with ``kind``.
         delay: Frames from a decision to the first frame that has it.
     """
 
-    lighting: str | dict[str, Any] = "static"
+    lighting: Any = "static"
     delay: int = Field(default=0, ge=0, le=16)
 
     @property
     def at_rest(self) -> bool:
-        """Whether neither light nor delay differ from the plainest case."""
-        static = self.lighting in ("static", {"kind": "static"})
-        return static and self.delay == 0
+        """Whether the light is static and nothing delayed."""
+        return self.lighting in ("static", {"kind": "static"}) and self.delay == 0
 
 
 class EvaluationPlan(Configuration):
-    """Everything that decides an evaluation but the policies' own content.
+    """Everything that decides an evaluation except the policies' own content.
 
     Args:
         name: Shown in the report.
@@ -54,8 +64,8 @@ class EvaluationPlan(Configuration):
         scene_ids: Scenes to use, in this order; empty for all of the split.
         max_scenes: Use at most so many scenes, source groups in turn; None for all.
         conditions: By name.
-        delays: Each condition is run with each of these delays; beside the first it is called
-            ``NAME/delayD``. Conditions with a delay of their own are run with that only.
+        delays: Each condition is run with each of these delays; except for the first, it is called
+            ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
         starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
         frames: Actions per episode.
         seeds: Each gives every scene another motion, defocus, phase of the light and noise.
@@ -89,8 +99,8 @@ class EvaluationPlan(Configuration):
 
     @model_validator(mode="after")
     def _check(self) -> EvaluationPlan:
-        for rule, values in (("starts", self.starts), ("seeds", self.seeds)):
-            if not values:
+        for rule in ("starts", "seeds", "conditions", "delays"):
+            if not getattr(self, rule):
                 raise ValueError(f"`{rule}` must have one entry or more")
         for start in self.starts:
             if start not in STARTS:
@@ -98,32 +108,23 @@ class EvaluationPlan(Configuration):
                 raise ValueError(f"`starts` (={start!r}) must be of {list(STARTS)}{hint}")
         if min(self.seeds) < 0 or max(self.seeds) > MAX_SEED:
             raise ValueError(f"`seeds` (={list(self.seeds)}) must be in [0, {MAX_SEED}]")
-        if not self.conditions or not self.delays:
-            raise ValueError("`conditions` and `delays` must have one entry or more")
         for name in self.conditions:
             if not _NAME.fullmatch(name) or name in _RESERVED:
                 raise ValueError(
                     f"`conditions` (={name!r}): a name must be of letters, digits and _+./-, and "
                     f"none of {list(_RESERVED)}"
                 )
-        for name in ("lighting", "delay", "with_oracle", "max_episode_steps", "autoreset_mode"):
+        for name in (*CONDITION_ARGUMENTS, *_OWN_ARGUMENTS):
             if name in self.environment:
                 raise ValueError(f"`environment` must not have `{name}`: give it as a condition's")
         for name, condition in self.all_conditions.items():
-            self._check_options(name, condition)
-        try:
-            self.canonical()
-        except TypeError as error:
-            raise ValueError(f"every entry must be a JSON value: {error}") from error
+            try:
+                options = self.options(condition)
+                options.make_grid(), options.make_camera(), options.make_scorer()
+                options.make_lighting()
+            except ValueError as error:
+                raise ValueError(f"condition {name!r}: {error}") from error
         return self
-
-    def _check_options(self, name: str, condition: Condition) -> None:
-        try:
-            options = self.options(condition)
-            options.make_grid(), options.make_camera(), options.make_scorer()
-            options.make_lighting()
-        except ValueError as error:
-            raise ValueError(f"condition {name!r}: {error}") from error
 
     @property
     def all_conditions(self) -> dict[str, Condition]:
@@ -138,25 +139,43 @@ class EvaluationPlan(Configuration):
                     found[label] = condition.model_copy(update={"delay": delay})
         return found
 
+    @property
+    def static_condition(self) -> str:
+        """The condition of unchanging light without delay; the first one where there is none."""
+        conditions = self.all_conditions
+        return next((n for n, c in conditions.items() if c.at_rest), next(iter(conditions)))
+
+    def options(self, condition: Condition | None = None, **changes: Any) -> EnvOptions:
+        """The checked arguments of the environment in `condition`."""
+        from ae_env.options import EnvOptions
+
+        return EnvOptions.from_kwargs({**self.arguments(condition or Condition()), **changes})
+
     def arguments(self, condition: Condition) -> dict[str, Any]:
         """Arguments of the environment in `condition`."""
         base = {"split": "test", **self.environment}
         return {**base, "lighting": condition.lighting, "delay": condition.delay}
 
-    def options(self, condition: Condition | None = None) -> EnvOptions:
-        """The checked arguments of the environment in `condition`."""
-        from ae_env.options import EnvOptions
+    def describe(self) -> dict[str, Any]:
+        """Every entry as a JSON value; objects of a caller's own as text."""
+        return _json_values(dict(self), default=repr)
 
-        return EnvOptions.from_kwargs(self.arguments(condition or Condition()))
+    @property
+    def protocol_entries(self) -> list[str]:
+        """Names of the entries that decide the episodes and their scores."""
+        return [name for name, _ in self if name not in _NOT_OF_THE_PROTOCOL]
 
     def protocol(self) -> dict[str, Any]:
-        """JSON values of all that decides the episodes and their scores."""
-        content = self.model_dump(mode="json")
-        return {key: content[key] for key in content if key not in _NOT_OF_THE_PROTOCOL}
+        """JSON values of everything that decides the episodes and their scores.
 
-    def canonical(self) -> str:
-        """`protocol` as text, the same for the same plan however its YAML is written."""
-        return json.dumps(self.protocol(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+        Raises:
+            ValueError: If an entry is none.
+        """
+        content = {name: getattr(self, name) for name in self.protocol_entries}
+        try:
+            return _json_values(content)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"every entry of a plan must be a JSON value: {error}") from error
 
     def changed(self, **entries: Any) -> EvaluationPlan:
         """The same plan with other entries, checked.
@@ -164,19 +183,31 @@ class EvaluationPlan(Configuration):
         Raises:
             ValueError: If an entry is out of range.
         """
-        return EvaluationPlan.model_validate({**self.model_dump(), **entries})
+        return EvaluationPlan.model_validate({**dict(self), **entries})
 
 
 def load_plan(name: str | Path) -> EvaluationPlan:
     """The plan of a preset of ``configs/evaluation``, or of a YAML file of one's own.
 
     Raises:
-        ValueError: If there is none, or an entry is unknown or out of range; the message names the
-            file and the entry.
+        ValueError: If there is none, or an entry is unknown, out of range or no JSON value; the
+            message names the file and the entry.
     """
     from ae_env.utils.presets import find_preset
 
-    return load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
+    plan = load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
+    plan.protocol()
+    return plan
+
+
+def light_name(lighting: Any) -> str:
+    """Name of a condition: the kind of its light.
+
+    >>> light_name("sine"), light_name({"kind": "step", "stops": 4})
+    ('sine', 'step')
+    """
+    kind = lighting.get("kind") if isinstance(lighting, Mapping) else lighting
+    return kind if isinstance(kind, str) and _NAME.fullmatch(kind) else "light"
 
 
 def digest(*parts: object) -> str:
@@ -187,3 +218,92 @@ def digest(*parts: object) -> str:
     """
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _json_values(content: Any, default: Any = None) -> dict[str, Any]:
+    def converted(value: Any) -> Any:
+        if isinstance(value, Condition):
+            return dict(value)
+        if default is None:
+            raise TypeError(f"{value!r} is none")
+        return default(value)
+
+    found: dict[str, Any] = json.loads(json.dumps(content, default=converted, allow_nan=False))
+    return found
+
+
+# -- scenes and episodes --------------------------------------------------------------------------
+
+
+def plan_scenes(plan: EvaluationPlan) -> list[Scene]:
+    """The scenes of `plan`, in its order; of a sequence, its first frame.
+
+    Raises:
+        ValueError: If one of `scene_ids` is not there.
+    """
+    options = plan.options()
+    scenes = options.load_scenes()
+    if options.in_sequences:
+        scenes = [scenes[i] for i in np.unique(sequence_bounds(scenes)[0])]
+    if plan.scene_ids:
+        known = {scene.scene_id: scene for scene in scenes}
+        for name in plan.scene_ids:
+            if name not in known:
+                hint = did_you_mean(name, known)
+                raise ValueError(
+                    f"`scene_ids` (={name!r}) must name scenes of the {len(known)} of "
+                    f"{plan.environment.get('scenes', 'bundled')!r}{hint}"
+                )
+        scenes = [known[name] for name in plan.scene_ids]
+    return groups_in_turn(scenes, plan.max_scenes)
+
+
+def groups_in_turn(scenes: Sequence[Scene], count: int | None) -> list[Scene]:
+    """At most `count` of `scenes`: kinds in turn, and within a kind source groups in turn."""
+    if count is None or count >= len(scenes):
+        return list(scenes)
+    ranks: list[tuple[int, int, int]] = []
+    seen: dict[str, int] = {}
+    groups: dict[str, dict[str, int]] = {}
+    for i, scene in enumerate(scenes):
+        repeat = seen[scene.group] = seen.get(scene.group, -1) + 1
+        of_kind = groups.setdefault(scene.kind, {})
+        rank = of_kind.setdefault(scene.group, len(of_kind))
+        ranks.append((repeat, rank, i))
+    chosen = sorted(sorted(range(len(scenes)), key=lambda i: ranks[i])[:count])
+    return [scenes[i] for i in chosen]
+
+
+def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureGrid) -> Episodes:
+    """The episodes of a condition of `plan`: starts change slowest, then seeds, scenes fastest.
+
+    Episodes that differ in their start only have the same seed: the same motion, defocus, light and
+    noise.
+    """
+    own = [(seed * _SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
+    repeats = len(plan.starts)
+    return Episodes(
+        scenes=scenes,
+        seeds=[seed for seed, _ in own] * repeats,
+        scene=np.array([j for _, j in own] * repeats),
+        starts=[start_state(start, scenes[j], grid) for start in plan.starts for _, j in own],
+    )
+
+
+def start_state(start: str, scene: Scene, grid: ExposureGrid) -> int | None:
+    """State in which an episode begins, among those that the scene allows; ties to the lower ISO.
+
+    Args:
+        start: ``"dark"``: the least exposure of the grid, its highest EV100 (the under-exposed
+            end); ``"middle"``: the state whose EV100 is nearest to that of the scene's right
+            exposure; ``"bright"``: the most exposure of the grid; ``"random"``: drawn.
+        scene: What is photographed.
+        grid: The states.
+    """
+    if start == "random":
+        return None
+    ends = {"dark": float(grid.ev100.max()), "bright": float(grid.ev100.min())}
+    distance = np.abs(grid.ev100 - ends.get(start, scene.ev100)).round(9)
+    if scene.allowed is not None:
+        distance = np.where(scene.allowed, distance, np.inf)
+    return int(np.argmin(distance))

@@ -1,4 +1,4 @@
-"""What is measured of a policy: pure functions of scores, states and exposure values.
+"""The metrics of a policy: pure functions of scores, states and exposure values.
 
 Axes: ``S`` states of the grid, ``T`` frames of an episode, ``E`` episodes; leading axes broadcast.
 All scores are expected scores q, never those of one noisy capture.
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.metering.programs import SAME_EV
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -18,8 +20,6 @@ Ints = NDArray[np.int64]
 SCORE_TOLERANCE = 0.01
 #: A third of a stop, with room for the rounding of f-numbers.
 THIRD_EV = 1.0 / 3.0 + 1e-6
-#: EVs nearer than this are the same exposure: 1/15 s stands for 1/16 s, 0.09 EV from it.
-SAME_EV = 1.0 / 6.0
 #: Light that rests for fewer frames at the end of an episode is not waited for.
 MIN_REST = 4
 
@@ -70,8 +70,9 @@ def regret_given_ev(
         allowed: Action masks, broadcastable to `scores`.
     """
     same = np.abs(ev100 - ev100[states][..., None]) < SAME_EV
-    best = np.where(same & allowed, scores, -np.inf).max(axis=-1)
-    return best - score_of(scores, states)
+    best: Floats = np.where(same & allowed, scores, -np.inf).max(axis=-1)
+    best -= score_of(scores, states)
+    return best
 
 
 def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bool_]) -> Floats:
@@ -155,7 +156,8 @@ def overshoot(evs: Floats, since: Ints | int = 0) -> Floats:
     direction = np.sign(final - first)
     beyond = evs - final
     along = np.where(direction == 0, np.abs(beyond), beyond * direction)
-    return np.maximum(along.max(axis=-1), 0.0)
+    most: Floats = np.maximum(along.max(axis=-1), 0.0)
+    return most
 
 
 def reversals(evs: Floats) -> Ints:
@@ -201,11 +203,11 @@ def delayed_oracle_score(
 
     Args:
         scores: ``(E, T, S)``.
-        allowed: ``(E, S)``.
+        allowed: Action masks, broadcastable to `scores`.
         start_states: State that is kept until the first decision takes effect, ``(E,)``.
         delay: Frames.
     """
-    best = np.where(allowed[:, None], scores, -np.inf).argmax(axis=-1)
+    best = np.where(allowed, scores, -np.inf).argmax(axis=-1)
     waiting = np.repeat(start_states[:, None], min(delay, best.shape[1]), axis=1)
     return score_of(scores, np.concatenate([waiting, best], axis=1)[:, : best.shape[1]])
 

@@ -1,4 +1,4 @@
-"""How the states that policies chose fare under scorers that they were not trained on."""
+"""Scores of the chosen states under scorers that no policy was trained on."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.plan_episodes import groups_in_turn
+from ae_env.scorers import CompositeScorer, make_scorer
+from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.score_table import prepare_scene
+from agents.evaluation.evaluation_plan import EvaluationPlan, groups_in_turn
 from agents.evaluation.result import EvaluationResult
 
 if TYPE_CHECKING:
+    from ae_env.options import EnvOptions
     from ae_env.scenes import Scene
-    from ae_env.scorers import CompositeScorer
-    from agents.evaluation.plan_run import PlanRun
 
 Floats = NDArray[np.float64]
 #: Noisy captures that a scorer of images is averaged over.
@@ -24,9 +26,50 @@ NOISE_SEEDS = 2
 _CHUNK = 16
 
 
+def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, dict[str, float]]:
+    """Mean expected score of the states that each policy chose, by scorer and policy.
+
+    Of some scenes of the first seed, all starts and frames; averaged over frames, then training
+    seeds, episodes of a source group, and source groups.
+
+    Args:
+        result: The results in unchanging light.
+        plan: The plan, with the names of the scorers.
+    """
+    tables = len(result.scene_ids) // len(plan.starts)
+    count = tables // len(plan.seeds)
+    scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first
+    chosen = groups_in_turn(scenes, plan.other_scorer_scenes)
+    options = plan.options()
+    made = {name: make_scorer(name) for name in plan.other_scorers}  # raises before any work
+    found: dict[str, dict[str, float]] = {}
+    for name, scorer in made.items():
+        means: dict[str, dict[str, list[float]]] = {policy: {} for policy in result.tracks}
+        for scene in chosen:
+            j = scenes.index(scene)
+            episodes = np.flatnonzero(np.arange(len(result.scene_ids)) % tables == j)
+            visited = np.unique(
+                np.concatenate([t.states[:, episodes].ravel() for t in result.tracks.values()])
+            )
+            speed = 0.0 if result.speed is None else float(result.speed[j])
+            defocus = 0.0 if result.defocus is None else float(result.defocus[j])
+            scores = np.full(len(result.grid), np.nan)
+            scores[visited] = state_scores(
+                scorer, options, scene, visited.tolist(), speed=speed, defocus=defocus
+            )
+            for policy, track in result.tracks.items():
+                mean = float(scores[track.states[:, episodes]].mean())
+                means[policy].setdefault(scene.group, []).append(mean)
+        found[name] = {
+            policy: float(np.mean([np.mean(values) for values in groups.values()]))
+            for policy, groups in means.items()
+        }
+    return found
+
+
 def state_scores(
     scorer: CompositeScorer,
-    run: PlanRun,
+    options: EnvOptions,
     scene: Scene,
     states: Sequence[int],
     *,
@@ -36,23 +79,19 @@ def state_scores(
     """Expected score of some states of a scene, ``(n,)``; image scorers over `NOISE_SEEDS`.
 
     Args:
-        scorer: What rates them.
-        run: Whose grid, camera and options.
-        scene: What is photographed.
+        scorer: The scorer.
+        options: The environment's arguments: grid, camera, tolerance.
+        scene: The scene.
         states: Indices into the grid.
         speed: Image speed [frame heights per second].
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
     """
-    from ae_env.scorers.captures import describe_captures
-    from ae_env.scorers.score_table import prepare_scene
-
-    options = run.plan.options()
-    camera = options.make_camera()
+    camera, grid = options.make_camera(), options.make_grid()
     prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
     prepared = replace(prepared, tolerance=options.tolerance)
     found = []
     for first in range(0, len(states), _CHUNK):
-        settings = [run.grid[int(state)] for state in states[first : first + _CHUNK]]
+        settings = [grid[int(state)] for state in states[first : first + _CHUNK]]
         count = len(settings)
         captures = describe_captures(
             [scene] * count,
@@ -73,53 +112,3 @@ def state_scores(
             totals.append(scorer.totals(sums))
         found.append(np.mean(totals, axis=0))
     return np.concatenate(found)
-
-
-def other_scores(
-    run: PlanRun, result: EvaluationResult, blur: tuple[Floats, Floats], scorers: Sequence[str]
-) -> dict[str, dict[str, float]]:
-    """Mean expected score of the states that each policy chose, under each of `scorers`.
-
-    Some scenes of the first seed, all starts and frames; averaged over frames, then training
-    seeds, episodes of a source group, and source groups.
-
-    Args:
-        run: The plan that was run.
-        result: What was measured in unchanging light.
-        blur: Image speed and defocus of the episodes (`PlanRun.blur`).
-        scorers: Names, as `make_scorer` takes them.
-
-    Returns:
-        ``{scorer: {policy: mean}}``.
-    """
-    from ae_env.scorers import make_scorer
-
-    chosen = groups_in_turn(run.scenes, run.plan.other_scorer_scenes)
-    places = {scene.scene_id: j for j, scene in enumerate(run.scenes)}
-    made = {name: make_scorer(name) for name in scorers}  # all are known before any work
-    table: dict[str, dict[str, float]] = {}
-    for name, scorer in made.items():
-        means: dict[str, dict[str, list[float]]] = {policy: {} for policy in result.tracks}
-        for scene in chosen:
-            j = places[scene.scene_id]  # the first seed's episodes come first
-            episodes = np.flatnonzero(run.episodes.table == j)
-            visited = np.unique(
-                np.concatenate([t.states[:, episodes].ravel() for t in result.tracks.values()])
-            )
-            scores = np.full(len(run.grid), np.nan)
-            scores[visited] = state_scores(
-                scorer,
-                run,
-                scene,
-                visited.tolist(),
-                speed=float(blur[0][j]),
-                defocus=float(blur[1][j]),
-            )
-            for policy, track in result.tracks.items():
-                mean = float(scores[track.states[:, episodes]].mean())
-                means[policy].setdefault(scene.group, []).append(mean)
-        table[name] = {
-            policy: float(np.mean([np.mean(values) for values in groups.values()]))
-            for policy, groups in means.items()
-        }
-    return table

@@ -1,79 +1,72 @@
-"""A plan with its scenes and episodes: score tables once per light, every policy, the results."""
+"""Runs a plan by the names of its policies: finished parts in files, work in several processes."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ae_env.scorers.score_table import TIE
+from ae_env.scorers import make_scorer
+from ae_env.scorers.registry import scorer_fingerprint
+from agents.evaluation.engine import TRACK_ARRAYS, Arrays, EvaluationRun, Member
 from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
-from agents.evaluation.plan_episodes import (
-    PlanEpisodes,
-    batch_size,
-    judged_envs,
-    plan_scenes,
-    seen_envs,
-)
-from agents.evaluation.protocol import fit_policies
+from agents.evaluation.other_scorers import other_scores
 from agents.evaluation.result import EvaluationResult, Track
-from agents.evaluation.running import (
-    TIMED_FRAMES,
-    check_captures,
-    concatenate_parts,
-    milliseconds_alone,
-    run_batch,
-    stack_seeds,
+from agents.evaluation.running import Progress
+from agents.evaluation.store import (
+    EvaluationStore,
+    file_content,
+    part_key,
+    policy_content,
+    scene_content,
 )
-from agents.evaluation.store import EvaluationStore, code_digest, part_key, policy_content
-from agents.policy import Policy, PolicyContext, make_policy
+from agents.learning.training import core_count, run_in_parallel, tell
 
 if TYPE_CHECKING:
-    from ae_env.grid import ExposureGrid
     from ae_env.scenes import Scene
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-_ARRAYS = ("states", "image_mean", "clipped_high", "clipped_low")
+#: About the time of a frame's score table in static and in changing light, of a frame of a policy,
+#: and of a policy's `fit` [ms]: only the order of the work and the progress bar depend on it.
+_STATIC_MS, _LIGHT_MS, _FRAME_MS, _FIT_MS = 0.2, 20.0, 0.3, 6000.0
+#: Work that does not pay for a second process, which takes some seconds to begin [ms].
+_SMALL_MS = 12_000
 
 
 @dataclass(frozen=True)
-class Member:
-    """One policy of a plan, or one training seed of an agent.
+class Job:
+    """A piece of work for one process.
 
     Args:
-        policy: Name in the tables.
-        name: What makes it, for `agents.make_policy`.
-        index: Number of the training seed.
+        conditions: Names of the condition whose light is judged, or of those of one delay in which
+            a policy is run.
+        member: The policy; None for the light.
+        cost: About the time that it takes [ms].
     """
 
-    policy: str
-    name: str
-    index: int = 0
+    conditions: tuple[str, ...]
+    member: Member | None
+    cost: float
+
+    @property
+    def label(self) -> str:
+        """For the progress bar."""
+        return f"light: {self.conditions[0]}" if self.member is None else self.member.name
 
 
-def _names(spec: Any) -> list[str]:
-    """What `spec` may name: a scorer, a mapping of scorers, or the file of a lighting."""
-    if isinstance(spec, Mapping):
-        return [*map(str, spec), *(value for value in spec.values() if isinstance(value, str))]
-    return [spec] if isinstance(spec, str) else []
-
-
-class PlanRun:
-    """A plan with its scenes and episodes, and where its parts are kept.
+class StoredRun(EvaluationRun):
+    """A run whose finished parts are files.
 
     Args:
-        plan: The plan.
-        folder: Where finished parts are.
+        plan: The plan, of JSON values.
+        folder: Folder of the finished parts.
         scenes: Those of the plan; loaded by default.
         device: Torch device of a learnt agent's network.
-        code: Hash of the source, `code_digest()` by default: parts of other code are others.
     """
 
     def __init__(
@@ -81,221 +74,219 @@ class PlanRun:
         plan: EvaluationPlan,
         folder: Path,
         scenes: list[Scene] | None = None,
+        *,
         device: str = "cpu",
-        code: str | None = None,
     ) -> None:
-        self.plan, self.store, self.device = plan, EvaluationStore(folder), device
-        self.code = code or code_digest()
-        self.scenes = plan_scenes(plan) if scenes is None else scenes
-        self.grid: ExposureGrid = plan.options().make_grid()
-        self.episodes = PlanEpisodes.of(plan, self.scenes, self.grid)
-
-    @cached_property
-    def _content(self) -> list[Any]:
-        """JSON values of what the scenes are."""
-        return [
-            [
-                *(
-                    s.scene_id,
-                    s.group,
-                    s.kind,
-                    s.hard,
-                    s.content,
-                    round(s.ev100, 5),
-                    s.median_speed,
-                ),
-                # Rounded: made anew, they may differ in the last bit from those of the cache.
-                *([round(gain, 5) for gain in s.white_balance], s.box_factor),
-                round(s.reference.log2_exposure, 5),
-            ]
-            for s in self.scenes
-        ]
+        plan.protocol()  # raises where an entry cannot be a part of a key
+        super().__init__(plan, scenes, device=device)
+        self.store = EvaluationStore(folder)
+        options = plan.options()
+        shown = options.load_scenes() if options.in_sequences else self.scenes
+        scorer = plan.environment.get("scorer")
+        judged = (scorer_fingerprint(options.make_scorer()), file_content(scorer))
+        base = {k: v for k, v in plan.environment.items() if k != "costs"}
+        self._shared = (base, judged, scene_content(shown), plan.frames, plan.seeds)
 
     def light_key(self, condition: Condition) -> str:
         """Name of the part with the score tables of the light of `condition`."""
-        return part_key("light", *self._shared(condition), self.plan.frames, self.plan.seeds)
-
-    def _shared(self, condition: Condition) -> tuple[Any, ...]:
-        base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-        named = [*_names(base.get("scorer")), *_names(condition.lighting)]
-        files = [policy_content(name) for name in named]
-        return self.code, base, condition.lighting, files, self._content
+        lighting = condition.lighting
+        return part_key("light", *self._shared, lighting, file_content(lighting))
 
     def policy_key(self, member: Member, condition: Condition) -> str:
-        """Name of the part with what `member` did in `condition`."""
-        return part_key(
-            "policy",
-            *self._shared(condition),
-            condition.delay,
-            self.plan.frames,
-            self.plan.seeds,
-            self.plan.starts,
-            member.name,
-            policy_content(member.name),
-            self.device,
-        )
+        """Name of the part with the track of `member` in `condition`."""
+        own = (member.name, policy_content(member.name), self.device)
+        shown = (condition.delay, self.plan.starts)
+        return part_key("policy", self.light_key(condition), *shown, *own)
 
-    def scorers_key(self, condition: Condition, result: EvaluationResult) -> str:
-        """Name of the part with what other scorers say of the states chosen in `condition`."""
-        states = {
-            n: hashlib.sha256(t.states.tobytes()).hexdigest() for n, t in result.tracks.items()
-        }
-        plan, scorers = self.plan, list(self.plan.other_scorers)
-        files = [policy_content(name) for name in scorers]
-        shown = (plan.seeds, plan.starts, scorers, files, plan.other_scorer_scenes)
-        return part_key("scorers", *self._shared(condition), *shown, states)
+    @cached_property
+    def privileged(self) -> dict[Member, bool]:
+        """Whether each member is told the best states.
 
-    # -- score tables -------------------------------------------------------------------------
+        Raises:
+            ValueError: If a policy is unknown, or does not fit the environment of some delay.
+        """
+        found = {}
+        for condition in {c.delay: c for c in self.plan.all_conditions.values()}.values():
+            for member in self.members:
+                found[member] = bool(getattr(self.make(member, condition), "privileged", False))
+        return found
 
-    def judge(self, condition: Condition, report: Callable[[float], None]) -> None:
-        """Works out q of every state in every frame of the light of `condition`; keeps them."""
-        key, episodes = self.light_key(condition), self.episodes
-        if self.store.has(key):
+    @property
+    def ranked_policies(self) -> list[str]:
+        """Policies that a ranking has: all but privileged ones."""
+        return list(dict.fromkeys(m.policy for m, told in self.privileged.items() if not told))
+
+    def run(
+        self, *, workers: int | None = 1, progress: Progress | None = None
+    ) -> dict[str, EvaluationResult]:
+        """Does the work that is left; see `run_plan`."""
+        if not self.plan.policies:
+            raise ValueError("`policies` (=[]) must hold at least one policy")
+        for scorer in self.plan.other_scorers:
+            _check_scorer(scorer)
+        privileged = self.privileged
+        jobs = self._jobs()
+        total = max(sum(job.cost for job in jobs), 1.0)
+        done = 0.0
+
+        def report(job: Job, cost: float) -> None:
+            nonlocal done
+            done += cost
+            if progress is not None:
+                progress(int(min(done, total)), int(total), job.label)
+
+        if workers is None:
+            workers = core_count() if total > _SMALL_MS else 1
+        # A privileged policy needs the score tables: it waits for all of them.
+        last = [job for job in jobs if job.member is not None and privileged[job.member]]
+        first = [job for job in jobs if job not in last]
+        if workers > 1 and len(first) > 1:
+            tasks = [(self.plan, self.store.folder, self.device, job) for job in first]
+            run_in_parallel(_work, tasks, workers=workers, progress=report)
+            first = []
+        for job in (*first, *last):
+            self.do(job, partial(report, job))
+        if progress is not None:
+            progress(int(total), int(total), "")
+        return self._finished()
+
+    def _jobs(self) -> list[Job]:
+        """The work that is left: light first, and the longest first of each, so that processes end
+        at about the same time.
+        """
+        conditions, frames = self.plan.all_conditions, self.plan.frames
+        lights: dict[str, str] = {}
+        for name, condition in conditions.items():
+            lights.setdefault(self.light_key(condition), name)
+        found = []
+        for key, name in lights.items():
+            if not self.store.has(key):
+                ms = _STATIC_MS if conditions[name].lighting == "static" else _LIGHT_MS
+                found.append(Job((name,), None, ms * frames * self.num_tables))
+        for member in self.members:
+            for delay in {c.delay: None for c in conditions.values()}:
+                left = tuple(
+                    name
+                    for name, c in conditions.items()
+                    if c.delay == delay and not self.store.has(self.policy_key(member, c))
+                )
+                if left:
+                    fit = _FIT_MS * ("tuned" in member.name)
+                    cost = fit + len(left) * len(self.episodes) * frames * _FRAME_MS
+                    found.append(Job(left, member, cost))
+        return sorted(found, key=lambda job: (job.member is not None, -job.cost))
+
+    def do(self, job: Job, report: Callable[[float], None]) -> None:
+        """Does a job and saves its parts; `report` gets its costs as they are done [ms]."""
+        conditions = [self.plan.all_conditions[name] for name in job.conditions]
+        if job.member is None:
+            each = job.cost / (self.plan.frames * self.num_tables)
+            light = self.judge(conditions[0], lambda frames: report(frames * each))
+            self.store.save(self.light_key(conditions[0]), light)
             return
-        count = episodes.num_tables
-        one_start = replace(
-            episodes,
-            seeds=episodes.seeds[:count],
-            scene=episodes.scene[:count],
-            table=episodes.table[:count],
-            starts=[0] * count,
-        )
-        envs = judged_envs(self.plan, condition, self.scenes, batch_size(count))
-        base: Any = envs.unwrapped
-        parts, drawn = [], []
-        try:
-            for _, batch in one_start.batches(envs):
-                tables = [base.expected_scores()]
-                for _ in range(self.plan.frames):
-                    envs.step(np.zeros(envs.num_envs, np.int64))
-                    tables.append(base.expected_scores())
-                    report(float(batch.valid.sum()))
-                parts.append(np.stack(tables, axis=1)[batch.valid])
-                drawn += [base.episode(i) for i in np.flatnonzero(batch.valid)]
-        finally:
-            envs.close()
-        arrays = {
-            "scores": np.concatenate(parts),
-            "speed": np.array([e.speed for e in drawn]),
-            "defocus": np.array([e.defocus for e in drawn]),
-        }
-        self.store.save(key, arrays, {})
+        name = job.member.name
+        policy = self.fitted(job.member, conditions[0])
+        for condition in conditions:
+            told = getattr(policy, "privileged", False)
+            start_states, track = self.follow(
+                name,
+                policy,
+                condition,
+                self.light(condition) if told else None,
+                lambda frames: report(frames * _FRAME_MS),
+            )
+            content = dict(vars(track))
+            arrays = {key: content.pop(key)[0] for key in TRACK_ARRAYS}
+            key = self.policy_key(job.member, condition)
+            self.store.save(key, {**arrays, "start_states": start_states}, content)
 
-    def tables(self, condition: Condition) -> Floats:
-        """q of every state, the reset frame first, ``(J, T + 1, S)``."""
-        return self._light(condition)["scores"]
+    def light(self, condition: Condition) -> Arrays:
+        """The finished score tables of `condition`; see `judge`."""
+        return self._loaded(self.light_key(condition))[0]
 
-    def blur(self, condition: Condition) -> tuple[Floats, Floats]:
-        """Image speed and defocus of the episodes that have a score table, ``(J,)`` each."""
-        found = self._light(condition)
-        return found["speed"], found["defocus"]
-
-    def _light(self, condition: Condition) -> dict[str, np.ndarray]:
-        found = self.store.load(self.light_key(condition))
+    def _loaded(self, key: str) -> tuple[Arrays, dict[str, Any]]:
+        found = self.store.load(key)
         if found is None:
-            raise ValueError("the score tables are not there: call `judge` first")
-        return found[0]
+            raise FileNotFoundError(f"{self.store.path(key)} was removed while the evaluation ran")
+        return found
 
-    # -- policies -----------------------------------------------------------------------------
+    def _finished(self) -> dict[str, EvaluationResult]:
+        """The results of all conditions, from the finished parts."""
+        results = {}
+        for name, condition in self.plan.all_conditions.items():
+            tracks: dict[Member, Track] = {}
+            start_states = np.zeros(0, np.int64)
+            for member in self.members:
+                arrays, meta = self._loaded(self.policy_key(member, condition))
+                start_states = arrays.pop("start_states")
+                content: dict[str, Any] = {key: value[None] for key, value in arrays.items()}
+                tracks[member] = Track(**content, **meta)
+            light = self.light(condition)
+            results[name] = self.result(condition, light, start_states, tracks)
+        static = self.plan.static_condition
+        if self.plan.other_scorers:
+            results[static] = self._rated(results[static], self.plan.all_conditions[static])
+        return results
 
-    def follow(self, member: Member, report: Callable[[float], None]) -> None:
-        """Runs `member` in all conditions that it was not run in yet, and keeps what it did."""
-        fitted: dict[int, Policy] = {}
-        for condition in self.plan.all_conditions.values():
-            key = self.policy_key(member, condition)
-            if self.store.has(key):
-                continue
-            if condition.delay not in fitted:
-                fitted[condition.delay] = self._fitted(member, condition)
-            arrays, meta = self._episodes_of(member, fitted[condition.delay], condition, report)
-            self.store.save(key, arrays, meta)
+    def _rated(self, result: EvaluationResult, condition: Condition) -> EvaluationResult:
+        """`result` with other scorers' means, which are a part too: image scorers take a while."""
+        plan, tracks = self.plan, result.tracks.items()
+        states = {n: hashlib.sha256(t.states.tobytes()).hexdigest() for n, t in tracks}
+        names = list(plan.other_scorers)
+        own = (names, file_content(dict.fromkeys(names)), plan.other_scorer_scenes, states)
+        key = part_key("scorers", self.light_key(condition), plan.starts, *own)
+        known = self.store.load(key)
+        scores = other_scores(result, plan) if known is None else known[1]
+        if known is None:
+            self.store.save(key, {}, scores)
+        return replace(result, other_scores=scores)
 
-    def _fitted(self, member: Member, condition: Condition) -> Policy:
-        from agents.cli.quickstart import training_scenes
 
-        policy = self.make(member, condition)
-        base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-        source = base.get("scenes", "bundled")
-        if isinstance(source, str):
-            base["scenes"] = training_scenes(source)[0]
-        fit_policies({member.name: policy}, base, seed=self.plan.seeds[0])
-        return policy
+def run_plan(
+    plan: EvaluationPlan,
+    folder: str | os.PathLike[str],
+    *,
+    scenes: list[Scene] | None = None,
+    workers: int | None = 1,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> dict[str, EvaluationResult]:
+    """Runs a plan, or the part of it that is left.
 
-    def make(self, member: Member, condition: Condition) -> Policy:
-        """The policy of `member`, for the camera of `condition`; not fitted."""
-        envs = seen_envs(self.plan, condition, self.scenes[:1], 1)
-        try:
-            context = PolicyContext.from_envs(envs)
-        finally:
-            envs.close()
-        policy = make_policy(member.name, context, device=self.device)
-        check_captures(member.name, policy)
-        return policy
+    Args:
+        plan: The plan, with its policies.
+        folder: Folder of finished parts.
+        scenes: Those of the plan where they are loaded already.
+        workers: Processes; None for one per core where the work is enough to pay for them.
+        device: Torch device of a learnt agent's network.
+        progress: Called with work done, work in all, and what is being done.
 
-    def _episodes_of(
-        self,
-        member: Member,
-        policy: Policy,
-        condition: Condition,
-        report: Callable[[float], None],
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        episodes, frames = self.episodes, self.plan.frames
-        oracle: Ints | None = None
-        if getattr(policy, "privileged", False):
-            tables = self.tables(condition)
-            oracle = np.argmax(tables >= tables.max(-1, keepdims=True) - TIE, axis=-1)
-        envs = seen_envs(self.plan, condition, self.scenes, episodes.batch)
-        parts, starts = [], []
-        try:
-            for index, batch in episodes.batches(envs):
-                best = None if oracle is None else oracle[episodes.table[index]]
-                starts.append(np.array(batch.info["state"], np.int64)[batch.valid])
-                parts.append(run_batch(member.name, policy, envs, batch, frames, oracle=best))
-                report(float(batch.valid.sum()) * frames)
-        finally:
-            envs.close()
-        track = concatenate_parts(parts, policy)
-        alone = None
-        if condition.at_rest:
-            single = seen_envs(self.plan, condition, self.scenes[:1], 1, TIMED_FRAMES)
-            best = None if oracle is None else oracle[0]
-            alone = milliseconds_alone(member.name, policy, single, best)
-            single.close()
-        arrays = {name: getattr(track, name)[0] for name in _ARRAYS}
-        meta = {
-            "ms_per_decision": track.ms_per_decision,
-            "captures_per_decision": track.captures_per_decision,
-            "privileged": track.privileged,
-            "ms_alone": alone,
-        }
-        return {**arrays, "start_states": np.concatenate(starts)}, meta
+    Returns:
+        The results by condition.
 
-    # -- results ------------------------------------------------------------------------------
+    Raises:
+        ValueError: If a policy, a scorer or a scene is unknown, or a policy does not fit the
+            environment; before any work is done.
+        UserCodeError: If a policy raises, or returns something else than allowed states.
+    """
+    with StoredRun(plan, Path(folder), scenes, device=device) as run:
+        return run.run(workers=workers, progress=progress)
 
-    def result(self, condition: Condition, members: Sequence[Member]) -> EvaluationResult:
-        """Everything measured in `condition`, from the finished parts."""
-        tracks: dict[tuple[str, int], Track] = {}
-        start_states = np.zeros(0, np.int64)
-        for member in members:
-            found = self.store.load(self.policy_key(member, condition))
-            if found is None:
-                raise ValueError(f"policy {member.name!r} has not been run: call `follow` first")
-            arrays, meta = found
-            start_states = arrays["start_states"]
-            own: dict[str, Any] = {name: arrays[name][None] for name in _ARRAYS}
-            tracks[member.policy, member.index] = Track(**own, **meta)
-        scenes = [self.scenes[i] for i in self.episodes.scene]
-        scores = self.tables(condition)[:, 1:][self.episodes.table]
-        return EvaluationResult(
-            grid=self.grid,
-            scene_ids=np.array([s.scene_id for s in scenes]),
-            groups=np.array([s.group for s in scenes]),
-            kinds=np.array([s.kind for s in scenes]),
-            hard=np.array([bool(s.hard) for s in scenes]),
-            start_states=start_states,
-            scores=scores,
-            allowed=np.ones((len(scenes), len(self.grid)), bool),
-            tracks=stack_seeds(tracks),
-            seed=self.plan.seeds[0],
-            delay=condition.delay,
-        )
+
+def _check_scorer(name: str) -> None:
+    try:
+        make_scorer(name)
+    except ValueError as error:
+        raise ValueError(f"`other_scorers` (={name!r}): {error}") from error
+
+
+#: In a worker, which serves one run: the run, made by its first job.
+_worker_run: StoredRun | None = None
+
+
+def _work(task: tuple[EvaluationPlan, Path, str, Job]) -> None:
+    global _worker_run
+    plan, folder, device, job = task
+    if _worker_run is None:
+        _worker_run = StoredRun(plan, folder, device=device)
+    _worker_run.do(job, partial(tell, job))

@@ -1,8 +1,9 @@
-"""Everything that an evaluation measured, per episode and frame."""
+"""Everything that an evaluation measured in one condition, per episode and frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ from agents.evaluation import metrics
 
 if TYPE_CHECKING:
     from ae_env.grid import ExposureGrid
+    from ae_env.scenes import Scene
+    from agents.evaluation.evaluation_plan import EvaluationPlan
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -22,7 +25,9 @@ CONDITIONS = ("all", "hard", "rest")
 
 @dataclass(frozen=True)
 class Track:
-    """What one policy did. Leading axis K: training seeds (1 where there is nothing to train).
+    """The states that one policy chose, and the frames that they gave.
+
+    Leading axis K: training seeds (1 where there is nothing to train).
 
     Args:
         states: States of the frames after each action, ``(K, E, T)``; with a delay those that
@@ -32,7 +37,7 @@ class Track:
         clipped_low: Share of black pixels, ``(K, E, T)``.
         ms_per_decision: Time in `act` per camera and frame [ms], in batches.
         captures_per_decision: Frames taken for one decision.
-        privileged: Whether it saw what no camera sees.
+        privileged: Whether the policy was told the best states.
         ms_alone: Time in `act` for one camera alone [ms]; None where it was not measured.
     """
 
@@ -45,10 +50,25 @@ class Track:
     privileged: bool
     ms_alone: float | None = None
 
+    @classmethod
+    def of_seeds(cls, tracks: Sequence[Track]) -> Track:
+        """The tracks of several training seeds as one."""
+        alone = [track.ms_alone for track in tracks if track.ms_alone is not None]
+        return cls(
+            states=np.concatenate([t.states for t in tracks]),
+            image_mean=np.concatenate([t.image_mean for t in tracks]),
+            clipped_high=np.concatenate([t.clipped_high for t in tracks]),
+            clipped_low=np.concatenate([t.clipped_low for t in tracks]),
+            ms_per_decision=float(np.mean([t.ms_per_decision for t in tracks])),
+            captures_per_decision=tracks[0].captures_per_decision,
+            privileged=tracks[0].privileged,
+            ms_alone=float(np.mean(alone)) if alone else None,
+        )
+
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Everything measured, per episode and frame; `E` episodes, `T` frames, `S` states.
+    """Everything measured in one condition; `E` episodes, `T` frames, `S` states.
 
     Args:
         grid: The exposure states.
@@ -58,10 +78,17 @@ class EvaluationResult:
         hard: Whether the episode's scene is in the hard part.
         start_states: State of the reset frame.
         scores: q of every state, ``(E, T, S)``.
-        allowed: Action masks, ``(E, S)``.
-        tracks: What each policy did.
-        seed: Seed of the first episode.
+        allowed: Action masks of every frame, ``(E, T, S)``.
+        tracks: By policy.
+        seed: The plan's first seed.
         delay: Frames between a decision and the frame that it exposes.
+        plan: The plan that the condition belongs to; None where a result was put together by hand,
+            as everything below.
+        scenes: Scene of each episode.
+        speed: Image speed of each episode [frame heights per second], ``(E,)``.
+        defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
+        other_scores: Mean score of the states that each policy chose under scorers that nothing was
+            trained on: by scorer, then by policy.
     """
 
     grid: ExposureGrid
@@ -75,11 +102,17 @@ class EvaluationResult:
     tracks: dict[str, Track]
     seed: int
     delay: int = 0
+    plan: EvaluationPlan | None = None
+    scenes: Sequence[Scene] = ()
+    speed: Floats | None = None
+    defocus: Floats | None = None
+    other_scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @cached_property
     def oracle(self) -> Floats:
         """Mean q of the oracle over the frames, ``(E,)``."""
-        return metrics.oracle_score(self.scores, self.allowed[:, None]).mean(axis=-1)
+        mean: Floats = metrics.oracle_score(self.scores, self.allowed).mean(axis=-1)
+        return mean
 
     @cached_property
     def delayed_oracle(self) -> Floats:
@@ -87,18 +120,21 @@ class EvaluationResult:
         per_frame = metrics.delayed_oracle_score(
             self.scores, self.allowed, self.start_states, self.delay
         )
-        return per_frame.mean(axis=-1)
+        mean: Floats = per_frame.mean(axis=-1)
+        return mean
 
     @cached_property
     def random(self) -> Floats:
         """Exact mean q of a random policy over the frames, ``(E,)``."""
-        return metrics.random_score(self.scores, self.allowed[:, None]).mean(axis=-1)
+        mean: Floats = metrics.random_score(self.scores, self.allowed).mean(axis=-1)
+        return mean
 
     @cached_property
     def oracle_states(self) -> Ints:
         """The oracle's state in the last frame, ties to the lower index, ``(E,)``."""
-        last = np.where(self.allowed, self.scores[:, -1], -np.inf)
-        return last.argmax(axis=-1).astype(np.int64)
+        last = np.where(self.allowed[:, -1], self.scores[:, -1], -np.inf)
+        best: Ints = last.argmax(axis=-1).astype(np.int64)
+        return best
 
     def episode_metrics(self, policy: str) -> dict[str, NDArray[Any]]:
         """Every metric of `policy` per training seed and episode, ``(K, E)``.
@@ -121,7 +157,7 @@ class EvaluationResult:
 
     def _measured(self, policy: str) -> dict[str, NDArray[Any]]:
         track = self.tracks[policy]
-        ev100, allowed = self.grid.ev100, self.allowed[:, None]
+        ev100, allowed = self.grid.ev100, self.allowed
         score = metrics.score_of(self.scores, track.states).mean(axis=-1)
         errors = metrics.ev_error(self.scores, track.states, ev100, allowed)
         frames, converged = metrics.frames_to_converge(errors, since=self.settling)
@@ -160,7 +196,7 @@ class EvaluationResult:
     def group_gains(self, policy: str, condition: str = "all") -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
-        These are what `agents.evaluation.statistics` takes.
+        These are the arguments of `agents.evaluation.intervals`.
         """
         members = self.condition(condition)
         gains = (self.episode_metrics(policy)["score"] - self.random)[:, members]

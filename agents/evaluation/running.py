@@ -1,9 +1,9 @@
-"""Running one policy through a batch of episodes."""
+"""One policy at a time: fitted on training scenes, and run through a batch of episodes."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,114 +12,154 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.utils.checks import UserCodeError, check_number
-from agents.episodes import EpisodeBatch
-from agents.evaluation.result import Track
-from agents.metering.meters import linear_signal
+from agents.episodes import EpisodeBatch, Episodes, action_masks, make_envs
+from agents.metering.reading import linear_signal
 from agents.policy import Policy
 
 Ints = NDArray[np.int64]
+VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
+#: Called with work done, work in all, and what is being done.
+Progress = Callable[[int, int, str], None]
 #: Frames in which the time of one camera's decision is measured, the first ones to warm up.
 TIMED_FRAMES, _WARM_UP = 28, 4
+
+
+def fit_policies(
+    policies: Mapping[str, Policy],
+    env_options: Mapping[str, Any],
+    *,
+    seed: int = 0,
+    batch: int = 64,
+    progress: Progress | None = None,
+) -> None:
+    """Call `fit` of every policy that has one, on the training split.
+
+    Args:
+        policies: By name; changed in place.
+        env_options: Arguments of the environment; `split` is set to ``"train"``.
+        seed: Decides the training episodes.
+        batch: Episodes at a time.
+        progress: Called before and after each fit.
+    """
+    learners = {n: p for n, p in policies.items() if getattr(type(p), "fit", None)}
+    learners = {n: p for n, p in learners.items() if type(p).fit is not Policy.fit}
+    if not learners:
+        return
+    envs = make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
+    try:
+        for i, (name, policy) in enumerate(learners.items()):
+            if progress is not None:
+                progress(i, len(learners), name)
+            with errors_of(name, "fit"):
+                policy.fit(envs, seed)
+        if progress is not None:
+            progress(len(learners), len(learners), "")
+    finally:
+        envs.close()
+
+
+def cache_score_tables(environment: Mapping[str, Any], progress: Progress) -> None:
+    """Works out the score tables of all scenes, so that every process finds them in the cache.
+
+    Args:
+        environment: Arguments of the environment.
+        progress: Called with scenes done, scenes in all, and "".
+    """
+    from ae_env.options import EnvOptions
+    from ae_env.scorers.score_table import ScoreTables
+
+    options = EnvOptions.from_kwargs(environment)
+    scenes = options.load_scenes()
+    tables = ScoreTables(options.make_grid(), options.make_camera(), options.make_scorer())
+    for i, scene in enumerate(scenes):
+        tables.closed_parts(scene)
+        progress(i + 1, len(scenes), "")
 
 
 def run_batch(
     name: str,
     policy: Policy,
-    envs: gym.vector.VectorEnv,
+    envs: VectorEnv,
     batch: EpisodeBatch,
     frames: int,
     *,
     oracle: Ints | None = None,
-    after_frame: Callable[[], None] | None = None,
-) -> dict[str, Any]:
+) -> dict[str, NDArray[Any]]:
     """Run one policy over one batch of episodes.
 
     Args:
-        name: What errors call the policy.
-        policy: It.
+        name: The policy's name in errors.
+        policy: The policy.
         envs: Freshly reset to `batch`.
-        batch: What they show.
+        batch: The episodes.
         frames: Actions.
         oracle: (N, frames + 1) best state of every frame, the reset frame first, which a privileged
-            policy's ``info`` gets where the environment's has none.
-        after_frame: Called after every step.
+            policy's ``info`` gets.
 
     Returns:
-        ``states``, ``image_mean``, ``clipped_high`` and ``clipped_low`` (n, frames) of the valid
-        episodes, ``seconds`` in `act` and the number of ``decisions``.
+        Of the valid episodes ``states``, ``image_mean``, ``clipped_high`` and ``clipped_low``
+        (n, frames) after each action, and their ``start_states`` (n,); ``seconds`` (frames,) that
+        `act` took for the batch.
 
     Raises:
         UserCodeError: If the policy raises, or returns something else than allowed states.
     """
     base: Any = envs.unwrapped
-    with named(name, "reset"):
+    with errors_of(name, "reset"):
         policy.reset(envs.num_envs, seed=batch.seed)
-    observations, info = batch.observations, batch.info
-    states, means, high, low = [], [], [], []
-    seconds = 0.0
+    observations, info, masks = batch.observations, batch.info, batch.action_masks
+    start = np.array(info["state"], dtype=np.int64)
+    states, means, high, low, seconds = [], [], [], [], []
     for frame in range(frames):
         extra: dict[str, Any] = {}
         if getattr(policy, "privileged", False):
             extra = {"info": info if oracle is None else {**info, "oracle_state": oracle[:, frame]}}
         begin = time.perf_counter()
-        with named(name, "act"):
-            actions = policy.act(observations, batch.action_masks, **extra)
-        seconds += time.perf_counter() - begin
-        actions = _checked(name, actions, batch.action_masks)
-        observations, _, _, _, info = envs.step(actions)
+        with errors_of(name, "act"):
+            actions = policy.act(observations, masks, **extra)
+        seconds.append(time.perf_counter() - begin)
+        observations, _, _, _, info = envs.step(_checked(name, actions, masks))
+        masks = action_masks(envs)  # the next frame of a sequence is another scene
         states.append(np.array(info["state"], dtype=np.int64))  # with a delay, an older choice
         means.append(linear_signal(observations["raw"], base.camera).mean(axis=(1, 2, 3)))
         high.append(np.array(info["clipped_high"], dtype=np.float64))
         low.append(np.array(info["clipped_low"], dtype=np.float64))
-        if after_frame is not None:
-            after_frame()
-    keep = batch.valid
     return {
-        "states": np.stack(states, axis=1)[keep],
-        "image_mean": np.stack(means, axis=1)[keep],
-        "clipped_high": np.stack(high, axis=1)[keep],
-        "clipped_low": np.stack(low, axis=1)[keep],
-        "seconds": seconds,
-        "decisions": frames * len(keep),
+        "states": np.stack(states, axis=1)[batch.valid],
+        "image_mean": np.stack(means, axis=1)[batch.valid],
+        "clipped_high": np.stack(high, axis=1)[batch.valid],
+        "clipped_low": np.stack(low, axis=1)[batch.valid],
+        "start_states": start[batch.valid],
+        "seconds": np.array(seconds),
     }
 
 
 def milliseconds_alone(
-    name: str, policy: Policy, envs: gym.vector.VectorEnv, oracle: Ints | None = None
+    name: str, policy: Policy, envs: VectorEnv, episodes: Episodes, oracle: Ints | None = None
 ) -> float:
     """Median time in `act` for one camera alone [ms].
 
     Args:
-        name: What errors call the policy.
-        policy: It.
+        name: The policy's name in errors.
+        policy: The policy.
         envs: One environment, of `TIMED_FRAMES` or more.
-        oracle: (T,) best state of every frame, for a privileged policy.
+        episodes: The episode.
+        oracle: (1, T) best state of every frame, for a privileged policy; the last one stays.
     """
-    observations, info = envs.reset(seed=0)
-    base: Any = envs.unwrapped
-    masks = np.array(base.action_masks(), dtype=np.bool_)
-    times = []
-    with named(name, "reset"):
-        policy.reset(1, seed=0)
-    for frame in range(TIMED_FRAMES):
-        extra: dict[str, Any] = {}
-        if getattr(policy, "privileged", False):
-            best = 0 if oracle is None else oracle[min(frame, len(oracle) - 1)]
-            extra = {"info": {**info, "oracle_state": np.array([best])}}
-        begin = time.perf_counter()
-        with named(name, "act"):
-            actions = policy.act(observations, masks, **extra)
-        times.append(time.perf_counter() - begin)
-        observations, _, _, _, info = envs.step(_checked(name, actions, masks))
-    return 1000.0 * float(np.median(times[_WARM_UP:]))
+    if oracle is not None:
+        last = np.repeat(oracle[:, -1:], TIMED_FRAMES, axis=1)
+        oracle = np.concatenate([oracle, last], axis=1)
+    batch = next(episodes.batches(envs))
+    found = run_batch(name, policy, envs, batch, TIMED_FRAMES, oracle=oracle)
+    return 1000.0 * float(np.median(found["seconds"][_WARM_UP:]))
 
 
 @contextmanager
-def named(policy: str, method: str) -> Iterator[None]:
-    """What a policy raises then names the policy, which may be the user's own."""
+def errors_of(policy: str, method: str) -> Iterator[None]:
+    """An error that a policy raises inside becomes a `UserCodeError` that names the policy."""
     try:
         yield
-    except Exception as error:
+    except Exception as error:  # the policy may be the user's own, and raise anything
         text = f"policy {policy!r}: `{method}` raised {type(error).__name__}: {error}"
         raise UserCodeError(text) from error
 
@@ -135,10 +175,14 @@ def check_captures(name: str, policy: Policy) -> float:
 
 
 def _checked(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
-    """The policy's actions as int64, or an error that says what is wrong with them."""
+    """The policy's actions as int64.
+
+    Raises:
+        UserCodeError: Unless they are allowed states, one per camera.
+    """
     try:
         array = np.asarray(actions)
-    except Exception:  # rows of different lengths, a tensor of a GPU
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor of a GPU
         array = np.empty(0, object)
     if array.shape != masks.shape[:1] or not np.issubdtype(array.dtype, np.integer):
         raise UserCodeError(
@@ -154,37 +198,3 @@ def _checked(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
     if forbidden.any():
         raise UserCodeError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")
     return array.astype(np.int64)
-
-
-def concatenate_parts(parts: list[dict[str, Any]], policy: Policy) -> Track:
-    """What one policy did in all batches, from what `run_batch` returns."""
-    arrays: dict[str, Any] = {
-        key: np.concatenate([p[key] for p in parts])[None]
-        for key in ("states", "image_mean", "clipped_high", "clipped_low")
-    }
-    seconds, decisions = (sum(p[key] for p in parts) for key in ("seconds", "decisions"))
-    return Track(
-        **arrays,
-        ms_per_decision=1000.0 * seconds / decisions,
-        captures_per_decision=float(getattr(policy, "captures_per_decision", 1.0)),
-        privileged=bool(getattr(policy, "privileged", False)),
-    )
-
-
-def stack_seeds(tracks: dict[tuple[str, int], Track]) -> dict[str, Track]:
-    """Join the training seeds of each policy."""
-    result = {}
-    for name in dict.fromkeys(name for name, _ in tracks):
-        own = [track for (other, _), track in tracks.items() if other == name]
-        alone = [t.ms_alone for t in own if t.ms_alone is not None]
-        result[name] = Track(
-            states=np.concatenate([t.states for t in own]),
-            image_mean=np.concatenate([t.image_mean for t in own]),
-            clipped_high=np.concatenate([t.clipped_high for t in own]),
-            clipped_low=np.concatenate([t.clipped_low for t in own]),
-            ms_per_decision=float(np.mean([t.ms_per_decision for t in own])),
-            captures_per_decision=own[0].captures_per_decision,
-            privileged=own[0].privileged,
-            ms_alone=float(np.mean(alone)) if alone else None,
-        )
-    return result

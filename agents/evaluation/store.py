@@ -1,4 +1,8 @@
-"""What an evaluation has finished, kept in files so that a second run goes on."""
+"""Finished parts of an evaluation in files, so that a run that was stopped goes on.
+
+A part's name is a hash of everything that decides its content: the version of this package, the
+plan's entries, the scenes' light, and the files of policies, scorers and lightings of a user's own.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +10,37 @@ import hashlib
 import io
 import json
 import logging
-import os
+import lzma
+import struct
 import zipfile
-from collections.abc import Mapping
-from functools import lru_cache
+import zlib
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.evaluation.evaluation_plan import digest
-from agents.policy import split_name, training_seeds
+from agents.policy import split_class, split_options, training_seeds
 from simulator.utils.files import sibling, write_atomically
+from simulator.utils.results import package_version
+
+if TYPE_CHECKING:
+    from ae_env.scenes import Scene
 
 logger = logging.getLogger(__name__)
 
-#: Bumped when what a file holds changes.
-_VERSION = 1
+#: Increased when the layout of a file changes.
+_LAYOUT = 2
 #: Python files beside one's own that count as parts of it.
 _MAX_NEIGHBOURS = 200
-_ROOT = Path(__file__).resolve().parents[2]
-#: Modules that only show results: a change of theirs leaves what was measured as it is.
-_SHOWING = ("ae_bench", "commands", "plan_jobs", "ranking", "result_table", "statistics")
-_COMMANDS = ("cli", "console", "rendering", "scorer_commands")
+#: Errors that reading a damaged file can end in.
+_DAMAGED = (
+    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RuntimeError, ValueError),
+    *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
+)
 
 
 class EvaluationStore:
@@ -47,60 +58,111 @@ class EvaluationStore:
         return self.folder / f"{key}.npz"
 
     def has(self, key: str) -> bool:
-        """Whether the part is there, whole and readable."""
+        """Whether the part is there and readable."""
         return self.load(key) is not None
 
-    def load(self, key: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+    def load(self, key: str) -> tuple[dict[str, NDArray[Any]], dict[str, Any]] | None:
         """Arrays and JSON values of a part; None where there is none, or it is damaged."""
         file = self.path(key)
         try:
-            # All of it first: of a damaged file, NumPy leaves the handle open.
-            with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as content:
-                arrays = {name: content[name] for name in content.files}
-            return arrays, json.loads(str(arrays.pop("meta")))
+            return _read(file.read_bytes())
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            logger.warning("%s is damaged and is made anew: %s", file, error)
+        except _DAMAGED as error:
+            logger.warning("%s is damaged and is measured again: %s", file, error)
             return None
 
-    def save(self, key: str, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> Path:
-        """Writes a part: whole, or not at all."""
+    def save(
+        self, key: str, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any] | None = None
+    ) -> Path:
+        """Writes a part under a temporary name, then renames it."""
         stream = io.BytesIO()
-        text = np.array(json.dumps(dict(meta), sort_keys=True))
-        content: dict[str, Any] = {"meta": text, **arrays}
+        text = json.dumps({"digest": _arrays_digest(arrays), **(meta or {})}, sort_keys=True)
+        content: dict[str, Any] = {"meta": np.array(text), **arrays}
         np.savez_compressed(stream, **content)
         return write_atomically(self.path(key), stream.getvalue())
 
 
+def _read(content: bytes) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    # The checksums first: the header of a damaged array might ask for any amount of memory.
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise ValueError(f"the checksum of {damaged!r} is wrong")
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    meta = json.loads(str(arrays.pop("meta")))
+    if meta.pop("digest") != _arrays_digest(arrays):  # the list of the arrays has no checksum
+        raise ValueError("arrays are missing")
+    return arrays, meta
+
+
+def _arrays_digest(arrays: Mapping[str, NDArray[Any]]) -> str:
+    found = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        found.update(f"{name}\0{array.dtype.str}\0{array.shape}\0".encode() + array.tobytes())
+    return found.hexdigest()
+
+
 def part_key(kind: str, *parts: object) -> str:
-    """Name of a part: its kind and a hash of all that decides its content."""
-    return f"{kind}-{digest(_VERSION, *parts)[:32]}"
+    """Name of a part: its kind and a hash of this package's version and of JSON values `parts`."""
+    return f"{kind}-{digest(_LAYOUT, package_version(), *parts)[:32]}"
+
+
+def scene_content(scenes: Sequence[Scene]) -> list[Any]:
+    """JSON values that change with the scenes."""
+    return [
+        [
+            *(s.scene_id, s.group, s.kind, s.hard, s.content, s.median_speed, s.box_factor),
+            # Computed again, these may differ in the last bit from those of the cache.
+            *(round(value, 5) for value in (s.ev100, s.reference.log2_exposure, *s.white_balance)),
+            None if s.allowed is None else np.flatnonzero(~s.allowed).tolist(),
+        ]
+        for s in scenes
+    ]
+
+
+def file_content(spec: Any) -> list[str]:
+    """Hashes of the files that a scorer's or a lighting's specification names.
+
+    Args:
+        spec: A name, or a mapping of names to weights or from options to files.
+    """
+    names: list[Any] = [spec]
+    if isinstance(spec, Mapping):
+        names = [*spec, *spec.values()]
+    return [policy_content(name) for name in names if isinstance(name, str)]
 
 
 def policy_content(name: str) -> str:
-    """Hash of what decides a policy beside its name: its file or module, weights and folders.
+    """Hash of the files that decide a policy: its module, weights and folders; "" without any.
 
-    With a Python file, all of its folder count, since it may import them; data that it reads is
-    not known.
+    With a Python file, all others of its folder count, since it may import them; data that it reads
+    is not known.
 
     Args:
-        name: As `agents.make_policy` takes it; a scorer's name or a file's will do as well.
+        name: As `agents.make_policy` takes it; the name of a scorer or a file works as well.
     """
-    base, options = split_name(name)
+    base, options = split_options(name)
     files = _own_files(base) or _named_files(base)
     for value in options.values():
         files += _named_files(str(value))
-    return _files_digest(files) if files else ""
+    if not files:
+        return ""
+    found = hashlib.sha256()
+    for file in files:
+        content = file.read_bytes() if file.is_file() else b""
+        found.update(f"{file.name}\0{len(content)}\0".encode() + content)
+    return found.hexdigest()
 
 
 def _own_files(base: str) -> list[Path]:
-    head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
+    head, tail = split_class(base)
     if head.endswith(".py"):
         return _with_neighbours(Path(head).expanduser())
     if head in ("ppo", "regression"):
-        weights = tail or training_seeds(head)[0].partition(":")[2]
-        return _named_files(weights)
+        return _named_files(tail or training_seeds(head)[0].partition(":")[2])
     if head == "recorded":
         return _named_files(tail)
     if tail and "." in head:
@@ -116,7 +178,7 @@ def _own_files(base: str) -> list[Path]:
 def _with_neighbours(file: Path) -> list[Path]:
     """A Python file, and the first `_MAX_NEIGHBOURS` others of its folder by name."""
     others = sorted(other for other in file.parent.glob("*.py") if other.name != file.name)
-    return [file, *(o for o in others[:_MAX_NEIGHBOURS] if os.access(o, os.R_OK))]
+    return [file, *others[:_MAX_NEIGHBOURS]]
 
 
 def _named_files(text: str) -> list[Path]:
@@ -126,29 +188,3 @@ def _named_files(text: str) -> list[Path]:
         return sorted(file for file in path.rglob("*") if file.is_file())
     pair = [sibling(path, end) for end in (".safetensors", ".json")] if path.name else []
     return [file for file in (path, *pair) if file.is_file()]
-
-
-@lru_cache(maxsize=1)
-def code_digest() -> str:
-    """Hash of the source that measurements come from: other code, other parts."""
-    files = [
-        file
-        for package in ("simulator", "ae_env", "agents")
-        for file in sorted((_ROOT / package).rglob("*.py"))
-        if not (package == "agents" and (file.stem in _SHOWING or file.parent.name == "report"))
-        and not (package == "ae_env" and file.stem in _COMMANDS)
-    ]
-    return _files_digest(files)
-
-
-def _place(file: Path) -> str:
-    """Name of a file that is the same wherever the packages are installed."""
-    return str(file.relative_to(_ROOT)) if file.is_relative_to(_ROOT) else file.name
-
-
-def _files_digest(files: list[Path]) -> str:
-    found = hashlib.sha256()
-    for file in files:
-        content = file.read_bytes() if file.is_file() else b""
-        found.update(f"{_place(file)}\0{len(content)}\0".encode() + content)
-    return found.hexdigest()

@@ -108,10 +108,11 @@ def peak(values: Floats, positions: Floats) -> Floats:
     inner = np.clip(best, 1, len(positions) - 2)[:, None]
     left, middle, right = (np.take_along_axis(values, inner + i, axis=1)[:, 0] for i in (-1, 0, 1))
     curvature = left - 2.0 * middle + right
-    found = positions[best].astype(np.float64)
+    found: Floats = positions[best].astype(np.float64)
     fits = (curvature < -1e-12) & (best == inner[:, 0])
     offset = 0.5 * (left - right) / np.where(fits, curvature, -1.0)
-    return found + np.where(fits, offset, 0.0) * (positions[1] - positions[0])
+    found += np.where(fits, offset, 0.0) * (positions[1] - positions[0])
+    return found
 
 
 def _green_shares(observations: Observations, camera: CameraProfile) -> Floats:

@@ -88,7 +88,8 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
     else:
         area = SPOT_AREA * height * width / height**2  # in frame heights squared
         weights = (radius <= np.sqrt(area / np.pi)).astype(np.float64)
-    return (weights / weights.sum()).astype(np.float32)
+    normalised: NDArray[np.float32] = (weights / weights.sum()).astype(np.float32)
+    return normalised
 
 
 def weighted_reading(
@@ -155,4 +156,5 @@ def _zone_weights() -> NDArray[np.float64]:
     offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
     profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
     weights: NDArray[np.float64] = np.outer(profile, profile).ravel()
-    return weights / weights.sum()
+    weights /= weights.sum()
+    return weights

@@ -1,25 +1,25 @@
-"""From a metered EV to one state of the grid: the programs P, A, S and M, and the tuned ones."""
+"""The programs P, A, S and M: from a metered EV to one exposure state of the grid.
+
+P is free in everything, A (aperture priority) keeps the f-number, S (shutter priority) the exposure
+time, M both and, where it is given, the ISO speed. `StateChooser` ranks the states by the settings
+chosen by hand and by EV; `program_cost` says which of the states of one EV a program prefers.
+"""
 
 from __future__ import annotations
 
-import os
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.observation import SENSOR_RANGES, decode_sensors
-from agents.episodes import episode_batches, expected_scores, scenes_of
-from agents.metering.ev_tracker import EVTracker
-from agents.metering.meters import make_meter
-from agents.metering.reference_frames import ReferenceFrames
-from agents.metering.state_choice import ProgramOptions, StateChooser, check_program, check_used
-from agents.metering.tuned import ScoreRegression
-from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
+from ae_env.grid import ExposureGrid
+from ae_env.utils.checks import check_number, check_word
+from agents.policy import MANUAL_PROGRAMS
 
-if TYPE_CHECKING:
-    import gymnasium as gym
+Floats = NDArray[np.float64]
 
+#: EVs nearer than this are the same exposure: 1/15 s stands for 1/16 s, 0.09 EV from it.
+SAME_EV = 1.0 / 6.0
 #: Longest shutter of a hand-held camera that knows nothing of its motion [s]; the rule of thumb
 #: 1 / focal length for a normal lens.
 HANDHELD_LIMIT = 1 / 60
@@ -27,207 +27,250 @@ HANDHELD_LIMIT = 1 / 60
 BLUR_LIMIT = 1 / 64
 #: Aperture that P tends to.
 PROGRAM_F_NUMBER = 5.6
-#: Meters whose reading is the most exposure that may be given: no state above it is chosen.
-CEILING_METERS = ("highlight_weighted",)
-#: Meters that try other exposures on a frame, and so need one that shows the scene well.
-SEARCH_METERS = ("skewness", "entropy", "shim", "zhang")
-#: Advantage of the last state in a tuned program [score], and in program P; there the square of a
-#: stop counts 1/4 to 1.
-HYSTERESIS_SCORE, HYSTERESIS_COST = 0.002, 0.1
-#: Episodes (in all, at least one per scene and pass) and frames per episode from which a tuned
-#: program learns; three times as many take 35 s and did not score higher on unseen scenes.
-FIT_EPISODES, FIT_FRAMES = 1600, 4
-#: Episodes of one scene in a pass, at most.
-FIT_PER_SCENE = 4
-#: Distance of the second pass's seeds from the first's: other episodes of the same scenes.
-SECOND_PASS = 1_000_000
+#: A program keeps its EV until another is nearer to the metered one by this, in steps of the grid:
+#: on even steps, while it is within 0.6 steps.
+HYSTERESIS_STEPS = 0.2
+#: Aperture of A and M, and shutter of S and M [s], where no other is given.
+PRIORITY_F_NUMBER, PRIORITY_TIME = 8.0, 1 / 125
+#: Options that not every program uses, and the programs that do.
+USED_BY = {
+    "f_number": ("A", "M"),
+    "exposure_time": ("S", "M"),
+    "iso": ("M",),
+    "flicker_period": ("P", "A"),
+    "weights": ("tuned", "tuned_blind"),
+}
+#: Largest exposure compensation [EV].
+MAX_COMPENSATION = 32.0
+#: Weights of what comes first, second and third in the choice of a state.
+_CAPPED, _BY_HAND, _DISTANCE = 1e9, 1e6, 1e3
+#: A state above the ceiling is so much farther than it is [EV]: any below it is nearer.
+_ABOVE_CEILING_EV = 100.0
 
 
-class MeteringPolicy(Policy):
-    """A light meter and a program that splits its EV between ISO, shutter and aperture.
+@dataclass(frozen=True)
+class ProgramOptions:
+    """The options that every metering policy takes.
 
     Args:
-        context: The camera, the grid and the observation.
-        meter: One of `agents.policy.METERS`, such as ``"average"``.
-        program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
-            and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
-        compensation: Exposure compensation [EV], positive is brighter.
+        compensation: Exposure compensation [EV], positive is brighter, in [-32, 32].
         damping: Share of the distance to the metered EV that is kept per frame, in [0, 1).
-        shutter_cap: Longest exposure time that may be used [s].
-        f_number: Aperture that A and M keep; None: f/8.
-        exposure_time: Shutter that S and M keep [s]; None: 1/125.
+        shutter_cap: Longest exposure time that may be used, whatever the meter says, where there is
+            a shorter one [s]; None: no limit.
+        f_number: Aperture that A and M keep.
+        exposure_time: Shutter that S and M keep [s].
         iso: ISO speed that M keeps; None: it follows the meter.
-        weights: File of a tuned program, as `save` writes it.
 
     Raises:
-        ValueError: If an argument is unknown, out of range or of another program.
+        ValueError: If one is out of range.
+    """
+
+    compensation: float = 0.0
+    damping: float = 0.0
+    shutter_cap: float | None = None
+    f_number: float = PRIORITY_F_NUMBER
+    exposure_time: float = PRIORITY_TIME
+    iso: float | None = None
+
+    def __post_init__(self) -> None:
+        limit = MAX_COMPENSATION
+        values = {
+            "compensation": check_number("compensation", self.compensation, -limit, limit),
+            "damping": check_damping(self.damping),
+            "f_number": check_number("f_number", self.f_number, 0.1, 1000.0),
+            "exposure_time": check_number("exposure_time", self.exposure_time, 1e-7, 1e5),
+        }
+        if self.shutter_cap is not None:
+            values["shutter_cap"] = check_number("shutter_cap", self.shutter_cap, 1e-7, 1e5)
+        if self.iso is not None:
+            values["iso"] = check_number("iso", self.iso, 1.0, 1e7)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+
+class StateChooser:
+    """How well each state of a grid fits an EV and what is set by hand.
+
+    Args:
+        grid: The exposure states.
+        program: ``"P"``, ``"A"``, ``"S"`` or ``"M"``; nothing is set by hand in any other.
+        options: What is set by hand, and the shutter cap.
+        ceiling: Whether the EV wanted is the most exposure that may be given.
     """
 
     def __init__(
-        self,
-        context: PolicyContext,
-        meter: str = "centre_weighted",
-        program: str = "P",
-        *,
-        compensation: float = 0.0,
-        damping: float = 0.0,
-        shutter_cap: float | None = None,
-        f_number: float | None = None,
-        exposure_time: float | None = None,
-        iso: float | None = None,
-        weights: str | os.PathLike[str] | None = None,
+        self, grid: ExposureGrid, program: str, options: ProgramOptions, ceiling: bool = False
     ) -> None:
-        super().__init__(context)
-        self.program = check_program(program, PROGRAMS)
-        by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
-        check_used(program, **by_hand, weights=weights)
-        given = {name: value for name, value in by_hand.items() if value is not None}
-        self.options = ProgramOptions(compensation, damping, shutter_cap, **given)
-        self.meter = make_meter(meter, context.camera)
-        self._meter_name = meter
-        self.name = f"{meter}:{program}"
-        self.uses_sensors = context.has_sensors and program != "tuned_blind"
-        self.regression = None if weights is None else ScoreRegression.load(weights, "weights")
-        self._chooser = StateChooser(context.grid, program, self.options, meter in CEILING_METERS)
-        self.reset(0)
+        apex = np.array([(s.aperture_stop / 3.0, s.time_value, s.speed_value) for s in grid.states])
+        self.aperture, self.time, self.speed = apex.T
+        self.ev100 = grid.ev100
+        self.ceiling = ceiling
+        self.step = ev_step(grid)
+        self.hysteresis = HYSTERESIS_STEPS * self.step
+        self._fixed = self._off(program, options)
+        #: Stops by which each state is slower than the cap, ``(S,)``.
+        self.over_cap = np.zeros(len(grid))
+        if options.shutter_cap is not None:
+            times = np.array([s.exposure_time for s in grid.states])
+            self.over_cap = np.maximum(np.log2(times / options.shutter_cap) - 1e-6, 0.0)
+        first = _CAPPED * self.over_cap + _BY_HAND * self._fixed
+        self._allowed = first == first.min()
 
-    def reset(self, num_envs: int, seed: int | None = None) -> None:
-        """Forget the past of `num_envs` cameras."""
-        super().reset(num_envs, seed)
-        ev100 = self.context.grid.ev100
-        ev_range = (float(ev100.min()), float(ev100.max()))
-        options = self.options
-        self._tracker = EVTracker(num_envs, ev_range, options.damping, options.compensation)
-        searches = self._meter_name in SEARCH_METERS
-        self._reference = ReferenceFrames(self.context.camera) if searches else None
-        self._sensor_sum = np.zeros((num_envs, 2))
-        self._frames = 0
-        self._previous: NDArray[np.int64] | None = None
+    def _off(self, program: str, options: ProgramOptions) -> Floats:
+        """Stops by which each state is further from what is set by hand than the nearest one is."""
+        off: Floats = np.zeros_like(self.aperture)
+        if program in ("A", "M"):
+            off += _above_least(np.abs(self.aperture - 2.0 * np.log2(options.f_number)))
+        if program in ("S", "M"):
+            off += _above_least(np.abs(self.time + np.log2(options.exposure_time)))
+        if program == "M" and options.iso is not None:
+            off += _above_least(np.abs(self.speed - np.log2(options.iso / 100.0) - 5.0))
+        return off
 
-    def act(
-        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
-    ) -> NDArray[np.int64]:
-        """Meter the frames, then choose by the program."""
-        readings = self.observe(observations)
-        if self.program in ("tuned", "tuned_blind"):
-            utility = self._tuned_utility(readings)
-        else:
-            utility = self._program_utility(readings)
-        self._previous = masked_argmax(utility, action_masks)
-        return self._previous.copy()
+    def with_hysteresis(self, target: Floats, previous: NDArray[np.int64] | None) -> Floats:
+        """`target` [EV] ``(N,)``, or the EV of the `previous` states where that is near enough."""
+        if previous is None:
+            return target
+        old = self.ev100[previous]
+        if self.ceiling:  # a brighter state must be below the ceiling by the hysteresis
+            return np.where(old < target, target, np.minimum(target + self.hysteresis, old))
+        farther = np.abs(target - old) - self._least_distance(self._distance(target))[:, 0]
+        return np.where(farther < self.hysteresis, old, target)
 
-    def observe(self, observations: Observations) -> NDArray[np.float64]:
-        """Take in one frame; returns metered EV100, log2 speed, log2 defocus, ``(N, 1 or 3)``.
+    def _distance(self, target: Floats) -> Floats:
+        darker: Floats = self.ev100[None] - target[:, None]  # (N, S)
+        distance: Floats = np.abs(darker)
+        return distance + _ABOVE_CEILING_EV * (darker < -1e-9) if self.ceiling else distance
 
-        The sensors are averaged, in stops, over the frames of the episode.
-        """
-        self.check_reset(observations)
-        self._frames += 1
-        metered = observations if self._reference is None else self._reference.update(observations)
-        held = np.clip(self._tracker.ev100, *self._tracker.ev_range)  # no farther than can be set
-        ev = self._tracker.update(self.meter(metered, held))
-        if not self.uses_sensors:
-            return ev[:, None]
-        speed, defocus = decode_sensors(observations["sensors"])
-        values = np.stack([np.maximum(speed, 2.0 ** SENSOR_RANGES[0, 0]), defocus], axis=1)
-        self._sensor_sum += np.log2(values)
-        return np.concatenate([ev[:, None], self._sensor_sum / self._frames], axis=1)
+    def _least_distance(self, distance: Floats) -> Floats:
+        """Of the states that the cap and what is set by hand leave, ``(N, 1)``."""
+        least: Floats = distance[:, self._allowed].min(axis=1, keepdims=True)
+        return least
 
-    def _program_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Minus the cost of each state, by the program's priorities."""
-        chooser = self._chooser
-        target = readings[:, 0] - self.options.compensation
-        slow = np.maximum(self._shutter_limit(readings) - chooser.time[None], 0.0)  # stops too slow
-        gain = (chooser.speed - chooser.speed.min())[None]
-        if self.program in ("S", "M"):
-            cost = 0.1 * gain
-        elif self.program == "A":
-            cost = 10.0 * slow + 0.1 * gain
-        else:
-            wide = np.maximum(self._aperture_limit(readings) - chooser.aperture[None], 0.0)
-            line = np.abs(chooser.aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))[None]
-            cost = slow**2 + 0.5 * wide**2 + 0.25 * gain**2 + 0.05 * line**2
-            if self._previous is not None:
-                cost[np.arange(len(cost)), self._previous] -= HYSTERESIS_COST
-        return chooser.utility(chooser.kept(target, self._previous), cost)
+    def nearby(self, target: Floats, limit: float) -> NDArray[np.bool_]:
+        """States that may be used within `limit` [EV] of `target` or as near as any, ``(N, S)``."""
+        distance = self._distance(target)
+        near = np.maximum(self._least_distance(distance) + SAME_EV, limit)
+        found: NDArray[np.bool_] = (distance <= near) & self._allowed
+        return found
 
-    def _shutter_limit(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Tv of the slowest shutter that keeps motion blur within the limit, ``(N, 1)``."""
-        if not self.uses_sensors:
-            return np.full((len(readings), 1), -np.log2(HANDHELD_LIMIT))
-        limit: NDArray[np.float64] = readings[:, 1:2] - np.log2(BLUR_LIMIT)
-        return limit
+    def utility(self, target: Floats, preference: Floats) -> Floats:
+        """How well each state fits, ``(N, S)``; the highest is to be taken.
 
-    def _aperture_limit(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Av of the widest aperture that keeps defocus within the limit, ``(N, 1)``."""
-        if not self.uses_sensors:
-            return np.full((len(readings), 1), 2.0 * np.log2(PROGRAM_F_NUMBER))
-        # Blur diameter at f-number N is 4 D / N pixels of a 64-pixel frame.
-        limit: NDArray[np.float64] = 2.0 * (2.0 + readings[:, 2:3] - np.log2(64 * BLUR_LIMIT))
-        return limit
-
-    def _tuned_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
-        if self.regression is None:
-            raise ValueError(
-                f"policy {self.name!r} learns from scenes first: call fit(envs), or give `weights`"
-            )
-        if self.regression.features.shape[1] != readings.shape[1]:
-            raise ValueError(
-                f"policy {self.name!r} was fitted on {self.regression.features.shape[1]} readings "
-                f"but sees {readings.shape[1]}: the environments must agree on `sensors`"
-            )
-        compensated = readings - np.eye(1, readings.shape[1]) * self.options.compensation
-        scores = self.regression.predict(compensated) - 10.0 * self._chooser.over_cap
-        if self._previous is not None:
-            scores[np.arange(len(scores)), self._previous] += HYSTERESIS_SCORE
-        return scores
-
-    def fit(self, envs: gym.vector.VectorEnv, seed: int = 0) -> None:
-        """Tune on the scenes of `envs` (tuned programs only; the others have nothing to learn).
-
-        Episodes run twice: led by program P, then by what was learnt from those, so that the
-        readings are those of the frames that the tuned program itself brings about.
+        The shutter cap comes first, what is set by hand second, then the EV; among states of the
+        same exposure, `preference` decides.
 
         Args:
-            envs: Training environments; their episodes must not end within 4 frames.
-            seed: Decides the episodes.
+            target: EV100 wanted, ``(N,)``.
+            preference: Cost of each state besides, well below 1000, ``(S,)`` or ``(N, S)``.
         """
-        if self.program not in ("tuned", "tuned_blind"):
-            return
-        tuned, self.program = self.program, "P"
-        per_scene = FIT_EPISODES // (2 * len(scenes_of(envs)))
-        per_scene = min(max(per_scene, 1), FIT_PER_SCENE)
-        first = self._gather(envs, seed, per_scene)
-        self.program = tuned
-        self.regression = ScoreRegression.fit(*first)
-        second = self._gather(envs, seed + SECOND_PASS, per_scene)
-        both: Any = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
-        self.regression = ScoreRegression.fit(*both)
+        distance = self._distance(target)
+        # Nominal values are rounded (1/15 s for 1/16 s): states this near are the same exposure.
+        distance = np.maximum(distance - self._least_distance(distance) - SAME_EV, 0.0)
+        first = _CAPPED * self.over_cap + _BY_HAND * self._fixed
+        return -(first + _DISTANCE * distance + preference)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a tuned program; ``weights=path`` restores it.
 
-        Raises:
-            ValueError: If there is none yet.
-        """
-        if self.regression is None:
-            raise ValueError(f"policy {self.name!r} has nothing to save before fit(envs)")
-        self.regression.save(path)
+def check_damping(damping: float) -> float:
+    """`damping` as a float.
 
-    def _gather(
-        self, envs: gym.vector.VectorEnv, seed: int, episodes: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
-        """Readings after the meter has settled, scores of all states, source groups."""
-        features, scores, groups = [], [], []
-        for batch in episode_batches(envs, episodes_per_scene=episodes, seed=seed):
-            self.reset(envs.num_envs)
-            observations, masks = batch.observations, batch.action_masks
-            for _ in range(FIT_FRAMES - 1):
-                actions = self.act(observations, masks)
-                observations = envs.step(actions)[0]
-            readings = self.observe(observations)
-            features.append(readings[batch.valid])
-            scores.append(expected_scores(envs)[batch.valid])
-            groups.append(batch.groups[batch.valid])
-        self.reset(0)
-        return np.concatenate(features), np.concatenate(scores), np.concatenate(groups)
+    Raises:
+        ValueError: Unless it is a number in [0, 1).
+    """
+    value = check_number("damping", damping, 0.0, 1.0)
+    if value == 1.0:
+        raise ValueError(f"`damping` (={damping!r}) must be below 1: nothing would ever move")
+    return value
+
+
+def check_program(program: str, programs: tuple[str, ...] = MANUAL_PROGRAMS) -> str:
+    """`program` as it is.
+
+    Raises:
+        ValueError: Unless it is one of `programs`.
+    """
+    check_word("program", program, programs)
+    return program
+
+
+def check_used(program: str, **options: object) -> None:
+    """Raises a `ValueError` if one of the `options` of `USED_BY` is given to another program."""
+    for name, value in options.items():
+        users = USED_BY[name]
+        if value is not None and program not in users:
+            programs = f"program{'s' if len(users) > 1 else ''} {' and '.join(users)}"
+            raise ValueError(
+                f"`{name}` (={value!r}) is an option of {programs} only, not of {program}"
+            )
+
+
+def ev_step(grid: ExposureGrid) -> float:
+    """Distance between neighbouring exposures of a grid [EV], the median.
+
+    States within 1/6 EV count as the same exposure.
+
+    >>> round(ev_step(ExposureGrid.default())), round(3 * ev_step(ExposureGrid.third_stop()))
+    (1, 1)
+    """
+    levels = np.sort(grid.ev100)
+    gaps = np.diff(levels)
+    starts = np.concatenate([[True], gaps > SAME_EV])
+    steps = np.diff(levels[starts])
+    return float(np.median(steps)) if len(steps) else 1.0
+
+
+def _above_least(values: Floats) -> Floats:
+    """How far each value is above the least one."""
+    above: Floats = values - values.min()
+    return np.where(above < 1e-9, 0.0, above)
+
+
+def program_cost(program: str, chooser: StateChooser, readings: Floats) -> Floats:
+    """Which of the states of one EV a program prefers: the cost of each, ``(N or 1, S)``.
+
+    P trades in squares of stops: motion blur counts 1, defocus 1/2, gain 1/4, the distance from
+    f/5.6 1/20. A avoids motion blur, then gain; S and M avoid gain.
+
+    Args:
+        program: ``"P"``, ``"A"``, ``"S"`` or ``"M"``.
+        chooser: The states.
+        readings: Metered EV100, and log2 of the image speed and of the defocus spread where the
+            camera has sensors, ``(N, 1 or 3)``.
+    """
+    gain: Floats = (chooser.speed - chooser.speed.min())[None]
+    if program in ("S", "M"):
+        cost: Floats = 0.1 * gain
+        return cost
+    slow = np.maximum(shutter_limit(readings) - chooser.time[None], 0.0)  # stops too slow
+    if program == "A":
+        cost = 10.0 * slow
+        cost += 0.1 * gain
+        return cost
+    wide = np.maximum(aperture_limit(readings) - chooser.aperture[None], 0.0)  # stops too wide
+    line = np.abs(chooser.aperture - 2.0 * np.log2(PROGRAM_F_NUMBER))[None]
+    cost = slow**2 + 0.5 * wide**2
+    cost += 0.25 * gain**2 + 0.05 * line**2
+    return cost
+
+
+def shutter_limit(readings: Floats) -> Floats:
+    """Tv of the slowest shutter that keeps motion blur within the limit, ``(N, 1)``.
+
+    Without a speed among the `readings`, that of a camera in the hand.
+    """
+    if readings.shape[1] == 1:
+        return np.full((len(readings), 1), -np.log2(HANDHELD_LIMIT))
+    limit: Floats = readings[:, 1:2] - np.log2(BLUR_LIMIT)
+    return limit
+
+
+def aperture_limit(readings: Floats) -> Floats:
+    """Av of the widest aperture that keeps defocus within the limit, ``(N, 1)``.
+
+    Without a defocus spread among the `readings`, that of f/5.6.
+    """
+    if readings.shape[1] == 1:
+        return np.full((len(readings), 1), 2.0 * np.log2(PROGRAM_F_NUMBER))
+    # Blur diameter at f-number N is 4 D / N pixels of a 64-pixel frame.
+    limit: Floats = 2.0 * (2.0 + readings[:, 2:3] - np.log2(64 * BLUR_LIMIT))
+    return limit

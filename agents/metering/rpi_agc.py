@@ -1,31 +1,98 @@
 """A camera's own AGC: a model of libcamera's for the Raspberry Pi.
 
 Written from its published behaviour ("Raspberry Pi Camera Algorithm and Tuning Guide", libcamera
-and its tuning of the imx477); `agents.metering.rpi_agc_tuning` has the numbers.
+and its tuning of the imx477). The numbers of that tuning come first.
 """
 
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.utils.checks import check_integer, check_number, check_word
-from agents.metering import rpi_agc_tuning as tuning
-from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
-from agents.metering.state_choice import (
+from agents.metering.programs import (
     PRIORITY_TIME,
     ProgramOptions,
     StateChooser,
     check_program,
     check_used,
 )
+from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 
 Floats = NDArray[np.float64]
 
+#: Weights of the 15 zones (see `zone_map`) in each metering mode.
+ZONE_WEIGHTS = {
+    "centre_weighted": (3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0),
+    "spot": (2, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0),
+    "matrix": (1,) * 15,
+}
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """How an exposure mode splits an exposure: the shutter up to a rung, then the gain, and so on.
+
+    Args:
+        shutter: Rungs of the exposure time [s].
+        gain: Rungs of the gain, 1 at ISO 100.
+    """
+
+    shutter: tuple[float, ...]
+    gain: tuple[float, ...]
+
+
+LADDERS = {
+    "normal": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
+    "short": Ladder((100e-6, 5e-3, 10e-3, 20e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
+    "long": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 120e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
+}
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """The mean of the pixels between two quantiles must not be below, or above, a target.
+
+    Args:
+        lower: Whether the target is a lower bound.
+        quantiles: Between which the pixels are averaged.
+        target: Signal, white is 1.
+    """
+
+    lower: bool
+    quantiles: tuple[float, float]
+    target: float
+
+
+_TOP = Constraint(True, (0.98, 1.0), 0.3)
+CONSTRAINTS = {
+    "normal": (_TOP,),
+    "highlight": (_TOP, Constraint(False, (0.98, 1.0), 0.8)),
+    "shadows": (Constraint(True, (0.0, 0.5), 0.17),),
+}
+
+#: Illuminance [lux] and the mean signal aimed at; linear between, constant outside.
+TARGET_LUX, TARGET_SIGNALS = (0.0, 1000.0, 10000.0), (0.16, 0.165, 0.17)
+#: No target is above this, whatever the compensation: close to white a mean says nothing.
+TARGET_LIMIT = 0.9
+#: Share of the distance to the target that the filter goes per frame.
+SPEED = 0.2
+#: Within this of the target the filter goes with the square root of its speed.
+NEAR = 0.2
+#: Within this of the target it stays.
+STABLE = 0.02
+#: Frames of the start, in which it goes all of the way.
+STARTUP_FRAMES = 10
+#: A target above this that the picture exceeds is approached from below, at this part of the
+#: exposure.
+FAST_REDUCE = 0.4
+#: Passes in which the gain is found (zones saturate), the most that one may add, and when to stop.
+GAIN_PASSES, GAIN_LIMIT, GAIN_DONE = 8, 10.0, 1.01
 #: Least signal by which a target is divided.
 _LEAST_SIGNAL = 1e-3
 #: How near to whole periods a flicker-free exposure time is, as a part of it.
@@ -85,15 +152,15 @@ class RpiAgc(Policy):
         iso: float | None = None,
         max_gain: float = 16.0,
         flicker_period: float | None = None,
-        speed: float = tuning.SPEED,
-        startup_frames: int = tuning.STARTUP_FRAMES,
+        speed: float = SPEED,
+        startup_frames: int = STARTUP_FRAMES,
     ) -> None:
         super().__init__(context)
         self.program = check_program(program)
         check_used(program, exposure_time=exposure_time, iso=iso, flicker_period=flicker_period)
-        check_word("metering", metering, tuple(tuning.ZONE_WEIGHTS))
-        check_word("mode", mode, tuple(tuning.LADDERS))
-        check_word("constraint", constraint, tuple(tuning.CONSTRAINTS))
+        check_word("metering", metering, tuple(ZONE_WEIGHTS))
+        check_word("mode", mode, tuple(LADDERS))
+        check_word("constraint", constraint, tuple(CONSTRAINTS))
         time = PRIORITY_TIME if exposure_time is None else exposure_time
         self.options = ProgramOptions(compensation, damping, shutter_cap, f_number, time, iso)
         self.speed = check_number("speed", speed, 1e-3, 1.0)
@@ -103,11 +170,11 @@ class RpiAgc(Policy):
             flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
         self.flicker_period = flicker_period
         self.name = f"rpi_agc:{program}"
-        self._weights = np.array(tuning.ZONE_WEIGHTS[metering], np.float64)
-        self._constraints = tuning.CONSTRAINTS[constraint]
-        ladder = tuning.LADDERS[mode]
+        self._weights = np.array(ZONE_WEIGHTS[metering], np.float64)
+        self._constraints = CONSTRAINTS[constraint]
+        ladder = LADDERS[mode]
         gains = (*ladder.gain[:-1], max(max_gain, 1.0))
-        self._ladder = tuning.Ladder(ladder.shutter, tuple(min(g, max_gain) for g in gains))
+        self._ladder = Ladder(ladder.shutter, tuple(min(g, max_gain) for g in gains))
         self._chooser = StateChooser(context.grid, program, self.options)
         self.reset(0)
 
@@ -127,8 +194,8 @@ class RpiAgc(Policy):
         # Exposures are relative to that of EV100 0.
         target = np.exp2(-frame_ev100(observations)) * gain
         filtered = self._filter.update(np.minimum(target, self._most_exposure()))
-        reduce = (target_signal > tuning.FAST_REDUCE) & (gain < np.sqrt(target_signal))
-        ev = -np.log2(filtered * np.where(reduce, tuning.FAST_REDUCE, 1.0))
+        reduce = (target_signal > FAST_REDUCE) & (gain < np.sqrt(target_signal))
+        ev = -np.log2(filtered * np.where(reduce, FAST_REDUCE, 1.0))
         states = self.context.grid.ev100
         before = np.clip(self._damped, states.min(), states.max())
         kept = self.options.damping * (before - ev)
@@ -146,7 +213,7 @@ class RpiAgc(Policy):
             np.maximum(brightness, _LEAST_SIGNAL) / TARGET_SIGNAL
         )
         lux = 2.5 * np.exp2(light)
-        wanted = self._compensated(np.interp(lux, tuning.TARGET_LUX, tuning.TARGET_SIGNALS))
+        wanted = self._compensated(np.interp(lux, TARGET_LUX, TARGET_SIGNALS))
         gain = zone_gain(zones, self._weights, wanted)
         pixels = signal.reshape(len(signal), -1)
         for constraint in self._constraints:
@@ -158,7 +225,8 @@ class RpiAgc(Policy):
         return gain, wanted
 
     def _compensated(self, signal: Floats) -> Floats:
-        return np.minimum(signal * 2.0**self.options.compensation, tuning.TARGET_LIMIT)
+        target: Floats = np.minimum(signal * 2.0**self.options.compensation, TARGET_LIMIT)
+        return target
 
     def _most_exposure(self) -> float:
         """The most that the ladder allows, relative to EV100 0."""
@@ -197,7 +265,7 @@ class RpiAgc(Policy):
     def _utility(self, ev: Floats) -> Floats:
         """How well each state fits the exposures and the ladder, ``(N, S)``."""
         chooser = self._chooser
-        target = chooser.kept(ev, self._previous)
+        target = chooser.with_hysteresis(ev, self._previous)
         time, gain = self.split(self.options.f_number**2 * np.exp2(-target))
         aperture = chooser.aperture - 2.0 * np.log2(self.options.f_number)
         slower = np.log2(time)[:, None] + chooser.time[None]  # stops shorter than the ladder's
@@ -205,7 +273,9 @@ class RpiAgc(Policy):
         cost = slower**2 + 0.25 * higher**2 + 4.0 * (aperture**2)[None]
         if self._previous is not None:  # of nominally equal exposures the last one stays
             cost[np.arange(len(cost)), self._previous] -= _STAYS
-        return chooser.utility(target, cost) - _FLICKERS * self._flickers(time, target)
+        utility = chooser.utility(target, cost)
+        utility -= _FLICKERS * self._flickers(time, target)
+        return utility
 
     def _flickers(self, time: Floats, target: Floats) -> Any:
         """1.0 where lamps flicker in a state but not in one near the EV, ``(N, S)``.
@@ -241,8 +311,8 @@ class ExposureFilter:
     def __init__(
         self,
         num_envs: int,
-        speed: float = tuning.SPEED,
-        startup_frames: int = tuning.STARTUP_FRAMES,
+        speed: float = SPEED,
+        startup_frames: int = STARTUP_FRAMES,
     ) -> None:
         self.exposure = np.full(num_envs, np.nan)
         self.speed, self.startup_frames = speed, startup_frames
@@ -255,10 +325,10 @@ class ExposureFilter:
         if self._frames <= self.startup_frames:
             new = target.copy()
         else:
-            near = (old < (1.0 + tuning.NEAR) * target) & (old > (1.0 - tuning.NEAR) * target)
+            near = (old < (1.0 + NEAR) * target) & (old > (1.0 - NEAR) * target)
             speed = np.where(near, np.sqrt(self.speed), self.speed)
             new = speed * target + (1.0 - speed) * old
-            stable = (old * (1.0 - tuning.STABLE) < target) & (old * (1.0 + tuning.STABLE) > target)
+            stable = (old * (1.0 - STABLE) < target) & (old * (1.0 + STABLE) > target)
             new = np.where(np.isnan(old), target, np.where(stable, old, new))
         self.exposure = new
         return new.copy()
@@ -276,11 +346,11 @@ def zone_gain(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
     """
     gain = np.ones(zones.shape[1])
     done = np.zeros(zones.shape[1], bool)
-    for _ in range(tuning.GAIN_PASSES):
+    for _ in range(GAIN_PASSES):
         mean = weights @ np.minimum(zones * gain, 1.0) / weights.sum()
-        extra = np.minimum(tuning.GAIN_LIMIT, wanted / (mean + _LEAST_SIGNAL))
+        extra = np.minimum(GAIN_LIMIT, wanted / (mean + _LEAST_SIGNAL))
         gain = np.where(done, gain, gain * extra)
-        done |= extra < tuning.GAIN_DONE
+        done |= extra < GAIN_DONE
         if done.all():
             break
     return gain
@@ -298,7 +368,8 @@ def quantile_mean(values: NDArray[Any], low: float, high: float) -> Floats:
     begin = min(int(np.ceil(low * count - 1e-9)), count - 1)
     end = max(int(np.floor(high * count + 1e-9)), begin + 1)
     ordered = np.partition(values, (begin, end - 1), axis=1)
-    return ordered[:, begin:end].mean(axis=1, dtype=np.float64)
+    mean: Floats = ordered[:, begin:end].mean(axis=1, dtype=np.float64)
+    return mean
 
 
 def zone_map(height: int, width: int) -> NDArray[np.int64]:
@@ -335,5 +406,6 @@ def zone_map(height: int, width: int) -> NDArray[np.int64]:
 def _zone_matrix(height: int, width: int) -> Floats:
     """Weights of the pixels in the mean of each zone, ``(15, height * width)``."""
     zones = zone_map(height, width).ravel()
-    matrix = (zones[None] == np.arange(15)[:, None]).astype(np.float64)
-    return matrix / np.maximum(matrix.sum(axis=1, keepdims=True), 1.0)
+    matrix: Floats = (zones[None] == np.arange(15)[:, None]).astype(np.float64)
+    matrix /= np.maximum(matrix.sum(axis=1, keepdims=True), 1.0)
+    return matrix

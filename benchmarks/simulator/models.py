@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import nn
 
-from agents.cli.simulator_commands import training_scenes
+from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import list_pretrained, load_modules
 from simulator.training.config import load_config
@@ -102,6 +102,6 @@ def _weights(
         path.parent.mkdir(parents=True, exist_ok=True)
         command = f"ae-env train-simulator {config.as_posix()}"
         train_and_save(
-            load_config(config), training_scenes, path, command=command, progress=progress
+            load_config(config), reference_scenes_of, path, command=command, progress=progress
         )
     return path if path.is_file() else None

@@ -2,8 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
-from agents.policy import make_policy
+from agents.episodes import make_envs
+from agents.policy import PolicyContext, make_policy
+from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 FRAMES = {"raw": np.zeros((500, 4, 8, 8), np.uint8)}
 
@@ -37,3 +40,67 @@ def test_oracle_reads_info_and_nothing_else(context):
     assert policy.act({}, None, info={"oracle_state": np.array([4, 5])}).tolist() == [4, 5]
     with pytest.raises(ValueError, match="with_oracle=True"):
         policy.act({})
+
+
+# -- recorded settings ----------------------------------------------------------------------------
+
+SETTINGS = (
+    (100, 1 / 1000, 4.0),
+    (400, 1 / 125, 5.6),
+    (3200, 1 / 16, 11.0),  # ISO 1600 and 6400 are as near; the EV decides with 1/15
+)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    camera = get_camera("nikon_z6")
+    for i, settings in enumerate(SETTINGS):
+        raw = RawImage(torch.full((4, 16, 16), 0.1), CameraSettings(*settings), camera=camera)
+        write_dng(tmp_path / f"frame_{i:02d}.dng", raw)
+    (tmp_path / "notes.txt").write_text("not a raw")
+    return tmp_path
+
+
+def test_settings_are_replayed_in_the_order_of_names(context, photograph, folder):
+    policy = make_policy(f"recorded:{folder}", context)
+    assert policy.name == f"recorded:{folder}"
+    frame = photograph(np.ones((64, 64)), 9.0, [0, 1])
+    for _ in range(2):  # a second episode begins anew
+        policy.reset(2)
+        path = [policy.act(frame) for _ in range(5)]
+        assert all(states[0] == states[1] for states in path)
+        found = [context.grid[int(states[0])] for states in path]
+        # The first decision exposes frame 1: frame 0 is the one that a reset returns.
+        assert (found[0].iso, found[0].exposure_time, found[0].f_number) == SETTINGS[1]
+        assert (found[1].exposure_time, found[1].f_number) == (1 / 15, 11.0)
+        assert found[1] == found[2] == found[3] == found[4]
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_recording_is_replayed_on_its_own_raws(folder, delay):
+    """Every frame of the sequence is shot at the settings that its raw was recorded at."""
+    options = {"scenes": {"sequence": str(folder)}, "split": "test", "resolution": 36}
+    for i, settings in enumerate(SETTINGS):  # large enough for an environment
+        raw = RawImage(
+            torch.full((4, 40, 40), 0.1), CameraSettings(*settings), camera=get_camera("nikon_z6")
+        )
+        write_dng(folder / f"frame_{i:02d}.dng", raw)
+    envs = make_envs({**options, "delay": delay, "depth": "far"}, num_envs=1, frames=4)
+    policy = make_policy(f"recorded:{folder}", PolicyContext.from_envs(envs))
+    policy.reset(1)
+    observations, _ = envs.reset(seed=0, options={"state": 0})
+    for frame in range(1, 4):
+        observations, _, _, _, info = envs.step(policy.act(observations))
+        if frame > delay:
+            _, time, f_number = SETTINGS[min(frame, 2)]
+            assert info["f_number"][0] == f_number
+            assert info["exposure_time"][0] == pytest.approx(time, rel=0.07)
+    envs.close()
+
+
+def test_a_folder_without_raws_is_refused(context, tmp_path):
+    (tmp_path / "notes.txt").write_text("not a raw")
+    with pytest.raises(ValueError, match="holds no raw file"):
+        make_policy(f"recorded:{tmp_path}", context)
+    with pytest.raises(ValueError, match="must be a folder of raws"):
+        make_policy(f"recorded:{tmp_path / 'nowhere'}", context)

@@ -1,61 +1,32 @@
-"""The command line: what it writes."""
+"""The command line as a whole: its commands, its help, its errors and exit statuses."""
 
 from __future__ import annotations
 
-import csv
-import json
+import logging
 import re
+import runpy
 from pathlib import Path
 
-import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
 from agents.cli import main as cli
-from agents.learning.agent_weights import sibling
-from simulator import CameraSettings, RawImage, read_raw
 
 COMMANDS = sorted(c.callback.__name__.replace("_", "-") for c in cli.app.registered_commands)
-#: The design's columns of an evaluation, in their order.
-COLUMNS = [
-    "policy",
-    "condition",
-    "source",
-    "split",
-    "num_groups",
-    "seed",
-    "mean_score",
-    "normalised_score",
-    "regret",
-    "ci95",
-    "ev_error_median",
-    "ev_error_p95",
-    "ev_within_third",
-    "frames_to_converge",
-    "overshoot",
-    "reversals",
-    "flicker",
-    "clipped_high",
-    "clipped_low",
-    "captures_per_decision",
-    "ms_per_decision",
-]
+UNMADE = """\
+from agents import Policy
+class Unmade(Policy):
+    def __init__(self, context):
+        raise KeyError("x")
+    def act(self, observations, action_masks=None): ...
+"""
+SIMULATE = ("--iso", "800", "--shutter", "1/60", "--aperture", "4")
 
 
 def test_every_command_is_there() -> None:
-    assert COMMANDS == [
-        "bench",
-        "cache",
-        "convert-nima",
-        "evaluate",
-        "quickstart",
-        "scorers",
-        "simulate",
-        "sweep",
-        "train",
-        "train-simulator",
-    ]
+    names = "bench cache convert-nima evaluate quickstart scorers simulate sweep train"
+    assert [*names.split(), "train-simulator"] == COMMANDS
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -70,119 +41,177 @@ def test_help_has_an_example_and_out(command: str) -> None:
         assert "--seed" in text
 
 
-def test_help_of_the_program(ae_env) -> None:
+def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
     code, out, _ = ae_env("--help")
     assert code == 0
     assert all(command in out for command in COMMANDS)
+    monkeypatch.setattr("sys.argv", ["agents.cli", "--help"])
+    with pytest.raises(SystemExit):
+        runpy.run_module("agents.cli", run_name="__main__")
+    assert capsys.readouterr().out == out
 
 
-def test_simulate(ae_env, raw: RawImage, dng: Path, tmp_path: Path) -> None:
-    out = tmp_path / "new folder" / "out [1].dng"
-    arguments = ("--iso", 1600, "--shutter", "1/250", "--aperture", 8, "--seed", 3)
-    code, text, _ = ae_env("simulate", dng, *arguments, "-o", out, "--png", tmp_path / "a.png")
-    assert code == 0
-    assert f"wrote DNG: {out}" in text
-    assert "nikon_z6" in text
-    back = read_raw(out)
-    assert back.settings == CameraSettings(1600, 1 / 250, 8)
-    assert back.data.shape == raw.data.shape
-    # Light goes with ISO * time / N^2 (marked f-numbers are rounded: 5.6 stands for 4 sqrt 2).
-    ratio = (1600 / 400) * (64 / 250) * (32 / 64)
-    means = back.data.mean(dim=(1, 2)) / raw.data.mean(dim=(1, 2))
-    np.testing.assert_allclose(means.numpy(), ratio, rtol=0.01)
-    with Image.open(tmp_path / "a.png") as picture:
-        assert picture.size == (240, 200)
-    first = out.read_bytes()
-    ae_env("simulate", dng, *arguments, "-o", out)
-    assert read_raw(out).data.equal(back.data)
-    assert len(first) == len(out.read_bytes())
-    ae_env("simulate", dng, *arguments[:-1], 4, "-o", out)
-    assert not read_raw(out).data.equal(back.data)
-
-
-def test_sweep(ae_env, dng: Path, tmp_path: Path) -> None:
-    code, text, _ = ae_env("sweep", dng, "--out", tmp_path / "sweep", "--dngs")
-    assert code == 0
-    assert "contact sheet" in text
-    with Image.open(tmp_path / "sweep" / "contact_sheet.png") as sheet:
-        assert min(sheet.size) > 300
-    files = sorted((tmp_path / "sweep").glob("*.dng"))
-    assert [path.name for path in files] == [f"IMG_1-{i:02d}.dng" for i in range(64)]
-    assert read_raw(files[0]).settings == CameraSettings(100, 1 / 1000, 4)
-    assert read_raw(files[63]).settings == CameraSettings(6400, 1 / 2, 11)
-
-
-def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:
-    folder = tmp_path / "kept [1]"
-    monkeypatch.setenv("AE_ENV_CACHE", str(folder))
-    (folder / "scenes").mkdir(parents=True)
-    for i in range(2):
-        (folder / "scenes" / f"bundled-train-64-{i:024d}.safetensors").write_bytes(b"x" * 1000)
-    (folder / "denoised").mkdir()
-    (folder / "denoised" / f"{5:024d}.safetensors").write_bytes(b"x" * 123)
-    (folder / "denoised" / "mine.safetensors").write_bytes(b"x")
-    expected = {"scenes": ["2", "2,000"], "denoised": ["1", "123"], "score tables": ["0", "0"]}
-    for arguments in ((), ("--clear",)):
-        code, out, _ = ae_env("cache", *arguments)
-        assert code == 0
-        for kind, numbers in expected.items():
-            (line,) = (text for text in out.splitlines() if f" {kind} " in text)
-            assert re.findall(r"[\d,]+", line) == numbers
-        assert str(folder) in out.replace("\n", "")
-    assert [p.name for p in folder.rglob("*.safetensors")] == ["mine.safetensors"]
-    code, out, _ = ae_env("cache")
-    assert "1 " not in out.replace("kept [1]", "")
-
-
-def test_evaluate(ae_env, tmp_path: Path) -> None:
-    code, text, _ = ae_env(
-        *("evaluate", "--policy", "random", "--policy", "centre_weighted:P"),
-        *("--scenes", "bundled:small", "--resolution", 36, "--frames", 4, "--out", "result"),
-    )
-    assert code == 0
-    assert "centre_weighted:P" in text
-    folder = tmp_path / "result"
-    names = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html"}
-    names |= {"scores.png", "ev_error.png", "cost.png", "contact_sheet.png", "parts"}
-    assert {path.name for path in folder.iterdir()} == names
-    content = json.loads((folder / "results.json").read_text())
-    assert set(content) == {"meta", "rows"}
-    assert content["meta"]["command"].startswith("ae-env evaluate --policy random")
-    assert {"commit", "seed", "date", "machine", "versions"} <= set(content["meta"])
-    for row in content["rows"]:
-        assert list(row) == COLUMNS
-        assert (row["source"], row["split"]) == ("bundled:small", "test")
-    scores = {
-        row["policy"]: row["normalised_score"]
-        for row in content["rows"]
-        if row["condition"] == "all"
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("simulate", "none.dng", *SIMULATE), "`path` (='none.dng') does not exist"),
+        (("simulate", "picture.png", *SIMULATE), "PNG"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--iso", "-3"), "`iso` (=-3.0) must be"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "-o", "text.dng/a.dng"), "text.dng is a file"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--png", "/proc/x.png"), "`png` (='/proc/x.png')"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "-o", "empty.dng"), "a file, but it is a folder"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
+        (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
+        (("evaluate", "--policy", "randm"), "did you mean 'random'?"),
+        (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),
+        (("evaluate", "--policy", "own.py:Unmade"), "Unmade cannot be made: KeyError: 'x'"),
+        (("evaluate", "--policy", "script.py:Mine"), "script.py cannot be loaded: SystemExit: 0"),
+        (("evaluate", "--policy", "ppo:none"), "there is no none.safetensors"),
+        (("evaluate", "--policy", "random", "--scenes", "empty.dng"), "must hold raws"),
+        (("evaluate", "--policy", "random", "--split", "tset"), "did you mean 'test'?"),
+        (("evaluate", "--policy", "random", "--lighting", "disco"), "`lighting` (='disco')"),
+        (("quickstart", "--scenes", "empty.dng"), "must hold raws"),
+        (("train", "none.yaml"), "there is no such file"),
+        (("train", "wrong.yaml"), "training.frame is unknown"),
+        (("train", "agent.yaml", "--seed", 2**40), "`seed` (=1099511627776) must be in"),
+        (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
+        (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
+        (("bench", "thruput"), "did you mean 'throughput'?"),
+    ],
+    ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else "",
+)
+def test_errors_are_one_line(ae_env, dng: Path, arguments, message, monkeypatch) -> None:
+    folder = dng.parent
+    files = {
+        "text.dng": "not a raw\n",
+        "bad.py": "def (:\n",
+        "own.py": UNMADE,
+        "script.py": "import sys\nsys.exit(0)\n",
+        "wrong.yaml": "agent: regression\ntraining: {frame: 3}\n",
+        "agent.yaml": "agent: ppo\n",
     }
-    assert scores["random"] < 0.2 < scores["centre_weighted:P"] < 1.0
-    with (folder / "scenes.csv").open() as stream:
-        assert len(list(csv.reader(stream))) > 10
-    assert "centre_weighted:P" in (folder / "report.md").read_text()
-    with Image.open(folder / "scores.png") as picture:
-        assert min(picture.size) > 100
-
-
-def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
-    (tmp_path / "tiny.yaml").write_text(
-        "agent: regression\nnum_envs: 4\nenvironment: {scenes: 'bundled:small', resolution: 36}\n"
-        "training: {frames: 24, width: 8}\n"
-    )
-    out = Path("runs/a-0.5")
-    code, text, _ = ae_env("train", "tiny.yaml", "--out", out, "--seed", 2)
-    assert code == 0
-    assert f"next: ae-env evaluate --policy regression:{out}" in text
-    card = json.loads(sibling(tmp_path / out, ".json").read_text())
-    assert card["training"]["training"]["seed"] == 2
-    code, _, _ = ae_env(
-        *("evaluate", "--policy", f"regression:{out}", "--scenes", "bundled:small"),
-        *("--resolution", 36, "--frames", 2, "--episodes", 1),
-    )
-    assert code == 0
-    code, _, error = ae_env(
-        "evaluate", "--policy", f"regression:{out}", "--scenes", "bundled:small", "--sensors"
-    )
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    Image.new("RGB", (8, 8)).save(folder / "picture.png")
+    (folder / "empty.dng").mkdir()
+    if arguments[0] == "evaluate" and "--scenes" not in arguments:
+        arguments = (*arguments, "--scenes", "bundled:small")
+    before = {path.name for path in folder.iterdir()}
+    code, _, error = ae_env(*arguments)
     assert code == 2
-    assert "resolution = [4, 36, 36], the environment has [4, 64, 64]" in error
+    lines = error.strip().splitlines()
+    assert len(lines) == 1, error
+    assert lines[0].startswith("error ")
+    assert message in lines[0]
+    left = {path.name for path in folder.iterdir()} - before
+    assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
+
+
+#: A policy that loads, and fails when it is its turn; and one that fails before.
+OWN = """\
+from agents import Policy
+class Raises(Policy):
+    def act(self, observations, action_masks=None):
+        raise KeyError("lost")
+class Counts(Raises):
+    captures_per_decision = "two"
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "message"),
+    [
+        ("Raises", 1, "`act` raised KeyError: 'lost'"),
+        ("Counts", 2, "`captures_per_decision` of policy `own.py:Counts` (='two')"),
+    ],
+)
+def test_policies_that_fail(ae_env, tmp_path: Path, name: str, status: int, message: str) -> None:
+    (tmp_path / "own.py").write_text(OWN)
+    arguments = ("--scenes", "bundled:small", "--resolution", 36, "--frames", 1, "--episodes", 1)
+    code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *arguments)
+    assert (code, error.count("\n")) == (status, 1)
+    assert message in error
+    assert "own.py:" in error
+
+
+def test_a_scorer_that_fails_in_a_training(ae_env, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "failing_scorer.py").write_text(
+        "class Mine:\n    domain = 'raw'\n    def __call__(self, *_):\n        return 1 / 0\n"
+    )
+    (tmp_path / "a.yaml").write_text(
+        "agent: regression\nnum_envs: 2\ntraining: {frames: 4}\nenvironment: "
+        "{scenes: 'bundled:small', resolution: 36, scorer: 'failing_scorer:Mine'}\n"
+    )
+    code, _, error = ae_env("train", "a.yaml")
+    assert code == 1
+    assert error == "error scorer 'Mine' raised ZeroDivisionError: division by zero\n"
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "message"),
+    [
+        (OSError(28, "No space left on device"), 1, "error [Errno 28] No space left on device"),
+        (RuntimeError("out of\nmemory"), 1, "error RuntimeError: out of memory; `ae-env --debug`"),
+        (ImportError("needs: pip install x"), 1, "error needs: pip install x"),
+        (FileNotFoundError(2, "No such file", "a.dng"), 2, "No such file: 'a.dng'"),
+    ],
+)
+def test_failures_while_running(ae_env, dng, monkeypatch, raised, status, message) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
+        raise raised
+
+    monkeypatch.setattr("simulator.write_dng", fail)
+    code, _, error = ae_env("simulate", dng, *SIMULATE, "--weights", "none")
+    assert code == status
+    assert error.count("\n") == 1
+    assert message in error
+
+
+def test_unwritable_folder(ae_env, dng: Path, tmp_path: Path, monkeypatch) -> None:
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
+    code, _, error = ae_env("sweep", dng, "--out", "locked")
+    assert code == 2
+    assert "`out` (='locked') cannot be written: Permission denied" in error
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "a.dng"),
+        ("simulate", "a.dng", *SIMULATE, "--iso", "many"),
+        ("simulate", "a.dng", *SIMULATE, "--seed", 2**63),
+        ("evaluate",),
+        ("evaluate", "--policy", "random", "--frames", 0),
+        ("cache", "x"),
+        ("nonsense",),
+    ],
+)
+def test_usage_errors(ae_env, arguments: tuple[str, ...]) -> None:
+    code, _, error = ae_env(*arguments)
+    assert code == 2
+    assert "Usage: ae-env" in error
+
+
+def test_debug_shows_the_traceback(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
+    monkeypatch.setattr("sys.argv", ["ae-env", "--debug", "sweep", "none.dng"])
+    with pytest.raises((ValueError, FileNotFoundError)):
+        cli.main()
+
+
+def test_ctrl_c(ae_env, dng: Path, monkeypatch) -> None:
+    def interrupted(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("simulator.read_raw", interrupted)
+    code, _, error = ae_env("sweep", dng)
+    assert code == 130
+    assert error == "\nstopped\n"  # a sweep restarts

@@ -13,11 +13,12 @@ import pytest
 from PIL import Image
 
 from agents.cli import quickstart
-from agents.cli.quickstart import BASELINES, next_commands, run_quickstart, training_scenes
+from agents.cli.quickstart import BASELINES, next_commands, run_quickstart
 from agents.learning.agent_weights import load_agent
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
-FILES = {"results.json", "scenes.csv", "report.md", "scores.png", "contact_sheet.png"}
+FILES = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png"}
+FILES |= {"ev_error.png", "cost.png", "contact_sheet.png", "contact_sheet_2.png"}
 
 
 class Bars:
@@ -60,37 +61,6 @@ def check_files(done: quickstart.QuickstartResult, out: Path) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.slow
-def test_bundled_then_again(few_frames: None, tmp_path: Path, monkeypatch) -> None:
-    out = tmp_path / "quickstart"
-    bars = Bars()
-    done = run_quickstart("bundled:small", out, seed=1, progress=bars, command="ae-env quickstart")
-    content = check_files(done, out)
-    assert not done.zero_shot
-    assert content["meta"]["command"] == "ae-env quickstart"
-    assert {row["split"] for row in content["rows"]} == {"test"}
-    assert len(bars.last) == 6
-    assert all(done == total for done, total in bars.last.values()), bars.last
-    assert any(note.startswith("mse") for note in bars.notes)
-    assert any(note.startswith("reward") for note in bars.notes)
-    assert load_agent(done.agents["ppo"], "ppo")[1]["training"]["training"]["seed"] == 1
-    report = (out / "report.md").read_text()
-    for line in next_commands("bundled:small", out, done.agents):
-        assert line in report
-
-    # A second run finds both agents and gives the same numbers.
-    def trained_again(*args: object) -> None:
-        raise AssertionError("trained again")
-
-    monkeypatch.setattr("agents.learning.training.train_agent", trained_again)
-    monkeypatch.setattr("agents.learning.training.ProcessPoolExecutor", trained_again)
-    again = run_quickstart("bundled:small", out, seed=1, progress=Bars(), command="again")
-    second = json.loads(again.files["results.json"].read_text())
-    for before, after in zip(content["rows"], second["rows"], strict=True):
-        assert before["mean_score"] == after["mean_score"]
-        assert before["policy"] == after["policy"]
-
-
 @pytest.fixture
 def dngs(tmp_path: Path) -> Path:
     """Three raws of different patterns, as a user's folder."""
@@ -108,22 +78,34 @@ def dngs(tmp_path: Path) -> Path:
     return folder
 
 
-def test_few_raws_are_zero_shot(dngs: Path) -> None:
-    assert training_scenes(str(dngs)) == ("bundled", True)
-    assert training_scenes("bundled") == ("bundled", False)
-    assert training_scenes("bundled:small") == ("bundled:small", False)
-
-
-def test_a_folder_may_be_called_bundled(dngs: Path) -> None:
-    folder = dngs.rename(dngs.parent / "bundled_raws")
-    assert training_scenes(str(folder)) == ("bundled", True)
-
-
 @pytest.mark.slow
-def test_zero_shot(few_frames: None, dngs: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(quickstart, "training_scenes", lambda scenes: ("bundled:small", True))
-    out = tmp_path / "mine"
-    done = run_quickstart(str(dngs), out, seed=0, progress=Bars(), command="ae-env quickstart")
+def test_bundled_scenes_then_raws_of_ones_own(
+    few_frames: None, dngs: Path, tmp_path: Path, monkeypatch
+) -> None:
+    out = tmp_path / "quickstart"
+    bars = Bars()
+    done = run_quickstart("bundled:small", out, seed=1, progress=bars, command="ae-env quickstart")
+    content = check_files(done, out)
+    assert not done.zero_shot
+    assert content["meta"]["command"] == "ae-env quickstart"
+    assert {row["split"] for row in content["rows"]} == {"test"}
+    assert len(bars.last) == 5
+    assert all(done == total for done, total in bars.last.values()), bars.last
+    assert any(note.startswith("mse") for note in bars.notes)
+    assert any(note.startswith("reward") for note in bars.notes)
+    assert load_agent(done.agents["ppo"], "ppo")[1]["training"]["training"]["seed"] == 1
+    report = (out / "report.md").read_text()
+    for line in next_commands("bundled:small", out, done.agents):
+        assert line in report
+
+    # Few raws have no training split; the agents are there already.
+    def trained_again(*args: object) -> None:
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr("agents.learning.training.train_agent", trained_again)
+    monkeypatch.setattr("agents.learning.training.ProcessPoolExecutor", trained_again)
+    monkeypatch.setattr("agents.episodes.training_scenes", lambda _: ("bundled:small", True))
+    done = run_quickstart(str(dngs), out, seed=1, progress=Bars(), command="ae-env quickstart")
     content = check_files(done, out)
     assert done.zero_shot
     assert content["meta"]["zero_shot"] is True
@@ -132,6 +114,11 @@ def test_zero_shot(few_frames: None, dngs: Path, tmp_path: Path, monkeypatch) ->
     assert {row["num_groups"] for row in rows} <= {1, 2, 3}
     assert all(row["ci95"] is None for row in rows)  # too few groups for an interval
     assert "Every source group" in (out / "report.md").read_text()
+
+
+def test_a_seed_beyond_those_of_evaluations_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"`seed` \(=4294967295\) must be"):
+        run_quickstart("bundled:small", tmp_path, seed=2**32 - 1, progress=Bars(), command="")
 
 
 def test_next_commands_are_quoted() -> None:

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from agents.metering.gradient_meters import GAMMAS, _best_gamma
 from agents.metering.meters import make_meter
 from agents.policy import make_policy
 
@@ -40,24 +39,6 @@ def test_steps_go_on_from_the_estimate_and_not_from_the_state(context, photograp
     assert steps[0] > 0.3
 
 
-def test_zhang_rests_where_the_metric_is_highest(context, photograph):
-    from ae_env.scorers.detail import zhang_gradient
-    from agents.metering.histogram_meters import encoded
-
-    torch = pytest.importorskip("torch")
-    light = _texture(3)
-    meter = make_meter("zhang", context.camera)
-    frame = photograph(light, 9.0, context.grid.nearest(10.0))
-    estimate = np.array([10.0])
-    for _ in range(60):
-        estimate = 0.5 * (estimate + meter(frame, estimate).ev100)
-    evs = np.arange(4.0, 12.0, 0.05)
-    pictures = [encoded(np.clip(0.12 * light * 2.0 ** (9.0 - ev), 0, 1)) for ev in evs]
-    metric = zhang_gradient(torch.tensor(np.array(pictures), dtype=torch.float32)).numpy()
-    reached = np.interp(estimate[0], evs, metric)
-    assert reached > 0.97 * metric.max()
-
-
 def test_frames_without_gradient_ask_for_nothing_or_for_their_bound(context, photograph):
     for name in ("shim", "zhang"):
         meter = make_meter(name, context.camera)
@@ -87,9 +68,3 @@ def test_the_dark_is_left(context, photograph, name):
             assert context.grid.ev100[state[0]] < 9.0 + 1.6
         state = policy.act(photograph(light, 35.0 if frame in (13, 14) else 9.0, state))
     assert context.grid.ev100[state[0]] < 9.0 + 1.6
-
-
-def test_best_gamma_is_the_top_of_the_parabola():
-    gammas = np.array(GAMMAS)
-    metric = np.stack([1.0 - (gammas - 1.05) ** 2, gammas, 3.0 - gammas, np.zeros(7)])
-    np.testing.assert_allclose(_best_gamma(metric), [1.05, 1.9, 0.1, 1.0], atol=1e-9)

@@ -30,6 +30,18 @@ def test_highlights_are_exposed_to_nine_tenths_of_white(context, photograph):
     assert reading.saturated[0] == 0.0
 
 
+def test_the_brightest_plane_of_each_pixel_counts_in_every_frame(context, photograph):
+    light = np.ones((4, 64, 64))
+    light[3, :8] = 5.0  # blue, an eighth of the frame
+    state = context.grid.nearest(9.0)
+    frame = photograph(light, 9.0, [state, state])
+    reading = make_meter("highlight_weighted", context.camera)(frame)
+    np.testing.assert_allclose(reading.ev100, [9.0 + math.log2(0.6 / 0.9)] * 2, atol=0.03)
+    assert reading.black.tolist() == [False, False]
+    dark = photograph(GREY, -6.0, context.grid.nearest(17.0))
+    assert make_meter("highlight_weighted", context.camera)(dark).black.tolist() == [True]
+
+
 def test_blown_highlights_read_brighter_than_they_show(context, photograph):
     light = GREY.copy()
     light[:4] = 100.0
@@ -75,15 +87,27 @@ def test_simulated_histogram_is_that_of_the_exposed_frame():
     edges = (np.clip(codes[:, None] + [-0.5, 0.5], 0, 255) / 255.0) ** 2 * (1 + 1 / 1024) - 1 / 1024
     shares = np.diff(np.clip(edges, 0.0, 1.0), axis=1)[:, 0]
     moved = histogram_meters._exposed(shares[None], np.array([-1.0, 0.0, 1.0]))[0]
+    assert moved.shape == (3, 256)
     assert moved.sum(axis=1) == pytest.approx(1.0)
     share = moved[:, 128:].sum(axis=1)  # above half of the code: signal above 0.214
     border = _linear(0.5)
-    assert share[1] == pytest.approx(1.0 - border, abs=3e-3)
-    assert share[2] == pytest.approx(1.0 - border / 2, abs=3e-3)
-    assert share[0] == pytest.approx(1.0 - border * 2, abs=6e-3)  # white lies at 0.5 there
+    assert share[1] == pytest.approx(1.0 - border, abs=5e-4)
+    assert share[2] == pytest.approx(1.0 - border / 2, abs=5e-4)
+    assert share[0] == pytest.approx(1.0 - border * 2, abs=1e-3)  # white lies at 0.5 there
+
+
+def test_saturated_pixels_add_to_what_a_search_finds():
+    shares = np.zeros((2, 256))
+    shares[0, [100, 255]] = 0.75, 0.25
+    shares[1, 0] = 1.0
+    found = histogram_meters._search_reading(shares, np.array([8.0, 8.0]), np.array([-1.0, 2.0]))
+    assert found.ev100.tolist() == [9.0 + 0.25 * 3.0, 6.0]
+    assert found.saturated.tolist() == [0.25, 0.0]
+    assert found.black.tolist() == [False, True]
 
 
 def test_peak_is_the_top_of_a_parabola():
     x = np.arange(-3.0, 3.01, 0.5)
-    values = np.stack([-((x - 0.7) ** 2), -((x + 1.2) ** 2), x, np.zeros_like(x)])
-    np.testing.assert_allclose(histogram_meters.peak(values, x), [0.7, -1.2, 3.0, 0.0])
+    tops = (0.7, -1.2, -3.2, 3.2)  # the last two lie beyond the ends
+    values = np.stack([*(-((x - top) ** 2) for top in tops), x, np.zeros_like(x)])
+    np.testing.assert_allclose(histogram_meters.peak(values, x), [0.7, -1.2, -3, 3, 3, 0])

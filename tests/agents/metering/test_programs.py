@@ -1,235 +1,190 @@
-from __future__ import annotations
+"""The programs' arithmetic on a grid whose APEX values are written out by hand."""
 
-import dataclasses
-import itertools
+from __future__ import annotations
 
 import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from agents.metering.programs import MeteringPolicy
-from agents.metering.tuned import ScoreRegression
-from agents.policy import PROGRAMS, make_policy
+from agents.metering.programs import (
+    ProgramOptions,
+    StateChooser,
+    aperture_limit,
+    check_program,
+    check_used,
+    ev_step,
+    program_cost,
+    shutter_limit,
+)
 
-GREY = np.ones((64, 64))
-
-
-def _run(policy, photograph, scene_ev, *, frames=5, start=0, masks=None, **blur):
-    policy.reset(1, seed=0)
-    state = np.array([start])
-    path = []
-    for _ in range(frames):
-        state = policy.act(photograph(GREY, scene_ev, state, **blur), masks)
-        path.append(int(state[0]))
-    return path
-
-
-@pytest.mark.parametrize("program", ["P", "A", "S"])
-@pytest.mark.parametrize("scene_ev", [2.0, 6.0, 10.0, 14.0])
-@pytest.mark.parametrize("start", [0, 63])
-def test_programs_reach_the_ev_of_a_grey_card_and_stay(
-    context, photograph, program, scene_ev, start
-):
-    policy = make_policy(f"average:{program}", context)
-    path = _run(policy, photograph, scene_ev, start=start)
-    reachable = context.grid.ev100
-    if program == "S":  # 1/125 s alone reaches EV 5 to 14
-        reachable = reachable[np.isclose([s.exposure_time for s in context.grid], 1 / 125)]
-    elif program == "A":  # f/8 alone reaches some EVs less closely
-        reachable = reachable[np.isclose([s.f_number for s in context.grid], 8.0)]
-    nearest = np.abs(reachable - scene_ev).min()
-    assert abs(context.grid.ev100[path[-1]] - scene_ev) < nearest + 0.25
-    assert path[-1] == path[-2] == path[-3]
+#: ISO 100 and 400, 1/64 and 1/4 s, f/4 and f/8: every value a power of two.
+GRID = ExposureGrid((100, 400), (1 / 64, 1 / 4), (4, 8))
+#: Av, Tv and Sv of its states, in their order: ISO slowest, aperture fastest.
+APEX = np.array(
+    [(av, tv, sv) for sv in (5.0, 7.0) for tv in (6.0, 2.0) for av in (4.0, 6.0)], dtype=float
+)
+EV = np.array([10.0, 12.0, 6.0, 8.0, 8.0, 10.0, 4.0, 6.0])  # Av + Tv - (Sv - 5)
 
 
-def test_priorities_are_kept(context, photograph):
-    for ev in (3.0, 9.0, 15.0):
-        aperture = _run(make_policy("spot:A", context), photograph, ev)
-        shutter = _run(make_policy("spot:S", context), photograph, ev)
-        assert {context.grid[s].f_number for s in aperture} == {8.0}
-        assert {context.grid[s].exposure_time for s in shutter} == {1 / 125}
+def chooser(program="P", ceiling=False, grid=GRID, **options) -> StateChooser:
+    return StateChooser(grid, program, ProgramOptions(**options), ceiling)
 
 
-def test_aperture_priority_takes_an_option_and_raises_iso_only_against_shake(context, photograph):
-    policy = make_policy("average:A", context, f_number=4.0)
-    bright = context.grid[_run(policy, photograph, 11.0, speed=0.5)[-1]]
-    assert (bright.f_number, bright.iso) == (4.0, 100.0)  # 1/125 s
-    moving = context.grid[_run(policy, photograph, 5.0, speed=2.0)[-1]]
-    steady = context.grid[_run(policy, photograph, 5.0, speed=0.0)[-1]]
-    assert steady.iso < moving.iso
-    assert steady.exposure_time > moving.exposure_time
+def best(found: StateChooser, target: float, preference=0.0) -> list[int]:
+    """All states of the highest utility."""
+    cost = np.broadcast_to(np.asarray(preference, float), (len(EV),))
+    utility = found.utility(np.array([target]), cost)[0]
+    return np.flatnonzero(utility == utility.max()).tolist()
 
 
-def test_program_p_follows_the_sensors(context, photograph):
-    def choose(ev, **blur):
-        return context.grid[_run(make_policy("average:P", context), photograph, ev, **blur)[-1]]
-
-    still, fast = (choose(7.0, speed=v, defocus=0.1) for v in (0.0, 4.0))
-    assert fast.exposure_time < still.exposure_time
-    sharp, deep = (choose(11.0, speed=0.0, defocus=d) for d in (0.1, 4.0))
-    assert deep.f_number > sharp.f_number
-
-
-def test_compensation_is_in_ev_and_positive_is_brighter(context, photograph):
-    plain = _run(make_policy("average:P", context), photograph, 9.0)[-1]
-    brighter = _run(make_policy("average:P", context, compensation=2.0), photograph, 9.0)[-1]
-    assert context.grid.ev100[plain] - context.grid.ev100[brighter] == pytest.approx(2.0, abs=0.2)
-
-
-@pytest.mark.parametrize("program", ["P", "A", "S"])
-def test_masked_states_are_never_chosen(context, photograph, program):
-    policy = make_policy(f"matrix:{program}", context)
-    free = _run(policy, photograph, 8.0)
-    masks = np.ones((1, len(context.grid)), bool)
-    masks[0, free] = False
-    assert not set(_run(policy, photograph, 8.0, masks=masks)) & set(free)
-
-
-def _fitted(context, program="tuned"):
-    """Best state = (ISO by EV, shutter by speed, aperture by defocus): known by construction."""
-    rng = np.random.default_rng(0)
-    features = np.stack(
-        [rng.uniform(0, 16, 4000), rng.uniform(-9, 3, 4000), rng.uniform(-3, 3, 4000)], axis=1
-    )
-    best = _best_state(context.grid, features)
-    scores = np.exp(-0.5 * (np.arange(64) != best[:, None]))
-    columns = features if program == "tuned" else features[:, :1]
-    return ScoreRegression(columns, scores, np.full(columns.shape[1], 0.3))
-
-
-def _best_state(grid: ExposureGrid, features):
-    iso = np.where(features[:, 0] > 8, 0, 3)
-    time = np.where(features[:, 1] > -3, 0, 3)
-    aperture = np.where(features[:, 2] > 0, 3, 0)
-    return np.array([grid.index(*c) for c in zip(iso, time, aperture, strict=True)])
-
-
-def test_tuned_program_uses_ev_speed_and_defocus(context, photograph, tmp_path):
-    _fitted(context).save(tmp_path / "tuned.safetensors")
-    policy = make_policy("average:tuned", context, weights=tmp_path / "tuned.safetensors")
-    for ev, speed, defocus in ((12.0, 2.0, 4.0), (4.0, 0.004, 0.25), (12.0, 0.004, 4.0)):
-        wanted = _best_state(context.grid, np.log2([[2.0**ev, speed, defocus]]))[0]
-        path = _run(policy, photograph, ev, speed=speed, defocus=defocus, start=wanted)
-        assert path[-1] == wanted
-
-
-def test_tuned_needs_a_fit_and_the_same_readings(context, photograph, tmp_path):
-    with pytest.raises(ValueError, match="call fit"):
-        _run(make_policy("average:tuned", context), photograph, 8.0)
-    with pytest.raises(ValueError, match="nothing to save"):
-        make_policy("average:tuned", context).save(tmp_path / "x.safetensors")
-    _fitted(context).save(tmp_path / "three.safetensors")
-    blind = make_policy("average:tuned_blind", context, weights=tmp_path / "three.safetensors")
-    with pytest.raises(ValueError, match="agree on `sensors`"):
-        _run(blind, photograph, 8.0)
-
-
-def test_sensors_are_averaged_over_the_frames(context, photograph):
-    policy = MeteringPolicy(context, "average", "P")
-    policy.reset(1)
-    for speed in (0.5, 2.0, 1.0):
-        readings = policy.observe(photograph(GREY, 8.0, 20, speed=speed, defocus=1.0))
-    assert readings[0, 1] == pytest.approx(0.0, abs=1e-5)  # mean of -1, 1, 0 stops
-    policy.reset(1)
-    again = policy.observe(photograph(GREY, 8.0, 20, speed=0.5, defocus=1.0))
-    assert again[0, 1] == pytest.approx(-1.0, abs=1e-5)
-
-
-def test_arguments_are_checked(context):
-    with pytest.raises(ValueError, match="`program`"):
-        MeteringPolicy(context, "average", "X")
-    with pytest.raises(ValueError, match="`f_number`"):
-        MeteringPolicy(context, f_number=0.0)
-    with pytest.raises(ValueError, match=r"`weights` \(='/no/file'\) cannot be read"):
-        MeteringPolicy(context, "average", "tuned", weights="/no/file")
-    for program in PROGRAMS:
-        assert MeteringPolicy(context, "average", program).program == program
+def test_values_of_the_states():
+    found = chooser()
+    np.testing.assert_allclose(np.stack([found.aperture, found.time, found.speed], 1), APEX)
+    np.testing.assert_allclose(found.ev100, EV)
+    assert found.step == 2.0
+    assert found.hysteresis == pytest.approx(0.4)
+    assert not found.over_cap.any()
 
 
 @pytest.mark.parametrize(
-    ("name", "option"),
+    ("program", "options", "target", "states"),
     [
-        *[(f"spot:{p}", "f_number") for p in ("P", "S", "tuned", "tuned_blind")],
-        *[(f"spot:{p}", "exposure_time") for p in ("P", "A", "tuned")],
-        *[(f"spot:{p}", "iso") for p in ("P", "A", "S", "tuned")],
-        *[(f"spot:{p}", "weights") for p in ("P", "A", "S", "M")],
-        *[("rpi_agc:P", "exposure_time"), ("rpi_agc:A", "iso"), ("rpi_agc:M", "flicker_period")],
+        ("P", {}, 10.0, [0, 5]),
+        ("P", {}, 9.2, [0, 5]),  # 0.8 from EV 10, 1.2 from 8
+        ("P", {}, 9.05, [0, 3, 4, 5]),  # 0.95 and 1.05: within a sixth of an EV
+        ("P", {}, 40.0, [1]),
+        ("A", {"f_number": 4.0}, 10.0, [0]),
+        ("A", {"f_number": 8.0}, 6.2, [7]),
+        ("A", {"f_number": 5.0}, 10.0, [0]),  # 0.64 of a stop from f/4, 1.36 from f/8
+        ("S", {"exposure_time": 1 / 4}, 8.0, [3]),
+        ("S", {"exposure_time": 1 / 50}, 8.0, [4]),
+        ("M", {"f_number": 4.0, "exposure_time": 1 / 4}, 12.0, [2]),
+        ("M", {"f_number": 4.0, "exposure_time": 1 / 4, "iso": 400}, 12.0, [6]),
+        ("M", {"f_number": 8.0, "exposure_time": 1 / 64, "iso": 199}, 0.0, [1]),
+        ("M", {"f_number": 8.0, "exposure_time": 1 / 64, "iso": 201}, 20.0, [5]),  # border: 200
+        ("P", {"f_number": 8.0}, 10.0, [0, 5]),  # set by hand in other programs only
+        ("S", {"exposure_time": 1 / 4, "shutter_cap": 1 / 30}, 8.0, [4]),  # the cap comes first
+        ("P", {"shutter_cap": 1 / 8}, 4.0, [4]),  # 1/64 s and as near as that allows
+        ("P", {"shutter_cap": 1 / 1000}, 12.0, [1]),  # none is shorter: the shortest
     ],
 )
-def test_options_of_other_programs_are_refused(context, name, option):
-    with pytest.raises(ValueError, match=rf"`{option}` \(=4\) is an option of programs? .* only"):
-        make_policy(f"{name}?{option}=4", context)
+def test_states_that_fit_best(program, options, target, states):
+    assert best(chooser(program, **options), target) == states
 
 
-def test_a_policy_that_was_not_reset_says_so(context, photograph):
-    frame = photograph(GREY, 9.0, [1, 2])
-    for name in ("matrix:P", "shim:A", "rpi_agc"):
-        policy = make_policy(name, context)
-        with pytest.raises(ValueError, match=r"are of 2: call reset\(num_envs\) first"):
-            policy.act(frame)
+def test_preference_decides_among_states_of_one_exposure_only():
+    found = chooser()
+    cost = np.zeros(8)
+    cost[0] = 1.0
+    assert best(found, 10.0, cost) == [5]
+    cost[[0, 5]] = 400.0  # 0.4 EV count as much: still nearer than the next exposure
+    assert best(found, 10.0, cost) == [0, 5]
 
 
-UNEVEN = ExposureGrid((100, 800), (1 / 4000, 1 / 500, 1 / 400, 1 / 30), (2.8, 16))
+def test_utility_in_numbers():
+    found = chooser("A", f_number=8.0, shutter_cap=1 / 16)
+    utility = found.utility(np.array([11.0]), np.arange(8.0))[0]
+    # Nearest that is allowed: states 1 and 5 (f/8, 1/64 s), 1 EV away; a sixth of an EV is free.
+    assert -utility[1] == pytest.approx(1.0)
+    assert -utility[5] == pytest.approx(5.0)
+    assert -utility[0] == pytest.approx(2e6)  # two stops from f/8
+    assert chooser("A", f_number=5.0).utility(np.array([10.0]), np.zeros(8))[0, 0] == 0.0
+    slow = 2e9 * (1 - 0.5e-6) + 1e3 * (3.0 - 1.0 - 1 / 6) + 3.0  # two stops slower than the cap
+    assert -utility[3] == pytest.approx(slow, rel=1e-12)
 
 
-@pytest.mark.parametrize("program", ["P", "A", "S", "M"])
-@pytest.mark.parametrize("grid", [ExposureGrid.default(), UNEVEN])
-@pytest.mark.parametrize("masked", [False, True])
-def test_highlights_have_a_ceiling_on_uneven_grids(context, photograph, program, grid, masked):
-    """A frame-filling card at 0.12 * 2^d: never above 0.9 of white where a darker state is left."""
-    policy = make_policy(f"highlight_weighted:{program}", dataclasses.replace(context, grid=grid))
-    masks = np.random.default_rng(0).random((1, len(grid))) < (0.5 if masked else 2.0)
-    allowed = policy._chooser._allowed & masks[0]  # by the program and the masks
-    for scene_ev in np.arange(2.0, 16.0, 0.7):
-        reading = scene_ev - np.log2(0.9 / 0.12)
-        policy.reset(1)
-        start = context.grid.nearest(scene_ev)
-        for drift in (0.0, 0.1, -0.1):  # hysteresis must not lead above it
-            frame = photograph(GREY, scene_ev + drift, start)
-            chosen = grid.ev100[policy.act(frame, masks)[0]]
-            darker = grid.ev100[allowed & (grid.ev100 > reading + 0.2)]
-            if len(darker):
-                assert chosen > reading + min(drift, 0.0) - 0.06  # half a code
-                assert chosen <= darker.min() + 0.4 * policy._chooser.step
-    assert allowed.any()
+def test_ceiling_chooses_the_next_darker_state():
+    found = chooser(ceiling=True)
+    assert best(found, 8.5) == [0, 5]  # 8 is nearer, but brighter
+    assert best(found, 8.0) == [3, 4]
+    assert best(found, 20.0) == [1]  # none is darker
+    assert best(chooser(), 8.5) == [3, 4]
 
 
-def test_p_keeps_a_state_while_the_sensors_waver(context):
-    """Of two states of one exposure the better one may change with every look at the motion."""
-    policy = make_policy("average:P", context)
-
-    def choose(speed):
-        readings = np.array([[7.0, speed, -1.0]])
-        return int(policy._program_utility(readings).argmax())
-
-    policy.reset(1)
-    speeds = np.arange(-8.0, 3.0, 0.01)
-    chosen = [choose(speed) for speed in speeds]
-    borders = [s for s, (a, b) in zip(speeds, itertools.pairwise(chosen), strict=False) if a != b]
-    assert len(borders) >= 2
-    for border in borders:
-        policy.reset(1)
-        path = []
-        for k in range(6):
-            path.append(choose(border + (0.02 if k % 2 else -0.02)))
-            policy._previous = np.array(path[-1:])
-        assert len(set(path)) == 1
+def test_hysteresis_is_a_fifth_of_a_step():
+    found = chooser()
+    previous = np.array([0])  # EV 10; the border to 8 is at 9, that to 12 at 11
+    for target, expected in ((8.81, 10.0), (8.79, 8.79), (11.19, 10.0), (11.21, 11.21)):
+        assert found.with_hysteresis(np.array([target]), previous) == pytest.approx(expected)
+    assert found.with_hysteresis(np.array([8.0]), None) == 8.0
+    ceiling = chooser(ceiling=True)
+    # Darker than the state: at once. Brighter: it stays while it is within 0.4 EV of the ceiling.
+    for target, expected in ((10.1, 10.1), (9.7, 10.0), (9.5, 9.9)):
+        assert ceiling.with_hysteresis(np.array([target]), previous) == pytest.approx(expected)
 
 
-def test_compensation_moves_the_reading_of_a_tuned_program(context, photograph, tmp_path):
-    """Above EV 8 the best ISO is 100, below 6400: at EV 9, 2 EV brighter is looked up at 7."""
-    _fitted(context).save(tmp_path / "tuned.safetensors")
-    weights = tmp_path / "tuned.safetensors"
-    for compensation, iso in ((0.0, 100.0), (2.0, 6400.0)):
-        policy = make_policy("average:tuned", context, weights=weights, compensation=compensation)
-        path = _run(policy, photograph, 9.0, speed=2.0, defocus=4.0, start=20)
-        assert context.grid[path[-1]].iso == iso
+def test_states_nearby():
+    found = chooser("S", exposure_time=1 / 64)
+    assert np.flatnonzero(found.nearby(np.array([9.0]), 0.5)[0]).tolist() == [0, 4, 5]
+    assert np.flatnonzero(found.nearby(np.array([9.9]), 0.5)[0]).tolist() == [0, 5]
+    assert np.flatnonzero(found.nearby(np.array([10.0]), 2.0)[0]).tolist() == [0, 1, 4, 5]
+    capped = chooser("S", exposure_time=1 / 4, shutter_cap=1 / 8)  # the cap excludes what is set
+    assert np.flatnonzero(capped.nearby(np.array([6.0]), 9.0)[0]).tolist() == [0, 1, 4, 5]
 
 
-def test_shutter_cap_holds_in_a_tuned_program(context, photograph, tmp_path):
-    _fitted(context).save(tmp_path / "tuned.safetensors")
-    policy = make_policy(
-        "average:tuned?shutter_cap=1/100", context, weights=tmp_path / "tuned.safetensors"
-    )
-    path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
-    assert all(context.grid[s].exposure_time <= 1 / 100 for s in path)
+def test_limits_of_shutter_and_aperture():
+    blind, seen = np.array([[8.0]]), np.array([[8.0, 1.0, 2.0]])  # 2 frame heights/s, 4 pixels
+    np.testing.assert_allclose(shutter_limit(blind), [[np.log2(60)]])
+    np.testing.assert_allclose(shutter_limit(seen), [[np.log2(128)]])  # a 64th of a frame height
+    np.testing.assert_allclose(aperture_limit(blind), [[2 * np.log2(5.6)]])
+    # The blur 4 * 4 / N pixels is one at f/16: Av 8.
+    np.testing.assert_allclose(aperture_limit(seen), [[8.0]])
+
+
+def test_costs_of_the_programs():
+    found = chooser(grid=ExposureGrid((100, 800), (1 / 64, 1 / 4), (4, 8)))
+    readings = np.array([[8.0, -1.0, 1.25]])  # Tv 5 and Av 6.5 are enough
+    slow = np.array([0, 0, 3, 3, 0, 0, 3, 3.0])
+    gain = np.array([0, 0, 0, 0, 3, 3, 3, 3.0])
+    wide = np.array([2.5, 0.5] * 4)
+    line = np.abs(np.array([4.0, 6.0] * 4) - 2 * np.log2(5.6))
+    expected = slow**2 + wide**2 / 2 + gain**2 / 4 + line**2 / 20
+    np.testing.assert_allclose(program_cost("P", found, readings)[0], expected)
+    np.testing.assert_allclose(program_cost("A", found, readings)[0], 10 * slow + gain / 10)
+    for program in ("S", "M"):
+        np.testing.assert_allclose(program_cost(program, found, readings)[0], gain / 10)
+
+
+@pytest.mark.parametrize(
+    ("grid", "step"),
+    [
+        (ExposureGrid.default(), 1.0),
+        (GRID, 2.0),
+        (ExposureGrid((100,), (1 / 64,), (4,)), 1.0),  # nothing to step to
+        (ExposureGrid((100,), (1 / 64, 1 / 60, 1 / 8), (4,)), 3.0),  # 1/60 is 1/64
+        (ExposureGrid((100,), (1 / 64, 1 / 32, 1 / 16, 1 / 2), (4,)), 1.0),  # the median
+    ],
+)
+def test_step_of_a_grid(grid, step):
+    assert ev_step(grid) == pytest.approx(step, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("option", "low", "high"),
+    [
+        ("compensation", -32.0, 32.0),
+        ("damping", 0.0, 0.999),
+        ("f_number", 0.1, 1000.0),
+        ("exposure_time", 1e-7, 1e5),
+        ("shutter_cap", 1e-7, 1e5),
+        ("iso", 1.0, 1e7),
+    ],
+)
+def test_ranges_of_the_options(option, low, high):
+    for value in (low, high):
+        assert getattr(ProgramOptions(**{option: value}), option) == value
+    for value in (low - 0.1, high * 1.01, float("nan"), "half", True):
+        with pytest.raises(ValueError, match=rf"`{option}` \(="):
+            ProgramOptions(**{option: value})
+    assert (ProgramOptions().f_number, ProgramOptions().exposure_time) == (8.0, 1 / 125)
+
+
+def test_options_belong_to_programs():
+    check_used("M", f_number=4.0, exposure_time=0.1, iso=100, weights=None)
+    with pytest.raises(ValueError, match=r"`iso` \(=100\) is an option of program M only, not of"):
+        check_used("A", iso=100)
+    with pytest.raises(ValueError, match=r"option of programs A and M only, not of P"):
+        check_used("P", f_number=4)
+    assert check_program("S") == "S"
+    with pytest.raises(ValueError, match=r"`program` \(='tuned'\)"):
+        check_program("tuned")

@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from ae_env.utils.presets import load_preset
-from agents.metering.rpi_agc import ExposureFilter, quantile_mean, zone_gain, zone_map
-from agents.metering.rpi_agc_tuning import ZONE_WEIGHTS
+from agents.metering.rpi_agc import (
+    ZONE_WEIGHTS,
+    ExposureFilter,
+    RpiAgc,
+    quantile_mean,
+    zone_gain,
+    zone_map,
+)
 from agents.policy import make_policy
 
 GREY = np.ones((64, 64))
@@ -91,14 +96,6 @@ def test_mean_is_put_at_the_target_of_its_illuminance(context, photograph, scene
     assert found == pytest.approx(scene_ev - math.log2(target / 0.12), abs=0.04)
 
 
-def test_a_card_that_fills_the_frame_is_lifted_to_the_lower_bound(context, photograph):
-    """Its brightest 2 % are all of it: at 0.3 of white."""
-    for scene_ev in (7.0, 10.0, 13.0):
-        frame = photograph(GREY, scene_ev, context.grid.nearest(scene_ev))
-        found = _exposure(make_policy("rpi_agc", context), frame)
-        assert found == pytest.approx(scene_ev - math.log2(0.3 / 0.12), abs=0.06)
-
-
 def test_constraints(context, photograph):
     """Wide range: half of the frame dark, 4 % of it highlights in the corners."""
     light = np.full((64, 64), 1.0)
@@ -172,48 +169,6 @@ def test_lamps_do_not_flicker_on_a_grid_with_other_shutters(context):
     assert used["rpi_agc?flicker_period=0.01"] <= {1 / 100, 1 / 50, 1 / 120}
 
 
-@pytest.mark.parametrize("preset", ["static", "office_led"])
-def test_flicker_does_not_cost_exposure(context, preset):
-    """The default grid has one shutter of whole periods, 1/2 s; that of `office_led` has three."""
-    grid = ExposureGrid.from_spec(load_preset(preset).get("grid", "default"))
-    policy = make_policy("rpi_agc?flicker_period=0.01", dataclasses.replace(context, grid=grid))
-    evs = np.linspace(grid.ev100.min(), grid.ev100.max(), 120)
-    states = policy._utility(evs).argmax(axis=1)
-    least = np.abs(grid.ev100[None] - evs[:, None]).min(axis=1)
-    assert (np.abs(grid.ev100[states] - evs) <= np.maximum(least + 0.17, 0.5)).all()
-    times = np.array([grid[int(s)].exposure_time for s in states])
-    dim = evs < 8.0  # the ladder is at 10 ms and more: f/5.6 at 1/100 s is EV100 11.6
-    if preset == "static":
-        assert (times[dim] < 0.2).mean() > 0.5  # half a second is no shutter of the ladder
-    else:
-        reached = least[dim] < 0.4
-        assert set(times[dim][reached]) <= {0.01, 0.02, 0.04}
-
-
-def test_shutter_cap_and_manual_shutter_in_the_ladder(context):
-    capped = make_policy("rpi_agc?shutter_cap=0.02", context).split(np.array([0.05]))
-    np.testing.assert_allclose(np.ravel(capped), [0.02, 2.5])
-    manual = make_policy("rpi_agc:S?exposure_time=0.008", context).split(np.array([0.05]))
-    np.testing.assert_allclose(np.ravel(manual), [0.008, 6.25])
-
-
-def test_exposure_ends_with_the_ladder(context, photograph):
-    frame = photograph(GREY, -1.0, context.grid.nearest(2.0))
-    # 66.666 ms at a gain of 16 and f/5.6 is EV100 log2(32 / (0.066666 * 16)) = 4.9 at the least.
-    assert _ev(_act(make_policy("rpi_agc", context), frame)) == pytest.approx(4.9, abs=0.6)
-    further = _ev(_act(make_policy("rpi_agc?max_gain=64", context), frame))
-    assert further == pytest.approx(2.9, abs=0.6)
-
-
-def test_programs_keep_what_is_set_by_hand(context, photograph):
-    for ev in (4.0, 8.0, 14.0):
-        frame = photograph(GREY, ev, context.grid.nearest(ev))
-        assert _act(make_policy("rpi_agc:A?f_number=4", context), frame).f_number == 4.0
-        assert _act(make_policy("rpi_agc:S", context), frame).exposure_time == 1 / 125
-        manual = _act(make_policy("rpi_agc:M?f_number=11&iso=1600", context), frame)
-        assert (manual.f_number, manual.exposure_time, manual.iso) == (11.0, 1 / 125, 1600.0)
-
-
 @pytest.mark.parametrize(
     ("option", "value"),
     [
@@ -230,7 +185,5 @@ def test_programs_keep_what_is_set_by_hand(context, photograph):
     ],
 )
 def test_arguments_are_checked(context, option, value):
-    from agents.metering.rpi_agc import RpiAgc
-
     with pytest.raises(ValueError, match=rf"`{option}` \(="):
         RpiAgc(context, **{option: value})

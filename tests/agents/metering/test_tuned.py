@@ -49,12 +49,6 @@ def test_fit_picks_nearly_the_best_state_of_unseen_samples():
     assert regret.mean() < 0.01
 
 
-def test_fit_works_on_a_single_group_and_a_single_reading():
-    features, scores, _ = _samples(60)
-    model = ScoreRegression.fit(features[:, :1], scores, np.zeros(60, int))
-    assert model.bandwidths.shape == (1,)
-
-
 def test_save_and_load_give_the_same_regression(tmp_path):
     model = ScoreRegression.fit(*_samples(200))
     again = ScoreRegression.load(model.save(tmp_path / "deep" / "tuned.safetensors"))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from agents.evaluation.statistics import MIN_GROUPS, difference_interval, score_interval
+from agents.evaluation.intervals import MIN_GROUPS, difference_interval, rank, score_interval
 
 
 def _data(groups=60, seeds=1, seed=0):
@@ -46,15 +46,6 @@ def test_paired_difference_agrees_with_scipy_and_is_narrower_than_unpaired():
     assert found.high - found.low < 0.2 * (alone.high - alone.low)
 
 
-def test_standard_error_over_groups_has_its_closed_form():
-    rng = np.random.default_rng(3)
-    gains, span = rng.normal(0.4, 0.1, 200), np.ones(200)  # the mean of 200 values
-    found = score_interval(gains, span, resamples=20_000)
-    error = gains.std() / np.sqrt(200)
-    assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.03)
-    assert found.low < gains.mean() < found.high
-
-
 def test_training_seeds_that_differ_widen_the_interval_by_their_variance():
     groups, seeds = 50, 4
     span = np.ones(groups)
@@ -86,7 +77,48 @@ def test_seeded_and_antisymmetric():
     assert swapped.low == pytest.approx(-once.high, abs=3e-3)
 
 
-def test_shapes_must_agree():
-    gains, span = _data()
-    with pytest.raises(ValueError, match=r"one column for each of the 60 groups"):
-        difference_interval(gains, gains[:, 1:], span)
+# -- ranking --------------------------------------------------------------------------------------
+
+SPAN = np.ones(60)
+
+
+def _gains(seed: int = 0, **means: float) -> dict[str, np.ndarray]:
+    """Policies that share the difficulty of the groups, with noise of 0.02 of their own."""
+    rng = np.random.default_rng(seed)
+    groups = rng.normal(0.0, 0.2, 60)
+    return {n: (m + groups + rng.normal(0, 0.02, 60))[None] for n, m in means.items()}
+
+
+def test_differences_far_beyond_the_noise_make_tiers():
+    found = rank(_gains(low=0.3, best=0.8, alike=0.799), SPAN, resamples=4000)
+    assert [one.policy for one in found] == ["best", "alike", "low"]
+    assert [one.tier for one in found] == [1, 1, 2]
+    best, alike, low = found
+    assert best.to_best is None
+    assert low.to_next is None
+    assert not best.to_next.significant
+    assert low.to_best.significant
+    assert alike.to_next.significant
+    # Every policy's own interval is wide: the groups differ by 0.2.
+    assert best.score.high - best.score.low > 0.08
+    assert low.to_best.high - low.to_best.low < 0.04
+
+
+def test_more_policies_widen_the_intervals_as_tukeys_range_does():
+    # Independent policies of equal noise: the factor is the studentised range quantile / sqrt(2).
+    rng = np.random.default_rng(1)
+    gains = {f"p{i}": rng.normal(0.5, 0.1, (1, 400)) for i in range(6)}
+    found = rank(gains, np.ones(400), resamples=20_000)
+    change = gains[found[-1].policy] - gains[found[0].policy]
+    factor = scipy.stats.studentized_range.ppf(0.95, 6, np.inf) / np.sqrt(2)
+    error = change.std() / np.sqrt(400)
+    half = (found[-1].to_best.high - found[-1].to_best.low) / 2
+    assert half == pytest.approx(factor * error, rel=0.06)
+
+
+def test_few_groups_have_an_order_but_no_claims():
+    gains = {"a": np.full((1, MIN_GROUPS - 1), 0.9), "b": np.zeros((1, MIN_GROUPS - 1))}
+    found = rank(gains, np.ones(MIN_GROUPS - 1))
+    assert [(one.policy, one.tier) for one in found] == [("a", None), ("b", None)]
+    assert not found[1].to_best.significant
+    assert found[1].to_best.value == pytest.approx(-0.9)

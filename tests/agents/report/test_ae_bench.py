@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from agents.evaluation import ae_bench
-from agents.evaluation.evaluation_plan import EvaluationPlan
-from agents.evaluation.plan_episodes import plan_scenes
-from agents.evaluation.plan_jobs import run_plan
-from agents.report.tables import overall_ranking
+from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
+from agents.evaluation.plan_run import run_plan
+from agents.report import ae_bench
+from agents.report.result_table import overall_ranking
 
 PLAN = EvaluationPlan(
     name="Bench",
@@ -87,8 +86,8 @@ def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog
     assert {row["hash"] for row in rows} == {plan.hash}
     assert float(rows[0]["normalised_score"]) == pytest.approx(ranking[0].score.value, abs=5e-5)
     page = (tmp_path / "docs" / "ae-bench.md").read_text()
-    assert "| `matrix:P` |" in page
-    assert page.index("matrix:P") < page.index("`random`")
+    assert "| matrix:P |" in page
+    assert page.index("matrix:P") < page.index("| random |")
     assert str(tmp_path) not in page
     with pytest.raises(ValueError, match="they do not compare"):
         ae_bench.append_results(table, plan.changed(hash="0"), results, ranking, author="x")
@@ -101,17 +100,6 @@ def _table(file, plan, **entries):
     row = dict.fromkeys(ae_bench.COLUMNS, "") | {"hash": plan.hash} | entries
     file.write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
     return file
-
-
-def test_names_of_rows_have_no_folder():
-    names = {
-        "/home/u/my.py:Mine": "my.py:Mine",
-        "u/my.py:Mine?path=a/b": "my.py:Mine?path=a/b",
-        "regression:runs/mine": "regression:mine",
-        "package.module:Class": "package.module:Class",
-        "centre_weighted:P?shutter_cap=1/50": "centre_weighted:P?shutter_cap=1/50",
-    }
-    assert {name: ae_bench.row_name(name) for name in names} == names
 
 
 def test_a_table_is_checked_before_the_run(plan, tmp_path):

@@ -14,11 +14,10 @@ import numpy as np
 
 from agents.evaluation import metrics
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest
-from agents.evaluation.ranking import Rank
-from agents.evaluation.result import EvaluationResult
-from agents.policy import split_name
-from agents.report.of_evaluation import markdown_table
-from agents.report.tables import static_condition
+from agents.evaluation.intervals import Rank
+from agents.policy import split_class, split_options
+from agents.report.markdown import escape, markdown_table
+from agents.report.result_table import Results
 from simulator.utils.files import write_atomically
 from simulator.utils.results import machine, versions
 
@@ -37,10 +36,37 @@ COLUMNS = (
     *("hard", "regret", "ev_within_third", "frames_to_converge", "converged", "clipped_high"),
     *("clipped_low", "ms_alone", "cpu", "training_seeds", "version", "hash"),
 )
+#: Metrics of a row that are means over all conditions.
+_MEANS = COLUMNS[8:14]
+_PAGE = """\
+# {name}
+
+<!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->
+
+{scenes} bundled scenes that nothing was trained on, conditions {conditions}; starts {starts}; \
+{frames} frames; scorer `{scorer}`. Score: normalised score over all conditions, each with the \
+same weight; 0 is a random policy, 1 an oracle that is told the best state of the last frame's \
+light in every frame. What the columns mean: [evaluation.md](evaluation.md). Times are those of \
+each row's own machine (`cpu` in the CSV file).
+
+Add your own policy with one command:
+
+    ae-env evaluate --preset ae_bench_v1 --policy my.py:Mine \\
+        --append {table} --author "Your name"
+
+Its row replaces the one of the same policy and author, where there is one, and no other. Send it \
+as a pull request with the two files that the command changes, `{table}` and `{page}`, and, if it \
+may be public, the policy's file.
+
+The plan and the light of its scenes have the hash `{hash}`, which every row carries; a run under \
+another one is refused.
+
+{rows}
+"""
 
 
 def scene_signature(scene: Scene) -> list[Any]:
-    """JSON values of what a scene is: its names, its right exposure, its light in blocks.
+    """JSON values that identify a scene: its names, its right exposure, its light in blocks.
 
     Args:
         scene: At the resolution of the plan.
@@ -61,7 +87,7 @@ def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
 
 
 def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
-    """Checks that a benchmark is what it was when its hash was written down.
+    """Checks that a benchmark is still the one that its hash was written down for.
 
     Raises:
         ValueError: If it is not.
@@ -77,32 +103,17 @@ def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
         )
 
 
-def refuse_changes(plan: EvaluationPlan, options: Sequence[str]) -> None:
-    """Raises a `ValueError` where options would change a benchmark.
-
-    Args:
-        plan: The benchmark.
-        options: Names of the options given that change a plan.
-    """
-    if options:
-        raise ValueError(
-            f"`preset` (={plan.name!r}) is a fixed benchmark: it does not take "
-            f"{', '.join('--' + name for name in options)}"
-        )
-
-
 def row_name(policy: str) -> str:
     """A policy's name as the table has it: without the folder of a file of one's own.
 
     >>> row_name("u/my.py:Mine?gain=2"), row_name("ppo:runs/mine"), row_name("matrix:P")
     ('my.py:Mine?gain=2', 'ppo:mine', 'matrix:P')
     """
-    base, _ = split_name(policy)
+    base, _ = split_options(policy)
     options = policy[len(base) :]
-    if ".py:" in base:
-        file, _, cls = base.rpartition(":")
-        return f"{Path(file).name}:{cls}{options}"
-    head, _, tail = base.partition(":")
+    head, tail = split_class(base)
+    if head.endswith(".py"):
+        return f"{Path(head).name}:{tail}{options}"
     if head in _WITH_FILES and tail:
         return f"{head}:{Path(tail).name}{options}"
     return policy
@@ -148,14 +159,9 @@ def check_append(
 
 
 def append_results(
-    table: Path,
-    plan: EvaluationPlan,
-    results: Mapping[str, EvaluationResult],
-    ranking: Sequence[Rank],
-    *,
-    author: str,
+    table: Path, plan: EvaluationPlan, results: Results, ranking: Sequence[Rank], *, author: str
 ) -> dict[str, Path]:
-    """Adds a row per policy to a benchmark's table, and writes its page anew.
+    """Adds a row per policy to a benchmark's table, and writes its page again.
 
     A row of the same policy and author is replaced, which is logged; rows of other authors stay.
 
@@ -227,15 +233,12 @@ def page_of(table: Path) -> Path:
     >>> page_of(Path("docs/ae-bench/v1.csv")).as_posix(), page_of(Path("mine.csv")).as_posix()
     ('docs/ae-bench.md', 'mine.md')
     """
-    if table.parent.name == "ae-bench":
-        return table.parent.with_suffix(".md")
-    return table.with_suffix(".md")
+    folder = table.parent
+    return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
 
 
-def _row(
-    plan: EvaluationPlan, results: Mapping[str, EvaluationResult], one: Rank, author: str
-) -> dict[str, str]:
-    name, static = one.policy, results[static_condition(plan)]
+def _row(plan: EvaluationPlan, results: Results, one: Rank, author: str) -> dict[str, str]:
+    name, static = one.policy, results[plan.static_condition]
     track = static.tracks[name]
 
     def mean(key: str) -> float:
@@ -257,7 +260,7 @@ def _row(
         "ci95_high": high,
         "static": score("all"),
         "hard": score("hard") if static.hard.any() else None,
-        **{key: mean(key) for key in COLUMNS[8:14]},
+        **{key: mean(key) for key in _MEANS},
         "ms_alone": track.ms_alone,
     }
     return {
@@ -272,16 +275,20 @@ def _row(
     }
 
 
-def _shown(table: Path) -> str:
-    """The table's path as a reader has it: a full path is of one machine only."""
-    return table.name if table.is_absolute() else table.as_posix()
-
-
 def table_page(plan: EvaluationPlan, rows: Sequence[Mapping[str, str]], table: Path) -> str:
     """The page of a benchmark's table as Markdown."""
+
+    def shown(path: Path) -> str:  # a full path is of one machine only
+        return path.name if path.is_absolute() else path.as_posix()
+
+    head = [
+        *("policy", "score", "95 % interval", "static", "static, hard", "regret"),
+        *("within 1/3 EV", "frames to converge", "converged", "white", "ms alone", "seeds"),
+        *("author", "date", "version"),
+    ]
     body = [
         [
-            f"`{row['policy']}`",
+            escape(row["policy"]),
             row["normalised_score"],
             f"{row['ci95_low']} to {row['ci95_high']}" if row["ci95_low"] else "-",
             *(row[key] for key in ("static", "hard", "regret")),
@@ -290,35 +297,19 @@ def table_page(plan: EvaluationPlan, rows: Sequence[Mapping[str, str]], table: P
             f"{float(row['converged']):.0%}",
             f"{float(row['clipped_high']):.2%}",
             *(row["ms_alone"] or "-", row["training_seeds"]),
-            *(row[key].replace("|", "/") for key in ("author", "date", "version")),
+            *(escape(row[key]) for key in ("author", "date", "version")),
         ]
         for row in rows
     ]
-    head = [
-        *("policy", "score", "95 % interval", "static", "static, hard", "regret"),
-        *("within 1/3 EV", "frames to converge", "converged", "white", "ms alone", "seeds"),
-        *("author", "date", "version"),
-    ]
-    conditions = ", ".join(f"`{name}`" for name in plan.all_conditions)
-    lines = [
-        f"# {plan.name}",
-        "<!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->",
-        f"{len(plan.scene_ids)} bundled scenes that nothing was trained on, conditions "
-        f"{conditions}; starts {', '.join(plan.starts)}; {plan.frames} frames; scorer "
-        f"`{plan.environment.get('scorer', 'balanced')}`. Score: normalised score over all "
-        "conditions, each with the same weight; 0 is a random policy, 1 an oracle that is told the "
-        "best state of the last frame's light in every frame. What the columns mean: "
-        "[evaluation.md](evaluation.md). Times are those of each row's own machine (`cpu` in the "
-        "CSV file).",
-        "Add your own policy with one command:",
-        f"    ae-env evaluate --preset ae_bench_v1 --policy my.py:Mine \\\n"
-        f'        --append {_shown(table)} --author "Your name"',
-        "Its row replaces the one of the same policy and author, where there is one, and no other. "
-        "Send it as a pull request with the two files that the command changes, "
-        f"`{_shown(table)}` and `{_shown(page_of(table))}`, and, if it may be public, the "
-        "policy's file.",
-        f"The plan and the light of its scenes have the hash `{plan.hash}`, which every row "
-        "carries; a run under another one is refused.",
-        markdown_table(head, body),
-    ]
-    return "\n\n".join(lines) + "\n"
+    return _PAGE.format(
+        name=plan.name,
+        scenes=len(plan.scene_ids),
+        conditions=", ".join(f"`{name}`" for name in plan.all_conditions),
+        starts=", ".join(plan.starts),
+        frames=plan.frames,
+        scorer=plan.environment.get("scorer", "balanced"),
+        table=shown(table),
+        page=shown(page_of(table)),
+        hash=plan.hash,
+        rows=markdown_table(head, body),
+    )

@@ -1,0 +1,41 @@
+"""``ae-env bench``: the measurements whose results are in docs/results."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ae_env.utils.checks import check_word
+from agents.cli.console import Seed, make_folder
+
+BENCHMARKS = (
+    *("agents", "brackets", "colour_checker", "convergence", "defects", "scorers", "simulator"),
+    *("stability", "throughput", "work-precision"),
+)
+#: The checkout that this package runs from; the benchmarks are not installed with it.
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+def bench(
+    name: Annotated[str, typer.Argument(help=", ".join(BENCHMARKS))],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("docs/results"),
+    seed: Seed = 0,
+    quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
+) -> None:
+    """Run one of the measurements whose results are in docs/results.
+
+    Example: `ae-env bench throughput --quick --out /tmp/results`
+    """
+    check_word("name", name, BENCHMARKS)
+    if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
+        raise ValueError(
+            f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
+            "run this in a clone of the repository, installed with `pip install -e .`"
+        )
+    make_folder(out)
+    sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
+    importlib.import_module(f"benchmarks.{name.replace('-', '_')}").run(out, seed=seed, quick=quick)

@@ -1,0 +1,89 @@
+"""``ae-env sweep``: all exposure states of one raw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from agents.cli.console import (
+    Device,
+    Seed,
+    make_folder,
+    print_files,
+    progress_bars,
+    save_picture,
+    torch_device,
+)
+from agents.cli.simulate import Cache, Depth, Weights, make_simulator
+from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+
+if TYPE_CHECKING:
+    from ae_env.scenes import Scene
+
+#: Packed pixels a side of a picture on a contact sheet, at most.
+_SHEET_SIZE = 128
+
+
+def sweep(
+    raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("sweep"),
+    dngs: Annotated[bool, typer.Option(help="Also write the 64 DNGs, full size.")] = False,
+    seed: Seed = 0,
+    weights: Weights = "compact",
+    depth: Depth = "far",
+    tolerance: Annotated[
+        float, typer.Option(help="Of the DNGs: error to accept for speed, see simulate.")
+    ] = DEFAULT_TOLERANCE,
+    device: Device = "auto",
+    cache: Cache = True,
+) -> None:
+    """All 64 exposure states of one raw as a contact sheet, coloured by score.
+
+    Example: `ae-env sweep IMG_0001.CRW --out sweep`
+    """
+    from ae_env.grid import ExposureGrid
+    from ae_env.rendering import contact_sheet
+    from ae_env.scenes import Scene
+    from simulator import read_raw, write_dng
+
+    _check_depth(depth, weights)
+    check_tolerance(tolerance)
+    device = torch_device(device)
+    source = read_raw(raw)
+    make_folder(out)
+    scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth, cache)
+    sheet = out / "contact_sheet.png"
+    save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
+    files = {"contact sheet": sheet}
+    if dngs:
+        grid, simulator = ExposureGrid.default(), make_simulator(weights, device, cache)
+        prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
+        with progress_bars() as progress, progress("DNGs") as task:
+            for i, settings in enumerate(grid):
+                path = out / f"{raw.stem}-{i:02d}.dng"
+                write_dng(path, simulator.simulate(prepared, settings, seed=seed))
+                task(i + 1, len(grid))
+        files["DNGs"] = out
+    print_files(files)
+
+
+def _check_depth(depth: str, weights: str) -> None:
+    """Raises a `ValueError` if `depth` is unknown to us, or needs networks that are not there."""
+    if depth not in ("far", "unknown"):
+        raise ValueError(f"`depth` (={depth!r}) must be 'far' or 'unknown'")
+    if depth == "unknown" and weights == "none":
+        raise ValueError("`depth` (='unknown') needs networks: leave out `--weights none`")
+
+
+def _small_scene(scene: Scene, weights: str, depth: str, cache: bool) -> Scene:
+    """`scene` at the size of a contact sheet, with what the networks find out about it."""
+    from ae_env.scenes.loading import SceneNetworks
+
+    size = min(_SHEET_SIZE, *scene.light.shape[1:])
+    if weights == "none":
+        return scene.resized(size)
+    networks = SceneNetworks(weights, cache=cache)
+    small = networks.resized(scene, size) if depth == "unknown" else scene.resized(size)
+    return networks.denoised(small)

@@ -1,0 +1,237 @@
+"""The figures of an evaluation: scores, EV error over time, cost, and paths on contact sheets."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agents.evaluation import metrics
+from agents.evaluation.result import EvaluationResult
+from simulator.utils.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
+_DASHES = ("-", "--", ":", "-.")
+#: Colour, shape (for print without colour) and vertical offset of each part's marks.
+_PARTS = {
+    "all": ("#000000", "o", 0.0),
+    "hard": ("#D55E00", "v", 0.2),
+    "rest": ("#0072B2", "^", -0.2),
+    "all conditions": ("#009E73", "s", 0.38),
+}
+#: Panels in a row of the plot of EV errors.
+_COLUMNS = 4
+#: Paths on one contact sheet, and frames of a path.
+_PATHS, _PATH_FRAMES = 5, 8
+#: The kind of scene whose contact sheet is shown, where there is one.
+_KIND = "back_light"
+
+
+def plot_scores(path: Path, rows: Sequence[Mapping[str, Any]], title: str = "") -> Path:
+    """Draw the normalised score of each policy, a mark per part, and write it as PNG.
+
+    Args:
+        path: File to write.
+        rows: As `result_rows` returns them; those of other conditions are left out.
+        title: Text above the figure.
+    """
+    overall = {r["policy"]: r["normalised_score"] for r in rows if r["condition"] == "all"}
+    names = sorted((n for n in overall if n != "oracle"), key=lambda n: overall[n])
+    figure = _figure(7.5, 1.6 + 0.42 * len(names))
+    axes = figure.add_subplot()
+    shown = [part for part in _PARTS if any(r["condition"] == part for r in rows)]
+    for part in shown:
+        colour, marker, offset = _PARTS[part]
+        own = {r["policy"]: r for r in rows if r["condition"] == part}
+        heights = {n: i + (offset if len(shown) > 1 else 0.0) for i, n in enumerate(names)}
+        groups = next(iter(own.values()))["num_groups"]
+        for name in names:
+            if name in own and own[name]["ci95"] is not None:
+                interval = own[name]["ci95"]
+                axes.plot(interval, [heights[name]] * 2, color=colour, lw=1.6, alpha=0.6)
+        axes.plot(
+            [own[name]["normalised_score"] for name in names if name in own],
+            [heights[name] for name in names if name in own],
+            color=colour,
+            marker=marker,
+            linestyle="none",
+            markersize=6,
+            label=f"{part} ({groups} groups)",
+        )
+    axes.axvline(1.0, color="0.35", lw=1.0)
+    axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
+    axes.axvline(0.0, color="0.75", lw=1.0, ls=":")
+    axes.set_yticks(range(len(names)), [_text(name) for name in names])
+    axes.set_ylim(-0.6, len(names) - 0.4)
+    axes.set_xlabel("normalised score (random 0, oracle 1); bars: 95 % interval")
+    axes.grid(axis="x", color="0.92")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    columns = 2 if len(shown) > 3 else 3
+    axes.legend(loc="lower center", bbox_to_anchor=(0.4, 1.0), ncols=columns, frameon=False)
+    if title:
+        figure.suptitle(_text(title), fontsize=11)
+    return _write(path, figure)
+
+
+def plot_convergence(
+    path: Path, results: Mapping[str, EvaluationResult], order: Sequence[str]
+) -> Path:
+    """Draw the mean EV error of every frame, a panel per condition, and write it as PNG.
+
+    Args:
+        path: File to write.
+        results: By condition.
+        order: Policies, the best first.
+    """
+    columns = min(_COLUMNS, len(results))
+    rows = -(-len(results) // columns)
+    figure = _figure(3.1 * columns + 1.0, 2.1 * rows + 1.2)
+    panels = figure.subplots(rows, columns, sharey=True, sharex=True, squeeze=False)
+    lines: list[Any] = []
+    for panel, (name, result) in zip(panels.flat, results.items(), strict=False):
+        lines = []
+        for i, policy in enumerate(order):
+            errors = result.episode_metrics(policy)["ev_error"].mean(axis=0)  # (E, T)
+            means = metrics.group_means(errors.T, result.groups)[0].mean(axis=-1)
+            frames = np.arange(1, len(means) + 1)
+            lines += panel.plot(frames, means, lw=1.3, **line_style(i))
+        panel.set_title(name, fontsize=9)
+        panel.set_yscale("symlog", linthresh=1.0, linscale=1.0)
+        panel.set_yticks([0, 1, 2, 4, 8, 16], ["0", "1", "2", "4", "8", "16"], fontsize=8)
+        panel.set_ylim(0, None)
+        panel.xaxis.get_major_locator().set_params(integer=True)
+        panel.grid(color="0.93")
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.tick_params(labelsize=8)
+    for panel in panels.flat[len(results) :]:
+        panel.set_visible(False)
+    for panel in panels[-1]:
+        panel.set_xlabel("frame", fontsize=9)
+    figure.supylabel("mean EV error [EV]", fontsize=9)
+    labels, wide = [_text(policy) for policy in order], min(5, len(order))
+    figure.legend(lines, labels, loc="outside lower center", ncols=wide, fontsize=8)
+    return _write(path, figure)
+
+
+def line_style(index: int) -> dict[str, str]:
+    """Colour and dashes of a policy by its position in the ranking."""
+    dashes = _DASHES[index // len(PALETTE) % len(_DASHES)]
+    return {"color": PALETTE[index % len(PALETTE)], "linestyle": dashes}
+
+
+def pareto_front(costs: Mapping[str, float], scores: Mapping[str, float]) -> list[str]:
+    """Names that no other beats in both cost and score, the cheapest first.
+
+    >>> pareto_front({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 0.5, "b": 0.4, "c": 0.9})
+    ['a', 'c']
+    """
+    front: list[str] = []
+    for name in sorted(costs, key=lambda n: (costs[n], -scores[n])):
+        if not front or scores[name] > scores[front[-1]]:
+            front.append(name)
+    return front
+
+
+def plot_cost(path: Path, costs: Mapping[str, float], scores: Mapping[str, float]) -> Path:
+    """Draw normalised score against the time of one decision and write it as PNG.
+
+    Args:
+        path: File to write.
+        costs: Time in `act` for one camera alone by policy [ms].
+        scores: Normalised score by policy, the best first.
+    """
+    figure = _figure(7.5, 4.6)
+    axes = figure.add_subplot()
+    front = pareto_front(costs, scores)
+    axes.step(
+        [costs[n] for n in front],
+        [scores[n] for n in front],
+        where="post",
+        color="0.6",
+        lw=1.0,
+        label="nothing else is both faster and better",
+    )
+    for i, name in enumerate(scores):
+        position = costs[name], scores[name]
+        axes.plot(*position, "o", color=line_style(i)["color"], markersize=6)
+        offset = (5, 3 if i % 2 else -9)
+        axes.annotate(_text(name), position, xytext=offset, textcoords="offset points", fontsize=7)
+    axes.set_xscale("log")
+    axes.margins(x=0.18)
+    axes.set_xlabel("time of a decision for one camera alone [ms]")
+    axes.set_ylabel("normalised score (random 0, oracle 1)")
+    axes.grid(color="0.93")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    return _write(path, figure)
+
+
+def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) -> dict[str, Path]:
+    """Write contact sheets of one scene's states with the paths of the policies.
+
+    Args:
+        folder: Folder of ``contact_sheet.png``, and of ``contact_sheet_2.png`` and so on for
+            further policies.
+        result: The results in unchanging light.
+        order: Policies, the best first.
+
+    Returns:
+        The files by name; none where the scenes are not known, or the grid has more states than a
+        sheet shows.
+    """
+    from ae_env.rendering import MAX_SHEET_STATES, contact_sheet
+
+    if result.plan is None or not result.scenes or len(result.grid) > MAX_SHEET_STATES:
+        return {}
+    kinds = result.kinds.tolist()
+    episode = kinds.index(_KIND) if _KIND in kinds else 0
+    options = result.plan.options()
+    speed, defocus = (
+        0.0 if v is None else float(v[episode]) for v in (result.speed, result.defocus)
+    )
+    files = {}
+    for k, first in enumerate(range(0, len(order), _PATHS)):
+        paths = {}
+        for name in order[first : first + _PATHS]:
+            states = result.tracks[name].states[0, episode, :_PATH_FRAMES]
+            paths[name] = [int(result.start_states[episode]), *map(int, states)]
+        picture = contact_sheet(
+            result.scenes[episode],
+            camera=options.make_camera(),
+            grid=result.grid,
+            scorer=options.make_scorer(),
+            path=paths,
+            speed=speed,
+            defocus=defocus,
+        )
+        stream = io.BytesIO()
+        picture.save(stream, format="PNG")
+        name = "contact_sheet.png" if k == 0 else f"contact_sheet_{k + 1}.png"
+        files[name] = write_atomically(folder / name, stream.getvalue())
+    return files
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _text(name: str) -> str:
+    """A name as Matplotlib shows it: without formulas."""
+    return name.replace("$", r"\$")
+
+
+def _write(path: Path, figure: Figure) -> Path:
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png")
+    return write_atomically(path, picture.getvalue())

@@ -1,0 +1,47 @@
+"""`ae-env bench` runs the benchmarks of its own checkout, and no others."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from agents.cli import bench
+
+OURS = "def run(out, *, seed, quick): (out / 'ours').write_text(f'{seed} {quick}')\n"
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A checkout, and benchmarks of the user's own where Python looks first."""
+    for folder, code in (("checkout", OURS), ("mine", "raise RuntimeError('not ours')")):
+        (tmp_path / folder / "benchmarks").mkdir(parents=True)
+        (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")
+        (tmp_path / folder / "benchmarks" / "convergence.py").write_text(code)
+    loaded = {name: sys.modules.pop(name) for name in list(sys.modules) if "benchmarks" in name}
+    monkeypatch.syspath_prepend(tmp_path / "mine")  # takes back what is added to the path, too
+    monkeypatch.setattr(bench, "CHECKOUT", tmp_path / "checkout")
+    yield
+    for name in [name for name in sys.modules if "benchmarks" in name]:
+        del sys.modules[name]
+    sys.modules.update(loaded)
+
+
+def test_the_working_folder_does_not_matter(ae_env, folders, tmp_path):
+    code, _, _ = ae_env("bench", "convergence", "--quick", "--seed", 3, "--out", "here")
+    assert code == 0
+    assert (tmp_path / "here" / "ours").read_text() == "3 True"
+
+
+def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "CHECKOUT", tmp_path / "site-packages")
+    code, _, error = ae_env("bench", "throughput")
+    assert code == 2
+    assert "the benchmarks are not part of the installed package" in error
+    assert "pip install -e ." in error
+
+
+def test_the_checkout_is_the_packages_own():
+    assert Path(bench.__file__).resolve() == (bench.CHECKOUT / "agents" / "cli" / "bench.py")

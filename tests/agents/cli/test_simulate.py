@@ -1,0 +1,163 @@
+"""`ae-env simulate` and `ae-env sweep`, without networks and with them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
+from simulator.networks.weights import build_modules, save_modules
+
+
+@pytest.fixture
+def noisy(tmp_path: Path) -> Path:
+    light = np.random.default_rng(0).uniform(0.05, 0.4, (4, 40, 44)).astype(np.float32)
+    raw = RawImage(light, CameraSettings(6400, 1 / 64, 8), get_camera("nikon_z6"))
+    write_dng(tmp_path / "IMG_1.dng", raw)
+    return tmp_path / "IMG_1.dng"
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights that do something."""
+    torch.manual_seed(0)
+    modules = build_modules("compact").requires_grad_(False)
+    modules["noise"].network.tail.weight.mul_(5)
+    modules["aperture"].network.tail.bias.fill_(1.5)
+    path = tmp_path_factory.mktemp("networks") / "net.safetensors"
+    save_modules(path, modules, "compact", {})
+    return path
+
+
+def test_a_raw_at_other_settings(ae_env, raw: RawImage, dng: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new folder" / "out [1].dng"
+    arguments = ("--iso", 1600, "--shutter", "1/250", "--aperture", 8, "--seed", 3)
+    code, text, _ = ae_env("simulate", dng, *arguments, "-o", out, "--png", tmp_path / "a.png")
+    assert code == 0
+    assert f"wrote DNG: {out}" in text
+    assert "nikon_z6" in text
+    back = read_raw(out)
+    assert back.settings == CameraSettings(1600, 1 / 250, 8)
+    assert back.data.shape == raw.data.shape
+    # Light goes with ISO * time / N^2 (marked f-numbers are rounded: 5.6 stands for 4 sqrt 2).
+    ratio = (1600 / 400) * (64 / 250) * (32 / 64)
+    means = back.data.mean(dim=(1, 2)) / raw.data.mean(dim=(1, 2))
+    np.testing.assert_allclose(means.numpy(), ratio, rtol=0.01)
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.size == (240, 200)
+    first = out.read_bytes()
+    ae_env("simulate", dng, *arguments, "-o", out)
+    assert read_raw(out).data.equal(back.data)
+    assert len(first) == len(out.read_bytes())
+    ae_env("simulate", dng, *arguments[:-1], 4, "-o", out)
+    assert not read_raw(out).data.equal(back.data)
+
+
+def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
+    code, text, _ = ae_env("sweep", dng, "--out", tmp_path / "sweep", "--dngs")
+    assert code == 0
+    assert "contact sheet" in text
+    with Image.open(tmp_path / "sweep" / "contact_sheet.png") as sheet:
+        assert min(sheet.size) > 300
+    files = sorted((tmp_path / "sweep").glob("*.dng"))
+    assert [path.name for path in files] == [f"IMG_1-{i:02d}.dng" for i in range(64)]
+    assert read_raw(files[0]).settings == CameraSettings(100, 1 / 1000, 4)
+    assert read_raw(files[63]).settings == CameraSettings(6400, 1 / 2, 11)
+
+
+def simulated(ae_env, noisy: Path, *options: object, iso: int = 100, aperture: int = 8):
+    state = ("--iso", iso, "--shutter", "1", "--aperture", aperture)
+    return ae_env("simulate", noisy, *state, "-o", "out.dng", "--device", "cpu", *options)
+
+
+def test_simulate_with_networks(ae_env, noisy: Path, networks: Path, tmp_path: Path) -> None:
+    code, text, _ = simulated(ae_env, noisy, "--weights", networks)
+    assert code == 0
+    assert re.search(r"runs +exposure -> noise_reduction -> noise", text)
+    written = read_raw(tmp_path / "out.dng").data
+    simulator = CameraSimulator.from_pretrained(networks, device="cpu")
+    expected = simulator.simulate(read_raw(noisy), CameraSettings(100, 1, 8), seed=0).data
+    torch.testing.assert_close(written, expected, atol=1e-6, rtol=0)
+
+
+def test_networks_run_once_for_a_raw(
+    ae_env, noisy: Path, networks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "kept"))
+    target = ("--iso", 100, "--shutter", "1/8", "--aperture", 8, "--weights", networks)
+    simulate = ("simulate", noisy, *target, "--depth", "unknown")
+    sweep = ("sweep", noisy, "--weights", networks, "--depth", "unknown")
+    for command in (simulate, sweep):
+        assert ae_env(*command, "--no-cache")[0] == 0
+    assert not (tmp_path / "kept" / "denoised").exists()
+    assert not (tmp_path / "kept" / "defocus_maps").exists()
+    assert ae_env(*simulate, "-o", "first.dng")[0] == 0
+    assert ae_env(*sweep, "--out", "first")[0] == 0
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a network ran again")
+
+    monkeypatch.setattr(CameraSimulator, "denoise", refuse)
+    monkeypatch.setattr(CameraSimulator, "estimate_defocus", refuse)
+    assert ae_env(*simulate, "-o", "second.dng")[0] == 0
+    assert ae_env(*sweep, "--out", "second")[0] == 0
+    assert Path("first.dng").read_bytes() == Path("second.dng").read_bytes()
+    first, second = (Path(f, "contact_sheet.png").read_bytes() for f in ("first", "second"))
+    assert first == second
+
+
+def test_simulate_within_a_tolerance(ae_env, noisy: Path, networks: Path, tmp_path: Path) -> None:
+    """A target as noisy as the source: denoised only where nothing is to be left in."""
+    written = {}
+    for tolerance in (0, 0.1):
+        options = ("--weights", networks, "--tolerance", tolerance, "--shutter", "1/100")
+        code, text, _ = simulated(ae_env, noisy, *options, iso=6400)
+        assert code == 0
+        assert f"(tolerance {tolerance})" in text
+        assert ("runs      exposure -> noise_reduction" in text) == (tolerance == 0)
+        simulator = CameraSimulator.from_pretrained(networks, device="cpu")
+        settings = CameraSettings(6400, 1 / 100, 8)
+        expected = simulator.simulate(read_raw(noisy), settings, tolerance=tolerance).data
+        written[tolerance] = read_raw(tmp_path / "out.dng").data
+        torch.testing.assert_close(written[tolerance], expected, atol=1e-6, rtol=0)
+    assert not torch.equal(written[0], written[0.1])
+
+
+def test_simulate_with_unknown_depth(ae_env, noisy: Path, networks: Path, tmp_path: Path) -> None:
+    code, text, _ = simulated(
+        ae_env, noisy, "--weights", networks, "--depth", "unknown", aperture=4
+    )
+    assert code == 0
+    assert re.search(r"runs .*noise_reduction -> aperture", text)
+    blurred = read_raw(tmp_path / "out.dng").data
+    simulated(ae_env, noisy, "--weights", networks, aperture=4)
+    sharp = read_raw(tmp_path / "out.dng").data
+    assert blurred.diff(dim=-1).abs().mean() < 0.9 * sharp.diff(dim=-1).abs().mean()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--weights", "none.safetensors"), "there is no none.json"),
+        (("--weights", "none", "--depth", "unknown"), "`depth` (='unknown') needs an aperture"),
+        (("--depth", "near", "--weights", "none"), "`depth` (='near') must be one of"),
+    ],
+)
+def test_errors_of_simulated(ae_env, noisy: Path, options, message: str, tmp_path: Path) -> None:
+    code, _, error = simulated(ae_env, noisy, *options)
+    assert code == 2
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out.dng").exists()
+
+
+def test_a_baseline_cannot_simulated(ae_env, noisy: Path, tmp_path: Path) -> None:
+    save_modules(tmp_path / "pc", build_modules("pc"), "pc", {})
+    code, _, error = simulated(ae_env, noisy, "--weights", tmp_path / "pc.safetensors")
+    assert code == 2
+    assert "holds the baseline 'pc'" in error

@@ -1,0 +1,100 @@
+"""`ae-env train-simulator`: stopped and resumed, its options, its scenes."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from agents.cli import train_simulator
+from agents.cli.train_simulator import reference_scenes_of
+from simulator import CameraSimulator
+from simulator.networks.weights import load_modules
+from simulator.training.config import SimulatorConfig, StageConfig
+from simulator.training.data import ReferencePairs
+
+TINY = """\
+preset: compact
+scenes: {procedural: 4, size: 32}
+exposure: {steps: 2, batch: 2, crop: 16}
+noise: {steps: 2, batch: 2, crop: 16}
+aperture: {steps: 2, batch: 2, crop: 16}
+"""
+
+
+@pytest.fixture(autouse=True)
+def tiny_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    (tmp_path / "tiny.yaml").write_text(TINY)
+
+
+def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the second stage; the same command finishes, and simulate takes the result."""
+    real, steps = ReferencePairs.batch, []
+
+    def batch(self, step, *arguments, **options):
+        steps.append((self.stage, step))
+        if steps.count(("noise", 1)) == 1 and steps[-1] == ("noise", 1):
+            raise KeyboardInterrupt
+        return real(self, step, *arguments, **options)
+
+    monkeypatch.setattr(ReferencePairs, "batch", batch)
+    arguments = ("train-simulator", "tiny.yaml", "--device", "cpu")
+    code, _, error = ae_env(*arguments)
+    assert code == 130
+    assert error == "\nstopped; the same command goes on where it was\n"
+    before = len(steps)
+    code, text, error = ae_env(*arguments)
+    assert (code, error) == (0, "")
+    trained = [s for s in steps[before:] if s[1] < 2]
+    assert trained[:2] == [("exposure", 0), ("exposure", 1)]  # its validation, not its training
+    folder = tmp_path / "runs" / "simulator" / "tiny"
+    weights = folder / "compact.safetensors"
+    relative = weights.relative_to(tmp_path)
+    assert f"wrote weights: {relative}" in text
+    assert f"wrote model card: {relative.with_suffix('.json')}" in text
+    assert f"next: ae-env simulate RAW --weights {relative} ..." in text
+    assert list(folder.glob("tensorboard/**/events.out*"))
+    _, card = load_modules(weights)
+    assert card["command"] == "ae-env train-simulator tiny.yaml --device cpu"
+    assert [stage["steps"] for stage in card["stages"].values()] == [2, 2, 2]
+    assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
+
+
+def test_options_of_a_training(ae_env, tmp_path: Path) -> None:
+    (tmp_path / "pc.yaml").write_text(
+        "preset: pc\nscenes: {procedural: 2, size: 32}\nbaseline: {steps: 1, batch: 2, crop: 16}\n"
+    )
+    arguments = ("pc.yaml", "--out", "here", "--seed", 5, "--no-tensorboard", "--device", "cpu")
+    code, text, _ = ae_env("train-simulator", *arguments)
+    assert code == 0
+    assert "next:" not in text  # a baseline simulates nothing
+    names = {p.name for p in (tmp_path / "here").iterdir()}
+    assert names == {"baseline.checkpoint", "pc.json", "pc.safetensors"}
+    assert json.loads((tmp_path / "here" / "pc.json").read_text())["training"]["seed"] == 5
+
+
+def config(**scenes: object) -> SimulatorConfig:
+    stage = StageConfig(steps=1, crop=16)
+    return SimulatorConfig.model_validate(
+        {"preset": "pc", "scenes": {"size": 32, **scenes}, "baseline": stage}
+    )
+
+
+def test_scenes_of_a_training() -> None:
+    splits = {s: reference_scenes_of(config(procedural=4), s) for s in ("train", "validation")}
+    groups = {split: {scene.group for scene in scenes} for split, scenes in splits.items()}
+    assert not groups["train"] & groups["validation"]
+    # Three of four procedural scenes have depth; the fourth is draped over two depths.
+    deep = {
+        split: Counter(s.kind for s in scenes if s.depth is not None)
+        for split, scenes in splits.items()
+    }
+    assert deep == {"train": {"depth": 3, "draped": 2}, "validation": {"depth": 2}}
+    for scenes in splits.values():
+        sizes = {s.kind == "draped": s.light.shape for s in scenes}
+        assert sizes[False] == (4, 32, 32)
+        assert sizes.get(True, (4, 16, 16)) == (4, 16, 16)
+        assert all(s.illuminance is not None for s in scenes)

@@ -1,0 +1,205 @@
+"""`evaluate`: every policy on the same episodes, whatever the batch or the forbidden states."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from agents import Policy, evaluate, fit_policies, make_policy, run_plan
+from agents.episodes import make_envs
+from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
+from agents.policy import PolicyContext
+from simulator import CameraSettings, RawImage, get_camera, write_dng
+
+OPTIONS = {"scenes": "bundled:small", "split": "test", "resolution": 36}
+
+
+@pytest.fixture(scope="module")
+def small() -> PolicyContext:
+    envs = make_envs(OPTIONS, num_envs=4, frames=2)
+    context = PolicyContext.from_envs(envs)
+    envs.close()
+    return context
+
+
+@pytest.fixture(scope="module")
+def result(small):
+    policies = {n: make_policy(n, small) for n in ("random", "oracle", "matrix:P")}
+    policies["random*3"] = [make_policy("random", small) for _ in range(3)]
+    calls = []
+    found = evaluate(
+        policies,
+        OPTIONS,
+        episodes_per_scene=2,
+        frames=3,
+        batch=7,
+        progress=lambda *a: calls.append(a),
+    )
+    assert calls[-1][0] == calls[-1][1]
+    assert calls[-1][2] == "random*3"
+    return found
+
+
+def test_shapes_and_oracle(result):
+    episodes = len(result.scene_ids)
+    assert result.scores.shape == result.allowed.shape == (episodes, 3, 64)
+    assert result.tracks["random*3"].states.shape == (3, episodes, 3)
+    assert len(set(result.scene_ids.tolist())) == episodes // 2
+    np.testing.assert_array_equal(
+        result.tracks["oracle"].states[0], np.repeat(result.oracle_states[:, None], 3, axis=1)
+    )
+    assert result.tracks["oracle"].privileged
+    assert result.tracks["matrix:P"].ms_alone > 0
+    oracle = result.episode_metrics("oracle")
+    assert np.abs(oracle["regret"]).max() < 1e-12
+    assert oracle["ev_error"].max() == 0.0
+
+
+def test_the_batch_size_changes_nothing_and_a_plan_is_the_same(small, result, tmp_path):
+    policies = {"matrix:P": make_policy("matrix:P", small)}
+    again = evaluate(policies, OPTIONS, episodes_per_scene=2, frames=3, batch=32)
+    plan = EvaluationPlan(
+        environment=OPTIONS, starts=("random",), seeds=(0, 1), frames=3, policies=("matrix:P",)
+    )
+    for other in (again, run_plan(plan, tmp_path)["static"]):
+        for name in ("scene_ids", "start_states", "scores", "hard", "groups", "speed", "defocus"):
+            np.testing.assert_array_equal(getattr(other, name), getattr(result, name))
+        for name in ("states", "image_mean", "clipped_high"):
+            tracks = (one.tracks["matrix:P"] for one in (other, result))
+            np.testing.assert_array_equal(*(getattr(track, name) for track in tracks))
+
+
+# -- policies that do what they must not ----------------------------------------------------------
+
+
+class Bad(Policy):
+    answer: object = None
+
+    def act(self, observations, action_masks=None):
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (np.zeros(3, int), r"must return 8 integers, one per camera"),
+        (np.zeros(8), r"dtype float64"),
+        (np.full(8, 64), r"state 64 is not in \[0, 64\)"),
+        (np.full(8, -1), r"state -1 is not in \[0, 64\)"),
+        ([[0], [0, 1]], r"must return 8 integers"),
+        (torch.zeros(8, requires_grad=True), r"must return 8 integers"),
+        (None, r"must return 8 integers"),
+    ],
+)
+def test_wrong_actions_name_the_policy(small, answer, message):
+    policy = Bad(small)
+    policy.answer = answer
+    scenes = plan_scenes(EvaluationPlan(environment=OPTIONS, max_scenes=8))
+    with pytest.raises(ValueError, match=f"policy 'mine'.*{message}"):
+        evaluate({"mine": policy}, {**OPTIONS, "scenes": scenes}, frames=1)
+
+
+def test_arguments_are_checked(small):
+    policies = {"random": make_policy("random", small)}
+    for name, value in (("frames", 0), ("seed", -1), ("batch", 0), ("episodes_per_scene", 1.5)):
+        with pytest.raises(ValueError, match=rf"`{name}` \(={value}\)"):
+            evaluate(policies, OPTIONS, **{name: value})
+    with pytest.raises(ValueError, match="did you mean `scenes`"):
+        evaluate(policies, {"scens": "bundled"})
+    with pytest.raises(ValueError, match="`policies`"):
+        evaluate({}, OPTIONS)
+
+
+# -- states that a scene forbids ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def holes() -> dict:
+    """Scenes that allow a third of the states each, another third every time."""
+    scenes = plan_scenes(EvaluationPlan(environment=OPTIONS, max_scenes=6))
+    masks = [np.arange(64) % 3 == i % 3 for i in range(6)]
+    scenes = [dataclasses.replace(s, allowed=m) for s, m in zip(scenes, masks, strict=True)]
+    return {**OPTIONS, "scenes": scenes}
+
+
+def test_no_policy_chooses_a_forbidden_state(small, holes):
+    names = ("random", "best_fixed", "oracle", "spot:P", "zhang:A", "average:S", "matrix:M")
+    policies = {n: make_policy(n, small) for n in (*names, "average:tuned", "rpi_agc")}
+    policies["best_fixed"].mean_scores = np.linspace(0, 1, 64)
+    fit_policies({"tuned": policies["average:tuned"]}, OPTIONS, batch=20)
+    result = evaluate(policies, holes, frames=4, episodes_per_scene=2, batch=5)
+    allowed = result.allowed[:, 0]
+    assert (allowed.sum(axis=1) <= 22).all()
+    rows = np.arange(len(allowed))
+    assert allowed[rows, result.start_states].all()
+    for name, track in result.tracks.items():
+        for t in range(4):
+            assert allowed[rows, track.states[0, :, t]].all(), name
+    assert (result.tracks["best_fixed"].states[0, :, 0] >= 61).all()
+    # The oracle is the best of the allowed states, and random the mean over them.
+    best = np.where(allowed, result.scores[:, 0], -1.0).max(axis=1)
+    np.testing.assert_allclose(result.oracle, best, atol=1e-7)
+    assert np.abs(result.episode_metrics("oracle")["regret"]).max() < 1e-6
+    mean = (result.scores[:, 0] * allowed).sum(axis=1) / allowed.sum(axis=1)
+    np.testing.assert_allclose(result.random, mean)
+    assert (result.scores[:, 0].max(axis=1) > best + 1e-3).any()  # a forbidden one would be better
+
+
+def test_a_forbidden_choice_is_refused(small, holes):
+    policy = Bad(small)
+    policy.answer = np.zeros(6, int)
+    with pytest.raises(ValueError, match="policy 'mine': state 0 is masked in this scene"):
+        evaluate({"mine": policy}, holes, frames=1)
+
+
+# -- delays, fits, sequences ----------------------------------------------------------------------
+
+
+def test_delay_scores_the_frame_that_was_exposed(small):
+    options = {**OPTIONS, "delay": 1}
+    result = evaluate({"oracle": make_policy("oracle", small)}, options, frames=3, batch=8)
+    states = result.tracks["oracle"].states[0]
+    np.testing.assert_array_equal(states[:, 0], result.start_states)
+    np.testing.assert_array_equal(states[:, 1], result.oracle_states)
+    found = result.episode_metrics("oracle")
+    np.testing.assert_allclose(found["regret_delayed"], 0.0, atol=1e-12)
+    assert found["regret"].mean() > 0.01
+
+
+def test_fit_makes_tuned_and_fixed_policies_better_than_random(small):
+    names = ("best_fixed", "average:tuned", "average:tuned_blind", "random", "average:P")
+    policies = {n: make_policy(n, small) for n in names}
+    options = {**OPTIONS, "split": "train"}
+    fit_policies(policies, options, seed=1, batch=20)
+    result = evaluate(policies, options, frames=3, batch=20, seed=77)
+    score = {n: float(result.episode_metrics(n)["score"].mean()) for n in names}
+    assert score["average:tuned"] > score["average:P"] > score["random"]
+    assert score["best_fixed"] > score["random"]
+    assert policies["average:tuned"].regression.features.shape[1] == 3
+    assert policies["average:tuned_blind"].regression.features.shape[1] == 1
+    again = make_policy("average:tuned", small)
+    fit_policies({"again": again}, options, seed=1, batch=7)
+    np.testing.assert_array_equal(
+        again.regression.scores, policies["average:tuned"].regression.scores
+    )
+
+
+def test_a_recorded_sequence_is_watched_frame_by_frame(tmp_path):
+    """Three raws, each twice as bright as the last one: one episode, whose scores change."""
+    camera = get_camera("nikon_z6")
+    for i in range(3):
+        light = torch.full((4, 40, 40), 0.05) * 2.0**i
+        write_dng(tmp_path / f"{i}.dng", RawImage(light, CameraSettings(100, 1 / 64, 5.6), camera))
+    options = {"scenes": {"sequence": str(tmp_path)}, "resolution": 36, "split": "all"}
+    envs = make_envs({**options, "split": "all"}, num_envs=1, frames=1)
+    policy = make_policy(f"recorded:{tmp_path}", PolicyContext.from_envs(envs))
+    envs.close()
+    result = evaluate({"recorded": policy}, options, frames=3)
+    assert result.scores.shape == (1, 3, 64)
+    best = result.grid.ev100[result.scores[0].argmax(axis=-1)]
+    assert best[1] > best[0] - 0.1
+    assert not np.array_equal(result.scores[0, 0], result.scores[0, 1])
+    np.testing.assert_array_equal(result.scores[0, 1], result.scores[0, 2])  # the last one stays

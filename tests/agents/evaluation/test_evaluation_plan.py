@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from agents.evaluation.evaluation_plan import (
+    Condition,
+    EvaluationPlan,
+    digest,
+    groups_in_turn,
+    load_plan,
+    plan_episodes,
+    plan_scenes,
+    start_state,
+)
+
+PLAN = EvaluationPlan(
+    environment={"scenes": "bundled:small", "split": "test", "resolution": 36}, max_scenes=5
+)
+
+
+def test_delays_multiply_the_conditions_that_have_none_of_their_own():
+    plan = EvaluationPlan(
+        conditions={"late": Condition(delay=3), "static": Condition()}, delays=(0, 2)
+    )
+    found = {name: c.delay for name, c in plan.all_conditions.items()}
+    assert found == {"late": 3, "static": 0, "static/delay2": 2}
+    assert [name for name, c in plan.all_conditions.items() if c.at_rest] == ["static"]
+    assert plan.static_condition == "static"
+    changing = EvaluationPlan(conditions={"sine": Condition(lighting="sine")})
+    assert changing.static_condition == "sine"  # there is no other
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"starts": ["drak"]}, r"`starts` \(='drak'\).*did you mean 'dark'"),
+        ({"starts": []}, "`starts` must have one entry or more"),
+        ({"seeds": [0, 0]}, "must not have an entry twice"),
+        ({"seeds": [-1]}, r"must be in \[0, 4294967295\]"),
+        ({"frames": 0}, "greater than or equal to 1"),
+        ({"conditions": {"hard": {}}}, "none of"),
+        ({"conditions": {"a": {"lighting": "disco"}}}, "condition 'a': `lighting`"),
+        ({"conditions": {"a": {"delay": 99}}}, "less than or equal to 16"),
+        ({"environment": {"lighting": "sine"}}, "must not have `lighting`"),
+        ({"environment": {"scorrer": "noise"}}, "did you mean `scorer`"),
+        ({"polices": ["random"]}, "Extra inputs"),
+    ],
+)
+def test_mistakes_in_a_plan_are_told(entries, message):
+    with pytest.raises(ValueError, match=message):
+        EvaluationPlan.model_validate(entries)
+
+
+@pytest.mark.parametrize(("name", "conditions"), [("quick", 4), ("standard", 28)])
+def test_presets_are_valid(name, conditions):
+    plan = load_plan(name)
+    assert plan.policies
+    assert len(plan.all_conditions) == conditions
+
+
+def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
+    first = PLAN.model_dump(mode="json")
+    turned = dict(reversed([*first.items()]))
+    again = EvaluationPlan.model_validate({**turned, "policies": ["spot:P"], "hash": "x"})
+    assert digest(again.protocol()) == digest(PLAN.protocol())
+    assert digest(PLAN.changed(frames=9).protocol()) != digest(PLAN.protocol())
+    assert digest(1, "a") != digest("1a")
+    # Of the plan as it was when AE-Bench v1 was published: its hash must not move.
+    found = digest(load_plan("ae_bench_v1").protocol())
+    assert found == "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd"
+
+
+def test_objects_of_a_callers_own_are_described_but_are_no_protocol():
+    plan = PLAN.changed(environment={**PLAN.environment, "scenes": plan_scenes(PLAN)[:1]})
+    assert "dead_leaves" in str(plan.describe()["environment"]["scenes"])
+    with pytest.raises(ValueError, match="must be a JSON value"):
+        plan.protocol()
+
+
+def test_starts_are_the_ends_of_the_grid_and_the_right_exposure():
+    scenes, grid = plan_scenes(PLAN), PLAN.options().make_grid()
+    scene = scenes[0]
+    dark, middle, bright = (start_state(s, scene, grid) for s in ("dark", "middle", "bright"))
+    # f/11 (11.3), 1/1000 s, ISO 100 and f/4, 1/2 s, ISO 6400.
+    assert grid.ev100[dark] == pytest.approx(np.log2(128 * 1000), abs=0.01)
+    assert grid.ev100[bright] == pytest.approx(np.log2(16 * 2 / 64), abs=0.01)
+    assert abs(grid.ev100[middle] - scene.ev100) == np.abs(grid.ev100 - scene.ev100).min()
+    assert start_state("random", scene, grid) is None
+    allowed = np.ones(64, bool)
+    allowed[[dark, middle]] = False
+    holes = dataclasses.replace(scene, allowed=allowed)
+    assert grid.ev100[start_state("dark", holes, grid)] == pytest.approx(16, abs=0.1)
+    assert start_state("middle", holes, grid) != middle
+
+
+def test_episodes_of_another_start_share_everything_but_the_start():
+    scenes, grid = plan_scenes(PLAN), PLAN.options().make_grid()
+    plan = PLAN.changed(seeds=(0, 7), starts=("dark", "bright"))
+    episodes = plan_episodes(plan, scenes, grid)
+    assert len(episodes) == 2 * 2 * 5
+    assert episodes.seeds[:10] == episodes.seeds[10:]
+    assert len(set(episodes.seeds)) == 10
+    assert episodes.seeds[5] == 7 * 2**20
+    assert episodes.starts[:10] != episodes.starts[10:]
+    assert episodes.scene.tolist() == [0, 1, 2, 3, 4] * 4
+
+
+def test_fewer_scenes_take_kinds_and_groups_in_turn():
+    scenes = plan_scenes(PLAN.changed(max_scenes=None))
+    kinds = {scene.kind for scene in scenes}
+    few = groups_in_turn(scenes, len(kinds))
+    assert {scene.kind for scene in few} == kinds
+    assert [s.scene_id for s in few] == [s.scene_id for s in scenes if s in few]

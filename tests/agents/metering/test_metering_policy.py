@@ -1,0 +1,291 @@
+"""A meter and a program in the loop: with synthetic frames, and with the environment."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ae_env.grid import ExposureGrid
+from agents.episodes import make_envs
+from agents.metering.metering_policy import EVTracker, MeteringPolicy, ReferenceFrames
+from agents.metering.reading import Reading, frame_ev100
+from agents.metering.tuned import ScoreRegression
+from agents.policy import MANUAL_PROGRAMS, METERS, PolicyContext, make_policy
+
+CONTROLLERS = (*METERS, "rpi_agc")
+SMALL = {"scenes": "bundled:small", "split": "all", "resolution": 36}
+STILL = {"motion": "none", "depth": "far"}
+#: Scenes of every kind: each third of the small ones.
+EVERY = 3
+GREY = np.ones((64, 64))
+RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
+
+
+# -- what is remembered of earlier frames ---------------------------------------------------------
+
+
+def _reading(ev, saturated=0.0, black=False):
+    return Reading(np.array([ev]), np.array([saturated]), np.array([black]))
+
+
+@pytest.mark.parametrize("compensation", [0.0, 3.0])
+def test_damping_does_not_wind_up_in_the_dark(compensation):
+    """A range of 0 to 10: of 40 frames that read -9, at most the last one counts beyond it."""
+    tracker = EVTracker(1, (0.0, 10.0), 0.5, compensation)
+
+    def read(ev):
+        return Reading(np.array([ev]), np.zeros(1), np.zeros(1, bool))
+
+    for _ in range(40):
+        tracker.update(read(-9.0))
+    low = compensation
+    # 0.5 * -9 + 0.5 * low in the dark; that is clipped to low, and half of the way to 8 is left.
+    assert tracker.damped[0] == pytest.approx(0.5 * (low - 9.0))
+    assert tracker.update(read(8.0))[0] == pytest.approx(0.5 * (low + 8.0))
+
+
+def test_tracker_jumps_far_averages_near_and_respects_bounds():
+    tracker = EVTracker(1, (-1.0, 17.0))
+    assert tracker.update(_reading(8.0))[0] == 8.0
+    assert tracker.update(_reading(8.5))[0] == 8.25
+    assert tracker.update(_reading(12.0))[0] == 12.0
+    assert tracker.update(_reading(9.0, saturated=0.8))[0] == 12.0  # 12 is above the bound
+    assert tracker.update(_reading(13.0, black=True))[0] == 12.0  # and below this one
+    assert tracker.update(_reading(16.0, saturated=0.8))[0] == 16.0  # 12 is below 16 - 2.4
+    assert tracker.update(_reading(5.0, black=True))[0] == 2.0  # half of the way to -1
+    white = EVTracker(1, (-1.0, 17.0)).update(_reading(9.0, saturated=1.0))
+    assert white[0] == 0.5 * (9.0 - 3.0 + 17.0)
+
+
+def test_damping_keeps_its_share_of_the_distance_in_ev():
+    tracker = EVTracker(1, (-1.0, 17.0), damping=0.75)
+    assert tracker.update(_reading(4.0))[0] == 4.0  # nothing to keep yet
+    found = [tracker.update(_reading(12.0))[0] for _ in range(6)]
+    np.testing.assert_allclose(found, [12.0 - 8.0 * 0.75**n for n in range(1, 7)])
+
+
+def _kept(reference, observations):
+    return frame_ev100(reference.update(observations))[0]
+
+
+def test_the_brightest_frame_that_hides_nothing_is_kept(context, photograph):
+    grid = context.grid
+    dark, fair, bright = (grid.nearest(ev) for ev in (13.0, 10.0, 6.0))
+    reference = ReferenceFrames(context.camera)
+    for state, best in ((dark, dark), (fair, fair), (bright, fair), (dark, fair), (fair, fair)):
+        found = _kept(reference, photograph(RAMP, 9.0, state))
+        assert abs(found - grid.ev100[best]) < 0.05
+
+
+def test_another_light_is_noticed_at_once(context, photograph):
+    grid = context.grid
+    for change in (-6.0, -4.0, -1.0, 1.0, 4.0):
+        reference = ReferenceFrames(context.camera)
+        _kept(reference, photograph(RAMP, 9.0, grid.nearest(9.0)))
+        later = photograph(RAMP, 9.0 + change, grid.nearest(11.0))
+        assert abs(_kept(reference, later) - grid.ev100[grid.nearest(11.0)]) < 0.05
+
+
+# -- on frames of a grey card ---------------------------------------------------------------------
+
+
+def _run(policy, photograph, scene_ev, *, frames=5, start=0, masks=None, **blur):
+    policy.reset(1, seed=0)
+    state = np.array([start])
+    path = []
+    for _ in range(frames):
+        state = policy.act(photograph(GREY, scene_ev, state, **blur), masks)
+        path.append(int(state[0]))
+    return path
+
+
+def test_program_p_follows_the_sensors(context, photograph):
+    def choose(ev, **blur):
+        return context.grid[_run(make_policy("average:P", context), photograph, ev, **blur)[-1]]
+
+    still, fast = (choose(7.0, speed=v, defocus=0.1) for v in (0.0, 4.0))
+    assert fast.exposure_time < still.exposure_time
+    sharp, deep = (choose(11.0, speed=0.0, defocus=d) for d in (0.1, 4.0))
+    assert deep.f_number > sharp.f_number
+
+
+def _fitted(context, program="tuned"):
+    """Best state = (ISO by EV, shutter by speed, aperture by defocus): known by construction."""
+    rng = np.random.default_rng(0)
+    features = np.stack(
+        [rng.uniform(0, 16, 4000), rng.uniform(-9, 3, 4000), rng.uniform(-3, 3, 4000)], axis=1
+    )
+    best = _best_state(context.grid, features)
+    scores = np.exp(-0.5 * (np.arange(64) != best[:, None]))
+    columns = features if program == "tuned" else features[:, :1]
+    return ScoreRegression(columns, scores, np.full(columns.shape[1], 0.3))
+
+
+def _best_state(grid: ExposureGrid, features):
+    iso = np.where(features[:, 0] > 8, 0, 3)
+    time = np.where(features[:, 1] > -3, 0, 3)
+    aperture = np.where(features[:, 2] > 0, 3, 0)
+    return np.array([grid.index(*c) for c in zip(iso, time, aperture, strict=True)])
+
+
+def test_tuned_program_uses_its_readings_and_options(context, photograph, tmp_path):
+    weights = tmp_path / "tuned.safetensors"
+    _fitted(context).save(weights)
+    for ev, speed, defocus, option, looked_up in (
+        (12.0, 2.0, 4.0, "", 12.0),
+        (4.0, 0.004, 0.25, "", 4.0),
+        (12.0, 0.004, 4.0, "", 12.0),
+        (9.0, 2.0, 4.0, "?compensation=2", 7.0),  # brighter: the best of a darker scene
+    ):
+        policy = make_policy(f"average:tuned{option}", context, weights=weights)
+        wanted = _best_state(context.grid, np.log2([[2.0**looked_up, speed, defocus]]))[0]
+        path = _run(policy, photograph, ev, speed=speed, defocus=defocus, start=wanted)
+        assert path[-1] == wanted
+    policy = make_policy("average:tuned?shutter_cap=1/100", context, weights=weights)
+    path = _run(policy, photograph, 4.0, speed=0.004, defocus=0.25)  # the best is 1/2 s
+    assert all(context.grid[s].exposure_time <= 1 / 100 for s in path)
+
+
+def test_tuned_needs_a_fit_and_the_same_readings(context, photograph, tmp_path):
+    with pytest.raises(ValueError, match="call fit"):
+        _run(make_policy("average:tuned", context), photograph, 8.0)
+    with pytest.raises(ValueError, match="nothing to save"):
+        make_policy("average:tuned", context).save(tmp_path / "x.safetensors")
+    _fitted(context).save(tmp_path / "three.safetensors")
+    blind = make_policy("average:tuned_blind", context, weights=tmp_path / "three.safetensors")
+    with pytest.raises(ValueError, match="agree on `sensors`"):
+        _run(blind, photograph, 8.0)
+
+
+def test_sensors_are_averaged_over_the_frames(context, photograph):
+    policy = MeteringPolicy(context, "average", "P")
+    policy.reset(1)
+    for speed in (0.5, 2.0, 1.0):
+        readings = policy.observe(photograph(GREY, 8.0, 20, speed=speed, defocus=1.0))
+    assert readings[0, 1] == pytest.approx(0.0, abs=1e-5)  # mean of -1, 1, 0 stops
+    policy.reset(1)
+    again = policy.observe(photograph(GREY, 8.0, 20, speed=0.5, defocus=1.0))
+    assert again[0, 1] == pytest.approx(-1.0, abs=1e-5)
+
+
+def test_a_policy_that_was_not_reset_says_so(context, photograph):
+    frame = photograph(GREY, 9.0, [1, 2])
+    for name in ("matrix:P", "shim:A", "rpi_agc"):
+        policy = make_policy(name, context)
+        with pytest.raises(ValueError, match=r"are of 2: call reset\(num_envs\) first"):
+            policy.act(frame)
+
+
+def test_p_keeps_a_state_while_the_sensors_waver(context):
+    """Of two states of one exposure the better one may change with every look at the motion."""
+    policy = make_policy("average:P", context)
+
+    def choose(speed):
+        readings = np.array([[7.0, speed, -1.0]])
+        return int(policy._program_utility(readings).argmax())
+
+    policy.reset(1)
+    speeds = np.arange(-8.0, 3.0, 0.01)
+    chosen = [choose(speed) for speed in speeds]
+    borders = [s for s, (a, b) in zip(speeds, itertools.pairwise(chosen), strict=False) if a != b]
+    assert len(borders) >= 2
+    for border in borders:
+        policy.reset(1)
+        path = []
+        for k in range(6):
+            path.append(choose(border + (0.02 if k % 2 else -0.02)))
+            policy._previous = np.array(path[-1:])
+        assert len(set(path)) == 1
+
+
+# -- with the environment -------------------------------------------------------------------------
+
+
+@functools.cache
+def _loop(
+    name: str, frames: int, start: int | None = None, **options: Any
+) -> tuple[Any, np.ndarray, np.ndarray]:
+    """The grid, the states (E, T) and the EV of the light at the start (E,)."""
+    options = {
+        **SMALL,
+        **STILL,
+        **{k: dict(v) if k == "lighting" else v for k, v in options.items()},
+    }
+    envs = make_envs(options, num_envs=1, frames=1)
+    count = len(envs.unwrapped.scenes)  # type: ignore[attr-defined]
+    envs.close()
+    scenes = list(range(0, count, EVERY))
+    envs = make_envs(options, num_envs=len(scenes), frames=frames)
+    try:
+        base: Any = envs.unwrapped
+        policy = make_policy(name, PolicyContext.from_envs(envs))
+        policy.reset(len(scenes), seed=0)
+        observations, _ = envs.reset(
+            seed=0, options={"scene": scenes, **({} if start is None else {"state": start})}
+        )
+        states = []
+        for _ in range(frames):
+            states.append(policy.act(observations, base.action_masks()))
+            observations, *_ = envs.step(states[-1])
+        light = np.array([base.scenes[i].ev100 for i in scenes])
+        return base.grid, np.stack(states, axis=1), light
+    finally:
+        envs.close()
+
+
+@pytest.mark.parametrize(
+    ("program", "start"), [*((p, None) for p in MANUAL_PROGRAMS), ("P", 3), ("P", 60)]
+)
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_comes_to_rest_in_steady_light(name, program, start):
+    """From a start of the environment's, from the darkest state (3) and from the brightest (60)."""
+    grid, states, light = _loop(f"{name}:{program}", 24, start)
+    ev = grid.ev100[states]
+    # Shim's and Zhang's meters may still be on their way in the dark, but they do not turn back.
+    moves = np.sign(np.diff(ev[:, -10:], axis=1).round(1))
+    assert (np.abs(moves).sum(axis=1) == np.abs(moves.sum(axis=1))).all()
+    assert (moves != 0).sum() <= (2 if name in ("shim", "zhang") else 0)
+    if program == "P":
+        median = np.median(ev[:, -1] - light)
+        assert abs(median) < (3.5 if name in ("entropy", "shim", "zhang") else 1.5)
+
+
+@pytest.mark.parametrize("stops", [-4.0, 4.0])
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_comes_to_rest_after_a_step_with_delay(name, stops):
+    lighting = (("kind", "step"), ("stops", stops), ("at", 12))
+    grid, states, _ = _loop(f"{name}:P", 60, delay=2, lighting=lighting)
+    last = grid.ev100[states[:, -8:]]
+    assert (last.max(axis=1) - last.min(axis=1)).max() < 0.1
+    before, after = grid.ev100[states[:, 11]], grid.ev100[states[:, -1]]
+    end = 5.6 if name == "rpi_agc" else grid.ev100.min() + 0.6  # of its ladder
+    inside = (after > end) & (after < grid.ev100.max() - 0.6)
+    assert np.median((after - before)[inside]) == pytest.approx(stops, abs=1.5)
+
+
+@pytest.mark.parametrize("name", ["centre_weighted", "rpi_agc"])
+def test_damped_controllers_converge_on_whole_stops(name):
+    """A controller that took its EV back from the settings would stay: its first step is short."""
+    lighting = (("kind", "step"), ("stops", -3.0), ("at", 6))
+    grid, damped, _ = _loop(f"{name}:P?damping=0.9", 90, lighting=lighting)
+    _, free, _ = _loop(f"{name}:P", 90, lighting=lighting)
+    ev_damped, ev_free = grid.ev100[damped], grid.ev100[free]
+    assert np.abs(ev_damped[:, -1] - ev_free[:, -1]).max() < 1.1
+    assert np.mean(np.abs(ev_damped[:, -1] - ev_free[:, -1]) < 0.1) > 0.6
+    # 3 EV * 0.9^n falls below half a stop after 17 frames.
+    late = np.abs(ev_damped[:, 12] - ev_damped[:, 5]) <= 2.1
+    assert late.mean() > 0.9
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_compensation_shifts_the_exposure_by_its_ev(name):
+    grid, plain, _ = _loop(f"{name}:P", 24)
+    _, darker, _ = _loop(f"{name}:P?compensation=-2", 24)
+    first, second = grid.ev100[plain[:, -1]], grid.ev100[darker[:, -1]]
+    inside = (second < grid.ev100.max() - 0.6) & (first > grid.ev100.min() + 0.6)
+    assert inside.sum() >= 4
+    assert np.median((second - first)[inside]) == pytest.approx(2.0, abs=0.3)
