@@ -222,7 +222,9 @@ class SceneNetworks:
         def make() -> torch.Tensor:  # at tolerance 0, so that it serves every tolerance
             return self._simulator.denoise(replace(scene.prepared, tolerance=0.0))
 
-        return replace(scene, denoised=self._cached("denoised", scene, make, everywhere=True))
+        shape = scene.light.shape
+        denoised = self._cached("denoised", scene, make, shape=shape, everywhere=True)
+        return replace(scene, denoised=denoised)
 
     def resized(self, scene: Scene, resolution: int | None, crop: Crop = "box") -> Scene:
         """As `Scene.resized`, with `Scene.defocus_map` estimated before any pixels are averaged.
@@ -243,7 +245,8 @@ class SceneNetworks:
             return self._small_map(scene, resolution, crop)
 
         numbers = {"map": [MAP_VERSION, DEAD_ZONE], "resolution": resolution, "crop": crop}
-        return replace(small, defocus_map=self._cached("defocus_maps", scene, make, **numbers))
+        found = self._cached("defocus_maps", scene, make, shape=small.light.shape[1:], **numbers)
+        return replace(small, defocus_map=found)
 
     def _small_map(self, scene: Scene, resolution: int | None, crop: Crop) -> torch.Tensor:
         shorter = min(scene.light.shape[1:])
@@ -259,13 +262,19 @@ class SceneNetworks:
         return found
 
     def _cached(
-        self, kind: str, scene: Scene, make: Callable[[], torch.Tensor], **numbers: Any
+        self,
+        kind: str,
+        scene: Scene,
+        make: Callable[[], torch.Tensor],
+        *,
+        shape: Sequence[int],
+        **numbers: Any,
     ) -> torch.Tensor:
         """The result of `make` for `scene`, from the cache where its inputs were the same."""
         modules = [m for m in (self._simulator.noise, self._simulator.aperture) if m is not None]
         inputs = {"light": scene.light, "denoised": scene.denoised}
         nlf = [scene.nlf.shot, scene.nlf.read]
-        return self._results.result(kind, modules, inputs, make, nlf=nlf, **numbers)
+        return self._results.result(kind, modules, inputs, make, shape=shape, nlf=nlf, **numbers)
 
 
 def without_noise(scene: Scene) -> Scene:

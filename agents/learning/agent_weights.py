@@ -112,7 +112,7 @@ def describe_agent(width: int, context: PolicyContext, training: dict[str, Any])
 
     Args:
         width: Hidden features of its network.
-        context: What it was trained for.
+        context: The camera, grid and observation that it was trained for.
         training: JSON values that identify the training.
     """
     return {"width": width, "context": describe_context(context), "training": training}

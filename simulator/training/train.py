@@ -242,16 +242,13 @@ def train_stage(
     parts: dict[str, Any] = {"module": trained, "optimizer": optimizer}
     if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
         parts["scaler"] = accelerator.scaler
-    state = Checkpoint(
-        checkpoint,
-        [name, identity],
-        lambda: {
-            "step": clock.step,
-            "seconds": clock.seconds,
-            **{part: own.state_dict() for part, own in parts.items()},
-        },
-        writes=accelerator.is_main_process,
-    )
+
+    def now() -> dict[str, Any]:
+        states = {part: own.state_dict() for part, own in parts.items()}
+        return {"step": clock.step, "seconds": clock.seconds, **states}
+
+    writes = accelerator.is_main_process
+    state = Checkpoint(checkpoint, [name, identity], now, writes=writes)
     past = state.load()
     if past is not None:
         clock.step, clock.seconds = int(past["step"]), float(past["seconds"])
@@ -263,8 +260,8 @@ def train_stage(
     with state:
         while clock.share < 1.0:
             optimizer.param_groups[0]["lr"] = learning_rate(clock.share, stage.learning_rate)
-            rank = accelerator.process_index
-            batch = pairs.batch(clock.step, stage.batch, stage.crop, process=rank)
+            process = accelerator.process_index
+            batch = pairs.batch(clock.step, stage.batch, stage.crop, process=process)
             values = wrapped(batch.to(device))
             _follow(means, values, name)
             accelerator.backward(values["loss"])

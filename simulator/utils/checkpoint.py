@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import io
 import json
 import logging
@@ -15,6 +14,7 @@ from typing import Any
 import torch
 
 from simulator.utils.files import write_atomically
+from simulator.utils.results import package_version
 
 _LOGGER = logging.getLogger(__name__)
 #: Least time between two checkpoints of a training [s].
@@ -90,9 +90,9 @@ class Checkpoint:
         writes: bool = True,
     ) -> None:
         self.path, self.state, self.writes = path, state, writes
-        version = importlib.metadata.version("ae-env")
         # Through JSON, as tuples compare unequal to the lists that they come back as.
-        self.identity = json.dumps({"version": version, "training": identity}, sort_keys=True)
+        described = {"version": package_version(), "training": identity}
+        self.identity = json.dumps(described, sort_keys=True)
         self._saved = time.monotonic()
 
     def load(self) -> dict[str, Any] | None:

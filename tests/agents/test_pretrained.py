@@ -40,9 +40,3 @@ def test_a_pattern_names_the_training_seeds(tmp_path):
     assert training_seeds(f"ppo:{tmp_path}/ppo-0") == [f"ppo:{tmp_path}/ppo-0"]
     with pytest.raises(ValueError, match=r"no \.safetensors file fits"):
         training_seeds(f"regression:{tmp_path}/regression-*")
-
-
-def test_another_resolution_is_refused_by_name():
-    context = PolicyContext.from_envs(make_envs({**SCENES, "resolution": 48}, num_envs=1, frames=1))
-    with pytest.raises(ValueError, match="resolution"):
-        make_policy("ppo", context)

@@ -140,10 +140,6 @@ def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> Non
     with pytest.raises(ValueError, match="must be finite: their training has failed"):
         save_agent(agent, "regression", network, describe_agent(8, context, {}))
     assert sibling(agent, ".safetensors").read_bytes() == before
-    sibling(agent, ".safetensors").write_bytes(save(network.state_dict()))
-    change_card(agent, sha256=None)
-    with pytest.raises(ValueError, match="must be finite"):
-        load_agent(agent, "regression")
 
 
 def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None:

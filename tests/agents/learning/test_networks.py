@@ -76,16 +76,6 @@ def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> N
     assert error.abs().median() < 0.15
 
 
-@pytest.mark.parametrize("grid", [ExposureGrid.default(), ExposureGrid((100, 3200), (0.01,), (4,))])
-@pytest.mark.parametrize("sensors", [True, False])
-def test_state_head_values_every_state(grid: ExposureGrid, sensors: bool) -> None:
-    head = StateHead(grid, 6, sensors, outputs=2, width=5)
-    speed = torch.zeros(3, 2) if sensors else None
-    values = head(torch.randn(3, 6), speed)
-    assert values.shape == (3, len(grid), 2)
-    assert torch.isfinite(values).all()
-
-
 def test_state_head_needs_the_sensors_it_was_made_for() -> None:
     with pytest.raises(ValueError, match="`sensors` must be given"):
         StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)

@@ -15,18 +15,6 @@ from agents.policy import PolicyContext, make_policy
 TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
 
 
-@pytest.fixture(autouse=True)
-def global_random_state_is_restored():
-    """SB3 seeds the global generators."""
-    import random
-
-    states = random.getstate(), np.random.get_state()  # noqa: NPY002
-    with torch.random.fork_rng():
-        yield
-    random.setstate(states[0])
-    np.random.set_state(states[1])  # noqa: NPY002
-
-
 def test_progress_and_determinism(make_tiny_envs) -> None:
     seen: list[tuple[int, int, dict[str, float]]] = []
     first = train_ppo(make_tiny_envs(), TRAINING, progress=lambda *a: seen.append(a)).state_dict()

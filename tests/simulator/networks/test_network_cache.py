@@ -82,24 +82,6 @@ def test_the_same_source_runs_the_networks_once() -> None:
     assert torch.equal(prepared.denoised.light, simulator.denoise(prepared))  # type: ignore[arg-type]
 
 
-def test_the_papers_network_runs_once_for_an_f_number(folder: Path) -> None:
-    torch.manual_seed(0)
-    simulator = CameraSimulator("paper", device="cpu", cache="disk")
-    raw, target = _raw(), CameraSettings(6400, 1 / 1024, 4)
-    counter = Counter(simulator)
-    opened = []
-    for settings in (target, target, CameraSettings(6400, 1 / 1024, 5.6)):
-        f_number = settings.effective_f_number
-        aperture_blur = simulator.prepare(raw, depth="unknown").aperture_blur
-        assert aperture_blur is not None
-        opened.append(aperture_blur.opened(f_number, denoised=True))
-        aperture_blur.opened(f_number, denoised=True)
-        assert (counter.new() > 0) == (len(opened) != 2)
-    assert torch.equal(opened[0], opened[1])
-    assert not torch.equal(opened[0], opened[2])
-    assert len(list((folder / "opened").iterdir())) == 2
-
-
 def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path) -> None:
     raw = _raw()
     for depth in ("far", "unknown"):

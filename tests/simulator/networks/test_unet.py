@@ -155,14 +155,6 @@ def test_flat_map_becomes_the_shift(
     assert torch.equal(result, shift[:, :, None, None].expand_as(x))
 
 
-def test_flat_map_has_finite_gradients() -> None:
-    x = torch.full((1, 2, 4, 4), 0.3, requires_grad=True)
-    scale = torch.ones(1, 2, requires_grad=True)
-    shift = torch.zeros(1, 2, requires_grad=True)
-    instance_norm(x, scale, shift).square().sum().backward()
-    assert all(t.grad is not None and t.grad.isfinite().all() for t in (x, scale, shift))
-
-
 def test_statistics_of_half_precision_are_not_half_precise() -> None:
     """256 bfloat16 steps above zero, the mean itself would round by a third of the deviation."""
     x = (1.0 + normal64(1, 1, 32, 32) / 64).bfloat16()

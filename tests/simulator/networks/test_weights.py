@@ -126,16 +126,6 @@ def test_an_unknown_preset_in_the_card(saved: Path, preset: Any) -> None:
         load_modules(saved)
 
 
-def test_modules_that_are_not_finite_are_not_saved(saved: Path) -> None:
-    before = beside(saved, ".safetensors").read_bytes()
-    broken = build_modules("compact")
-    with torch.no_grad():
-        next(broken.parameters()).fill_(torch.inf)
-    with pytest.raises(ValueError, match="must be finite: their training has failed"):
-        save_modules(saved, broken, "compact", {})
-    assert beside(saved, ".safetensors").read_bytes() == before
-
-
 @pytest.fixture
 def package(saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: Any) -> Path:
     """A package that ships one set of weights, and a folder without any to be in."""

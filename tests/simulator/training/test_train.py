@@ -21,7 +21,6 @@ from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
 from simulator.training.train import (
     Clock,
-    learning_rate,
     make_accelerator,
     train_and_save,
     train_stage,
@@ -251,15 +250,6 @@ def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path: Path) -> None:
     assert same(resumed, whole)
 
 
-def test_another_trainings_checkpoint_is_not_taken_over(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    run(tmp_path / "a")
-    _, _, pairs = run(tmp_path / "a", identity="other")
-    assert pairs.steps == list(range(STEPS))
-    assert "other settings or of another version, training restarts" in caplog.text
-
-
 def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"stage 'noise': the loss \(=nan\) must be finite"):
         run(tmp_path / "a", broken=5)
@@ -314,16 +304,3 @@ def test_a_stage_ends_with_its_minutes(tmp_path: Path, monkeypatch: pytest.Monke
     assert pairs.steps == [4, 5, 6, 7, 8]
     assert clock.seconds == 63.0
     assert same(resumed, whole)
-
-
-def test_one_cycle() -> None:
-    """Rises to the peak at 5 %, is half of it in the middle of the cosine, ends at 0."""
-    shares = [i / 1000 for i in range(1001)]
-    rates = [learning_rate(share, 2.0) for share in shares]
-    assert rates[50] == max(rates) == pytest.approx(2.0)
-    assert rates[25] == pytest.approx(1.0)
-    assert rates[525] == pytest.approx(1.0)
-    assert rates[-1] == 0.0
-    assert rates[0] > 0  # the first step is not lost
-    assert rates[:51] == sorted(rates[:51])
-    assert rates[50:] == sorted(rates[50:], reverse=True)

@@ -149,7 +149,7 @@ def test_another_training_or_version(tmp_path: Path, monkeypatch: Any, caplog: A
     store(path, {"seed": 0}).save()
     assert store(path, {"seed": 0}).load() == {"step": 7}
     assert store(path, {"seed": 1}).load() is None
-    monkeypatch.setattr("importlib.metadata.version", lambda _: "77")
+    monkeypatch.setattr(checkpoint, "package_version", lambda: "77")
     assert store(path, {"seed": 0}).load() is None
     assert caplog.text.count("other settings or of another version, training restarts") == 2
 
