@@ -35,7 +35,7 @@ _RANGES: dict[str, tuple[Any, Any, Callable[..., Any]]] = {
 
 
 class RollingShutter(NamedTuple):
-    """How a frame is read: one sensor row after the other.
+    """Readout of a frame, one sensor row after the other.
 
     Args:
         rows: Rows of the packed frame.

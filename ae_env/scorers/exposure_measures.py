@@ -1,4 +1,4 @@
-"""How well a capture is exposed: classic measures of brightness, clipping and histogram.
+"""Classic measures of exposure: brightness, clipping and the histogram.
 
 Unlike `brightness`, none of them knows the incident light: they want every scene middle grey.
 """

@@ -395,14 +395,14 @@ class Nima:
 
 
 class NimaAesthetic(Nima):
-    """How pleasing people find the picture: NIMA (2018), trained on AVA."""
+    """Aesthetic quality as people rate it: NIMA (2018), trained on AVA."""
 
     needs = "weights: AE_ENV_NIMA_AESTHETIC"
     name = "nima_aesthetic"
 
 
 class NimaTechnical(Nima):
-    """How good people find the technical quality: NIMA (2018), trained on TID2013."""
+    """Technical quality as people rate it: NIMA (2018), trained on TID2013."""
 
     needs = "weights: AE_ENV_NIMA_TECHNICAL"
     name = "nima_technical"

@@ -16,7 +16,7 @@ from ae_env.scenes.dead_leaves import dead_leaves
 from ae_env.scenes.photographs import PHOTOGRAPHS, unprocess
 from ae_env.scenes.procedural import HARD_KINDS, draw, list_kinds
 from simulator.camera import get_camera
-from simulator.utils.cache import cache_dir
+from simulator.utils.cache import DiskCache, cache_dir
 
 CAMERA = get_camera("nikon_z6")
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
@@ -172,3 +172,21 @@ def test_cached_scenes_equal_fresh_ones(
         caplog.clear()
         load_scenes("bundled:small", "test", camera=CAMERA, resolution=48)
         assert not caplog.records
+
+
+def test_cached_scenes_that_cannot_be_right_are_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
+    fresh = load_scenes("bundled:snow", "test", camera=CAMERA, resolution=36)
+    cache, (file,) = DiskCache(), cached_files()
+    stored = cache.get("scenes", file.stem)
+    assert stored is not None
+    nan = stored["light"].clone()
+    nan[0, 0, 0, 0] = torch.nan
+    for light in (nan, stored["light"][1:], stored["light"][..., :30]):
+        cache.put("scenes", file.stem, {**stored, "light": light})
+        caplog.clear()
+        again = load_scenes("bundled:snow", "test", camera=CAMERA, resolution=36)
+        assert "are damaged" in caplog.text
+        assert all(torch.equal(a.light, b.light) for a, b in zip(again, fresh, strict=True))

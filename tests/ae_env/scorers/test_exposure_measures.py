@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from skimage.measure import shannon_entropy
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.detail import histogram_entropy
-from simulator import CameraSettings, develop
+from simulator import CameraSettings, NoiseLevelFunction, develop
 from tests.ae_env.scorer_images import CAMERA, captures_of, check_image_scorer, random_pictures
 
 IMAGE_SCORERS = ("mid_grey", "clipping", "well_exposedness", "entropy")
@@ -76,6 +77,23 @@ def test_dynamic_range_is_the_stops_between_percentiles_over_14() -> None:
     below = math.log2(0.5 / 2**10 / floor)
     assert scores == pytest.approx([6 / 14, 3 / 14, below / 14], rel=1e-3)
     assert below < 6  # so the floor did decide
+
+
+def test_dynamic_range_by_hand() -> None:
+    """The 11th and 991st of 1001 greens, each the mean of G1 and G2, from the noise floor on."""
+    states = [CameraSettings(iso=100, exposure_time=1 / 64, f_number=4)]
+    read, shot = (9.0, 2e-6, 6e-6, 9.0), (9.0, 1e-3, 3e-3, 9.0)
+    floor = 0.5 * (2e-3 + math.sqrt(4e-6 + 4 * 4e-6))  # of the greens' means, 2e-3 and 4e-6
+    for darkest, nlf, wanted in (
+        (1e-4, NoiseLevelFunction.zero(), math.log2(9e3) * 0.98 / 14),
+        (1e-4, NoiseLevelFunction(shot, read), math.log2(0.9 * 9e3**-0.01 / floor) / 14),
+        (1e-9, NoiseLevelFunction.zero(), 1.0),  # 29 stops are more than 14
+    ):
+        green = np.random.default_rng(0).permutation(np.geomspace(darkest, 0.9, 1001))
+        light = np.stack([green * 0 + 50.0, 1.5 * green, 0.5 * green, green * 0])[:, None]
+        captures = replace(captures_of(light, states), nlf=[nlf])
+        found = make_scorer("dynamic_range")(None, captures).item()
+        assert found == pytest.approx(wanted, rel=1e-5)
 
 
 def test_well_exposedness_is_mertens_product() -> None:

@@ -73,6 +73,11 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
     own.write_text("a: [")
     with pytest.raises(ValueError, match="not YAML"):
         ae_env.load_preset(str(own))
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
+    bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 30))
+    own.write_text(bomb)  # 10^30 entries with the aliases written out
+    with pytest.raises(ValueError, match=r"`preset` \(='.*own\.yaml'\)"):
+        ae_env.load_preset(str(own))
     assert find_preset("snow").read_text().startswith("#")
 
 
