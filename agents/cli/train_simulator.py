@@ -89,7 +89,7 @@ def reference_scenes_of(config: SimulatorConfig, split: str) -> Sequence[Referen
     if folder is not None:
         radiance = radiance.replace(f"${DATA_VARIABLE}", str(folder))
     radiance = os.path.expandvars(radiance)
-    if "$" in radiance:
+    if config.scenes.radiance and ("$" in radiance or not radiance):  # unset, or empty
         console.print(f"{config.scenes.radiance} is not set: training without radiance maps")
         radiance = ""
     camera = get_camera(config.camera)

@@ -18,8 +18,8 @@ from typing import Any, Generic, TypeVar
 
 import platformdirs
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 
 from simulator.utils.files import write_atomically
 from simulator.utils.results import package_version
@@ -178,10 +178,11 @@ class DiskCache:
         """
         path = self.path(kind, key)
         try:
-            with safe_open(path, framework="pt") as file:
-                stored = (file.metadata() or {}).get("digest")
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if stored != content_digest(tensors):
+            content = path.read_bytes()  # at once: another process may remove the file
+            tensors = load(content)
+            # The header is JSON after eight bytes of its length.
+            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+            if header.get("__metadata__", {}).get("digest") != content_digest(tensors):
                 raise ValueError("its content is not what was written")
         except (FileNotFoundError, NotADirectoryError):
             return None

@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from simulator import CameraSimulator
+from simulator.networks import weights
 from simulator.networks.weights import (
     PRESETS,
     build_modules,
@@ -123,6 +124,34 @@ def test_an_unknown_preset_in_the_card(saved: Path, preset: Any) -> None:
     card: dict[str, Any] = json.loads(beside(saved, ".json").read_text())
     beside(saved, ".json").write_text(json.dumps({**card, "preset": preset}))
     with pytest.raises(ValueError, match=re.escape(f"unknown preset {preset!r}")):
+        load_modules(saved)
+
+
+def test_a_writer_that_is_killed_leaves_no_pair_of_two_trainings(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, written = weights.write_atomically, []
+
+    def killed(path: Path, content: Any) -> Path:
+        if written:
+            raise KeyboardInterrupt
+        written.append(path)
+        return real(path, content)
+
+    monkeypatch.setattr(weights, "write_atomically", killed)
+    torch.manual_seed(1)  # another training
+    with pytest.raises(KeyboardInterrupt):
+        save_modules(saved, build_modules("compact"), "compact", {})
+    with pytest.raises(ValueError, match=r"the hash of net-0.5.safetensors .* another training"):
+        load_modules(saved)
+
+
+def test_weights_that_may_not_be_read(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(self: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", denied)
+    with pytest.raises(ValueError, match=r"net-0.5'\) cannot be read: .*net-0.5.safetensors"):
         load_modules(saved)
 
 

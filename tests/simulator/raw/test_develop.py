@@ -91,14 +91,6 @@ def test_saturated_areas_are_white(gains, level):
     assert (dimmed == dimmed[0, 0, 0]).all()  # grey, not magenta
 
 
-def test_only_the_ratio_of_gains_matters():
-    images = torch.rand(2, 4, 3, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(
-        develop(images, (1.6, 0.8, 1.2), Z6.colour_matrix),
-        develop(images, (2.0, 1.0, 1.5), Z6.colour_matrix),
-    )
-
-
 @example(torch.zeros(4, 1, 1), (1e-30, 1.0, 1e30), "linear")  # gains further apart than float32
 @given(
     lights(),
@@ -151,12 +143,8 @@ def test_render_sizes(size, pattern):
     assert full.dtype == half.dtype == torch.uint8
     # Schlick: 1.618 * .5 / (.618 * .5 + 1) = .618; sRGB .8077; 206
     assert set(full.unique().tolist()) == set(half.unique().tolist()) == {206}
-
-
-def test_exposure_correction_is_in_stops():
-    raw = RawImage(flat(0.1, 0.1, 0.1)[0], CameraSettings(100, 0.01, 4), Z6)
-    brighter = render_srgb(raw, "half", exposure_ev=1.0, tone="linear")
-    assert brighter.unique().item() == round(255 * float(srgb(np.array(0.2))))
+    darker = render_srgb(raw, "half", exposure_ev=-1.0, tone="linear")
+    assert darker.unique().tolist() == [round(255 * float(srgb(np.array(0.25))))]
 
 
 @pytest.mark.parametrize(

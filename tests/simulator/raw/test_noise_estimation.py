@@ -48,9 +48,7 @@ def worst_ratio(estimate: NoiseLevelFunction, truth: NoiseLevelFunction) -> tupl
 
 
 @pytest.mark.parametrize("light", [ramp(), patches()], ids=["ramp", "patches"])
-@pytest.mark.parametrize(
-    ("camera", "iso"), [("nikon_z6", 1600), ("nikon_z6", 12800), ("canon_70d", 100)]
-)
+@pytest.mark.parametrize(("camera", "iso"), [("nikon_z6", 12800), ("canon_70d", 100)])
 def test_flat_fields(light: np.ndarray, camera: str, iso: int) -> None:
     nlf = get_camera(camera).nlf(iso)
     low, high = worst_ratio(estimate_nlf(with_noise(light, nlf, seed=1)), nlf)
@@ -82,19 +80,11 @@ def test_clipped_half_does_not_count() -> None:
     light = np.concatenate(
         [ramp(), np.full((4, 256, 200), 1.2), np.full((4, 256, 90), -0.2)], axis=2
     )
-    low, high = worst_ratio(estimate_nlf(with_noise(np.maximum(light, 0), nlf, seed=4)), nlf)
-    assert low > 0.85
-    assert high < 1.15
-
-
-def test_black_clipped_at_zero() -> None:
-    """No pedestal: the dark half-noise is left out, the rest still tells."""
-    nlf = get_camera("canon_70d").nlf(6400)
-    noisy = np.maximum(with_noise(ramp(), nlf, seed=5), 0.0)
-    estimate = estimate_nlf(noisy)
-    for x in (0.1, 0.18, 0.5):
-        variance = estimate.read[0] + estimate.shot[0] * x
-        assert variance == pytest.approx(nlf.read[0] + nlf.shot[0] * x, rel=0.15)
+    noisy = with_noise(np.maximum(light, 0), nlf, seed=4)
+    for clipped in (noisy, np.maximum(noisy, 0.0)):  # with a pedestal, and without one
+        low, high = worst_ratio(estimate_nlf(clipped), nlf)
+        assert low > 0.85
+        assert high < 1.15
 
 
 def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level() -> None:

@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from simulator.camera import BayerPattern, CameraProfile, NoiseLevelFunction, get_camera
-from simulator.noise.noise_level_function import noise_generator
 from simulator.optics.lamps import PulsedLamp
 from simulator.optics.thin_lens import Lens
 from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
@@ -94,25 +93,6 @@ def test_box_average_and_marked_stops_in_the_blur() -> None:
     torch.testing.assert_close(marked, native / (2 * math.sqrt(2)))
 
 
-def test_two_f_numbers_give_the_area_ratio() -> None:
-    camera = ReferenceCamera(sensor(1e-4, 1e-8))
-    shot = scene(lamp(1.0), torch.full((41, 41), 1.2))
-    offset = np.arange(41) - 20
-    moments = {
-        f: (camera.blurred_light(shot, f)[1].double().numpy().sum(0) * offset**2).sum()
-        for f in (4.0, 5.6, 8.0)
-    }
-    # Area of the disc ~ second moment ~ 1 / N^2, and so is the light that comes through.
-    assert moments[4.0] / moments[5.6] == pytest.approx(2.0, rel=0.01)
-    assert moments[4.0] / moments[8.0] == pytest.approx(4.0, rel=0.01)
-    means = {
-        f: float(camera.capture(scene(flat(0.4)), replace(BASE, f_number=f), 0).mean.mean())
-        for f in (4.0, 5.6, 8.0)
-    }
-    assert means[4.0] / means[5.6] == pytest.approx(2.0, rel=1e-6)
-    assert means[4.0] / means[8.0] == pytest.approx(4.0, rel=1e-6)
-
-
 def test_saturated_lamp_out_of_focus_keeps_its_energy_and_is_a_white_disc() -> None:
     camera = ReferenceCamera(sensor(1e-4, 1e-7))
     shot = scene(lamp(1e4), torch.full((41, 41), 1.2))
@@ -125,22 +105,6 @@ def test_saturated_lamp_out_of_focus_keeps_its_energy_and_is_a_white_disc() -> N
         count = white[1].sum().item()
         assert abs(count - math.pi * diameter**2 / 4) < border
         assert bool(white[1, 20, 20])
-
-
-def test_sharp_foreground_keeps_free_of_a_bright_blurred_background() -> None:
-    light = flat(0.01, 40)
-    light[:, :, 20:] = 300.0
-    depth = torch.full((40, 40), 2.0)
-    depth[:, 20:] = 30.0
-    found = ReferenceCamera(sensor(1e-4, 1e-8)).blurred_light(scene(light, depth), 4.0)
-    assert torch.equal(found[:, :, :20], light[:, :, :20])
-
-
-def test_layers_of_equal_light_show_no_seam() -> None:
-    depth = torch.linspace(1.0, 9.0, 40).expand(40, 40).clone()
-    depth[:15, :15] = 0.8
-    found = ReferenceCamera(sensor(1e-4, 1e-8)).blurred_light(scene(flat(0.3, 40), depth), 4.0)
-    torch.testing.assert_close(found, flat(0.3, 40), rtol=2e-6, atol=0.0)
 
 
 def test_scene_without_depth_or_in_focus_is_left_as_it_is() -> None:
@@ -275,6 +239,7 @@ def test_black_offset_moves_the_numbers_but_not_the_noise_of_light() -> None:
 
 
 def test_drawn_bodies() -> None:
+    assert BodyError.none().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
     body = BodyError.draw(Z6, 5)
     assert body == BodyError.draw(Z6, 5)
     assert body != BodyError.draw(Z6, 6)
@@ -290,13 +255,6 @@ def test_drawn_bodies() -> None:
     stops = {CameraSettings(100, 1, f).aperture_stop for f in (1, 1.4, 2.8, 4, 5.6, 11, 22, 32)}
     assert stops <= set(body.transmission)
     assert min(b.exposure_time(1 / 8000) for b in bodies) > 0
-
-
-def test_no_error_is_no_error() -> None:
-    body = BodyError.none()
-    settings = CameraSettings(800, 1 / 8000, 22)
-    assert body.light_error(settings) == 1.0
-    assert body.exposure_time(0.3) == 0.3
 
 
 # --- motion, seeds, arguments -----------------------------------------------------------------
@@ -332,15 +290,6 @@ def test_same_seed_same_capture() -> None:
     noise = [camera.capture(dark, replace(BASE, **c), 4).sample.flatten() for c in changes]
     correlation = torch.corrcoef(torch.stack(noise)) - torch.eye(4)
     assert float(correlation.abs().max()) < 5 / math.sqrt(4 * 40 * 40)
-
-
-def test_records_any_number_of_images_at_once() -> None:
-    signal = torch.tensor([0.0, 0.2, 0.7])[:, None, None, None].expand(3, 4, 64, 64)
-    found = ReferenceCamera(Z6).record(signal, 6400.0, noise_generator(4))
-    assert found.shape == (3, 4, 64, 64)
-    assert found.dtype == torch.float32
-    np.testing.assert_allclose(found.mean((1, 2, 3)).numpy(), [0.0, 0.2, 0.7], atol=1e-3)
-    assert abs(float(torch.corrcoef(found.flatten(1))[1, 2])) < 0.05
 
 
 def test_scene_refuses_bad_input() -> None:

@@ -86,21 +86,6 @@ def test_any_tensor_has_a_digest(tensor: torch.Tensor) -> None:
 # -- in memory ------------------------------------------------------------------------------------
 
 
-def test_the_bound_holds_in_bytes() -> None:
-    cache: LruCache[int] = LruCache(10)
-    cache.put("a", 1, 4)
-    cache.put("b", 2, 4)
-    cache.put("c", 3, 7)  # 15: a and b go
-    assert (len(cache), cache.nbytes, cache.get("c")) == (1, 7, 3)
-    cache.put("a", 1, 11)  # larger than all of it: not stored, and nothing goes for it
-    assert (len(cache), cache.nbytes, cache.get("a")) == (1, 7, None)
-    cache.put("c", 5, 11)  # the old value of a key is not the value of the new one
-    assert (len(cache), cache.nbytes, cache.get("c")) == (0, 0, None)
-    cache.put("d", 6, 10)
-    cache.clear()
-    assert (len(cache), cache.nbytes, cache.get("d")) == (0, 0, None)
-
-
 def test_the_least_recently_used_goes_first() -> None:
     """Against a plain list that does the same slowly."""
     rng = np.random.default_rng(0)
@@ -121,6 +106,8 @@ def test_the_least_recently_used_goes_first() -> None:
                 model.pop(0)
         assert cache.nbytes == sum(item[2] for item in model) <= 40
         assert len(cache) == len(model)
+    cache.clear()
+    assert (len(cache), cache.nbytes, cache.get(0)) == (0, 0, None)
 
 
 def test_threads_share_it() -> None:
@@ -277,7 +264,7 @@ def test_the_bound_on_disk_holds(tmp_path: Path) -> None:
 
 
 def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
-    disk = DiskCache(tmp_path, max_bytes=4000)
+    disk = DiskCache(tmp_path, max_bytes=6000)
     folder = tmp_path / "denoised"
     folder.mkdir()
     names = ["compact.safetensors", "notes.txt", f"{KEYS[0]}.txt", f"my-{KEYS[0]}.safetensors"]
@@ -292,22 +279,17 @@ def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
     disk.put("denoised", KEYS[3], {"light": torch.zeros(10)})
     assert written.exists()
     assert not abandoned.exists()
+    disk.put("opened", KEYS[3], {"x": torch.zeros(1)})
+    size = disk.path("opened", KEYS[3]).stat().st_size
+    assert disk.usage() == dict.fromkeys(CACHE_KINDS, (0, 0)) | {
+        "denoised": (2, 4000 + disk.path("denoised", KEYS[3]).stat().st_size),
+        "opened": (1, size),
+    }
     disk.clear()
+    assert disk.usage() == dict.fromkeys(CACHE_KINDS, (0, 0))
+    assert not (tmp_path / "opened").exists()
     assert sorted(p.name for p in folder.iterdir()) == sorted(names)
     assert (tmp_path / "weights.safetensors").exists()
-
-
-def test_usage_counts_files_and_bytes_by_kind(tmp_path: Path) -> None:
-    disk = DiskCache(tmp_path)
-    for kind, keys in (("denoised", KEYS[:3]), ("score_tables", KEYS[:1])):
-        for key in keys:
-            disk.put(kind, key, {"x": torch.zeros(25)})
-    size = disk.path("denoised", KEYS[0]).stat().st_size
-    nothing = dict.fromkeys(CACHE_KINDS, (0, 0))
-    assert disk.usage() == nothing | {"score_tables": (1, size), "denoised": (3, 3 * size)}
-    disk.clear()
-    assert disk.usage() == nothing
-    assert list(tmp_path.iterdir()) == []
 
 
 def _use(folder: Path, seed: int, rounds: int) -> None:
