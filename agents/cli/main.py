@@ -14,13 +14,13 @@ from rich.markup import escape
 
 from ae_env.utils.checks import UserCodeError
 from agents.cli.bench import bench
-from agents.cli.cache import cache
+from agents.cli.cache_command import cache
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
 from agents.cli.scorers import convert_nima, scorers
 from agents.cli.simulate import simulate
 from agents.cli.sweep import sweep
-from agents.cli.train import train
+from agents.cli.train_agent import train
 from agents.cli.train_simulator import train_simulator
 
 app = typer.Typer(

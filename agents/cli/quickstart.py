@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -39,6 +39,9 @@ PPO_FRAMES = 80_000
 #: Episodes per scene of the evaluation.
 EPISODES = 2
 
+#: Opens a progress bar with the given title; yields the function that moves it.
+Progress = Callable[[str], AbstractContextManager[Callable[..., None]]]
+
 Scenes = Annotated[
     str, typer.Option(help="'bundled', or a folder or file of raws or .hdr/.exr radiance maps.")
 ]
@@ -67,17 +70,6 @@ def quickstart(
     console.print("\nTry next:")
     for line in next_commands(scenes, out, done.agents):
         print_line(f"  {line}")
-
-
-class Task(Protocol):
-    """A progress bar."""
-
-    def __call__(self, done: int, total: int, note: str = "") -> None:
-        """Moves the bar."""
-
-
-#: Opens a progress bar with the given title.
-Progress = Callable[[str], AbstractContextManager[Task]]
 
 
 @dataclass(frozen=True)

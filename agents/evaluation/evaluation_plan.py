@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +34,7 @@ _SEED_STRIDE = 2**20
 CONDITION_ARGUMENTS = ("lighting", "delay")
 _OWN_ARGUMENTS = ("with_oracle", "max_episode_steps", "autoreset_mode")
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
-_NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "hash")
+NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "hash")
 
 
 class Condition(Configuration):
@@ -156,26 +156,26 @@ class EvaluationPlan(Configuration):
         base = {"split": "test", **self.environment}
         return {**base, "lighting": condition.lighting, "delay": condition.delay}
 
-    def describe(self) -> dict[str, Any]:
-        """Every entry as a JSON value; objects of a caller's own as text."""
-        return _json_values(dict(self), default=repr)
+    def describe(self, other: Callable[[Any], Any] = repr) -> dict[str, Any]:
+        """Every entry as JSON values; objects of a caller's own by the function `other`."""
 
-    @property
-    def protocol_entries(self) -> list[str]:
-        """Names of the entries that decide the episodes and their scores."""
-        return [name for name, _ in self if name not in _NOT_OF_THE_PROTOCOL]
+        def converted(value: Any) -> Any:
+            return dict(value) if isinstance(value, Condition) else other(value)
+
+        text = json.dumps(dict(self), default=converted, allow_nan=False)
+        return dict(json.loads(text))
 
     def protocol(self) -> dict[str, Any]:
         """JSON values of everything that decides the episodes and their scores.
 
         Raises:
-            ValueError: If an entry is none.
+            ValueError: If an entry is no JSON value.
         """
-        content = {name: getattr(self, name) for name in self.protocol_entries}
-        try:
-            return _json_values(content)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"every entry of a plan must be a JSON value: {error}") from error
+
+        def refuse(value: Any) -> Any:
+            raise ValueError(f"every entry of a plan must be a JSON value, not {value!r}")
+
+        return {k: v for k, v in self.describe(refuse).items() if k not in NOT_OF_THE_PROTOCOL}
 
     def changed(self, **entries: Any) -> EvaluationPlan:
         """The same plan with other entries, checked.
@@ -218,18 +218,6 @@ def digest(*parts: object) -> str:
     """
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _json_values(content: Any, default: Any = None) -> dict[str, Any]:
-    def converted(value: Any) -> Any:
-        if isinstance(value, Condition):
-            return dict(value)
-        if default is None:
-            raise TypeError(f"{value!r} is none")
-        return default(value)
-
-    found: dict[str, Any] = json.loads(json.dumps(content, default=converted, allow_nan=False))
-    return found
 
 
 # -- scenes and episodes --------------------------------------------------------------------------

@@ -41,6 +41,11 @@ class Interval:
         """``[low, high]``, or None."""
         return None if self.low is None or self.high is None else [self.low, self.high]
 
+    @property
+    def significant(self) -> bool:
+        """Whether the interval leaves out zero."""
+        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
+
     def __str__(self) -> str:
         if self.low is None or self.high is None:
             return f"{self.value:+.3f} ({self.num_groups} groups: no interval)"
@@ -159,35 +164,6 @@ def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Flo
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Paired difference of two policies' normalised scores.
-
-    Args:
-        policy: The first one.
-        minus: The one that is subtracted.
-        value: Their difference.
-        low: Lower end of its simultaneous interval; None below 15 source groups.
-        high: Upper end.
-    """
-
-    policy: str
-    minus: str
-    value: float
-    low: float | None
-    high: float | None
-
-    @property
-    def pair(self) -> list[float] | None:
-        """``[low, high]``, or None."""
-        return None if self.low is None or self.high is None else [self.low, self.high]
-
-    @property
-    def significant(self) -> bool:
-        """Whether the interval leaves out zero."""
-        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
-
-
-@dataclass(frozen=True)
 class Rank:
     """One line of a ranking.
 
@@ -195,15 +171,16 @@ class Rank:
         policy: Name.
         score: Normalised score with its own (not simultaneous) interval.
         tier: 1 for the best; None below 15 source groups.
-        to_best: Difference to the best policy; None for itself.
-        to_next: Difference to the policy below; None for the last.
+        to_best: Paired difference of the scores to the best policy, with its simultaneous interval;
+            None for itself.
+        to_next: The same to the policy below; None for the last.
     """
 
     policy: str
     score: Interval
     tier: int | None
-    to_best: Difference | None
-    to_next: Difference | None
+    to_best: Interval | None
+    to_next: Interval | None
 
 
 def rank(
@@ -239,12 +216,12 @@ def rank(
     if len(span) >= MIN_GROUPS and len(names) > 1:
         widths = _half_widths([gains[name] for name in names], span, resamples, level, seed)
 
-    def difference(i: int, j: int) -> Difference:
+    def difference(i: int, j: int) -> Interval:
         value = scores[names[i]].value - scores[names[j]].value
-        if widths is None:
-            return Difference(names[i], names[j], value, None, None)
-        half = float(widths[i, j])
-        return Difference(names[i], names[j], value, value - half, value + half)
+        half = None if widths is None else float(widths[i, j])
+        low, high = (None, None) if half is None else (value - half, value + half)
+        seeds = max(scores[names[k]].num_seeds for k in (i, j))
+        return Interval(value, low, high, len(span), seeds)
 
     tiers = _tiers(len(names), difference) if widths is not None else [None] * len(names)
     return [
@@ -281,7 +258,7 @@ def _half_widths(
     return errors * float(np.quantile(largest, level))
 
 
-def _tiers(count: int, difference: Callable[[int, int], Difference]) -> list[int | None]:
+def _tiers(count: int, difference: Callable[[int, int], Interval]) -> list[int | None]:
     tiers: list[int | None] = []
     leader, tier = 0, 1
     for i in range(count):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.evaluation_plan import EvaluationPlan, digest
+from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
 from agents.evaluation.result import EvaluationResult
 from agents.report.markdown import cell, code, code_block, escape, html_report, markdown_table
@@ -124,7 +124,8 @@ def _meta(
     described = None
     if plan is not None:
         described = plan.describe()
-        described["sha256"] = digest({k: described[k] for k in plan.protocol_entries})
+        protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
+        described["sha256"] = digest(protocol)
     return {
         **result_meta(command, result.seed),
         "plan": described,

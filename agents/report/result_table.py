@@ -213,20 +213,21 @@ def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> list[Ran
 
 def ranking_rows(ranking: Sequence[Rank]) -> Rows:
     """A ranking as JSON values."""
+    names = [one.policy for one in ranking]
     rows = []
-    for position, one in enumerate(ranking, 1):
+    for i, one in enumerate(ranking):
         row: dict[str, Any] = {
-            "place": position,
+            "place": i + 1,
             "policy": one.policy,
             "tier": one.tier,
             "normalised_score": one.score.value,
             "ci95": one.score.pair,
         }
-        for key, change in (("to_best", one.to_best), ("to_next", one.to_next)):
+        for key, change, other in (("to_best", one.to_best, 0), ("to_next", one.to_next, i + 1)):
             row[key] = None
             if change is not None:
                 row[key] = {
-                    "other": change.minus,
+                    "other": names[other],
                     "difference": change.value,
                     "simultaneous_ci95": change.pair,
                     "significant": change.significant,

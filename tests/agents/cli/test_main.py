@@ -75,7 +75,7 @@ def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
         (("evaluate", "--policy", "random", "--lighting", "disco"), "`lighting` (='disco')"),
         (("quickstart", "--scenes", "empty.dng"), "must hold raws"),
         (("train", "none.yaml"), "there is no such file"),
-        (("train", "wrong.yaml"), "training.frame is unknown"),
+        (("train", "wrong.yaml"), "training.frame (=3): unknown, the entries"),
         (("train", "agent.yaml", "--seed", 2**40), "`seed` (=1099511627776) must be in"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),

@@ -76,7 +76,7 @@ def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
 def test_objects_of_a_callers_own_are_described_but_are_no_protocol():
     plan = PLAN.changed(environment={**PLAN.environment, "scenes": plan_scenes(PLAN)[:1]})
     assert "dead_leaves" in str(plan.describe()["environment"]["scenes"])
-    with pytest.raises(ValueError, match="must be a JSON value"):
+    with pytest.raises(ValueError, match="must be a JSON value, not"):
         plan.protocol()
 
 

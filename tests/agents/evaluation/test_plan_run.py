@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -122,29 +118,6 @@ def test_what_was_interrupted_keeps_what_was_finished(tmp_path, monkeypatch):
 def test_two_processes_give_what_one_does(results, folder, tmp_path):
     run_plan(PLAN, tmp_path, workers=2)
     _check_same(tmp_path, folder)
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_processes_and_the_next_run_goes_on(tmp_path):
-    options = ("--scenes", "bundled:small", "--resolution", "36", "--lighting", "sine")
-    command = ["evaluate", "--policy", "random", "--policy", "average:tuned", *options]
-    program = [sys.executable, "-m", "agents.cli", *command, "--workers", "2", "--out", "out"]
-    root = Path(__file__).parents[3]
-    env = {**__import__("os").environ, "PYTHONPATH": str(root)}
-    process = subprocess.Popen(
-        program, cwd=tmp_path, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    parts = tmp_path / "out" / "parts"
-    for _ in range(1200):
-        if parts.is_dir() and list(parts.glob("*.npz")):
-            break
-        time.sleep(0.1)
-    process.send_signal(signal.SIGINT)
-    _, words = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "the same command goes on where it was" in words
-    assert "Traceback" not in words
-    assert not list(parts.glob(".*"))
 
 
 def test_mistakes_are_told_before_any_work(tmp_path):
