@@ -33,7 +33,8 @@ from benchmarks.simulator.depth_views import (
 )
 from benchmarks.simulator.scenes import Progress, clipped, data_root
 from simulator import RawImage, get_camera
-from simulator.networks.aperture_module import ApertureModule, added_blur
+from simulator.networks.aperture_module import ApertureModule
+from simulator.optics.disc_bank import added_blur
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
 from simulator.optics.disc_bank import DiscBank
 
