@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from simulator.capture.kernels import PEDESTAL
+from simulator.capture.exposure import PEDESTAL
 from simulator.utils.jit import kernel
 
 if TYPE_CHECKING:

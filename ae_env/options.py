@@ -25,8 +25,8 @@ from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
 from ae_env.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture.exposure import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
-from simulator.capture.exposure import check_tolerance
+from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
+from simulator.capture.plan import check_tolerance
 from simulator.utils.cache import LruCache
 
 #: Smallest frame that the default networks of the common libraries take.

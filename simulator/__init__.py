@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from simulator.camera import BayerPattern as BayerPattern
     from simulator.camera import CameraProfile as CameraProfile
-    from simulator.camera import NoiseLevelFunction as NoiseLevelFunction
     from simulator.camera import get_camera as get_camera
     from simulator.camera import list_cameras as list_cameras
     from simulator.camera_simulator import CameraSimulator as CameraSimulator
     from simulator.capture.plan import SimulationPlan as SimulationPlan
     from simulator.capture.prepared_scene import PreparedScene as PreparedScene
+    from simulator.noise.noise_level_function import NoiseLevelFunction as NoiseLevelFunction
     from simulator.raw.decoding import RawFileError as RawFileError
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
@@ -50,10 +50,11 @@ __all__ = [
 
 #: Module of each public name; loaded when the name is first used, so that importing is fast.
 _MODULES = {
-    "camera": ["BayerPattern", "CameraProfile", "NoiseLevelFunction", "get_camera", "list_cameras"],
+    "camera": ["BayerPattern", "CameraProfile", "get_camera", "list_cameras"],
     "camera_simulator": ["CameraSimulator"],
     "capture.plan": ["SimulationPlan"],
     "capture.prepared_scene": ["PreparedScene"],
+    "noise.noise_level_function": ["NoiseLevelFunction"],
     "raw.decoding": ["RawFileError"],
     "raw.develop": ["develop", "render_srgb"],
     "raw.dng": ["write_dng"],

@@ -12,8 +12,7 @@ from enum import StrEnum
 from importlib import resources
 from numbers import Integral, Real
 
-#: Variances beyond it are limited: float32 holds their sums over a frame of any signals.
-VARIANCE_LIMIT = 1e24
+from simulator.noise.noise_level_function import NoiseLevelFunction
 
 
 class BayerPattern(StrEnum):
@@ -35,62 +34,6 @@ class BayerPattern(StrEnum):
         green_with_red = red ^ 1  # the other column of red's row
         green_with_blue = blue ^ 1
         return tuple(divmod(i, 2) for i in (red, green_with_red, green_with_blue, blue))
-
-
-@dataclass(frozen=True)
-class NoiseLevelFunction:
-    """Variance of a pixel as a function of its signal: ``read + shot * max(signal, 0)``.
-
-    Args:
-        shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1.
-        read: Variance at zero signal per plane.
-        extrapolated: Whether the ISO lies outside the calibrated table.
-        source: Where the numbers come from.
-    """
-
-    shot: tuple[float, float, float, float]
-    read: tuple[float, float, float, float]
-    extrapolated: bool = False
-    source: str = ""
-
-    def __post_init__(self) -> None:
-        for name in ("shot", "read"):
-            values = tuple(float(v) for v in getattr(self, name))
-            if len(values) != 4 or not all(0.0 <= v < math.inf for v in values):
-                raise ValueError(f"`{name}` (={values}) must be 4 finite values >= 0")
-            object.__setattr__(self, name, values)
-
-    @staticmethod
-    @functools.cache
-    def zero() -> NoiseLevelFunction:
-        """The NLF of a source without noise."""
-        return NoiseLevelFunction((0.0,) * 4, (0.0,) * 4, source="noise-free")
-
-    @functools.cached_property
-    def is_zero(self) -> bool:
-        """Whether there is no noise at all."""
-        return max(*self.shot, *self.read) == 0.0
-
-    def scaled(self, factor: float) -> NoiseLevelFunction:
-        """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
-        shot = tuple(v * factor for v in self.shot)
-        read = tuple(v * factor for v in self.read)
-        return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
-
-    def at_least(self, other: NoiseLevelFunction) -> NoiseLevelFunction:
-        """The larger shot and the larger read noise of both, plane by plane."""
-        shot = tuple(map(max, self.shot, other.shot))
-        read = tuple(map(max, self.read, other.read))
-        return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
-
-    def exposed(self, ratio: float) -> NoiseLevelFunction:
-        """NLF of this noise after the raw was multiplied by `ratio` (paper, section 3.2).
-
-        No variance exceeds `VARIANCE_LIMIT`.
-        """
-        shot = tuple(min(v * ratio, VARIANCE_LIMIT) for v in self.shot)
-        read = tuple(min(v * ratio * ratio, VARIANCE_LIMIT) for v in self.read)
-        return replace(self, shot=shot, read=read)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -16,15 +16,16 @@ from typing import Any, Literal, cast, get_args
 import torch
 from torch import nn
 
-from simulator.capture.aperture_blur import ApertureBlur, MapApertureBlur, NetworkApertureBlur
-from simulator.capture.denoised import Denoised
+from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
+from simulator.capture.blurred_light import ApertureBlur, Denoised
 from simulator.capture.plan import SimulationPlan
-from simulator.capture.prepared_scene import HasPrepared, Noise, PreparedScene, check_noise
+from simulator.capture.prepared_scene import HasPrepared, PreparedScene
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.full_run import FullRun, Stages
 from simulator.networks.network_cache import NetworkCache, Where
 from simulator.networks.noise_module import NoiseModule, Preset, smoothed, variance_map
+from simulator.noise.generator import Noise, check_noise
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.tiles import in_tiles, varying

@@ -1,13 +1,14 @@
 """The episodes behind both environments: n of them side by side, in one process.
 
 `AutoExposureEnv` runs one, `AutoExposureVectorEnv` many; everything that happens in an episode
-happens here, so that the two cannot differ.
+happens here, so that the two cannot differ. A step is `EpisodeCore.transition`, which applies the
+actions, and `EpisodeCore.observe`, which photographs, scores and reports.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +16,6 @@ import numpy as np
 
 from ae_env.episodes.draws import Draws, allowed_states
 from ae_env.episodes.light import FrameLight
-from ae_env.episodes.recorder import Recorder
 from ae_env.episodes.scores import PartScores
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.lighting import Lighting
@@ -23,8 +23,10 @@ from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
 from ae_env.options import COSTS, EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene
-from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from simulator.noise.generator import single_normals
+from ae_env.scorers.score_table import ScoreTable, ScoreTables, in_episode, prepare_scene
+from simulator.capture.batch import CaptureBatch
+from simulator.capture.prepared_scene import PreparedScene
+from simulator.noise.generator import Noise
 from simulator.optics.disc_bank import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
@@ -33,6 +35,14 @@ CHUNK_SAMPLES = 2**18
 LIGHT_CACHE_BYTES = 256 * 2**20
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
+#: How the noise is made, by the environment's argument.
+_NOISES: dict[bool | str, Noise | None] = {
+    False: None,
+    True: "bank",
+    "bank": "bank",
+    "exact": "exact",
+}
+#: What `CaptureBatch.record` calls each kind of observation.
 _OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
 
 
@@ -60,10 +70,9 @@ class EpisodeCore:
     """
 
     def __init__(self, options: EnvOptions, num_envs: int) -> None:
-        self.options = options
+        self.options, self.delay = options, int(options.delay)
         self.grid = options.make_grid()
         self.camera = options.make_camera()
-        self.delay = int(options.delay)
         self.scorer = options.make_scorer()
         self.lighting = options.make_lighting()
         self.scenes = options.load_scenes()
@@ -93,14 +102,20 @@ class EpisodeCore:
         )
         self._part_scores = PartScores(self.tables, self.scenes, self.episodes, static=self._static)
         self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
-        frame_bytes = 16 * options.resolution**2
-        keep = num_envs * self._kept_frames() * frame_bytes <= LIGHT_CACHE_BYTES
-        self.recorder = Recorder(
-            options, self.grid, self.camera, self.scenes, self.episodes, keep=keep
+        self._at_rest: dict[int, PreparedScene] = {}
+        size = options.resolution
+        self._captures = CaptureBatch(
+            self._prepared,
+            len(self.scenes) + num_envs,
+            states,
+            self.camera,
+            (size, size),
+            noise=_NOISES[options.noise],
+            keep_light=num_envs * self._cached_frames() * 16 * size**2 <= LIGHT_CACHE_BYTES,
         )
 
-    def _kept_frames(self) -> int:
-        """Blurred frames that an episode keeps at most."""
+    def _cached_frames(self) -> int:
+        """Blurred frames that are cached for an episode at most."""
         apertures = len(self.grid.f_numbers)
         if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results
             apertures += len(DIAMETERS) + apertures
@@ -117,8 +132,8 @@ class EpisodeCore:
             "linear": (-PEDESTAL, 1.0, np.float32),
             "dn": (0.0, self.camera.white_level, np.uint16),
         }[self.options.observation]
-        spaces: dict[str, gym.Space] = {
-            "raw": gym.spaces.Box(low, high, shape, dtype),
+        spaces: dict[str, gym.Space[Any]] = {
+            "raw": gym.spaces.Box(low, high, shape, dtype),  # type: ignore[arg-type]
             "settings": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
         }
         if self.options.sensors:
@@ -137,7 +152,7 @@ class EpisodeCore:
             return self.scenes
         return [self.scenes[i] for i in np.unique(self._sequence[0])]
 
-    # -- life of an episode -------------------------------------------------------------------
+    # -- reset --------------------------------------------------------------------------------
 
     def begin(
         self,
@@ -145,29 +160,60 @@ class EpisodeCore:
         rngs: Sequence[np.random.Generator],
         options: Sequence[Mapping[str, Any]] | None = None,
     ) -> None:
-        """Draws episodes for `env_indices` (K,), where others may end; see `Draws.draw`."""
+        """Draws new episodes for `env_indices` (K,), where others may end; see `Draws.draw`."""
         drawn = self._draws.draw(rngs, options)
         if self._sequence is not None:
             first = np.unique(self._sequence[0])[drawn["scene"]]
             drawn["scene"] = self._shown_at(first, drawn["frame"])
         self._forget(env_indices)
-        slots = self._slots(env_indices, drawn["scene"], drawn["speed"], drawn["defocus"])
-        self.episodes.begin(env_indices, drawn, slots)
+        self.episodes.begin(env_indices, drawn)
+        self._set_light_index(env_indices)
 
     def _forget(self, env_indices: np.ndarray) -> None:
-        """Lets go of what was worked out for the scenes that are shown at `env_indices`."""
-        self.recorder.end(env_indices)
-        self._part_scores.forget(len(self.scenes) + env_indices)
+        """Lets go of what was worked out for the scenes that are shown in `env_indices`."""
+        own = len(self.scenes) + env_indices
+        self._captures.forget(own)
+        self._part_scores.forget(own)
         for env_index in env_indices.tolist():
             self._tables[env_index] = None
 
-    def _slots(
-        self, env_indices: np.ndarray, scenes: np.ndarray, speed: np.ndarray, defocus: np.ndarray
-    ) -> np.ndarray:
-        """(K,) slots, see `Episodes`."""
-        # At rest, its light and its scores are those of every episode that shows its scene.
-        moves = (speed > 0.0) | (defocus > 0.0)
-        return np.where(~moves & self._shareable[scenes], scenes, len(self.scenes) + env_indices)
+    def _set_light_index(self, env_indices: np.ndarray) -> None:
+        """Sets `Episodes.light_index`: episodes at rest share the light of their scene."""
+        episodes = self.episodes
+        scenes = episodes.scene[env_indices]
+        moves = (episodes.speed[env_indices] > 0.0) | (episodes.defocus[env_indices] > 0.0)
+        shared, own = ~moves & self._shareable[scenes], len(self.scenes) + env_indices
+        episodes.light_index[env_indices] = np.where(shared, scenes, own)
+
+    # -- step: the transition -----------------------------------------------------------------
+
+    def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> None:
+        """Advances the episodes of `env_indices` (K,) by one frame.
+
+        Args:
+            env_indices: Whose turn it is.
+            actions: (K,) their actions, integers; applied after the delay.
+
+        Raises:
+            ValueError: If an action is not a state of the grid; no episode advances then.
+        """
+        self._check_begun(env_indices)
+        wrong = (actions < 0) | (actions >= len(self.grid))
+        if wrong.any():
+            raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {len(self.grid)})")
+        self.episodes.act(env_indices, actions)
+        if self._sequence is not None:
+            self._show_next(env_indices)
+
+    def _show_next(self, env_indices: np.ndarray) -> None:
+        """Shows the scene of the current frame in each of `env_indices`."""
+        episodes = self.episodes
+        now = self._shown_at(episodes.scene[env_indices], episodes.frame[env_indices])
+        changes = now != episodes.scene[env_indices]
+        env_indices, now = env_indices[changes], now[changes]
+        self._forget(env_indices)
+        episodes.scene[env_indices] = now
+        self._set_light_index(env_indices)
 
     def _shown_at(self, scenes: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Scenes that the sequences of `scenes` show in `frames`; the last one stays."""
@@ -175,19 +221,151 @@ class EpisodeCore:
         first, last = self._sequence
         return np.minimum(first[scenes] + frames, last[scenes])
 
-    def _show_next(self, env_indices: np.ndarray) -> None:
-        """Shows the scene of the current frame at each of `env_indices`."""
+    # -- step: the observation ----------------------------------------------------------------
+
+    def observe(self, env_indices: np.ndarray) -> Frames:
+        """Photographs the episodes of `env_indices` (B,), each in its current state."""
+        episodes, options = self.episodes, self.options
+        states = episodes.state[env_indices]
+        raw, columns = self._photograph(env_indices)
+        observation = {"raw": raw, "settings": self._settings[states]}
+        if options.sensors:
+            speed, focus_drive = episodes.speed[env_indices], episodes.focus_drive[env_indices]
+            normals = columns.pop("sensor_normals")
+            observation["sensors"] = encode_sensors(speed, focus_drive, normals)
+        rewards, reward = self._reward(env_indices, columns)
+        info: dict[str, Any] = {"scene_id": self._scene_ids[episodes.scene[env_indices]]}
+        info["state"] = states
+        info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
+        info |= columns | {"rewards": rewards}
+        if options.with_oracle:
+            tables = [self.score_table(env_index) for env_index in env_indices.tolist()]
+            best = np.array([t.mean[t.oracle] for t in tables])
+            info["oracle_state"] = np.array([t.oracle for t in tables])
+            info["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
+        return Frames(observation, info, reward)
+
+    def _photograph(self, env_indices: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Observations of ``raw``, and columns: of `info`, scores by ``score:`` and part, and more.
+
+        Worked out chunk by chunk where a part of the score reads the pixels.
+        """
+        size, episodes = self.options.resolution, self.episodes
+        raw = np.empty((len(env_indices), 4, size, size), _RAW_DTYPES[self.options.observation])
+        lights, states = episodes.light_index[env_indices], episodes.state[env_indices]
+        gains, rows = np.ones(len(env_indices)), None
+        if not self._static:
+            gains, rows = self._light.of_each(env_indices, self._bounds[1, states])
+        self._captures.prepare(lights, states, gains)
+        reads = self._part_scores.reads_pixels or rows is not None
+        step = max(1, CHUNK_SAMPLES // (4 * size**2) if reads else len(env_indices))
+        chunks = []
+        for start in range(0, len(env_indices), step):
+            part = slice(start, start + step)
+            some = None if rows is None else rows[part]
+            chunks.append(self._photograph_some(env_indices[part], gains[part], some, raw[part]))
+        if len(chunks) == 1:
+            return raw, chunks[0]
+        return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
+
+    def _photograph_some(
+        self, env_indices: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Columns of the episodes of `env_indices`; their observations are written to `raw`."""
+        episodes, costs = self.episodes, self.options.costs
+        outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
+        if self._part_scores.reads_images:  # else no float of every sample is made
+            outputs.setdefault("signals", np.empty(raw.shape, np.float32))
+        if "flicker" in costs:
+            outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
+        frames = self._captures.record(
+            episodes.light_index[env_indices],
+            episodes.state[env_indices],
+            episodes.noise_seed[env_indices],
+            episodes.frame[env_indices],
+            row_gain=rows,
+            **outputs,
+        )
+        columns = {
+            "clipped_high": frames.clipped_high,
+            "clipped_low": frames.clipped_low,
+            "excess_noise": frames.excess_variance,
+            "modules": frames.modules,
+        }
+        if self.options.sensors:
+            columns["sensor_normals"] = frames.sensor_normals(2)
+        columns |= self._part_scores.of(env_indices, outputs.get("signals"), gains, rows)
+        if self.options.observation == "linear":
+            np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
+        if "flicker" in costs:
+            codes = outputs["codes"].reshape(len(raw), -1)
+            columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
+        return columns
+
+    def _prepared(self, light_index: int) -> PreparedScene:
+        """What the camera sees under a `Episodes.light_index`, in the scene's own light."""
+        env_index = light_index - len(self.scenes)
+        if env_index < 0:
+            return self._prepared_at_rest(light_index)
+        episode = self.episodes[env_index]
+        at_rest = self._prepared_at_rest(episode.scene)
+        return in_episode(at_rest, speed=episode.speed, defocus=episode.defocus)
+
+    def _prepared_at_rest(self, scene: int) -> PreparedScene:
+        prepared = self._at_rest.get(scene)
+        if prepared is None:
+            prepared = prepare_scene(self.scenes[scene], self.camera)
+            prepared = replace(prepared, tolerance=self.options.tolerance)
+            if prepared.aperture_blur is None:  # which caches too much light to stay for long
+                self._at_rest[scene] = prepared
+        return prepared
+
+    # -- step: the reward ---------------------------------------------------------------------
+
+    def _reward(
+        self, env_indices: np.ndarray, columns: dict[str, np.ndarray]
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Terms of the reward by name, and the reward (B,): the score minus weighted costs.
+
+        Takes the scores and the image means out of `columns`.
+        """
+        rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
+        rewards["score"] = self._totals(rewards, env_indices)
+        reward = rewards["score"].copy()
+        for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
+            rewards[name] = cost
+            reward -= self.options.costs[name] * cost
+        return rewards, reward
+
+    def _totals(self, parts: dict[str, np.ndarray], env_indices: np.ndarray) -> np.ndarray:
+        """(B,) float64 scores before costs."""
+        # A closed form is its own expectation, and needs no table of all states.
+        if self.options.reward == "expected" and not self.scorer.closed_form:
+            pairs = zip(env_indices.tolist(), self.episodes.state[env_indices], strict=True)
+            return np.array([self.score_table(env_index).mean[state] for env_index, state in pairs])
+        return self._part_scores.totals(parts, env_indices)
+
+    def _costs(self, env_indices: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
+        """(B,) each; 0 in the first frame of an episode."""
+        if not self.options.costs:
+            return {}
         episodes = self.episodes
-        now = self._shown_at(episodes.scene[env_indices], episodes.frame[env_indices])
-        changes = now != episodes.scene[env_indices]
-        env_indices, now = env_indices[changes], now[changes]
-        self._forget(env_indices)
-        episodes.scene[env_indices] = now
-        speed, defocus = episodes.speed[env_indices], episodes.defocus[env_indices]
-        episodes.slot[env_indices] = self._slots(env_indices, now, speed, defocus)
+        first = episodes.previous[env_indices] < 0
+        costs = {name: np.zeros(len(env_indices)) for name in COSTS if name in self.options.costs}
+        if means is not None:
+            change = np.abs(means - episodes.image_mean[env_indices])
+            costs["flicker"] = np.where(first, 0.0, change)
+            episodes.image_mean[env_indices] = means
+        if "switch" in costs:
+            now = self.grid.controls(episodes.state[env_indices])
+            before = self.grid.controls(np.where(first, 0, episodes.previous[env_indices]))
+            costs["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
+        return costs
+
+    # -- what is known of an episode ----------------------------------------------------------
 
     def episode(self, env_index: int) -> Episode:
-        """The episode at `env_index` as it is now."""
+        """The episode of environment `env_index` as it is now."""
         self._check_begun(env_index)
         return self.episodes[env_index]
 
@@ -199,26 +377,8 @@ class EpisodeCore:
         if not self.episodes.begun[env_indices].all():
             raise gym.error.ResetNeeded("call reset() before step(), render() or scores")
 
-    def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> None:
-        """Lets the episodes at `env_indices` (K,) go on by one frame.
-
-        Args:
-            env_indices: Whose turn it is.
-            actions: (K,) their actions, integers; applied after the delay.
-
-        Raises:
-            ValueError: If an action is not a state of the grid; no episode goes on then.
-        """
-        self._check_begun(env_indices)
-        wrong = (actions < 0) | (actions >= len(self.grid))
-        if wrong.any():
-            raise ValueError(f"`action` (={actions[wrong][0]}) must be in [0, {len(self.grid)})")
-        self.episodes.act(env_indices, actions)
-        if self._sequence is not None:
-            self._show_next(env_indices)
-
     def score_table(self, env_index: int) -> ScoreTable:
-        """Scores of all states in the current frame of the episode at `env_index`."""
+        """Expected scores of all states in the current frame of environment `env_index`."""
         episode = self.episode(env_index)
         gain: float | np.ndarray = 1.0
         rows = None
@@ -239,98 +399,3 @@ class EpisodeCore:
             )
             known = self._tables[env_index] = (key, table)
         return known[1]
-
-    # -- what the camera records --------------------------------------------------------------
-
-    def observe(self, env_indices: np.ndarray) -> Frames:
-        """Photographs the episodes at `env_indices` (B,), each in its current state."""
-        raw, columns = self._capture_all(env_indices)
-        episodes = self.episodes
-        scenes, states = episodes.scene[env_indices], episodes.state[env_indices]
-        observation = {"raw": raw, "settings": self._settings[states]}
-        if self.options.sensors:
-            observation["sensors"] = encode_sensors(
-                episodes.speed[env_indices], episodes.focus_drive[env_indices], columns.pop("sensor_noise")
-            )
-        rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
-        rewards["score"] = self._totals(rewards, env_indices)
-        reward = rewards["score"].copy()
-        for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
-            rewards[name] = cost
-            reward -= self.options.costs[name] * cost
-        info = {"scene_id": self._scene_ids[scenes], "state": states}
-        info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
-        info |= columns | {"rewards": rewards}
-        if self.options.with_oracle:
-            tables = [self.score_table(env_index) for env_index in env_indices.tolist()]
-            best = np.array([t.mean[t.oracle] for t in tables])
-            info["oracle_state"] = np.array([t.oracle for t in tables])
-            info["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
-        return Frames(observation, info, reward)
-
-    def _totals(self, parts: dict[str, np.ndarray], env_indices: np.ndarray) -> np.ndarray:
-        """(B,) float64 scores before costs."""
-        # A closed form is its own expectation, and needs no table of all states.
-        if self.options.reward == "expected" and not self.scorer.closed_form:
-            pairs = zip(env_indices.tolist(), self.episodes.state[env_indices].tolist(), strict=True)
-            return np.array([self.score_table(env_index).mean[state] for env_index, state in pairs])
-        return self._part_scores.totals(parts, env_indices)
-
-    def _capture_all(self, env_indices: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Observations of `raw` and the info columns, worked out chunk by chunk."""
-        size = self.options.resolution
-        raw = np.empty((len(env_indices), 4, size, size), _RAW_DTYPES[self.options.observation])
-        gains, rows = np.ones(len(env_indices)), None
-        if not self._static:
-            gains, rows = self._light.of_each(env_indices, self._bounds[1, self.episodes.state[env_indices]])
-        self.recorder.prepare(env_indices, gains)
-        # Only where no part of the score needs it is no float of every sample made.
-        few = self._part_scores.reads_pixels or rows is not None
-        step = max(1, CHUNK_SAMPLES // (4 * size**2)) if few else len(env_indices)
-        if step >= len(env_indices):
-            return raw, self._capture(env_indices, gains, rows, raw)
-        chunks = []
-        for start in range(0, len(env_indices), step):
-            part = slice(start, start + step)
-            some = None if rows is None else rows[part]
-            chunks.append(self._capture(env_indices[part], gains[part], some, raw[part]))
-        return raw, {name: np.concatenate([c[name] for c in chunks]) for name in chunks[0]}
-
-    def _capture(
-        self, env_indices: np.ndarray, gains: np.ndarray, rows: np.ndarray | None, raw: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """Info columns of the episodes at `env_indices`; their observations are written to `raw`."""
-        outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
-        if self._part_scores.reads_images:
-            outputs.setdefault("signals", np.empty(raw.shape, np.float32))
-        if "flicker" in self.options.costs:
-            outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
-        columns = self.recorder.record(env_indices, row_gain=rows, **outputs)
-        key = columns.pop("noise_key")
-        if self.options.sensors:
-            columns["sensor_noise"] = single_normals(key, 2)
-        columns |= self._part_scores.of(env_indices, outputs.get("signals"), gains, rows)
-        if self.options.observation == "linear":
-            np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
-        if "flicker" in self.options.costs:
-            codes = outputs["codes"].reshape(len(raw), -1)
-            columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
-        return columns
-
-    def _costs(self, env_indices: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
-        """(B,) each; 0 in the first frame of an episode."""
-        if not self.options.costs:
-            return {}
-        episodes = self.episodes
-        first = episodes.previous[env_indices] < 0
-        costs = {name: np.zeros(len(env_indices)) for name in COSTS if name in self.options.costs}
-        if means is not None:
-            change = np.abs(means - episodes.image_mean[env_indices])
-            costs["flicker"] = np.where(first, 0.0, change)
-            episodes.image_mean[env_indices] = means
-        if "switch" in costs:
-            now = self.grid.controls(episodes.state[env_indices])
-            before = self.grid.controls(np.where(first, 0, episodes.previous[env_indices]))
-            costs["switch"] = np.where(first, 0.0, (before != now).mean(axis=-1))
-        return costs
-

@@ -34,41 +34,41 @@ class FrameLight:
         self.lighting, self.episodes, self.scenes = lighting, episodes, scenes
         self.camera, self.resolution = camera, resolution
 
-    def of(self, place: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
-        """Light of an exposure in the current frame of the episode at `place`.
+    def of(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
+        """Light of an exposure in the current frame of the episode of environment `env_index`.
 
         Args:
-            place: Of the episode.
+            env_index: Which episode.
             exposure_time: Time the shutter is open [s].
 
         Returns:
             That of the frame, and (R,) that of each row relative to it; None where all rows have
             the same.
         """
-        frame, phase = self.episodes.frame.item(place), self.episodes.phase.item(place)
+        frame, phase = self.episodes.frame.item(env_index), self.episodes.phase.item(env_index)
         if not self.lighting.within_frame:
             return self.lighting.gain(frame, exposure_time, phase), None
-        box = self.scenes[self.episodes.scene[place]].box_factor
+        box = self.scenes[self.episodes.scene[env_index]].box_factor
         shutter = RollingShutter(self.resolution, self.camera.row_time, 2 * box)
         return self.lighting.rows(frame, exposure_time, phase, shutter)
 
     def of_each(
-        self, places: np.ndarray, exposure_times: np.ndarray
+        self, env_indices: np.ndarray, exposure_times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Light of one exposure of each of `places` (B,).
+        """Light of one exposure of each of `env_indices` (B,).
 
         Returns:
             (B,) and (B, R) as of `of`; None where all rows of all frames are alike.
         """
-        pairs = zip(places.tolist(), exposure_times.tolist(), strict=True)
-        return _together([self.of(place, time) for place, time in pairs])
+        pairs = zip(env_indices.tolist(), exposure_times.tolist(), strict=True)
+        return _together([self.of(env_index, time) for env_index, time in pairs])
 
     def of_states(
-        self, place: int, exposure_times: np.ndarray
+        self, env_index: int, exposure_times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """The same for `exposure_times` (S,) at one place; each that differs is worked out once."""
+        """The same for `exposure_times` (S,) in one environment; equal ones are worked out once."""
         times = exposure_times.tolist()
-        known = {time: self.of(place, time) for time in set(times)}
+        known = {time: self.of(env_index, time) for time in set(times)}
         return _together([known[time] for time in times])
 
 

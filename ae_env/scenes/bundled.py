@@ -21,7 +21,8 @@ from ae_env.scenes.procedural import (
     draw,
 )
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
-from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from simulator.utils.cache import DiskCache, cache_key
 

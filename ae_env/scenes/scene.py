@@ -12,11 +12,12 @@ import numpy as np
 import torch
 
 from ae_env.scenes.colour import camera_from_srgb, check_rgb
-from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.denoised import Denoised
+from simulator.capture.blurred_light import BlurredLight, Denoised
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage, check_packed
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
@@ -209,7 +210,7 @@ class Scene:
             box_factor=self.box_factor,
             denoised=denoised,
             aperture_blur=aperture_blur,
-            statistics=self._statistics,
+            blurred_light=BlurredLight(self.light, denoised, aperture_blur, self._statistics),
         )
 
     @cached_property

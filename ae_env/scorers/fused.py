@@ -20,7 +20,7 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures
 from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
-from simulator.camera import NoiseLevelFunction
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.cache import LruCache
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares

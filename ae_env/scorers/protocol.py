@@ -9,7 +9,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import torch
 
-from simulator.camera import NoiseLevelFunction
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
 ColourMatrix = tuple[tuple[float, float, float], ...]

@@ -24,10 +24,9 @@ from ae_env.scorers.protocol import DependsOn, reads_pixels
 from ae_env.scorers.registry import scorer_fingerprint
 from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
-from simulator.capture.batch import expected_in_bands, expose_in_bands
-from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.record import clip_and_quantise
+from simulator.capture.sensor import clip_and_quantise
 from simulator.utils.cache import DiskCache, LruCache, cache_key
 
 #: Bumped when the way that scores are computed changes.
@@ -278,33 +277,25 @@ class ScoreTables:
         row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
-        changes = isinstance(gain, np.ndarray) or row_gain is not None
-        prepared = replace(
-            prepare_scene(scene, self.camera, speed=speed, defocus=defocus),
-            tolerance=self.tolerance,
-            gain=1.0 if isinstance(gain, np.ndarray) else gain,
-        )
+        prepared = prepare_scene(scene, self.camera, speed=speed, defocus=defocus)
+        prepared = replace(prepared, tolerance=self.tolerance)
+        if not isinstance(gain, np.ndarray):
+            gain = np.full(len(self.grid), gain)
         names = self.scorer.names("image")
         samples = {name: np.zeros((self.noise_seeds, len(self.grid))) for name in names}
         for part in _slices(len(self.grid), _CHUNK):
             states = self.grid.states[part]
-            gains = gain[part] if isinstance(gain, np.ndarray) else gain
-            rows = None if row_gain is None else row_gain[part]
+            gains, rows = gain[part], None if row_gain is None else row_gain[part]
             captures = self._captures.describe(
                 scene, states, speed=speed, defocus=defocus, gain=gains, row_gain=rows
             )
-            prepared_scenes = [prepared] * len(states)
-            if isinstance(gains, np.ndarray):
-                prepared_scenes = [replace(prepared, gain=value) for value in gains.tolist()]
+            light: Any = {"gain": gains, "row_gain": rows}
             for seed in range(self.noise_seeds):
-                if not self.noise:
-                    images = clip_and_quantise(
-                        expected_in_bands(prepared_scenes, states, rows), self.camera
-                    )
-                elif changes:
-                    images = expose_in_bands(prepared_scenes, states, rows, seed=seed)
+                if self.noise:
+                    images = prepared.expose(states, seed=seed, **light)
                 else:
-                    images = prepared.expose(states, seed=seed)
+                    signals = prepared.expected_sweep(states, **light)
+                    images = clip_and_quantise(signals, self.camera)
                 images = images.clamp_(0.0, 1.0)
                 for name, values in self.scorer.score_parts(images, captures, ("image",)).items():
                     samples[name][seed, part] = values.numpy()

@@ -18,7 +18,7 @@ from agents.cli.console import (
     save_picture,
     torch_device,
 )
-from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 
 if TYPE_CHECKING:
     from simulator.camera_simulator import CameraSimulator

@@ -17,7 +17,7 @@ from agents.cli.console import (
     torch_device,
 )
 from agents.cli.simulate import Cache, Depth, Weights, make_simulator
-from simulator.capture.exposure import DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene

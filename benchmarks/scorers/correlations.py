@@ -21,7 +21,7 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import prepare_scene
 from benchmarks.markdown import table
 from simulator import CameraProfile, develop
-from simulator.capture.record import clip_and_quantise
+from simulator.capture.sensor import clip_and_quantise
 
 SCORERS = ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced")
 #: What each scorer alone is about, measured on captures with no other fault than that one.

@@ -33,9 +33,9 @@ from benchmarks.simulator.depth_views import (
 )
 from benchmarks.simulator.scenes import Progress, clipped, data_root
 from simulator import RawImage, get_camera
-from simulator.networks.aperture_module import ApertureModule, added_blur
+from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
-from simulator.optics.disc_bank import DiscBank
+from simulator.optics.disc_bank import DiscBank, added_blur
 
 if TYPE_CHECKING:
     from benchmarks.simulator.models import Models

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.stability.case import Row, time_ratio
-from simulator.networks.paper_baselines import NUM_PARAMETERS
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
+from simulator.networks.paper_baselines import NUM_PARAMETERS
 from simulator.networks.unet import instance_norm
 from simulator.networks.weights import PRESETS, build_modules, load_modules
 from simulator.training.data import Batch

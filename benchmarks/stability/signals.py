@@ -12,7 +12,7 @@ import torch
 from benchmarks.stability.case import Row, time_ratio
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture.exposure import Exposure
-from simulator.capture.record import add_noise
+from simulator.capture.sensor import add_noise
 from simulator.noise.generator import FrameNoise
 from simulator.optics.blur import disc_blur, motion_blur
 from simulator.optics.shapes import disc_kernel, motion_kernel

@@ -27,8 +27,9 @@ from benchmarks.work_precision.methods import TOLERANCES
 from benchmarks.work_precision.trials import GRID, Trial, test_trials
 from simulator import CameraSettings, CameraSimulator, RawImage
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.record import exposed_light
-from simulator.noise.noise_level_function import noise_variance, top_up_variance
+from simulator.capture.sensor import exposed_light
+from simulator.noise.noise_level_function import noise_variance
+from simulator.noise.top_up import top_up_variance
 
 #: Photographs of each scene.
 DRAWS = 8
@@ -136,7 +137,7 @@ class Draws:
             exposure = prepared.exposure(settings)
             image = exposed_light(prepared.blurred_light.blurred(exposure), exposure)
             missing, _ = top_up_variance(
-                image, exposure.source_noise, exposure.target, exposure.remaining
+                image, exposure.source_noise, exposure.target, exposure.remaining_variance
             )
             light.append(image)
             added.append(missing)

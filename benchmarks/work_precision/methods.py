@@ -18,7 +18,7 @@ from benchmarks.simulator.models import FOLDER, Models
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, RawImage, exposure_ratio
 from simulator.capture.exposure import Exposure
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.record import add_noise, clip_and_quantise
+from simulator.capture.sensor import add_noise, clip_and_quantise
 from simulator.noise.generator import FrameNoise, sweep_keys
 from simulator.training.data import settings_parameters
 

@@ -1,50 +1,21 @@
-"""What a wider aperture does to a photograph whose depth is not known."""
+"""The blur that a wider aperture adds to a photograph whose depth is not known."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from simulator.capture.denoised import Denoised
+from simulator.capture.blurred_light import Denoised
 from simulator.capture.exposure import LIGHT_LIMIT
-from simulator.networks.aperture_module import added_blur
-from simulator.optics.disc_bank import HALO, DiscBank, remaining_variance
+from simulator.optics.disc_bank import HALO, DiscBank, added_blur, remaining_variance
 from simulator.utils.cache import LruCache
 from simulator.utils.tiles import TILE, Tile, make_tiles
 
-#: Memory that the opened light of one scene may take [byte].
-KEPT_BYTES = 256 * 2**20
-
-
-class ApertureBlur(Protocol):
-    """Opens the aperture of one scene's light; results are kept, as f-numbers are few."""
-
-    f_number: float
-    """Effective f-number at which the light was recorded."""
-
-    needs_denoised: bool
-    """Whether it works on the noise-reduced light only."""
-
-    everywhere: bool
-    """Whether it opens also where a positive tolerance needs no network."""
-
-    def extent(self, f_number: float) -> float:
-        """Largest diameter of the blur that opening to `f_number` adds [pixel]."""
-
-    def opened(self, f_number: float, *, denoised: bool) -> Tensor:
-        """Light (4, H, W) at the wider aperture, at unchanged exposure.
-
-        Args:
-            f_number: Effective f-number wanted, smaller than the source's.
-            denoised: Whether the noise-reduced light is opened, or the light as it was recorded.
-        """
-
-    def remaining(self, f_number: float) -> Tensor | None:
-        """(H, W) share of the recorded noise's variance that the blur leaves."""
+#: Memory that the cached opened light of one scene may take [byte].
+CACHE_BYTES = 256 * 2**20
 
 
 class MapApertureBlur:
@@ -55,10 +26,10 @@ class MapApertureBlur:
     Args:
         light: (4, H, W) as recorded.
         denoised: The same with little noise.
-        diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or what estimates it,
-            called when an aperture first opens.
+        diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or a function that
+            estimates it, called when an aperture first opens.
         f_number: Effective f-number of the light.
-        everywhere: See `ApertureBlur`.
+        everywhere: See `simulator.capture.blurred_light.ApertureBlur`.
     """
 
     needs_denoised = False
@@ -75,7 +46,7 @@ class MapApertureBlur:
         self.f_number, self._diameter, self.everywhere = f_number, diameter, everywhere
         self._recorded, self._denoised = light, denoised
         self._banks: dict[tuple[Tile, bool], DiscBank] = {}
-        self._kept: LruCache[Tensor] = LruCache(KEPT_BYTES)
+        self._cache: LruCache[Tensor] = LruCache(CACHE_BYTES)
 
     @cached_property
     def diameter(self) -> Tensor:
@@ -91,14 +62,14 @@ class MapApertureBlur:
     def opened(self, f_number: float, *, denoised: bool) -> Tensor:
         """See `ApertureBlur`."""
         key = (f_number, denoised)
-        result = self._kept.get(key)
+        result = self._cache.get(key)
         if result is None:
             light = self._denoised.light if denoised else self._recorded
             result = self._blurred(light, denoised, f_number)
-            self._kept.put(key, result, result.nbytes)
+            self._cache.put(key, result, result.nbytes)
         return result
 
-    def remaining(self, f_number: float) -> Tensor:
+    def remaining_variance(self, f_number: float) -> Tensor:
         """See `ApertureBlur`."""
         return remaining_variance(added_blur(self.diameter, self.f_number, f_number))
 
@@ -108,7 +79,7 @@ class MapApertureBlur:
 
     @cached_property
     def _tiles(self) -> list[Tile]:
-        """What is out of focus."""
+        """The parts of the frame that are out of focus."""
         return make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
 
     def _blurred(self, light: Tensor, denoised: bool, f_number: float) -> Tensor:
@@ -125,7 +96,7 @@ class MapApertureBlur:
         return result
 
     def _bank(self, light: Tensor, denoised: bool, tile: Tile) -> DiscBank:
-        """The discs of a tile, kept on small frames: neighbouring f-numbers share most of them."""
+        """The discs of a tile, cached on small frames: close f-numbers share most of them."""
         bank = self._banks.get((tile, denoised))
         if bank is None:
             # Beyond the limit sums would no longer resolve the shadows.
@@ -154,7 +125,7 @@ class NetworkApertureBlur:
         f_number: float,
     ) -> None:
         self.f_number, self._denoised, self._module = f_number, denoised, module
-        self._kept: LruCache[Tensor] = LruCache(KEPT_BYTES)
+        self._cache: LruCache[Tensor] = LruCache(CACHE_BYTES)
 
     def extent(self, f_number: float) -> float:
         """Unknown before the network ran: taken as large wherever the aperture opens."""
@@ -163,13 +134,13 @@ class NetworkApertureBlur:
     @torch.no_grad()
     def opened(self, f_number: float, *, denoised: bool = True) -> Tensor:
         """See `ApertureBlur`."""
-        result = self._kept.get(f_number)
+        result = self._cache.get(f_number)
         if result is None:
             image = self._denoised.light[None]
             f_numbers = (torch.tensor([n], device=image.device) for n in (self.f_number, f_number))
             result = self._module(image, torch.zeros_like(image), *f_numbers)[0]
-            self._kept.put(f_number, result, result.nbytes)
+            self._cache.put(f_number, result, result.nbytes)
         return result
 
-    def remaining(self, f_number: float) -> None:
+    def remaining_variance(self, f_number: float) -> None:
         """The recorded noise is gone: there is nothing to account for."""

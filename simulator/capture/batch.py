@@ -1,140 +1,311 @@
-"""What is kept between the frames of episodes: their plans, and the light that they blurred."""
+"""Many scenes side by side, photographed in batches: what the environment runs on.
+
+A capture here is cheap because nothing is worked out twice. All that a frame depends on but for its
+noise is planned when a state is first asked for, and kept as a row of columns; light that was
+blurred is kept as long as the scene is shown; a batch of frames is then one call of
+`simulator.capture.sensor.record`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from simulator.capture.exposure import Exposure
+from simulator.camera import CameraProfile
+from simulator.capture.exposure import LIGHT_LIMIT, Exposure, exposure_table
+from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.record import record_batch
-from simulator.noise.generator import sweep_keys
-from simulator.optics.blur_kernels import Blur
+from simulator.capture.sensor import Transitions, noise_balance, record
+from simulator.noise.generator import Noise, noise_keys, single_normals
+from simulator.optics.blur_kernels import Blur, blur_many
 from simulator.settings import CameraSettings
+from simulator.utils.threads import in_shares
 
 
-# Frames whose rows have light of their own: the bands of flickering light.
-#
-# The light of each row multiplies the blurred light before there is noise, so that the noise is that
-# of the banded signal. (Motion runs along the rows, and defocus is complete before a row is read.)
-# Noise that the source itself brings is multiplied with its light: its variance by the square of the
-# row's, r^2. What the kernels take away for it has the variance times r: exact for shot noise, whose
-# variance they work out from the banded signal, and off by r (1 - r) of the source's read noise.
-def in_bands(light: torch.Tensor, row_gain: np.ndarray) -> torch.Tensor:
-    """`light` (4, H, W) with the rows' own, (H,); new memory, contiguous."""
-    return (light * _column(row_gain)).contiguous()
-
-
-def remaining_in_bands(
-    remaining: torch.Tensor | None, row_gain: np.ndarray, width: int
-) -> torch.Tensor:
-    """`Exposure.remaining` (H, `width`) of a noisy source in the bands of `row_gain` (H,)."""
-    share = _column(row_gain).expand(-1, width)
-    return (share if remaining is None else share * remaining).contiguous()
-
-
-def expected_in_bands(
-    prepared_scenes: Sequence[PreparedScene],
-    states: Sequence[CameraSettings],
-    row_gain: np.ndarray | None,
-) -> torch.Tensor:
-    """Noise-free light (S, 4, H, W) at each state, not clipped; arguments of `expose_in_bands`."""
-    light = torch.stack([x.expected(s) for x, s in zip(prepared_scenes, states, strict=True)])
-    if row_gain is None:
-        return light
-    return light * torch.from_numpy(row_gain).float()[:, None, :, None]
-
-
-def expose_in_bands(
-    prepared_scenes: Sequence[PreparedScene],
-    states: Sequence[CameraSettings],
-    row_gain: np.ndarray | None,
-    *,
-    seed: int,
-) -> torch.Tensor:
-    """A sweep in which each state has light of its own, with the noise of `PreparedScene.expose`.
+@dataclass(frozen=True)
+class FrameStatistics:
+    """What is known of a batch of frames besides their pixels, (B,) each.
 
     Args:
-        prepared_scenes: The scene in the light of each state, S long; they share their `PreparedScene.blurred_light`.
-        states: S settings.
-        row_gain: (S, H) light of each row relative to that; None where all rows have the same.
-        seed: See `PreparedScene.capture`.
-
-    Returns:
-        (S, 4, H, W) float32 in [-pedestal, 1].
+        clipped_low: Share of the samples that are clipped low: at most 2**-10 of white.
+        clipped_high: Share of the samples that are clipped high: at white.
+        excess_variance: Mean over the pixels of the noise variance beyond the target's, relative
+            to it; in flickering light, that of the frame's mean light.
+        modules: Names of the steps that ran, joined by ``"+"``.
+        keys: Of the noise, uint64.
     """
-    exposures = [x.exposure(s) for x, s in zip(prepared_scenes, states, strict=True)]
-    lights = [x.blurred_light.blurred(e) for x, e in zip(prepared_scenes, exposures, strict=True)]
-    if row_gain is not None:
-        width = lights[0].shape[-1]
-        exposures = [
-            e
-            if e.source.is_zero
-            else replace(e, remaining=remaining_in_bands(e.remaining, g, width))
-            for e, g in zip(exposures, row_gain, strict=True)
-        ]
-        lights = [in_bands(x, g) for x, g in zip(lights, row_gain, strict=True)]
-    out = torch.empty((len(lights), *lights[0].shape))
-    keys = sweep_keys(seed, states)
-    record_batch(lights, exposures, prepared_scenes[0].camera, keys, "exact", out=out)
-    return out
+
+    clipped_low: np.ndarray
+    clipped_high: np.ndarray
+    excess_variance: np.ndarray
+    modules: np.ndarray
+    keys: np.ndarray
+
+    def sensor_normals(self, count: int) -> np.ndarray:
+        """(B, count) standard normals of each frame, apart from those of its pixels."""
+        return single_normals(self.keys, count)
 
 
-def _column(row_gain: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(row_gain).float()[:, None]
+class CaptureBatch:
+    """Photographs n scenes, each at any of S states, on the CPU.
+
+    For each batch of frames, call `prepare`, then `record`. When another scene is to be shown under
+    an index, call `forget` first.
+
+    Args:
+        prepared: Gives the scene of an index, in its own light; asked for when it is first needed.
+        num_scenes: Number of scenes, n.
+        states: The settings of the S states.
+        camera: The body.
+        shape: Height and width of every scene's light.
+        noise: How the noise is made; None for no noise.
+        keep_light: Whether the defocused light of every f-number is kept until a scene is
+            forgotten; else only that of the latest.
+    """
+
+    def __init__(
+        self,
+        prepared: Callable[[int], PreparedScene],
+        num_scenes: int,
+        states: Sequence[CameraSettings],
+        camera: CameraProfile,
+        shape: tuple[int, int],
+        *,
+        noise: Noise | None,
+        keep_light: bool,
+    ) -> None:
+        self.states, self.camera, self.noise = states, camera, noise
+        self._prepared, self._keep_light = prepared, keep_light
+        self._rows = _Rows(num_scenes, len(states))
+        self._buffers = _Buffers((4, *shape))
+        self._lights: dict[int, _SceneLight] = {}
+        # Row of the blurred light that each scene has at present.
+        self._blurred_row = np.full(num_scenes, -1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_lights": {}}  # a pickled copy works everything out again
+
+    def forget(self, indices: np.ndarray) -> None:
+        """Lets go of all that is known of the scenes `indices`; their memory is used again."""
+        for index in indices.tolist():
+            self._rows.forget(index)
+            light = self._lights.pop(index, None)
+            if light is not None:
+                light.give_back()
+            self._blurred_row[index] = -1
+
+    def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
+        """Plans the next frames, and makes their light.
+
+        Args:
+            indices: (B,) of the scenes.
+            states: (B,) at which each is photographed.
+            gains: (B,) light of each exposure relative to the scene's own.
+        """
+        rows = self._rows.of(indices, states)
+        stale = self._rows.gain[rows] != gains
+        if stale.any():
+            self._plan(indices[stale], rows[stale], gains[stale])
+        missing = self._rows.blurs[rows] & (self._blurred_row[indices] != rows)
+        if missing.any():
+            self._blur(indices[missing], rows[missing])
+
+    def record(
+        self,
+        indices: np.ndarray,
+        states: np.ndarray,
+        seeds: np.ndarray,
+        frames: np.ndarray,
+        *,
+        row_gain: np.ndarray | None = None,
+        codes: np.ndarray | None = None,
+        numbers: np.ndarray | None = None,
+        signals: np.ndarray | None = None,
+    ) -> FrameStatistics:
+        """Photographs scenes that are prepared, and fills every output that is given.
+
+        Args:
+            indices: (B,) of the scenes.
+            states: (B,) at which each is photographed.
+            seeds: (B,) integers >= 0, of the noise.
+            frames: (B,) numbers that the noise of one seed differs by.
+            row_gain: (B, H) light of each row relative to the gain that was prepared for; None
+                where all rows have the same.
+            codes: (B, 4, H, W) uint8, companded (`simulator.capture.exposure.PEDESTAL`).
+            numbers: (B, 4, H, W) uint16, digital numbers.
+            signals: (B, 4, H, W) float32, on the scale where white is 1.
+        """
+        rows, columns = self._rows.of(indices, states), self._rows
+        keys = noise_keys(seeds, frames)
+        light, remaining = columns.light[rows], None
+        if columns.blurs[rows].any():  # else all of the source's variance remains
+            remaining = columns.remaining_variance[rows]
+        counts = record(
+            Transitions(light, columns.table[rows], remaining),
+            self.camera,
+            keys=None if self.noise is None else keys,
+            noise=self.noise or "bank",
+            row_gain=row_gain,
+            codes=codes,
+            numbers=numbers,
+            signals=None if signals is None else torch.from_numpy(signals),
+            count=True,
+        )
+        samples = math.prod(self._buffers.shape)
+        return FrameStatistics(
+            clipped_low=counts[:, 0] / samples,
+            clipped_high=counts[:, 1] / samples,
+            excess_variance=columns.excess_variance[rows],
+            modules=columns.modules[rows],
+            keys=keys,
+        )
+
+    # -- planning -----------------------------------------------------------------------------
+
+    def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
+        """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
+        columns, noisy, exposures = self._rows, self.noise is not None, []
+        for index, row, gain in zip(indices.tolist(), rows.tolist(), gains.tolist(), strict=True):
+            prepared = self._light(index).prepared
+            exposure = prepared.exposure(self.states[row % len(self.states)], gain=gain)
+            blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
+            columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
+            if not blurs:
+                columns.light[row] = prepared.source_light(exposure).contiguous()
+            excess = _excess_variance(prepared.statistics, exposure) if noisy else 0.0
+            columns.excess_variance[row] = excess
+            columns.modules[row] = _modules(exposure, noisy)
+            exposures.append(exposure)
+        columns.table[rows] = exposure_table(exposures)
+        columns.gain[rows] = gains  # last: what is interrupted stays unknown
+        self._blurred_row[indices] = -1
+
+    def _light(self, index: int) -> _SceneLight:
+        light = self._lights.get(index)
+        if light is None:
+            light = _SceneLight(self._prepared(index), self._buffers, self._keep_light)
+            self._lights[index] = light
+        return light
+
+    def _blur(self, indices: np.ndarray, rows: np.ndarray) -> None:
+        """Makes the light of `rows`, on as many threads as torch may use."""
+        planned = list(zip(indices.tolist(), rows.tolist(), strict=True))
+        exposures = self._rows.exposure
+        try:
+            opened = [pair for pair in planned if exposures[pair[1]].opened_to is not None]
+            _in_shares(self._open, opened)
+            blurs = [self._begin_blur(index, row) for index, row in planned]
+            blur_many([blur for blur in blurs if blur is not None], limit=LIGHT_LIMIT)
+            _in_shares(self._balance, opened)
+        except BaseException:  # some of the light is not made
+            self.forget(indices)
+            raise
+        self._blurred_row[indices] = rows
+
+    def _open(self, index: int, row: int) -> None:
+        """Opens the aperture, which caches its result."""
+        self._light(index).prepared.source_light(self._rows.exposure[row])
+
+    def _begin_blur(self, index: int, row: int) -> Blur | None:
+        columns, exposure = self._rows, self._rows.exposure[row]
+        columns.light[row], blur = self._light(index).blurred(exposure)
+        remaining = exposure.remaining_variance
+        if remaining is not None:
+            remaining = remaining.float().contiguous()
+        columns.remaining_variance[row] = remaining
+        return blur
+
+    def _balance(self, index: int, row: int) -> None:
+        """The excess variance where only the pixels tell it."""
+        columns = self._rows
+        if np.isnan(columns.excess_variance[row]):
+            balance = noise_balance(columns.light[row], columns.exposure[row])
+            columns.excess_variance[row] = balance.relative_excess_variance
+        if not self._keep_light:  # an aperture blur caches the light of each f-number
+            self._light(index).prepared = self._prepared(index)
 
 
-class Plans:
+def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, int]]) -> None:
+    def run(first: int, last: int) -> None:
+        for index, row in planned[first:last]:
+            task(index, row)
+
+    in_shares(run, len(planned))
+
+
+def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
+    """See `FrameStatistics`; NaN where the pixels must tell."""
+    if exposure.source.is_zero:
+        return 0.0
+    source, target = exposure.source_noise, exposure.target
+    pairs = zip((*source.shot, *source.read), (*target.shot, *target.read), strict=True)
+    if all(brought <= wanted for brought, wanted in pairs):
+        return 0.0
+    if exposure.remaining_variance is not None:
+        return math.nan
+    return statistics.relative_excess_variance(exposure.ratio, source, target)
+
+
+def _modules(exposure: Exposure, noise: bool) -> str:
+    names = ["exposure", *(step.name for step in exposure.steps if step.runs)]
+    return "+".join(names + ["noise"] * noise)
+
+
+class _Rows:
     """Captures that were planned: all that a frame depends on but for its noise, as columns.
 
-    Row ``slot * num_states + state`` is that of a state of a slot (`Episodes.slot`). A row takes
-    some 40 bytes from the start, the rest of its memory when it is used. A pickled copy is empty.
-
-    Args:
-        num_slots: Number of slots.
-        num_states: Number of exposure states.
+    A row takes some 40 bytes from the start, the rest of its memory when it is used. A pickled
+    copy is empty.
 
     Attributes:
-        gain: Of the light that the row was planned for; NaN where it was not planned.
-        table: (5, 4) float32 each, as `simulator.capture.kernels.record_frames` takes exposures.
-        excess: As in `info`; NaN where it takes the blurred light to tell, and that is not made.
+        gain: Light that the row was planned for; NaN where it was not planned.
+        table: (5, 4) float32 each, of `exposure_table`.
+        excess_variance: As in `FrameStatistics`; NaN where it takes the blurred light to tell, and
+            that is not made.
         modules: Names of the steps, joined by ``"+"``.
-        light: (4, H, W) what is exposed; where it is blurred, until the place blurs another.
-        remaining: `Exposure.remaining` of that light; None for all.
+        light: (4, H, W) that is exposed; where it is blurred, until its scene blurs another.
+        remaining_variance: `Exposure.remaining_variance` of that light; None for all.
         blurs: Whether the light must be blurred; else it is the scene's own.
-        exposure: What happens to light that must be blurred; else None.
+        exposure: `Exposure` of light that must be blurred; else None.
     """
 
-    def __init__(self, num_slots: int, num_states: int) -> None:
-        rows = num_slots * num_states
-        self.num_slots, self.num_states = num_slots, num_states
+    def __init__(self, num_scenes: int, num_states: int) -> None:
+        rows = num_scenes * num_states
+        self.num_scenes, self.num_states = num_scenes, num_states
         self.gain = np.full(rows, np.nan)
         self.table = np.zeros((rows, 5, 4), np.float32)
-        self.excess = np.zeros(rows)
+        self.excess_variance = np.zeros(rows)
         self.blurs = np.zeros(rows, bool)
-        self.modules, self.light, self.remaining, self.exposure = np.empty((4, rows), object)
+        self.modules, self.light, self.remaining_variance, self.exposure = np.empty(
+            (4, rows), object
+        )
 
-    def forget(self, slot: int) -> None:
-        """Makes every state of `slot` unknown."""
-        rows = slice(slot * self.num_states, (slot + 1) * self.num_states)
+    def of(self, indices: np.ndarray, states: np.ndarray) -> np.ndarray:
+        """(B,) rows of scenes at states."""
+        return indices * self.num_states + states
+
+    def forget(self, index: int) -> None:
+        """Makes every state of a scene unknown."""
+        rows = slice(index * self.num_states, (index + 1) * self.num_states)
         self.gain[rows] = np.nan
-        self.light[rows] = self.remaining[rows] = self.exposure[rows] = None
+        self.light[rows] = self.remaining_variance[rows] = self.exposure[rows] = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.num_slots, self.num_states)
+        return type(self), (self.num_scenes, self.num_states)
 
 
-class Buffers:
+class _Buffers:
     """Images to write to that are used again: new memory costs more than what is written to it.
 
     A pickled copy is empty.
 
     Args:
-        shape: Of each image.
+        shape: Shape of each image.
     """
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -156,68 +327,60 @@ class Buffers:
         return type(self), (self.shape,)
 
 
-class LightCache:
-    """The light that the episode at one place has blurred. A pickled copy has none.
+class _SceneLight:
+    """The blurred light of one scene, in memory that is used again.
 
-    The latest one is kept, because an agent that has settled repeats it.
+    Other than `simulator.capture.blurred_light.BlurredLight`, which serves sweeps, it only says
+    what must be blurred, so that many scenes are blurred side by side. The latest light is kept,
+    because an agent that has settled repeats it.
 
     Args:
+        prepared: The scene in its own light.
         buffers: Where images are taken from.
-        keep: Whether the defocused light of every f-number is kept while an episode lasts.
-
-    Attributes:
-        prepared: What the camera sees of the scene in its own light; None until it is asked for.
+        keep: Whether the defocused light of every f-number is kept.
     """
 
-    def __init__(self, buffers: Buffers, keep: bool) -> None:
-        self.buffers, self.keep = buffers, keep
-        self.prepared: PreparedScene | None = None
+    def __init__(self, prepared: PreparedScene, buffers: _Buffers, keep: bool) -> None:
+        self.prepared, self._buffers, self._keep = prepared, buffers, keep
         self._defocused: dict[tuple[Any, ...], torch.Tensor] = {}  # by aperture
         self._blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
         self._streak: torch.Tensor | None = None
 
     def blurred(self, exposure: Exposure) -> tuple[torch.Tensor, Blur | None]:
-        """The light (4, H, W) of `prepared` with the blur of `exposure`, valid until the next call.
+        """The light (4, H, W) with the blur of `exposure`, valid until the next call.
 
         Returns:
-            The light, and what must be done (`simulator.optics.blur_kernels.blur_many`) to fill it; None
+            The light, and the blur (`simulator.optics.blur_kernels.blur_many`) that fills it; None
             where that was done before.
         """
-        lens = (exposure.denoised, exposure.opened_to, exposure.defocus_px)
-        key = (*lens, exposure.motion_px)
-        if self._blurred is not None and self._blurred[0] == key:
+        if self._blurred is not None and self._blurred[0] == exposure.blur:
             return self._blurred[1], None
-        light = self._defocused.get(lens)
+        light = self._defocused.get(exposure.lens_blur)
         source = defocused = moved = None
         if light is None:
-            assert self.prepared is not None
             light = source = self.prepared.source_light(exposure).contiguous()
             if exposure.defocus_px:
-                if not self.keep:
+                if not self._keep:
                     self._drop_defocused()
-                light = defocused = self._defocused[lens] = self.buffers.take()
+                light = defocused = self._defocused[exposure.lens_blur] = self._buffers.take()
         if exposure.motion_px:
             source = light if source is None else source
             if self._streak is None:
-                self._streak = self.buffers.take()
+                self._streak = self._buffers.take()
             light = moved = self._streak
-        self._blurred = (key, light)
+        self._blurred = (exposure.blur, light)
         if defocused is None and moved is None:
             return light, None
         assert source is not None
         return light, Blur(source, exposure.defocus_px, defocused, exposure.motion_px, moved)
 
-    def _drop_defocused(self) -> None:
-        for image in self._defocused.values():
-            self.buffers.give_back(image)
-        self._defocused.clear()
-
-    def end(self) -> None:
-        """Gives everything back, for another episode to begin."""
+    def give_back(self) -> None:
+        """Gives all memory back; the light is not to be used afterwards."""
         self._drop_defocused()
         if self._streak is not None:
-            self.buffers.give_back(self._streak)
-        self.prepared = self._streak = self._blurred = None
+            self._buffers.give_back(self._streak)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.buffers, self.keep)
+    def _drop_defocused(self) -> None:
+        for image in self._defocused.values():
+            self._buffers.give_back(image)
+        self._defocused.clear()

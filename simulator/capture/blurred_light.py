@@ -1,24 +1,109 @@
-"""The light of a scene behind the apertures and shutter times that were asked for."""
+"""The lights of one scene: as recorded, denoised, with the aperture opened, and blurred."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from functools import cached_property
+from typing import Protocol
 
 import torch
 
-from simulator.capture.aperture_blur import ApertureBlur
-from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import Exposure
-from simulator.capture.record import defocused_light
+from simulator.capture.light_statistics import LightStatistics
+from simulator.capture.sensor import defocused_light
 from simulator.optics.blur import motion_blur
+from simulator.raw.image import check_packed
 from simulator.utils.cache import LruCache
 
-#: Memory that the blurred light of one scene may take [byte].
-KEPT_BYTES = 512 * 2**20
+#: Memory that the cached blurred light of one scene may take [byte].
+CACHE_BYTES = 512 * 2**20
+
+
+class Denoised:
+    """Light with its noise removed by a noise module.
+
+    A network is the most expensive step there is, and many transitions do without: nothing runs
+    before `light` is read, and then once.
+
+    Args:
+        light: (4, H, W) float32, or a function that works it out.
+        everywhere: Whether the noise is also removed where a positive tolerance needs no network.
+    """
+
+    def __init__(
+        self, light: torch.Tensor | Callable[[], torch.Tensor], *, everywhere: bool = True
+    ) -> None:
+        if isinstance(light, torch.Tensor):
+            light = check_packed("denoised", light)
+        self._light, self.everywhere = light, everywhere
+        self._lock = threading.RLock()
+
+    def __reduce__(self) -> tuple[Callable[..., Denoised], tuple[torch.Tensor, bool]]:
+        return _restored, (self.light, self.everywhere)
+
+    @property
+    def light(self) -> torch.Tensor:
+        """(4, H, W) at the exposure of the source."""
+        with self._lock:
+            if not isinstance(self._light, torch.Tensor):
+                self._light = self._light()
+            return self._light
+
+    @property
+    def shape(self) -> torch.Size | None:
+        """Shape of `light`, where it is known already."""
+        return self._light.shape if isinstance(self._light, torch.Tensor) else None
+
+    @cached_property
+    def statistics(self) -> LightStatistics:
+        """Statistics of `light`."""
+        return LightStatistics(self.light)
+
+    def to(self, device: torch.device) -> Denoised:
+        """The same on `device`; itself where it is there already."""
+        light = self._light
+        if isinstance(light, torch.Tensor) and light.device == device:
+            return self
+        return Denoised(lambda: self.light.to(device), everywhere=self.everywhere)
+
+
+def _restored(light: torch.Tensor, everywhere: bool) -> Denoised:
+    return Denoised(light, everywhere=everywhere)
+
+
+class ApertureBlur(Protocol):
+    """Opens the aperture of one scene's light; results are cached, as f-numbers are few.
+
+    `simulator.capture.aperture_blur` has the two that there are.
+    """
+
+    f_number: float
+    """Effective f-number at which the light was recorded."""
+
+    needs_denoised: bool
+    """Whether it works on the noise-reduced light only."""
+
+    everywhere: bool
+    """Whether it opens also where a positive tolerance needs no network."""
+
+    def extent(self, f_number: float) -> float:
+        """Largest diameter of the blur that opening to `f_number` adds [pixel]."""
+
+    def opened(self, f_number: float, *, denoised: bool) -> torch.Tensor:
+        """Light (4, H, W) at the wider aperture, at unchanged exposure.
+
+        Args:
+            f_number: Effective f-number wanted, smaller than the source's.
+            denoised: Whether the noise-reduced light is opened, or the light as it was recorded.
+        """
+
+    def remaining_variance(self, f_number: float) -> torch.Tensor | None:
+        """(H, W) share of the recorded noise's variance that the blur leaves; None for all."""
 
 
 class BlurredLight:
-    """Blurs a scene's light, each blur when it is first asked for, and keeps the latest.
+    """Blurs a scene's light, each blur when it is first asked for, and caches the latest.
 
     Blur and exposure are linear: one light per f-number, and one per f-number and length of the
     streak, serve every ISO.
@@ -26,8 +111,9 @@ class BlurredLight:
     Args:
         light: (4, H, W) as recorded.
         denoised: The same with little noise, or None.
-        opening: Blur that wider apertures add, or None.
-        kept_bytes: Memory for what is kept; the light that was used longest ago goes first.
+        aperture_blur: Blur that wider apertures add, or None.
+        statistics: Statistics of `light`, where they are at hand.
+        cache_bytes: Memory of the cache; the light that was used longest ago goes first.
     """
 
     def __init__(
@@ -35,11 +121,13 @@ class BlurredLight:
         light: torch.Tensor,
         denoised: Denoised | None,
         aperture_blur: ApertureBlur | None,
-        kept_bytes: int = KEPT_BYTES,
+        statistics: LightStatistics | None = None,
+        cache_bytes: int = CACHE_BYTES,
     ) -> None:
         self.light, self.denoised, self.aperture_blur = light, denoised, aperture_blur
+        self.statistics = LightStatistics(light) if statistics is None else statistics
         self._added: dict[float, float] = {}
-        self._kept: LruCache[torch.Tensor] = LruCache(kept_bytes)
+        self._cache: LruCache[torch.Tensor] = LruCache(cache_bytes)
 
     def is_of(
         self, light: torch.Tensor, denoised: Denoised | None, aperture_blur: ApertureBlur | None
@@ -59,18 +147,18 @@ class BlurredLight:
             self._added[f_number] = self.aperture_blur.extent(f_number)
         return self._added[f_number]
 
-    def remaining(self, f_number: float, energy: float) -> torch.Tensor | None:
-        """(H, W) `Exposure.remaining` where other blurs left `energy` of the noise's variance."""
+    def remaining_variance(self, f_number: float, energy: float) -> torch.Tensor | None:
+        """(H, W) `Exposure.remaining_variance` where other blurs left a share `energy`."""
         if self.aperture_blur is None:
             return None
-        key = ("remaining", f_number, energy)
-        left = self._kept.get(key)
+        key = ("remaining_variance", f_number, energy)
+        left = self._cache.get(key)
         if left is None:
-            share = self.aperture_blur.remaining(f_number)
+            share = self.aperture_blur.remaining_variance(f_number)
             if share is None:
                 return None
             left = (share / energy).clamp(max=1.0)
-            self._kept.put(key, left, left.nbytes)
+            self._cache.put(key, left, left.nbytes)
         return left
 
     def source(self, exposure: Exposure) -> torch.Tensor:
@@ -82,30 +170,22 @@ class BlurredLight:
     def blurred(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""
         if exposure.motion_px:
-            return self._kept_light(
-                blur_key(exposure),
-                lambda: motion_blur(self._defocused(exposure), exposure.motion_px),
+            return self._cached(
+                exposure.blur, lambda: motion_blur(self._defocused(exposure), exposure.motion_px)
             )
         return self._defocused(exposure) if exposure.defocus_px else self.source(exposure)
 
     def _defocused(self, exposure: Exposure) -> torch.Tensor:
         if not exposure.defocus_px:
             return defocused_light(self.source(exposure), 0.0)  # limited, as blur needs it
-        return self._kept_light(
-            blur_key(exposure)[:-1],
+        return self._cached(
+            exposure.lens_blur,
             lambda: defocused_light(self.source(exposure), exposure.defocus_px),
         )
 
-    def _kept_light(
-        self, key: tuple[object, ...], make: Callable[[], torch.Tensor]
-    ) -> torch.Tensor:
-        light = self._kept.get(key)
+    def _cached(self, key: tuple[object, ...], make: Callable[[], torch.Tensor]) -> torch.Tensor:
+        light = self._cache.get(key)
         if light is None:
             light = make()
-            self._kept.put(key, light, light.nbytes)
+            self._cache.put(key, light, light.nbytes)
         return light
-
-
-def blur_key(exposure: Exposure) -> tuple[object, ...]:
-    """What the light on the sensor depends on, besides the exposure ratio."""
-    return (exposure.denoised, exposure.opened_to, exposure.defocus_px, exposure.motion_px)

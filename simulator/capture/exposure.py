@@ -1,77 +1,18 @@
-"""What one capture does to the light of a scene."""
+"""What one capture does to the light of a scene, and the limits that its numbers stay within."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from numbers import Real
+from typing import NamedTuple
 
+import numpy as np
 import torch
 
-from simulator.camera import NoiseLevelFunction
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.noise.top_up import top_up_table
 from simulator.optics.shapes import kernel_energy
-
-# How much of a transition may be left out, in units of the target's noise.
-#: By default the distribution of a pixel may move by a tenth of its noise's standard deviation.
-DEFAULT_TOLERANCE = 0.1
-
-
-def check_tolerance(tolerance: float) -> float:
-    """`tolerance` as a float.
-
-    Raises:
-        ValueError: Unless it is a finite number >= 0.
-    """
-    if (
-        isinstance(tolerance, bool)
-        or not isinstance(tolerance, Real)
-        or not 0 <= tolerance < math.inf
-    ):
-        raise ValueError(f"`tolerance` (={tolerance!r}) must be a finite number >= 0")
-    return float(tolerance)
-
-
-class Budget:
-    """Errors of the steps of one transition, and which of them a tolerance leaves out.
-
-    Noise that stays widens a pixel's distribution, blur that is missing shifts it: squares add.
-    Several missing blurs shift it the same way and add up; each is booked with what it adds to the
-    square, so that the root of the sum of squares of all errors is right for any set of steps.
-
-    Args:
-        tolerance: Bound on the root of the sum of squares of what is left out. 0 leaves out nothing
-            that changes a pixel.
-    """
-
-    def __init__(self, tolerance: float) -> None:
-        self.tolerance = tolerance
-        self.errors: dict[str, float] = {}
-        self._noise = self._blur = 0.0
-
-    def leaves_out_noise_reduction(self, error: float, *, pointless: bool = False) -> bool:
-        """Books noise reduction, which errs by `error` if left out.
-
-        Args:
-            error: See `simulator.capture.light_statistics.LightStatistics.excess`.
-            pointless: Whether the network would err as much: it is left out then whatever it costs,
-                unless nothing is to be left out.
-        """
-        self.errors["noise_reduction"] = error
-        left_out = self.tolerance > 0.0 and (error <= self.tolerance or pointless)
-        self._noise = error if left_out else 0.0
-        return left_out
-
-    def leaves_out_blur(self, name: str, error: float) -> bool:
-        """Books a blur, which errs by `error` if it alone is left out."""
-        together = self._blur + error
-        left_out = self.tolerance > 0.0 and math.hypot(self._noise, together) <= self.tolerance
-        self.errors[name] = math.sqrt(error * (together + self._blur)) if error else 0.0
-        if left_out:
-            self._blur = together
-        return left_out
-
 
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
@@ -79,8 +20,28 @@ SIGNAL_LIMIT = 1e6
 #: Light beyond this many times the reference's white is clipped before it is blurred: it is white
 #: at every exposure, and sums of larger numbers would no longer resolve the shadows.
 LIGHT_LIMIT = 1e9
-#: Exposure ratios beyond it are limited: float32 must hold them, and any two settings keep below.
+#: Exposure ratios are limited to this: float32 must hold them, and any two settings keep below.
 RATIO_LIMIT = 2.0**107
+#: Most negative signal that a companded 8-bit code shows; the offset under its square root.
+PEDESTAL = 1.0 / 1024.0
+
+
+class Step(NamedTuple):
+    """A step that a transition may leave out; `simulator.capture.plan.decide` makes it.
+
+    Args:
+        name: What it is called in `SimulationPlan.modules`.
+        runs: Whether it runs.
+        reason: Why it does, or does not; ``{extent}`` and ``{error}`` stand for the numbers.
+        error: Error of leaving it out, in units of the target's noise.
+        extent: Extent of its blur [pixel], where it is one.
+    """
+
+    name: str
+    runs: bool
+    reason: str
+    error: float = 0.0
+    extent: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -96,10 +57,9 @@ class Exposure:
         denoised: Whether it starts from the noise-reduced light; `source` is zero then.
         opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
             None where it does not.
-        remaining: (H, W) share that this blur leaves of the noise variance which the other blurs
-            have left; None for all.
-        errors: What leaving out each step that would do something errs or would err by, in units of
-            the target's noise (see `simulator.capture.exposure.Budget`).
+        remaining_variance: (H, W) share that this blur leaves of the noise variance which the other
+            blurs have left; None for all.
+        steps: Why each optional step runs or is left out.
     """
 
     ratio: float
@@ -109,14 +69,35 @@ class Exposure:
     defocus_px: float = 0.0
     denoised: bool = False
     opened_to: float | None = None
-    remaining: torch.Tensor | None = None
-    errors: Mapping[str, float] = field(default_factory=dict, compare=False)
+    remaining_variance: torch.Tensor | None = None
+    steps: tuple[Step, ...] = field(default=(), compare=False)
 
     @cached_property
     def source_noise(self) -> NoiseLevelFunction:
-        """Noise that reaches the sensor from the prepared scene: exposed, and averaged by the blur."""
+        """Noise that the source brings to the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
         return self.source.exposed(self.ratio).scaled(
             kernel_energy(self.motion_px, self.defocus_px)
         )
+
+    @property
+    def lens_blur(self) -> tuple[bool, float | None, float]:
+        """What the light behind the lens depends on, before motion and exposure."""
+        return self.denoised, self.opened_to, self.defocus_px
+
+    @property
+    def blur(self) -> tuple[bool, float | None, float, float]:
+        """What the light on the sensor depends on, besides the exposure ratio."""
+        return self.denoised, self.opened_to, self.defocus_px, self.motion_px
+
+
+def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
+    """Exposures as the columns of a batch: (B, 5, 4) float32, columns are the planes R, G1, G2, B.
+
+    The rows: exposure ratio; then the rows of `simulator.noise.top_up.top_up_table`.
+    """
+    table = np.empty((len(exposures), 5, 4), np.float32)
+    table[:, 0] = np.array([e.ratio for e in exposures]).reshape(-1, 1)
+    table[:, 1:] = top_up_table([e.source_noise for e in exposures], [e.target for e in exposures])
+    return table

@@ -1,9 +1,9 @@
 """Captures on the CPU, fused: from light to what the camera records in one pass over the samples.
 
-The steps are those of `simulator.capture.record`, which stays the reference and the path on other devices:
-multiply by the exposure ratio, add noise of the variance that is missing, round to digital numbers
-and clip. They run in blocks of 256 samples that stay in the first-level cache, vectorised by the
-compiler, on as many threads as `simulator.utils.threads` allows.
+The steps are those of `simulator.capture.sensor`, which stays the reference and the path on other
+devices: multiply by the exposure ratio, add noise of the variance that is missing, round to digital
+numbers and clip. They run in blocks of 256 samples that stay in the first-level cache, vectorised
+by the compiler, on as many threads as `simulator.utils.threads` allows.
 
 This module imports numba.
 """
@@ -18,13 +18,12 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.exposure import SIGNAL_LIMIT, Exposure
+from simulator.capture.exposure import PEDESTAL, SIGNAL_LIMIT
 from simulator.noise.generator import (
     BANK_SIZE,
     BLOCK,
     KEY_STEP,
     STRIDE,
-    FrameNoise,
     Noise,
     draw_block,
     mixed_word,
@@ -33,8 +32,6 @@ from simulator.noise.generator import (
 from simulator.utils.jit import addresses, as_pointer, kernel
 from simulator.utils.threads import in_shares
 
-#: Most negative signal that a companded code shows; the offset under its square root.
-PEDESTAL = 1.0 / 1024.0
 #: A sample at or below this signal counts as clipped low: ten stops below white.
 LOW_CLIP = 2.0**-10
 #: A sample at or above this signal counts as clipped high.
@@ -57,7 +54,7 @@ _START_BITS = np.uint64(BANK_SIZE // STRIDE - 1)
 
 @functools.lru_cache(maxsize=64)
 def sensor_table(camera: CameraProfile) -> np.ndarray:
-    """What `camera` does to a signal: (5, 4) float32, columns are the planes R, G1, G2, B.
+    """How `camera` digitises a signal: (5, 4) float32, columns are the planes R, G1, G2, B.
 
     The rows: digital numbers from black to white, digital number of black, largest one that counts
     as clipped low, smallest one that counts as clipped high, largest one.
@@ -71,21 +68,6 @@ def sensor_table(camera: CameraProfile) -> np.ndarray:
     table = np.stack([span[:, 0], black[:, 0], low, high, white]).astype(np.float32)
     table.flags.writeable = False
     return table
-
-
-def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
-    """What exposures do to light: (B, 5, 4) float32, columns are the planes R, G1, G2, B.
-
-    The rows: exposure ratio; shot and read noise that is missing to the target's (negative where
-    the source has more); shot and read noise of the source.
-    """
-    rows = []
-    for exposure in exposures:
-        target, source = exposure.target, exposure.source_noise
-        rows.append(((exposure.ratio,) * 4, target.shot, target.read, source.shot, source.read))
-    table = np.array(rows).reshape(-1, 5, 4)
-    table[:, 1:3] -= table[:, 3:]
-    return table.astype(np.float32)
 
 
 _jit = functools.partial(kernel, fastmath=_FAST, boundscheck=False)
@@ -123,7 +105,7 @@ def _digitise(size, light, bound, ratio, sensor, out):  # type: ignore[no-untype
 def _digitise_noisy(  # type: ignore[no-untyped-def]
     size, light, normals, sign, bound, ratio, shot, read, sensor, out
 ):
-    """The same with noise of the variance that is missing."""
+    """The same with noise of the variance that is missing (`simulator.noise.top_up`)."""
     span, black, white = sensor
     for j in range(size):
         x = _exposed(light[j], ratio, bound)
@@ -133,21 +115,21 @@ def _digitise_noisy(  # type: ignore[no-untyped-def]
 
 @_jit()
 def _digitise_averaged(  # type: ignore[no-untyped-def]
-    size, light, normals, sign, remaining, bound, ratio, noise, sensor, out
+    size, light, normals, sign, shares, bound, ratio, noise, sensor, out
 ):
-    """The same where a blur has left a share `remaining` of the source's variance."""
+    """The same where a blur has left only a share of the source's variance."""
     (shot, read, source_shot, source_read), (span, black, white) = noise, sensor
     for j in range(size):
         x = _exposed(light[j], ratio, bound)
         bright = x if x > _ZERO else _ZERO
         variance = bright * shot + read
-        variance += (_ONE - remaining[j]) * (bright * source_shot + source_read)
+        variance += (_ONE - shares[j]) * (bright * source_shot + source_read)
         out[j] = _rounded(_noisy(x, sign * normals[j], variance), span, black, white)
 
 
 @_jit()
 def _count(numbers, low, high, counts):  # type: ignore[no-untyped-def]
-    """Counts clipped samples by their place in the block: low ones as 1, high ones as 2^16.
+    """Counts clipped samples by their index in the block: low ones as 1, high ones as 2^16.
 
     A sum over the block would cost more than all comparisons.
     """
@@ -183,7 +165,7 @@ def _as_signals(numbers, black, span, out):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _in_bank(key, block):  # type: ignore[no-untyped-def]
-    """Where in the bank a block of a frame starts, and its sign; see `simulator.noise.generator`."""
+    """Where in the bank a block of a frame starts, and its sign (`simulator.noise.generator`)."""
     word = mixed_word(key + KEY_STEP * np.uint64(block + 1))
     return np.int64(word & _START_BITS) * STRIDE, -_ONE if word >> np.uint64(63) else _ONE
 
@@ -229,8 +211,8 @@ def _record(  # type: ignore[no-untyped-def]
             size, at, number = end - start, plane * samples + start, plane * blocks + block
             exposed, normals, sign = frame_light[at : at + size], made, _ONE
             if drawn == _BANK:
-                place, sign = _in_bank(keys[frame], number)
-                normals = bank[place : place + BLOCK]
+                offset, sign = _in_bank(keys[frame], number)
+                normals = bank[offset : offset + BLOCK]
             elif drawn == _DRAWN:
                 draw_block(keys[frame], number, words, made)
             if drawn == _OFF:
@@ -257,100 +239,59 @@ def _record(  # type: ignore[no-untyped-def]
 
 
 def record_frames(
-    light: np.ndarray,
-    samples: int,
-    exposure: np.ndarray,
+    light: Sequence[torch.Tensor],
+    table: np.ndarray,
     camera: CameraProfile,
     *,
     keys: np.ndarray | None = None,
     noise: Noise = "bank",
-    remaining: np.ndarray | None = None,
+    remaining_variance: Sequence[torch.Tensor | None] | None = None,
     codes: np.ndarray | None = None,
     numbers: np.ndarray | None = None,
     signals: np.ndarray | None = None,
     count: bool = True,
     threads: int | None = None,
 ) -> np.ndarray:
-    """Records a batch of frames; every output that is given is filled.
+    """`simulator.capture.sensor.record` on the CPU; every output that is given is filled.
 
     Args:
-        light: (B,) uintp `addresses` of each frame's light, 4 planes of `samples`
-            contiguous float32. The caller keeps that memory alive.
-        samples: Pixels of a plane.
-        exposure: (B, 5, 4) float32, see `exposure_table`.
+        light: (4, H, W) each, contiguous float32; B of them.
+        table: (B, 5, 4) float32 of `simulator.capture.exposure.exposure_table`.
         camera: The body.
         keys: (B,) uint64 of the noise, see `noise_keys`; None for no noise.
         noise: How the keys become noise.
-        remaining: (B,) uintp addresses of the share of the source's variance that a blur has left,
-            `samples` float32; 0 for all of it.
-        codes: (B, 4, samples) uint8, companded (`ae_env.observation`).
-        numbers: (B, 4, samples) uint16, digital numbers.
-        signals: (B, 4, samples) float32, on the scale where white is 1.
+        remaining_variance: (H, W) contiguous float32 each, share of the source's variance that a
+            blur has left, or None for all of it.
+        codes: (B, 4, H, W) uint8, ``round(255 sqrt((x + p) / (1 + p)))`` with p = `PEDESTAL`.
+        numbers: (B, 4, H, W) uint16, digital numbers.
+        signals: (B, 4, H, W) float32, on the scale where white is 1.
         count: Whether to count clipped samples.
         threads: At most so many; those of torch by default.
 
     Returns:
         (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
     """
-    frames = len(light)
+    frames, samples = len(light), light[0].shape[-2] * light[0].shape[-1]
     blocks = -(-samples // BLOCK)
     pieces = -(-blocks // _UNIT_BLOCKS)
     units = frames * 4 * pieces
     counts = np.empty((units if count else 0, 2), np.int64)
     drawn = _OFF if keys is None else _BANK if noise == "bank" else _DRAWN
+    empty, flat = (0, 4, 0), (frames, 4, samples)
     fixed = (
         samples,
-        np.ascontiguousarray(light, np.uintp),
-        np.zeros(frames, np.uintp) if remaining is None else remaining,
-        exposure,
+        addresses(light),
+        np.zeros(frames, np.uintp) if remaining_variance is None else addresses(remaining_variance),
+        table,
         np.zeros(frames, np.uint64) if keys is None else keys,
         drawn,
         noise_bank() if drawn == _BANK else _NO_BANK,
         sensor_table(camera),
-        np.empty((0, 4, 0), np.uint8) if codes is None else codes,
-        np.empty((0, 4, 0), np.uint16) if numbers is None else numbers,
-        np.empty((0, 4, 0), np.float32) if signals is None else signals,
+        np.empty(empty, np.uint8) if codes is None else codes.reshape(flat),
+        np.empty(empty, np.uint16) if numbers is None else numbers.reshape(flat),
+        np.empty(empty, np.float32) if signals is None else signals.reshape(flat),
         counts,
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     in_shares(lambda first, last: _record(first, last, *fixed), units, least=least, threads=threads)
     return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)
-
-
-def record_capture(
-    light: torch.Tensor,
-    exposure: Exposure,
-    camera: CameraProfile,
-    *,
-    noise: FrameNoise | None = None,
-    out: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """One capture of `light`: exposed, noisy, clipped and quantised, blurred by the caller.
-
-    Args:
-        light: (4, H, W) float32 on the CPU, at the exposure of the prepared scene.
-        exposure: What happens to it; its blur is not applied here.
-        camera: The body.
-        noise: The noise; None for none.
-        out: (4, H, W) contiguous float32 to write into.
-
-    Returns:
-        (4, H, W) float32 in [-pedestal, 1].
-    """
-    light = light.contiguous()
-    signals = torch.empty(light.shape) if out is None else out
-    remaining = exposure.remaining
-    if remaining is not None:
-        remaining = remaining.float().contiguous()
-    record_frames(
-        addresses([light]),
-        light[0].numel(),
-        exposure_table([exposure]),
-        camera,
-        keys=None if noise is None else np.array([noise.key], np.uint64),
-        noise="bank" if noise is None else noise.kind,
-        remaining=addresses([remaining]),
-        signals=signals.numpy().reshape(1, 4, -1),
-        count=False,
-    )
-    return signals

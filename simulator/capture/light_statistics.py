@@ -1,4 +1,4 @@
-"""What must be known of a light to tell what leaving a step out would change."""
+"""Statistics of a light, from which the errors of leaving steps out are worked out."""
 
 from __future__ import annotations
 
@@ -9,31 +9,40 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from simulator.camera import NoiseLevelFunction
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares
 
+#: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
+BINS = 64
+SAMPLES = 65_536
+#: Pixels of a plane that are sorted for bins and median, at most about this many.
+_SORTED = 4096
+#: Pixels from which another thread is worth waking.
+_WORTH_A_THREAD = 2**16
+_FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
 
-# Sums over pixels, and over bins of pixels, for `simulator.capture.light_statistics`; CPU only.
-#
-# This module imports numba.
+
+# -- sums over pixels, and over bins of pixels ------------------------------------------------
+
+
 @kernel()
-def _find(values, limits, places):  # type: ignore[no-untyped-def]
+def _find(values, limits, indices):  # type: ignore[no-untyped-def]
     """Number of `limits` that each value reaches; they are a full tree, ascending.
 
     Values come in any order: a branch would be mispredicted half of the time.
     """
-    places[:] = 0
+    indices[:] = 0
     step = (len(limits) + 1) // 2
     while step:
         for x in range(len(values)):
-            reached = values[x] >= limits[places[x] + np.uint32(step - 1)]
-            places[x] += np.uint32(step) * np.uint32(reached)
+            reached = values[x] >= limits[indices[x] + np.uint32(step - 1)]
+            indices[x] += np.uint32(step) * np.uint32(reached)
         step //= 2
 
 
 @kernel()
-def accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[no-untyped-def]
+def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[no-untyped-def]
     """Adds each pixel of some rows to the bin of its light.
 
     Args:
@@ -50,7 +59,7 @@ def accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[n
     while 2 * half <= edges.shape[1]:
         half *= 2
     limits = np.empty(2 * half - 1, np.float32)
-    places = np.empty(width, np.uint32)
+    indices = np.empty(width, np.uint32)
     bins = np.empty((2 * half, 6))
     for plane in range(first, last):
         limits[:] = np.inf
@@ -60,10 +69,10 @@ def accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[n
         for y in rows:
             centre = light[plane, y]
             above, below = light[plane, max(y - 1, 0)], light[plane, min(y + 1, height - 1)]
-            _find(centre, limits, places)
+            _find(centre, limits, indices)
             for x in range(width):
                 value = centre[x]
-                found = bins[places[x]]
+                found = bins[indices[x]]
                 twice = 2.0 * np.float64(value)
                 left, right = centre[max(x - 1, 0)], centre[min(x + 1, width - 1)]
                 along = np.float64(left) + np.float64(right) - twice
@@ -75,19 +84,19 @@ def accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[n
                 found[3] += along * along
                 found[4] = min(found[4], level)
                 found[5] = max(found[5], level)
-        for place in range(sums.shape[2]):
+        for index in range(sums.shape[2]):
             for kind in range(4):
-                sums[kind, plane, place] += bins[place, kind]
-            levels[0, plane, place] = min(levels[0, plane, place], bins[place, 4])
-            levels[1, plane, place] = max(levels[1, plane, place], bins[place, 5])
+                sums[kind, plane, index] += bins[index, kind]
+            levels[0, plane, index] = min(levels[0, plane, index], bins[index, 4])
+            levels[1, plane, index] = max(levels[1, plane, index], bins[index, 5])
 
 
 _SUMS = {"reassoc", "nnan", "nsz", "contract"}
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def excess(share, edges, ratio, source, target, floor):  # type: ignore[no-untyped-def]
-    """`simulator.capture.light_statistics.LightStatistics.excess` of bins.
+def _excess_error(share, edges, ratio, source, target, floor):  # type: ignore[no-untyped-def]
+    """`LightStatistics.excess_error` of bins.
 
     Args:
         share: (P, B) share of all pixels.
@@ -106,17 +115,17 @@ def excess(share, edges, ratio, source, target, floor):  # type: ignore[no-untyp
         shot, read = target[0, plane] * ratio, target[1, plane]
         for edge in range(2):
             light, shares = edges[edge, plane], share[plane]
-            for place in range(len(shares)):
-                wanted = read + shot * light[place]
-                given = source_read + source_shot * light[place]
+            for index in range(len(shares)):
+                wanted = read + shot * light[index]
+                given = source_read + source_shot * light[index]
                 beyond = np.sqrt(given / (wanted if wanted > floor else floor)) - 1.0
                 beyond = beyond if beyond > 0.0 else 0.0
-                total += shares[place] * beyond * beyond
+                total += shares[index] * beyond * beyond
     return np.sqrt(total / 2.0)
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no-untyped-def]
+def _curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no-untyped-def]
     """Root mean squares over bins of second differences in units of a target's noise.
 
     Args:
@@ -130,24 +139,17 @@ def curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no
     discs, rows = 0.0, 0.0
     for plane in range(share.shape[0]):
         shot, read = target[0, plane], target[1, plane]
-        for place in range(share.shape[1]):
-            wanted = read + shot * ratio * light[plane, place]
+        for index in range(share.shape[1]):
+            wanted = read + shot * ratio * light[plane, index]
             wanted = wanted if wanted > floor else floor
             # What the mean moves by, and with it the deviation of shot noise.
-            weight = share[plane, place] * (1.0 + shot * shot / wanted) / wanted
-            discs += weight * disc[plane, place]
-            rows += weight * row[plane, place]
+            weight = share[plane, index] * (1.0 + shot * shot / wanted) / wanted
+            discs += weight * disc[plane, index]
+            rows += weight * row[plane, index]
     return np.sqrt(discs), np.sqrt(rows)
 
 
-#: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
-BINS = 64
-SAMPLES = 65_536
-#: Pixels of a plane that are sorted for bins and median, at most about this many.
-_SORTED = 4096
-#: Pixels from which another thread is worth waking.
-_WORTH_A_THREAD = 2**16
-_FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
+# -- the statistics ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +196,10 @@ class LightStatistics:
         middle = self._sorted.shape[1] // 2
         return np.maximum(self._sorted[:, [middle, -middle - 1]].mean(axis=1), 0.0)
 
-    def excess(self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction) -> float:
-        """Error of a source's noise that is left where it exceeds the target's, rather too high.
+    def excess_error(
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+    ) -> float:
+        """Error of leaving a source's noise where it exceeds the target's, rather too high.
 
         Args:
             ratio: Exposure ratio from the light to the target.
@@ -204,41 +208,26 @@ class LightStatistics:
         """
         if source.is_zero:
             return 0.0
-
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = _numbers(source), _numbers(target)
-        return float(excess(bins.share, bins.edges, float(ratio), *noises, _FLOOR))
+        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR))
 
-    def blur_error(
-        self,
-        ratio: float,
-        target: NoiseLevelFunction,
-        motion_px: float | np.ndarray = 0.0,
-        disc_px: float | np.ndarray = 0.0,
-    ) -> float | np.ndarray:
-        """Bound on the error of leaving out a streak and a disc, of one or of many extents.
+    def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
+        """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
 
-        A symmetric kernel with second moment m per axis moves the light by at most m / 2 times its
-        discrete Laplacian, in the root mean square: ``1 - cos(k t) <= k^2 (1 - cos t)``.
+        Others go with the square of their extent. A symmetric kernel with second moment m per axis
+        moves the light by at most m / 2 times its discrete Laplacian, in the root mean square:
+        ``1 - cos(k t) <= k^2 (1 - cos t)``.
 
         Args:
             ratio: Exposure ratio from the light to the target.
             target: Noise that the capture should have.
-            motion_px: Length of the streak along the rows [pixel].
-            disc_px: Diameter of the disc [pixel].
         """
-        disc, row = self.curvature(ratio, target)
-        return disc * disc_px * disc_px + row * motion_px * motion_px
-
-    def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
-        """`blur_error` of a disc of one pixel and of a streak of one pixel; others go with the
-        square of their extent."""
-
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
         squares = bins.edges[0], bins.disc, bins.row
-        disc, row = curvature(bins.share, *squares, float(ratio), _numbers(target), _FLOOR)
+        disc, row = _curvature(bins.share, *squares, float(ratio), _numbers(target), _FLOOR)
         return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
@@ -255,12 +244,12 @@ class LightStatistics:
         wanted = np.maximum(_variance(signal, target), _FLOOR)
         return _root_mean(self._bins.share, _variance(signal, source.exposed(ratio)) / wanted)
 
-    def relative_excess(
+    def relative_excess_variance(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
         """Mean over the pixels of the variance that `source` brings beyond the target's.
 
-        Relative to the target's. Other than in `excess`, `source` is on the target's scale,
+        Relative to the target's. Other than in `excess_error`, `source` is on the target's scale,
         averaged by what blur there is.
         """
         signal = self._bins.light * ratio
@@ -270,7 +259,7 @@ class LightStatistics:
 
     @property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Light (4, R, W) with the rows that are looked at and their neighbours, and their places.
+        """Light (4, R, W): rows that are looked at and their neighbours; and which they are.
 
         Whole rows: every column counts alike whatever the width, and a row is read at once.
         """
@@ -295,7 +284,6 @@ class LightStatistics:
 
     @functools.cached_property
     def _bins(self) -> _Bins:
-
         light, rows = self._rows
         samples = len(rows) * light.shape[-1]
         edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
@@ -303,7 +291,7 @@ class LightStatistics:
         levels[0] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
         fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
-        in_shares(lambda first, last: accumulate(first, last, *fixed), 4, least=least)
+        in_shares(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
         counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
         return _Bins(
             share=sums[0] / (4.0 * samples),

@@ -1,21 +1,33 @@
-"""What a change of settings takes, why the rest is left out, and what it costs."""
+"""Which steps a transition takes: decided, explained and priced in one place.
+
+`decide` looks at numbers only and says for each step whether it runs and why; captures follow it
+(`PreparedScene.exposure`), and `SimulationPlan` shows it.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from numbers import Real
+from typing import NamedTuple
 
-from simulator.capture.exposure import Exposure
-from simulator.capture.record import noise_balance
+import numpy as np
+import torch
+
+from simulator.capture.exposure import Exposure, Step
+from simulator.capture.light_statistics import LightStatistics
+from simulator.capture.sensor import NoiseBalance
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from simulator.utils.tiles import varying
 
-if TYPE_CHECKING:
-    from simulator.capture.prepared_scene import PreparedScene
-
-#: What the compact noise module errs by itself: a share of the standard deviation of the noise that
+#: How much of a transition may be left out, in units of the target's noise: by default the
+#: distribution of a pixel may move by a tenth of its noise's standard deviation.
+DEFAULT_TOLERANCE = 0.1
+#: Noise below this share of the light is not worth denoising: the networks' own error is as large.
+WORTH_DENOISING = 0.006
+#: Error of the compact noise module itself: a share of the standard deviation of the noise that
 #: it removes, and a share of the light. Calibrated on 41 scenes of the validation split
 #: (procedural, photographs, radiance maps, draped ones) at ISO 100 to 6400, 8 noisy captures each:
 #: with these, `SimulationPlan.predicted_difference` bounds 98 % of 261 measured distances between
@@ -23,11 +35,203 @@ if TYPE_CHECKING:
 BIAS, GAMMA = 0.35, 0.015
 #: What float32 loses in a transition, as a share of the light.
 ROUNDING = 2.0**-20
-_EXPOSE_OPERATIONS = 2
-_NOISE_OPERATIONS = 14
-_CLIP_OPERATIONS = 6
-_STREAK_OPERATIONS = 6
-_GATHER_OPERATIONS = 4
+#: Arithmetic operations per sample of the steps whose cost does not depend on anything.
+_OPERATIONS = {
+    "exposure": 2,
+    "noise_reduction": 1,
+    "aperture": 4,
+    "motion_blur": 6,
+    "noise": 14,
+    "clip_and_quantise": 6,
+}
+
+
+def check_tolerance(tolerance: float) -> float:
+    """`tolerance` as a float.
+
+    Raises:
+        ValueError: Unless it is a finite number >= 0.
+    """
+    if (
+        isinstance(tolerance, bool)
+        or not isinstance(tolerance, Real)
+        or not 0 <= tolerance < math.inf
+    ):
+        raise ValueError(f"`tolerance` (={tolerance!r}) must be a finite number >= 0")
+    return float(tolerance)
+
+
+# -- deciding ---------------------------------------------------------------------------------
+
+
+class Situation(NamedTuple):
+    """All that decides which steps a transition takes.
+
+    Args:
+        ratio: Exposure ratio from the source to the target.
+        source: Noise of the source, at its own exposure.
+        target: Noise that the capture should have.
+        tolerance: Bound on the root of the sum of squares of the errors of all that is left out.
+            0 leaves out nothing that changes a pixel.
+        noise: Whether a capture is wanted; else the light without noise, in which noise of the
+            source cannot count as part of the target's.
+        statistics: Of the light as it was recorded.
+        denoised: Gives the statistics of the noise-reduced light; None without a noise module.
+        defocus_px: Diameter of the defocus disc [pixel].
+        motion_px: Length of the streak of motion [pixel].
+        aperture_px: Largest diameter of the blur that the opening aperture adds [pixel], inf where
+            it is not known; None where no defocus was estimated.
+        opens: Whether the aperture opens.
+        opens_denoised: Whether it is opened by a network that needs the noise-reduced light.
+    """
+
+    ratio: float
+    source: NoiseLevelFunction
+    target: NoiseLevelFunction
+    tolerance: float
+    noise: bool
+    statistics: LightStatistics
+    denoised: Callable[[], LightStatistics] | None = None
+    defocus_px: float = 0.0
+    motion_px: float = 0.0
+    aperture_px: float | None = None
+    opens: bool = False
+    opens_denoised: bool = False
+
+
+def decide(given: Situation) -> tuple[Step, Step, Step, Step]:
+    """Noise reduction, aperture, defocus and motion blur, in the order in which they run.
+
+    Noise that stays widens a pixel's distribution, blur that is missing shifts it: squares add.
+    Several missing blurs shift it the same way and add up; the error of each is what it adds to the
+    square, so that the root of the sum of squares of all errors is right for any set of steps.
+    """
+    noise_reduction = _decide_noise_reduction(given)
+    if not (given.aperture_px or given.defocus_px or given.motion_px):
+        return noise_reduction, _no_aperture(given), _no_defocus(given), _NO_MOTION
+    missing_noise = missing_blur = 0.0
+    if given.denoised is not None and not noise_reduction.runs:
+        missing_noise = noise_reduction.error
+    disc, row = _curvature(given, noise_reduction.runs)
+
+    def blur(name: str, extent: float, curvature: float) -> Step:
+        nonlocal missing_blur
+        error = math.inf if extent == math.inf else curvature * extent * extent
+        together = missing_blur + error
+        left_out = math.hypot(missing_noise, together) <= given.tolerance
+        added = math.sqrt(error * (together + missing_blur)) if error else 0.0
+        if left_out:
+            missing_blur = together
+        reason = (_LEFT_OUT if left_out else _NEEDED)[name, extent == math.inf]
+        if not left_out and added < math.inf:
+            reason += _WITHOUT
+        return Step(name, not left_out, reason, added, extent)
+
+    aperture_px, defocus_px, motion_px = given.aperture_px, given.defocus_px, given.motion_px
+    return (
+        noise_reduction,
+        blur("aperture", aperture_px, disc) if aperture_px else _no_aperture(given),
+        blur("defocus", defocus_px, disc) if defocus_px else _no_defocus(given),
+        blur("motion_blur", motion_px, row) if motion_px else _NO_MOTION,
+    )
+
+
+def _curvature(given: Situation, denoised: bool) -> tuple[float, float]:
+    """`LightStatistics.curvature` of the light that is blurred."""
+    if given.tolerance == 0.0:  # no blur is left out, however small
+        return math.inf, math.inf
+    if not (given.defocus_px or given.motion_px or given.aperture_px != math.inf):
+        return math.inf, math.inf  # nobody asks: the network need not run for it
+    light = given.statistics
+    if denoised and given.denoised is not None:
+        light = given.denoised()
+    return light.curvature(given.ratio, given.target)
+
+
+def _decide_noise_reduction(given: Situation) -> Step:
+    if given.source.is_zero:
+        return _CLEAN_SOURCE
+    name = "noise_reduction"
+    error_of = given.statistics.excess_error if given.noise else given.statistics.relative_noise
+    error = error_of(given.ratio, given.source, given.target)
+    if given.denoised is None:
+        return Step(name, False, "the simulator has no noise module", error)
+    # Blur averages noise, too. That is not counted on: it may be left out itself.
+    if given.opens_denoised and given.aperture_px:
+        reason = "the aperture module works on the noise-reduced light only"
+        return Step(name, True, reason + _WITHOUT, error)
+    if given.tolerance > 0.0:
+        if error <= given.tolerance:
+            return Step(name, False, _small_noise(given, error), error)
+        if not _worth_denoising(given):
+            reason = "the source has so little noise that the network's own error is as large"
+            return Step(name, False, reason, error)
+    if not given.noise:
+        reason = "no noise of the target's is there to take the source's up"
+    elif error == 0.0:
+        reason = "tolerance 0 takes no noisy pixel for its mean"
+    else:
+        reason = "the source is noisier than the target"
+    return Step(name, True, reason + _WITHOUT, error)
+
+
+def _worth_denoising(given: Situation) -> bool:
+    """Whether the noise is more than `WORTH_DENOISING` of the light, at its median level."""
+    signal = given.statistics.median
+    deviation = np.sqrt(np.array(given.source.read) + np.array(given.source.shot) * signal)
+    return bool((deviation > WORTH_DENOISING * signal).any())
+
+
+def _small_noise(given: Situation, error: float) -> str:
+    if not given.noise:
+        return "the source's noise is small against the target's"
+    if error == 0.0:
+        return "the target is at least as noisy: noise is added up to it"
+    return "the source is hardly noisier than the target, elsewhere noise is added up to it"
+
+
+def _no_aperture(given: Situation) -> Step:
+    if given.aperture_px is None:
+        return _NO_APERTURE_MODULE
+    return _IN_FOCUS if given.opens else _CLOSES
+
+
+def _no_defocus(given: Situation) -> Step:
+    return _FAR if given.aperture_px is None else _DEFOCUS_ESTIMATED
+
+
+#: Steps that would do nothing.
+_CLEAN_SOURCE = Step("noise_reduction", False, "the source carries no noise")
+_NO_APERTURE_MODULE = Step(
+    "aperture", False, "no defocus was estimated: `depth` is not 'unknown'"
+)
+_CLOSES = Step(
+    "aperture", False, "the aperture does not open; what is blurred in the source stays so"
+)
+_IN_FOCUS = Step("aperture", False, "the picture was found to be in focus throughout")
+_FAR = Step("defocus", False, "the scene is taken as far or in focus throughout")
+_DEFOCUS_ESTIMATED = Step(
+    "defocus", False, "none is given for the whole frame: each pixel's was estimated"
+)
+_NO_MOTION = Step("motion_blur", False, "the image does not move")
+_WITHOUT = "; leaving it out would be an error of {error:.2g}"
+#: Reasons by step, and whether the extent is unknown; filled in when a plan is shown.
+_NEEDED = {
+    ("aperture", False): "the aperture opens and adds blur (up to {extent:.2g} pixel)",
+    ("aperture", True): "the aperture opens and adds blur",
+    ("defocus", False): "the defocus disc is {extent:.3g} pixel wide",
+    ("motion_blur", False): "the image moves by {extent:.3g} pixel during the exposure",
+}
+_LEFT_OUT = {
+    ("aperture", False): "the blur that opening adds (up to {extent:.2g} pixel) would hardly show",
+    ("defocus", False): "the defocus disc is {extent:.2g} pixel wide, which would hardly show",
+    ("motion_blur", False): (
+        "the image moves by {extent:.2g} pixel during the exposure, which would hardly show"
+    ),
+}
+
+
+# -- showing ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -38,7 +242,7 @@ class PlannedStep:
         name: What it is called in `SimulationPlan.modules`.
         runs: Whether it runs.
         reason: Why it does, or does not.
-        error: What leaving it out errs, in units of the target's noise; 0 if it runs.
+        error: Error of leaving it out, in units of the target's noise; 0 if it runs.
         operations: Arithmetic operations that it takes, all pixels together.
     """
 
@@ -69,7 +273,7 @@ class SimulationPlan:
         extrapolated_noise: Whether the target's ISO lies outside the camera's calibration.
         predicted_rmse: Root mean square of the excess noise, 1 is sensor white.
         predicted_difference: Bound on the distance to the full run (`CameraSimulator.simulate` with
-            ``tolerance=None``), which also has what the networks that it runs err themselves.
+            ``tolerance=None``), including the errors of the networks that it runs.
     """
 
     settings: CameraSettings
@@ -145,191 +349,83 @@ class SimulationPlan:
 
 
 def make_plan(
-    prepared: PreparedScene, settings: CameraSettings, *, noise: bool = True
+    settings: CameraSettings,
+    exposure: Exposure,
+    given: Situation,
+    balance: NoiseBalance,
+    light: torch.Tensor,
+    clipped_source: float,
 ) -> SimulationPlan:
-    """Steps, reasons, predicted error and cost of a capture of `prepared` at `settings`.
+    """Steps, reasons, predicted error and cost of a capture, or of the light without noise.
 
     Args:
-        prepared: The scene's light.
         settings: Settings to simulate.
-        noise: Whether a capture is wanted, or the light on the sensor without noise.
+        exposure: What was decided for them.
+        given: What it was decided on.
+        balance: The source's noise against the target's.
+        light: (4, H, W) as it was recorded.
+        clipped_source: See `SimulationPlan`.
     """
-    exposure = prepared.exposure(settings, noise=noise)
-    # A clean source lacks all of the noise: its light need not be made to see that.
-    light = prepared.light if exposure.source.is_zero else prepared.source_light(exposure)
-    balance = noise_balance(light, exposure)
-    pixels = prepared.light.numel()
-    steps = (
-        PlannedStep("exposure", True, "", 0.0, _EXPOSE_OPERATIONS * pixels),
-        _noise_reduction(prepared, exposure, noise, pixels),
-        _aperture(prepared, settings, exposure, pixels),
-        _defocus(prepared, settings, exposure, pixels),
-        _motion_blur(prepared, settings, exposure, pixels),
-        _noise(noise, balance.is_short, pixels),
-        _clip(noise, pixels),
-    )
+    samples = light.numel()
+    optional = tuple(_planned(step, samples) for step in exposure.steps)
+    wanted, reason = given.noise, "only the light is asked for"
+    noise = Step("noise", wanted and balance.lacks_noise, "" if wanted else reason)
+    if wanted and not balance.lacks_noise:
+        reason = "no pixel lacks noise: the source has the target's already, or more"
+        noise = Step("noise", False, reason)
+    clip = Step("clip_and_quantise", wanted, "" if wanted else "only the light is asked for")
     return SimulationPlan(
         settings=settings,
         exposure_ratio=exposure.ratio,
-        steps=steps,
-        tolerance=prepared.tolerance,
-        excess_noise=balance.relative_excess,
-        clipped_source=0.0
-        if prepared.saturated is None
-        else int(prepared.saturated.count_nonzero()) / prepared.saturated.numel(),
+        steps=(
+            _planned(Step("exposure", True, ""), samples),
+            *optional,
+            _planned(noise, samples),
+            _planned(clip, samples),
+        ),
+        tolerance=given.tolerance,
+        excess_noise=balance.relative_excess_variance,
+        clipped_source=clipped_source,
         extrapolated_noise=exposure.target.extrapolated,
-        predicted_rmse=balance.excess**0.5,
-        predicted_difference=_difference(prepared, exposure, steps),
+        predicted_rmse=balance.excess_variance**0.5,
+        predicted_difference=_difference(exposure, given, optional, light),
     )
 
 
+def _planned(step: Step, samples: int) -> PlannedStep:
+    reason = step.reason.format(extent=step.extent, error=step.error)
+    if not step.runs:
+        return PlannedStep(step.name, False, reason, step.error, 0)
+    per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
+    return PlannedStep(step.name, True, reason, 0.0, per_sample * samples)
+
+
 def _difference(
-    prepared: PreparedScene, exposure: Exposure, steps: tuple[PlannedStep, ...]
+    exposure: Exposure, given: Situation, steps: tuple[PlannedStep, ...], light: torch.Tensor
 ) -> float:
     """See `SimulationPlan.predicted_difference`."""
-    ratio, target = exposure.ratio, exposure.target
-    found = prepared.statistics  # of the light as recorded: a plan need not run the network
-    errors = {step.name: step.error for step in steps}
-    excess = errors.pop("noise_reduction")
-    level = found.relative_level(ratio, target)
-    moved = math.hypot(*errors.values()) + ROUNDING * level
-    if prepared.denoised is None:  # the full run does not reduce the noise either
+    excess, *errors = (step.error for step in steps)  # noise reduction is the first
+    level = given.statistics.relative_level(given.ratio, given.target)
+    moved = math.hypot(*errors) + ROUNDING * level
+    if given.denoised is None:  # the full run does not reduce the noise either
         return moved
     if exposure.denoised:
-        noise, level = _untouched(prepared, exposure)
+        noise, level = (0.0, 0.0) if given.tolerance == 0.0 else _untouched(given, light)
     else:
-        noise = found.relative_noise(ratio, prepared.nlf, target)
-    if not prepared.nlf.is_zero:
+        noise = given.statistics.relative_noise(given.ratio, given.source, given.target)
+    if not given.source.is_zero:
         moved += math.hypot(BIAS * noise, GAMMA * level)
     return math.hypot(0.0 if exposure.denoised else excess, moved)
 
 
-def _untouched(prepared: PreparedScene, exposure: Exposure) -> tuple[float, float]:
+def _untouched(given: Situation, light: torch.Tensor) -> tuple[float, float]:
     """Noise and level, in units of the target's noise, of the regions that needed no network."""
-    if prepared.tolerance == 0.0 or prepared.denoised is None:
-        return 0.0, 0.0
     noise, level = 0.0, 0.0
-    brought = prepared.nlf.exposed(exposure.ratio)
-    constant = ~varying(prepared.light)
+    brought, target = given.source.exposed(given.ratio), given.target
+    constant = ~varying(light)
     for plane in range(4):
-        signal = (prepared.light[plane][constant] * exposure.ratio).clamp_(min=0.0).double()
-        target = exposure.target
+        signal = (light[plane][constant] * given.ratio).clamp_(min=0.0).double()
         wanted = (signal * target.shot[plane] + target.read[plane]).clamp_(min=1e-30)
-        share = 1.0 / prepared.light.numel()
-        level += share * float((signal**2 / wanted).sum())
-        given = signal * brought.shot[plane] + brought.read[plane]
-        noise += share * float((given / wanted).sum())
-    return math.sqrt(noise), math.sqrt(level)
-
-
-def _step(
-    exposure: Exposure, name: str, runs: bool, reasons: tuple[str, str], operations: int
-) -> PlannedStep:
-    """A step that would do something: it runs because of its error, or is left out within it."""
-    error = exposure.errors[name]
-    if not runs:
-        return PlannedStep(name, False, reasons[0], error, 0)
-    cause = f"; leaving it out would err by {error:.2g}" if error < math.inf else ""
-    return PlannedStep(name, True, reasons[1] + cause, 0.0, operations)
-
-
-def _unneeded(name: str, reason: str, error: float = 0.0) -> PlannedStep:
-    return PlannedStep(name, False, reason, error, 0)
-
-
-def _noise_reduction(
-    prepared: PreparedScene, exposure: Exposure, noise: bool, pixels: int
-) -> PlannedStep:
-    name = "noise_reduction"
-    if prepared.nlf.is_zero:
-        return _unneeded(name, "the source carries no noise")
-    left = prepared.statistics.excess if noise else prepared.statistics.relative_noise
-    error = left(exposure.ratio, prepared.nlf, exposure.target)
-    if prepared.denoised is None:
-        return _unneeded(name, "the simulator has no noise module", error)
-    if error > prepared.tolerance:
-        left_out = "the source has so little noise that the network would err as much"
-    elif not noise:
-        left_out = "the source's noise is small against the target's"
-    elif error == 0.0:
-        left_out = "the target is at least as noisy: noise is added up to it"
-    else:
-        left_out = "the source is hardly noisier than the target, elsewhere noise is added up to it"
-    needed = "the source is noisier than the target"
-    if not noise:
-        needed = "no noise of the target's is there to take the source's up"
-    elif error == 0.0:
-        needed = "tolerance 0 takes no noisy pixel for its mean"
-    if (
-        prepared.aperture_blur is not None
-        and prepared.aperture_blur.needs_denoised
-        and exposure.opened_to
-    ):
-        needed = "the aperture module works on the noise-reduced light only"
-    return _step(exposure, name, exposure.denoised, (left_out, needed), pixels)
-
-
-def _aperture(
-    prepared: PreparedScene, settings: CameraSettings, exposure: Exposure, pixels: int
-) -> PlannedStep:
-    name, aperture_blur = "aperture", prepared.aperture_blur
-    if aperture_blur is None:
-        return _unneeded(name, "no defocus was estimated: `depth` is not 'unknown'")
-    if settings.effective_f_number >= aperture_blur.f_number:
-        return _unneeded(name, "the aperture does not open; what is blurred in the source stays so")
-    added = prepared.blurred_light.added_blur(settings.effective_f_number)
-    if not added:
-        return _unneeded(name, "the picture was found to be in focus throughout")
-    largest = f" (up to {added:.2g} pixel)" if added < math.inf else ""
-    reasons = (
-        f"the blur that opening adds{largest} would hardly show",
-        f"the aperture opens and adds blur{largest}",
-    )
-    runs = exposure.opened_to is not None
-    return _step(exposure, name, runs, reasons, _GATHER_OPERATIONS * pixels)
-
-
-def _defocus(
-    prepared: PreparedScene, settings: CameraSettings, exposure: Exposure, pixels: int
-) -> PlannedStep:
-    name = "defocus"
-    if prepared.defocus:
-        disc = prepared.defocus * 4.0 / settings.effective_f_number
-        taps = 1 + int(disc) ** 2
-        reasons = (
-            f"the defocus disc is {disc:.2g} pixel wide, which would hardly show",
-            f"the defocus disc is {disc:.3g} pixel wide",
-        )
-        return _step(exposure, name, exposure.defocus_px > 0, reasons, taps * 2 * pixels)
-    if prepared.aperture_blur is not None:
-        return _unneeded(name, "none is given for the whole frame: each pixel's was estimated")
-    return _unneeded(name, "the scene is taken as far or in focus throughout")
-
-
-def _motion_blur(
-    prepared: PreparedScene, settings: CameraSettings, exposure: Exposure, pixels: int
-) -> PlannedStep:
-    name = "motion_blur"
-    if prepared.image_speed == 0:
-        return _unneeded(name, "the image does not move")
-    streak = prepared.image_speed * settings.exposure_time * prepared.light.shape[-2]
-    reasons = (
-        f"the image moves by {streak:.2g} pixel during the exposure, which would hardly show",
-        f"the image moves by {streak:.3g} pixel during the exposure",
-    )
-    return _step(exposure, name, exposure.motion_px > 0, reasons, _STREAK_OPERATIONS * pixels)
-
-
-def _noise(wanted: bool, is_short: bool, pixels: int) -> PlannedStep:
-    if not wanted:
-        return _unneeded("noise", "only the light is asked for")
-    if not is_short:
-        reason = "no pixel lacks noise: the source has the target's already, or more"
-        return _unneeded("noise", reason)
-    return PlannedStep("noise", True, "", 0.0, _NOISE_OPERATIONS * pixels)
-
-
-def _clip(wanted: bool, pixels: int) -> PlannedStep:
-    if not wanted:
-        return _unneeded("clip_and_quantise", "only the light is asked for")
-    return PlannedStep("clip_and_quantise", True, "", 0.0, _CLIP_OPERATIONS * pixels)
+        level += float((signal**2 / wanted).sum())
+        noise += float(((signal * brought.shot[plane] + brought.read[plane]) / wanted).sum())
+    return math.sqrt(noise / light.numel()), math.sqrt(level / light.numel())

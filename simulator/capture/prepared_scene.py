@@ -3,39 +3,39 @@
 from __future__ import annotations
 
 import functools
-import itertools
-import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Protocol
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, cast
 
 import numpy as np
 import torch
 
-from simulator.camera import CameraProfile, NoiseLevelFunction
-from simulator.capture.aperture_blur import ApertureBlur
-from simulator.capture.blurred_light import BlurredLight, blur_key
-from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import (
-    DEFAULT_TOLERANCE,
-    RATIO_LIMIT,
-    Budget,
-    Exposure,
-    check_tolerance,
-)
+from simulator.camera import CameraProfile
+from simulator.capture.blurred_light import ApertureBlur, BlurredLight, Denoised
+from simulator.capture.exposure import RATIO_LIMIT, Exposure
 from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.plan import SimulationPlan, make_plan
-from simulator.capture.record import exposed_light, noise_balance, record, record_batch
-from simulator.noise.generator import FrameNoise, Noise, check_noise, sweep_keys
+from simulator.capture.plan import (
+    DEFAULT_TOLERANCE,
+    SimulationPlan,
+    Situation,
+    check_tolerance,
+    decide,
+    make_plan,
+)
+from simulator.capture.sensor import Transitions, exposed_light, noise_balance, record
+from simulator.noise.generator import Noise, check_noise, sweep_keys
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.shapes import kernel_energy
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
 
-#: Noise below this share of the light is not worth denoising: the networks err as much.
-WORTH_DENOISING = 0.006
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
+#: Fastest image [frame heights per second]: even 1/1000 s smears it over the whole frame.
+MAX_IMAGE_SPEED = 1000.0
+#: Discs of defocus may be as wide as the frame, on small frames this wide [pixel]: the memory that
+#: a blur takes grows with the square of it.
+MAX_DISC_PX = 512.0
 
 
 class HasPrepared(Protocol):
@@ -58,18 +58,18 @@ class PreparedScene:
         saturated: (H, W) bool, pixels whose light is only known to be at least this; None if none.
         white_balance: Gains of R, G, B of the scene's light.
         box_factor: Sensor pixels averaged per side into one pixel of `light`.
-        image_speed: Speed of the image along the rows [frame heights per second].
+        image_speed: Speed of the image along the rows [frame heights per second], at most 1000.
         defocus: Diameter of the defocus disc at f/4 [pixel of `light`]; 0 for a scene that is far
-            or in focus throughout.
+            or in focus throughout. No disc may be wider than both the frame and 512 pixel.
         gain: Light relative to `light`, where it changes over time.
         denoised: `light` with its noise removed by a noise module, for targets that are cleaner
             than the source; None where there is no such module or no noise.
-        opening: Adds the blur of apertures wider than the reference's to a scene whose depth is not
-            known; None takes it as far.
+        aperture_blur: Adds the blur of apertures wider than the reference's to a scene whose depth
+            is not known; None takes it as far.
         tolerance: How far the distribution of a capture may move by what is left out, in units of
             the target's noise; 0 leaves out only what changes nothing.
-        statistics: Of `light`; made here, and shared by copies with that light.
-        optics: Blurs the light and keeps what it has blurred; made here, and shared likewise.
+        blurred_light: Blurs the light and caches what it has blurred. It is made here, and copies
+            with the same light (`dataclasses.replace`) share it.
     """
 
     light: torch.Tensor
@@ -85,128 +85,147 @@ class PreparedScene:
     denoised: Denoised | None = None
     aperture_blur: ApertureBlur | None = None
     tolerance: float = DEFAULT_TOLERANCE
-    statistics: LightStatistics = None  # type: ignore[assignment]
-    blurred_light: BlurredLight = None  # type: ignore[assignment]
+    blurred_light: BlurredLight = field(default=cast(BlurredLight, None), repr=False)
 
     def __post_init__(self) -> None:
-        known = self.blurred_light is not None and self.blurred_light.is_of(
-            self.light, self.denoised, self.aperture_blur
-        )
-        if not known:  # a copy's light was checked before
-            object.__setattr__(self, "light", check_packed("light", self.light))
+        cached = cast(BlurredLight | None, self.blurred_light)
+        if cached is None or not cached.is_of(self.light, self.denoised, self.aperture_blur):
+            same_light = cached is not None and cached.light is self.light
+            if not same_light:  # a copy's light was checked before
+                object.__setattr__(self, "light", check_packed("light", self.light))
+            self._check_denoised()
+            statistics = cached.statistics if cached is not None and same_light else None
+            lights = BlurredLight(self.light, self.denoised, self.aperture_blur, statistics)
+            object.__setattr__(self, "blurred_light", lights)
+        if not 0.0 <= self.image_speed <= MAX_IMAGE_SPEED:
+            raise ValueError(
+                f"`image_speed` (={self.image_speed!r}) must be in [0, {MAX_IMAGE_SPEED:g}] frame "
+                "heights per second"
+            )
+        if not self.defocus >= 0.0:
+            raise ValueError(f"`defocus` (={self.defocus!r}) must be finite and >= 0")
+        self._disc(4.0)
+        if not 0.0 <= self.gain < float("inf"):
+            raise ValueError(f"`gain` (={self.gain!r}) must be finite and >= 0")
+        object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
+
+    def _check_denoised(self) -> None:
         denoised = self.denoised
-        if denoised is not None and not isinstance(denoised, Denoised):
+        if denoised is None:
+            return
+        if not isinstance(denoised, Denoised):
             raise ValueError(f"`denoised` (={type(denoised).__name__}) must be Denoised or None")
-        if denoised is not None and denoised.shape not in (None, self.light.shape):
+        if denoised.shape not in (None, self.light.shape):
             raise ValueError(
                 f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
                 f"{tuple(self.light.shape)}"
             )
-        for name in ("image_speed", "defocus", "gain"):
-            value = getattr(self, name)
-            if not 0.0 <= value < float("inf"):
-                raise ValueError(f"`{name}` (={value!r}) must be finite and >= 0")
-        object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
-        if self.statistics is None or self.statistics.light is not self.light:
-            object.__setattr__(self, "statistics", LightStatistics(self.light))
-        if not known:
-            object.__setattr__(
-                self, "blurred_light", BlurredLight(self.light, self.denoised, self.aperture_blur)
-            )
 
-    def exposure(self, settings: CameraSettings, *, noise: bool = True) -> Exposure:
-        """What a capture at `settings` does to this light, and what `tolerance` leaves out of it.
+    @property
+    def statistics(self) -> LightStatistics:
+        """Statistics of `light`."""
+        return self.blurred_light.statistics
 
-        Tens of microseconds: what must be known of the light is in `statistics`, and kept.
+    # -- what a change of settings takes ------------------------------------------------------
+
+    def exposure(
+        self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
+    ) -> Exposure:
+        """What happens to this light in a capture at `settings`, less what `tolerance` leaves out.
+
+        Tens of microseconds: the statistics of the light are worked out once.
 
         Args:
             settings: Settings to simulate.
             noise: Whether the capture will be noisy; if not, noise of the source cannot count as
                 part of the target's.
+            gain: Light relative to this scene's.
         """
+        return self._exposure(settings, self._situation(settings, noise, gain))
+
+    def _situation(self, settings: CameraSettings, noise: bool, gain: float) -> Situation:
         if not isinstance(settings, CameraSettings):
             raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
-        f_number = settings.effective_f_number
-        ratio = min(self.gain * exposure_ratio(self.reference, settings), RATIO_LIMIT)
-        target = _averaged_nlf(self.camera, settings.iso, self.box_factor)
-        budget = Budget(self.tolerance)
-        added_px = self.blurred_light.added_blur(f_number)
-        denoised = self._denoises(ratio, target, added_px, budget, noise=noise)
-
-        def kept(name: str, extent: float) -> float:
-            """`extent` of a disc or of a streak, 0 where it may be left out."""
-            if not extent:
-                return 0.0
-            error = self._blur_error(ratio, target, name, extent, denoised)
-            return 0.0 if budget.leaves_out_blur(name, error) else extent
-
-        opened_to = f_number if kept("aperture", added_px) else None
-        defocus_px = kept("defocus", self.defocus * 4.0 / f_number)
-        motion_px = kept(
-            "motion_blur", self.image_speed * settings.exposure_time * self.light.shape[-2]
+        f_number, denoised = settings.effective_f_number, self.denoised
+        defocus_px = motion_px = 0.0  # where there is none, this is called in sweeps for each state
+        if self.defocus:
+            defocus_px = self._disc(f_number)
+        if self.image_speed:
+            motion_px = self.image_speed * settings.exposure_time * self.light.shape[-2]
+        aperture_px, opens, opens_denoised = None, False, False
+        if self.aperture_blur is not None:
+            aperture_px = self.blurred_light.added_blur(f_number)
+            opens = f_number < self.aperture_blur.f_number
+            opens_denoised = self.aperture_blur.needs_denoised
+        return Situation(
+            min(self.gain * gain * exposure_ratio(self.reference, settings), RATIO_LIMIT),
+            self.nlf,
+            _averaged_nlf(self.camera, settings.iso, self.box_factor),
+            self.tolerance,
+            noise,
+            self.blurred_light.statistics,
+            None if denoised is None else lambda: denoised.statistics,
+            defocus_px,
+            motion_px,
+            aperture_px,
+            opens,
+            opens_denoised,
         )
-        remaining = None
-        known = denoised or self.nlf.is_zero
-        if opened_to is not None and not known:
+
+    def _disc(self, f_number: float) -> float:
+        """Diameter of the defocus disc at `f_number` [pixel]."""
+        diameter = self.defocus * 4.0 / f_number
+        if diameter > MAX_DISC_PX and diameter > max(self.light.shape[-2:]):
+            raise ValueError(
+                f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel at "
+                f"f/{f_number:.3g}: it must not be wider than the frame ({max(self.light.shape)} "
+                f"pixel) and {MAX_DISC_PX:g} pixel"
+            )
+        return diameter
+
+    def _exposure(self, settings: CameraSettings, given: Situation) -> Exposure:
+        steps = noise_reduction, aperture, defocus, motion_blur = decide(given)
+        defocus_px = defocus.extent if defocus.runs else 0.0
+        motion_px = motion_blur.extent if motion_blur.runs else 0.0
+        opened_to = settings.effective_f_number if aperture.runs else None
+        denoised, remaining_variance = noise_reduction.runs, None
+        if opened_to is not None and not denoised and not self.nlf.is_zero:
             # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
             # it further. Both together leave about what the larger leaves alone.
-            remaining = self.blurred_light.remaining(
-                opened_to, kernel_energy(motion_px, defocus_px)
-            )
+            energy = kernel_energy(motion_px, defocus_px)
+            remaining_variance = self.blurred_light.remaining_variance(opened_to, energy)
         return Exposure(
-            ratio=ratio,
+            ratio=given.ratio,
             source=NoiseLevelFunction.zero() if denoised else self.nlf,
-            target=target,
+            target=given.target,
             motion_px=motion_px,
             defocus_px=defocus_px,
             denoised=denoised,
             opened_to=opened_to,
-            remaining=remaining,
-            errors=budget.errors,
+            remaining_variance=remaining_variance,
+            steps=steps,
         )
 
-    def _denoises(
-        self,
-        ratio: float,
-        target: NoiseLevelFunction,
-        added_px: float,
-        budget: Budget,
-        *,
-        noise: bool,
-    ) -> bool:
-        """Whether the noise-reduced light is needed; `noise` as in `exposure`."""
-        if self.denoised is None or self.nlf.is_zero:
-            return False
-        left = self.statistics.excess if noise else self.statistics.relative_noise
-        error = left(ratio, self.nlf, target)
-        # Blur averages noise, too. That is not counted on: it may be left out itself.
-        if self.aperture_blur is not None and self.aperture_blur.needs_denoised and added_px:
-            budget.errors["noise_reduction"] = error
-            return True
-        return not budget.leaves_out_noise_reduction(error, pointless=not self.is_noisy)
+    def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
+        """Steps, reasons, predicted error and cost of a capture at `settings`.
 
-    def _blur_error(
-        self, ratio: float, target: NoiseLevelFunction, name: str, extent: float, denoised: bool
-    ) -> float:
-        if self.tolerance == 0.0 or extent == math.inf:  # it is applied in any case
-            return math.inf
-        streak = name == "motion_blur"
-        return float(
-            self.statistics_of(denoised).blur_error(
-                ratio, target, motion_px=extent * streak, disc_px=extent * (not streak)
-            )
+        Args:
+            settings: Settings to simulate.
+            noise: False plans `expected`, the light without noise, instead of a capture.
+        """
+        given = self._situation(settings, noise, gain=1.0)
+        exposure = self._exposure(settings, given)
+        # A clean source lacks all of the noise: its light need not be made to see that.
+        light = self.light if exposure.source.is_zero else self.source_light(exposure)
+        marks = self.saturated
+        return make_plan(
+            settings,
+            exposure,
+            given,
+            noise_balance(light, exposure),
+            self.light,
+            clipped_source=0.0 if marks is None else int(marks.count_nonzero()) / marks.numel(),
         )
-
-    def statistics_of(self, denoised: bool) -> LightStatistics:
-        """Of the light that a transition starts from, denoised or as it was recorded."""
-        return self.denoised.statistics if denoised and self.denoised else self.statistics
-
-    @cached_property
-    def is_noisy(self) -> bool:
-        """Whether the noise is more than `WORTH_DENOISING` of the light, at its median level."""
-        signal = self.statistics.median
-        deviation = np.sqrt(np.array(self.nlf.read) + np.array(self.nlf.shot) * signal)
-        return bool((deviation > WORTH_DENOISING * signal).any())
 
     def source_light(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
@@ -222,19 +241,32 @@ class PreparedScene:
         source = exposure.source_noise.scaled(float(self.box_factor**2))
         return self.camera.nlf(settings.iso).at_least(source)
 
-    def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
-        """Steps, reasons, predicted error and cost of a capture at `settings`.
+    # -- captures -----------------------------------------------------------------------------
+
+    def expected(self, settings: CameraSettings, *, gain: float = 1.0) -> torch.Tensor:
+        """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped.
 
         Args:
             settings: Settings to simulate.
-            noise: False plans `expected`, the light without noise, instead of a capture.
+            gain: Light relative to this scene's.
         """
-        return make_plan(self, settings, noise=noise)
-
-    def expected(self, settings: CameraSettings) -> torch.Tensor:
-        """Noise-free light on the sensor at `settings`, (4, H, W), blurred and not clipped."""
-        exposure = self.exposure(settings, noise=False)
+        exposure = self.exposure(settings, noise=False, gain=gain)
         return exposed_light(self.blurred_light.blurred(exposure), exposure)
+
+    def expected_sweep(
+        self,
+        states: Sequence[CameraSettings],
+        *,
+        gain: np.ndarray | None = None,
+        row_gain: np.ndarray | None = None,
+    ) -> torch.Tensor:
+        """`expected` at each state, (S, 4, H, W); arguments of `expose`."""
+        gains = np.ones(len(states)) if gain is None else gain
+        pairs = zip(states, gains.tolist(), strict=True)
+        light = torch.stack([self.expected(s, gain=g) for s, g in pairs])
+        if row_gain is None:
+            return light
+        return light * torch.from_numpy(row_gain).to(light)[:, None, :, None]
 
     def capture(
         self, settings: CameraSettings, seed: int = 0, *, noise: Noise = "exact"
@@ -254,7 +286,8 @@ class PreparedScene:
         """
         exposure = self.exposure(settings)
         (frame,) = self.expose([settings], seed=seed, noise=noise)
-        return frame, noise_balance(self.blurred_light.blurred(exposure), exposure).relative_excess
+        balance = noise_balance(self.blurred_light.blurred(exposure), exposure)
+        return frame, balance.relative_excess_variance
 
     def expose(
         self,
@@ -262,6 +295,8 @@ class PreparedScene:
         *,
         seed: int = 0,
         noise: Noise = "exact",
+        gain: np.ndarray | None = None,
+        row_gain: np.ndarray | None = None,
         out: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """A sweep: one capture per state, (S, 4, H, W) float32.
@@ -273,6 +308,9 @@ class PreparedScene:
             states: Settings to simulate.
             seed: See `capture`.
             noise: See `capture`.
+            gain: (S,) light of each state relative to this scene's, where it depends on the
+                exposure time, as flickering light does; None for the same.
+            row_gain: (S, H) light of each row relative to that; None where all rows have the same.
             out: (S, 4, H, W) contiguous float32 to write to, instead of new memory.
         """
         check_noise(noise)
@@ -280,18 +318,28 @@ class PreparedScene:
         if not isinstance(states, list) or not all(isinstance(s, CameraSettings) for s in states):
             raise ValueError(f"`states` (={states!r}) must be several CameraSettings")
         frames = self._frames(len(states), out)
-        keys = sweep_keys(seed, states)  # a bad seed is told before any work
-        exposures = [self.exposure(settings) for settings in states]
+        keys = sweep_keys(seed, states)  # a bad seed raises before any work
+        gains = np.ones(len(states)) if gain is None else gain
+        exposures = [
+            self.exposure(s, gain=g) for s, g in zip(states, gains.tolist(), strict=True)
+        ]
         groups: dict[tuple[object, ...], list[int]] = {}
         for index, exposure in enumerate(exposures):
-            groups.setdefault(blur_key(exposure), []).append(index)
-        if len(groups) * self.light.nbytes <= _TOGETHER_BYTES and self.light.device.type == "cpu":
-            lights = [self.blurred_light.blurred(exposure) for exposure in exposures]
-            record_batch(lights, exposures, self.camera, keys, noise, out=frames)
-            return frames
-        for i in itertools.chain.from_iterable(groups.values()):
-            light, drawn = self.blurred_light.blurred(exposures[i]), FrameNoise(int(keys[i]), noise)
-            record(light, exposures[i], self.camera, drawn, out=frames[i])
+            groups.setdefault(exposure.blur, []).append(index)
+        parts = [slice(0, len(states))]
+        if len(groups) * self.light.nbytes > _TOGETHER_BYTES:
+            parts = [slice(i, i + 1) for group in groups.values() for i in group]
+        for some in parts:
+            chosen = exposures[some]
+            lights = [self.blurred_light.blurred(exposure) for exposure in chosen]
+            record(
+                Transitions.of(lights, chosen),
+                self.camera,
+                keys=keys[some],
+                noise=noise,
+                row_gain=None if row_gain is None else row_gain[some],
+                signals=frames[some],
+            )
         return frames
 
     def _frames(self, count: int, given: torch.Tensor | None) -> torch.Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from simulator.networks.noise_module import Preset, ResidualBlock, check_preset
 from simulator.networks.unet import AttentionUNet
 from simulator.optics.blur import box_mean, disc_blur
-from simulator.optics.disc_bank import DiscBank
+from simulator.optics.disc_bank import DiscBank, added_blur
 
 #: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
 DEAD_ZONE = 1.0
@@ -154,16 +154,6 @@ def dead_zone(diameter: Tensor, size: float = DEAD_ZONE) -> Tensor:
     return torch.where(
         remainder > 0, remainder.clamp(min=1e-12).sqrt(), 0.0
     )  # no infinite gradient
-
-
-def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | float) -> Tensor:
-    """Diameter of the disc that turns the blur at `f_source` into that at `f_target` [pixel].
-
-    The circle of confusion grows with 1 / N and squared diameters add: the difference of squares,
-    ``c^2 ((N_1 / N_2)^2 - 1)``, 0 where the aperture closes.
-    """
-    ratio = torch.as_tensor(f_source) / torch.as_tensor(f_target)
-    return diameter * (ratio.square() - 1.0).clamp(min=0.0).sqrt().to(diameter)
 
 
 class DefocusMap(nn.Module):

@@ -1,6 +1,6 @@
 """The full run: every module for one transition alone, nothing shared and nothing left out.
 
-What `simulator.capture.plan` predicts is the distance to this, and what it costs is measured against it.
+`simulator.capture.plan` predicts the distance to this; its cost is what others are measured against.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from simulator.camera import NoiseLevelFunction
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.record import record, sensor_light
+from simulator.capture.sensor import Transitions, record, sensor_light
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
-from simulator.noise.generator import FrameNoise, sweep_keys
+from simulator.noise.generator import sweep_keys
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
 
@@ -64,7 +64,7 @@ class FullRun:
                 source's leaves its blur.
             seed: Seed of the output's noise.
         """
-        key = int(sweep_keys(seed, [settings])[0])  # a bad seed is told before any work
+        keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
         bare = replace(prepared, denoised=None, aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = self.exposure(prepared.light[None], exposure.ratio)
@@ -84,6 +84,7 @@ class FullRun:
                 opened = self.aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
         light = sensor_light(opened[0], at_target)
-        capture = torch.empty_like(light)
-        record(light, at_target, prepared.camera, FrameNoise(key), out=capture)
-        return Stages(exposed[0], denoised[0], opened[0], light, capture)
+        capture = torch.empty_like(light)[None]
+        transition = Transitions.of([light], [at_target])
+        record(transition, prepared.camera, keys=keys, signals=capture)
+        return Stages(exposed[0], denoised[0], opened[0], light, capture[0])

@@ -1,4 +1,12 @@
-"""The noise of one frame: drawn for it alone, or looked up in a bank of normals."""
+"""Sensor noise: the standard normals of a frame, a function of its key and of nothing else.
+
+*Keys*: 64 bits from a seed and from the numbers that frames differ by, such as the settings of a
+sweep or the frame of an episode. *The bank* (``"bank"``): normals looked up in a table, in hashed
+pieces. *Exact draws* (``"exact"``): normals drawn by counting. Drawing 4 x 128 x 128 of them takes
+about 70 microseconds, everything else that a capture needs about 30: hence the bank.
+
+This module imports numba.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +18,63 @@ from numbers import Integral
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 from scipy.special import ndtri
 
 from simulator.settings import CameraSettings
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares
 
-# Keys of the noise of frames: 64 bits that depend on a seed and on numbers, on nothing else.
+#: How the noise of a frame is made: drawn, or looked up in a bank of normals.
+Noise = Literal["exact", "bank"]
+
+
+def check_noise(noise: str) -> None:
+    """Raises a `ValueError` unless `noise` is a kind of noise."""
+    if noise not in get_args(Noise):
+        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
+
+
+@dataclass(frozen=True)
+class FrameNoise:
+    """Standard normals of a frame, as an array: what `simulator.capture.kernels` adds.
+
+    For devices without those kernels, for the steps one by one, and for tests.
+
+    Args:
+        key: 64 bits, from `noise_keys`.
+        kind: How the key becomes normals.
+    """
+
+    key: int
+    kind: Noise = "exact"
+
+    def normals(self, shape: tuple[int, ...]) -> np.ndarray:
+        """(P, H, W) float32."""
+        planes, height, width = shape
+        make = bank_normals if self.kind == "bank" else drawn_normals
+        return make(self.key, (planes, height, width))
+
+
+def noise_generator(seed: int, *key: int | float) -> torch.Generator:
+    """A torch generator that depends on `seed` and on every number of `key`, and on nothing else.
+
+    For the reference camera and for training, which draw with torch.
+
+    Args:
+        seed: Integer >= 0.
+        key: What the noise shall differ by: the step of a training, the settings of a capture.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0")
+    words = [int(seed), *(int(np.float64(k).view(np.uint64)) for k in key)]
+    state = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
+    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+
+# -- keys -------------------------------------------------------------------------------------
 #
-# This module imports numba.
-# splitmix64 (Steele, Lea and Flood 2014).
+# A chain of splitmix64 (Steele, Lea and Flood 2014) over the seed and the bits of the numbers.
 KEY_STEP = np.uint64(0x9E3779B97F4A7C15)
 _MULTIPLIERS = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _SHIFTS = np.uint64(30), np.uint64(27), np.uint64(31)
@@ -66,21 +121,32 @@ def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndar
     count = next((len(values) for values in (given, *columns) if values.ndim), 1)
     keys, folded = np.empty(count, np.uint64), np.empty((count, len(columns)))
     keys[:] = given
-    for place, values in enumerate(columns):
-        folded[:, place] = values
+    for column, values in enumerate(columns):
+        folded[:, column] = values
     _fold(keys, folded.view(np.uint64))
     return keys
 
 
-# Sensor noise looked up instead of drawn: a bank of standard normals, read in hashed pieces.
+def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
+    """(S,) uint64 keys of the noise of a sweep's frames, which differ by their settings.
+
+    Raises:
+        ValueError: Unless `seed` is an integer >= 0 of at most 64 bits.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < 2**64:
+        raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0, below 2**64")
+    numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)
+    return noise_keys(int(seed), *numbers.reshape(-1, 3).T)
+
+
+# -- the bank ---------------------------------------------------------------------------------
 #
-# Drawing 4 x 128 x 128 normals (`simulator.noise.generator`) takes about 70 microseconds, everything
-# else that a capture needs about 30. The bank holds the 2**20 quantiles (i + 1/2) / 2**20 of the
-# normal distribution in a fixed random order. A frame reads it in blocks of 256 samples; where each
-# block starts (any multiple of 16) and its sign come from a hash of the frame's key and the block's
-# number, so that a frame is a function of its key alone. Every start is as likely as any other, so
-# each sample has the bank's distribution exactly, and two samples share a value only by the chance
-# that blocks overlap.
+# It holds the 2**20 quantiles (i + 1/2) / 2**20 of the normal distribution in a fixed random order.
+# A frame reads it in blocks of 256 samples; where each block starts (any multiple of 16) and its
+# sign come from a hash of the frame's key and the block's number. Every start is as likely as any
+# other, so each sample has the bank's distribution exactly, and two samples share a value only by
+# the chance that blocks overlap.
+
 #: Number of different normals.
 BANK_SIZE = 2**20
 #: Samples that are read in one piece; blocks do not reach over the end of a plane.
@@ -120,7 +186,7 @@ def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
 def bank_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
     """The standard normals that a frame of `shape` (P, H, W) reads, float32.
 
-    What `simulator.capture.kernels` adds, as an array of its own: for other devices, and for tests.
+    What `simulator.capture.kernels` adds, as an array of its own.
     """
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
@@ -132,14 +198,13 @@ def bank_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
     return values.reshape(planes, blocks * BLOCK)[:, :samples].reshape(shape)
 
 
-# Standard normals drawn by counting: each block of a frame from its number and the frame's key.
+# -- exact draws: each block of a frame from its number and the frame's key --------------------
 #
-# Philox4x32-10 (Salmon, Moraes, Dror and Shaw 2011) turns a counter and a key into four random words,
-# the transform of Box and Muller (1958) two words into two independent normals. Any block can be
-# drawn alone, on any thread, and the compiler draws many counters at once: 4 x 128 x 128 normals take
-# about 70 microseconds, with torch's generator 220. They reach to 6.7 standard deviations.
-#
-# This module imports numba.
+# Philox4x32-10 (Salmon, Moraes, Dror and Shaw 2011) turns a counter and a key into four random
+# words, the transform of Box and Muller (1958) two words into two independent normals. Any block can
+# be drawn alone, on any thread, and the compiler draws many counters at once: three times as fast as
+# torch's generator. The normals reach to 6.7 standard deviations.
+
 #: Counters of a block: each gives four words, and those four normals.
 _COUNTERS = BLOCK // 4
 _ROUNDS = 10
@@ -252,8 +317,7 @@ def _draw(first, last, key, blocks, out):  # type: ignore[no-untyped-def]
 def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
     """The standard normals of a frame of `shape` (P, H, W), float32.
 
-    What `simulator.capture.kernels` adds to it, as an array of its own: for other devices, for the steps
-    one by one, and for tests.
+    What `simulator.capture.kernels` adds, as an array of its own.
     """
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
@@ -264,47 +328,3 @@ def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
         least=1024,
     )
     return out.reshape(shape)
-
-
-#: How the noise of a capture is made: drawn (`simulator.noise.generator`), or looked up in a bank of
-#: normals (`simulator.noise.generator`).
-Noise = Literal["exact", "bank"]
-
-
-@dataclass(frozen=True)
-class FrameNoise:
-    """Standard normals of a frame, as a function of a key.
-
-    Args:
-        key: 64 bits, from `simulator.noise.generator.noise_keys`.
-        kind: How the key becomes normals.
-    """
-
-    key: int
-    kind: Noise = "exact"
-
-    def normals(self, shape: tuple[int, ...]) -> np.ndarray:
-        """(P, H, W) float32, what `simulator.capture.kernels` adds."""
-
-        planes, height, width = shape
-        make = bank_normals if self.kind == "bank" else drawn_normals
-        return make(self.key, (planes, height, width))
-
-
-def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
-    """(S,) uint64 keys of the noise of a sweep's frames, which differ by their settings.
-
-    Raises:
-        ValueError: Unless `seed` is an integer >= 0 of at most 64 bits.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < 2**64:
-        raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0, below 2**64")
-
-    numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)
-    return noise_keys(int(seed), *numbers.reshape(-1, 3).T)
-
-
-def check_noise(noise: str) -> None:
-    """Raises a `ValueError` unless `noise` is a kind of noise."""
-    if noise not in get_args(Noise):
-        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")

@@ -1,65 +1,101 @@
-"""Sensor noise: what must be added so that a raw carries the noise of other settings."""
+"""The noise level function: how much noise a pixel has at each signal."""
 
 from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
-from simulator.camera import NoiseLevelFunction
+#: Larger variances are limited to this: float32 holds their sums over a frame of any signals.
+VARIANCE_LIMIT = 1e24
 
 
-def noise_generator(seed: int, *key: int | float) -> torch.Generator:
-    """A generator that depends on `seed` and on every number of `key`, and on nothing else.
+@dataclass(frozen=True)
+class NoiseLevelFunction:
+    """Variance of a pixel as a function of its signal: ``read + shot * max(signal, 0)``.
 
     Args:
-        seed: Integer >= 0.
-        key: What the noise shall differ by: the step of an episode, the settings of a capture.
+        shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1.
+        read: Variance at zero signal per plane.
+        extrapolated: Whether the ISO lies outside the calibrated table.
+        source: Where the numbers come from.
+
+    Raises:
+        ValueError: Unless `shot` and `read` are 4 finite numbers >= 0 each.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0")
-    words = [int(seed), *(int(np.float64(k).view(np.uint64)) for k in key)]
-    state = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
-    return torch.Generator().manual_seed(int(state >> np.uint64(1)))
+
+    shot: tuple[float, float, float, float]
+    read: tuple[float, float, float, float]
+    extrapolated: bool = False
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("shot", "read"):
+            object.__setattr__(self, name, _four_variances(name, getattr(self, name)))
+
+    @staticmethod
+    @functools.cache
+    def zero() -> NoiseLevelFunction:
+        """The NLF of a source without noise."""
+        return NoiseLevelFunction((0.0,) * 4, (0.0,) * 4, source="noise-free")
+
+    @functools.cached_property
+    def is_zero(self) -> bool:
+        """Whether there is no noise at all."""
+        return max(*self.shot, *self.read) == 0.0
+
+    def scaled(self, factor: float) -> NoiseLevelFunction:
+        """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
+        return self._with((v * factor for v in self.shot), (v * factor for v in self.read))
+
+    def at_least(self, other: NoiseLevelFunction) -> NoiseLevelFunction:
+        """The larger shot and the larger read noise of both, plane by plane."""
+        return self._with(map(max, self.shot, other.shot), map(max, self.read, other.read))
+
+    def exposed(self, ratio: float) -> NoiseLevelFunction:
+        """NLF of this noise after the raw was multiplied by `ratio` (paper, section 3.2).
+
+        No variance exceeds `VARIANCE_LIMIT`.
+        """
+        return self._with(
+            (min(v * ratio, VARIANCE_LIMIT) for v in self.shot),
+            (min(v * ratio * ratio, VARIANCE_LIMIT) for v in self.read),
+        )
+
+    def _with(self, shot: Any, read: Any) -> NoiseLevelFunction:
+        return replace(self, shot=tuple(shot), read=tuple(read))
+
+
+def _four_variances(name: str, given: object) -> tuple[float, ...]:
+    try:
+        values = tuple(float(v) for v in given)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):  # a single number, a word
+        values = ()
+    if len(values) != 4 or not all(0.0 <= v < math.inf for v in values):
+        raise ValueError(
+            f"`{name}` (={given!r}) must be 4 finite values >= 0, one for each of R, G1, G2, B"
+        )
+    return values
 
 
 def nlf_tensors(
     nlf: NoiseLevelFunction, device: torch.device | str = "cpu"
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(shot, read), each (4, 1, 1) float32: variances reach 5e-9, so never a narrower dtype."""
-    shot = torch.tensor(nlf.shot, dtype=torch.float32, device=device)[:, None, None]
-    read = torch.tensor(nlf.read, dtype=torch.float32, device=device)[:, None, None]
-    return shot, read
+    return plane_tensor(nlf.shot, device), plane_tensor(nlf.read, device)
+
+
+def plane_tensor(values: Sequence[float] | np.ndarray, device: torch.device | str) -> torch.Tensor:
+    """One number for each plane as (4, 1, 1) float32."""
+    return torch.tensor(values, dtype=torch.float32, device=device)[:, None, None]
 
 
 def noise_variance(signal: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
     """Variance ``read + shot * max(signal, 0)`` of each pixel, (..., 4, H, W) float32."""
     shot, read = nlf_tensors(nlf, signal.device)
     return signal.float().clamp(min=0.0) * shot + read
-
-
-def top_up_variance(
-    signal: torch.Tensor,
-    source: NoiseLevelFunction,
-    target: NoiseLevelFunction,
-    remaining: torch.Tensor | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Variance to add so that a pixel with `source` noise carries `target` noise.
-
-    Args:
-        signal: (..., 4, H, W), on the target's scale.
-        source: Noise already in `signal` on that scale (`NoiseLevelFunction.exposed`).
-        target: Noise that the capture should have.
-        remaining: (H, W) share of the source's variance that a blur has left; None for all of it.
-
-    Returns:
-        ``(missing, excess)``, both >= 0: ``missing`` is to be added; ``excess`` is how much the
-        source is noisier than the target, where only denoising would help.
-    """
-    shot = tuple(t - s for t, s in zip(target.shot, source.shot, strict=True))
-    read = tuple(t - s for t, s in zip(target.read, source.read, strict=True))
-    slope = torch.tensor(shot, dtype=torch.float32, device=signal.device)[:, None, None]
-    offset = torch.tensor(read, dtype=torch.float32, device=signal.device)[:, None, None]
-    difference = signal.float().clamp(min=0.0) * slope + offset
-    if remaining is not None:
-        difference += (1.0 - remaining) * noise_variance(signal, source)
-    return difference.clamp(min=0.0), (-difference).clamp_(min=0.0)

@@ -1,8 +1,8 @@
 """Motion and defocus blur of linear light, energy-preserving and matched in second moment.
 
 Both work on *unclipped* light, so that a lamp ten times above white smears into a streak that is
-still white: clipping comes later, once (see `simulator.capture.record`). Borders are replicated. The
-shapes are those of `simulator.optics.shapes`.
+still white: clipping comes later, once (see `simulator.capture.sensor`). Borders are replicated.
+The shapes are those of `simulator.optics.shapes`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.optics.shapes import disc_kernel, motion_kernel
+from simulator.optics.shapes import disc_kernel, motion_kernel, streak_share
 
 _SUM_TAPS = 13  # streaks longer than this are cheaper as a running sum
 _FFT_TAPS = 11  # kernels wider than this are applied in the Fourier domain
@@ -29,15 +29,16 @@ def motion_blur(light: torch.Tensor, extent_px: float) -> torch.Tensor:
         (..., H, W), the same dtype. A running sum in float64 makes the cost of long streaks
         independent of the extent.
     """
-    weights = motion_kernel(extent_px)
-    if len(weights) == 1:
+    n, end = streak_share(extent_px)
+    if not n and not end:
         return light
     if _has_kernels(light):
         from simulator.optics.blur_kernels import streak  # numba: only where something is blurred
 
         return streak(light, extent_px)
-    width, radius = light.shape[-1], len(weights) // 2
-    edge, full = float(weights[0]), float(weights[1])
+    width, radius = light.shape[-1], n + 1
+    covered = 2 * n + 1 + 2.0 * end
+    full, edge = 1.0 / covered, end / covered
     if radius >= width:  # the whole row and both borders: counted, as padding might not fit
         column = torch.arange(width, device=light.device)
         left, right = radius - 1 - column + edge / full, column + radius - width + edge / full
@@ -45,8 +46,9 @@ def motion_blur(light: torch.Tensor, extent_px: float) -> torch.Tensor:
         total = rows.sum(-1, keepdim=True) + rows[..., :1] * left + rows[..., -1:] * right
         return (total * full).to(light.dtype)
     padded = F.pad(light.reshape(-1, 1, width), (radius, radius), mode="replicate")
-    if len(weights) <= _SUM_TAPS and light.device.type == "cpu":
-        return _shifted_sum(padded.transpose(0, 1), weights[None]).reshape(light.shape)
+    if 2 * radius + 1 <= _SUM_TAPS and light.device.type == "cpu":
+        weights = motion_kernel(extent_px)[None]
+        return _shifted_sum(padded.transpose(0, 1), weights).reshape(light.shape)
     sums = F.pad(padded.double().cumsum(-1), (1, 0))
     inner = sums[..., 2 * radius : 2 * radius + width] - sums[..., 1 : 1 + width]
     ends = padded[..., :width] + padded[..., 2 * radius :]

@@ -19,12 +19,14 @@ import numba
 import numpy as np
 import torch
 
-from simulator.optics.shapes import coverage, disc_radius, streak_share
+from simulator.optics.shapes import coverage, disc_kernel, disc_radius, streak_share
 from simulator.utils.jit import addresses, as_pointer, kernel
 from simulator.utils.threads import in_shares, thread_count
 
 #: Samples from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
+#: Discs wider than this are cheaper in the Fourier domain than as a sum [pixel].
+_WIDE_PX = 40.0
 #: Samples that are summed together: they stay in the first-level cache.
 _GROUP = 2048
 _jit = functools.partial(kernel, fastmath={"contract"})
@@ -194,7 +196,7 @@ def _blur_some(  # type: ignore[no-untyped-def]
 
 
 class Blur(NamedTuple):
-    """What `blur_many` does to one image: a disc, a streak, or one after the other.
+    """One image for `blur_many`: a disc, a streak, or one after the other.
 
     Args:
         light: (..., H, W) contiguous float32 on the CPU.
@@ -217,10 +219,11 @@ def blur_many(
     """Blurs images of one shape: as `disc` and `streak`, but each image on one thread.
 
     Args:
-        blurs: What to do to each.
+        blurs: The images and their blurs; (P, H, W) each where a disc is wide.
         limit: See `disc`.
         threads: At most so many; those of torch by default.
     """
+    blurs = _without_wide_discs(blurs, limit, threads)
     if not blurs:
         return
     # The costliest first, and dealt out in turn: every thread gets about as much to do.
@@ -245,6 +248,37 @@ def blur_many(
         len(blurs),
         threads=threads,
     )
+
+
+def _without_wide_discs(
+    blurs: Sequence[Blur], limit: float, threads: int | None
+) -> Sequence[Blur]:
+    """The blurs that are left once the discs that are wide are done."""
+    wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
+    if not wide:
+        return blurs
+
+    def run(first: int, last: int) -> None:
+        for blur in wide[first:last]:
+            _wide_disc(blur, limit)
+
+    in_shares(run, len(wide), threads=threads)
+    left = [b for b in blurs if b.defocused is None or b.diameter_px <= _WIDE_PX]
+    moved = [b for b in wide if b.moved is not None]
+    return left + [Blur(b.defocused, extent_px=b.extent_px, moved=b.moved) for b in moved]  # type: ignore[arg-type]
+
+
+def _wide_disc(blur: Blur, limit: float) -> None:
+    """`simulator.optics.blur.disc_blur` by numpy, whose transforms are safe in a forked process."""
+    assert blur.defocused is not None
+    weights = disc_kernel(blur.diameter_px)
+    radius = len(weights) // 2
+    light = np.clip(blur.light.numpy(), -limit, limit).astype(np.float64)
+    padded = np.pad(light, ((0, 0), (radius, radius), (radius, radius)), mode="edge")
+    size = padded.shape[-2:]
+    spectrum = np.fft.rfft2(padded) * np.fft.rfft2(weights, s=size)
+    blurred = np.fft.irfft2(spectrum, s=size)
+    blur.defocused.numpy()[...] = blurred[:, 2 * radius :, 2 * radius :]
 
 
 def streak(

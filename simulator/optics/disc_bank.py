@@ -192,6 +192,16 @@ _KNOTS = np.array(DIAMETERS) ** 2
 HALO = 20
 
 
+def added_blur(diameter: Tensor, f_source: Tensor | float, f_target: Tensor | float) -> Tensor:
+    """Diameter of the disc that turns the blur at `f_source` into that at `f_target` [pixel].
+
+    The circle of confusion grows with 1 / N and squared diameters add: the difference of squares,
+    ``c^2 ((N_1 / N_2)^2 - 1)``, 0 where the aperture closes.
+    """
+    ratio = torch.as_tensor(f_source) / torch.as_tensor(f_target)
+    return diameter * (ratio.square() - 1.0).clamp(min=0.0).sqrt().to(diameter)
+
+
 class DiscBank:
     """An image behind every disc of the bank; each blur is computed when it is first needed.
 
@@ -272,7 +282,7 @@ def _has_kernels(image: Tensor) -> bool:
 
 
 def _frame_of(diameter: Tensor) -> Tensor | None:
-    """The diameters as one frame (H, W) that `simulator.optics.disc_bank` takes; None if they are not.
+    """The diameters as one frame (H, W) that the kernels take; None if they are not.
 
     Nothing is learnt through the kernels: a gradient takes the other way.
     """

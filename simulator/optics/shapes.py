@@ -15,13 +15,14 @@ import numpy as np
 
 from simulator.utils.jit import kernel
 
-# How much of each pixel a disc covers; a kernel, as each new diameter asks for it.
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32
+#: Streaks longer than this [pixel] are not written out: they leave next to no noise in any case.
+_LONGEST_KERNEL = 4096.0
 _jit = functools.partial(kernel, fastmath={"contract"})
 
 
-@_jit()
+@_jit()  # every new diameter asks for it
 def coverage(radius):  # type: ignore[no-untyped-def]
     """Area of a disc of `radius` in the pixels of a quadrant, (r + 1, r + 1) float64.
 
@@ -85,7 +86,6 @@ def streak_share(extent_px: float) -> tuple[int, float]:
 
 def _disc_coverage(radius: float) -> np.ndarray:
     """Area of a disc of `radius` in each pixel, (K, K), K odd, sums to 1."""
-
     rows = coverage(radius)
     rows = np.concatenate([rows[:0:-1], rows])
     return np.concatenate([rows[:, :0:-1], rows], axis=1)
@@ -129,8 +129,13 @@ def disc_kernel(diameter_px: float) -> np.ndarray:
 
 @functools.lru_cache(maxsize=4096)
 def kernel_energy(motion_px: float, defocus_px: float) -> float:
-    """Sum of squared weights of both blurs together: what they leave of white noise's variance."""
-    streak, disc = motion_kernel(motion_px), disc_kernel(defocus_px)
+    """Sum of squared weights of both blurs together: the share of white noise's variance left."""
+    disc = disc_kernel(defocus_px)
+    if motion_px > _LONGEST_KERNEL:  # as if it were much longer than the disc is wide
+        n, end = streak_share(motion_px)
+        total = 2 * n + 1 + 2.0 * end
+        return float((disc.sum(axis=1) ** 2).sum()) * (2 * n + 1 + 2.0 * end**2) / total**2
+    streak = motion_kernel(motion_px)
     if disc.shape[0] == 1:
         return float((streak**2).sum())
     both = np.apply_along_axis(np.convolve, 1, disc, streak)

@@ -23,7 +23,8 @@ from typing import overload
 import numpy as np
 import torch
 
-from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
+from simulator.camera import CameraProfile, get_camera
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.dng import write_dng
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw

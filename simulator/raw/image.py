@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares

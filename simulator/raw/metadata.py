@@ -21,7 +21,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import tifffile
 
-from simulator.camera import VARIANCE_LIMIT, BayerPattern, NoiseLevelFunction
+from simulator.camera import BayerPattern
+from simulator.noise.noise_level_function import VARIANCE_LIMIT, NoiseLevelFunction
 from simulator.raw.dng import COMMENT_PREFIX, D65, SOFTWARE_NAME, OwnRecord
 from simulator.settings import CameraSettings
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from simulator.camera import NoiseLevelFunction
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares

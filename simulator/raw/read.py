@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera, list_cameras
+from simulator.camera import CameraProfile, get_camera, list_cameras
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.decoding import (
     COLOUR_FILTER_ARRAY,
     LINEAR_RAW,

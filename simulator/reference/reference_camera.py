@@ -16,8 +16,9 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import SIGNAL_LIMIT
-from simulator.capture.record import clip_and_quantise
-from simulator.noise.noise_level_function import nlf_tensors, noise_generator
+from simulator.capture.sensor import clip_and_quantise
+from simulator.noise.generator import noise_generator
+from simulator.noise.noise_level_function import nlf_tensors
 from simulator.optics.blur import motion_blur
 from simulator.optics.lamps import Lamp
 from simulator.optics.thin_lens import Lens, defocus

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from simulator.camera import CameraProfile, NoiseLevelFunction
+from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, sensor_signal
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from simulator.camera import CameraProfile
-from simulator.noise.noise_level_function import noise_generator
+from simulator.noise.generator import noise_generator
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Pair, Stage, draw_settings, select_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence

@@ -7,13 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from simulator.camera import (
-    BayerPattern,
-    CameraProfile,
-    NoiseLevelFunction,
-    get_camera,
-    list_cameras,
-)
+from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
+from simulator.noise.noise_level_function import NoiseLevelFunction
 
 # Retyped from the published table (shot and read of R, G, B): the Z6's DNG NoiseProfile tags.
 Z6 = {

@@ -10,7 +10,7 @@ import torch
 
 from ae_env.scenes.reference_scenes import reference_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.networks.aperture_module import added_blur
+from simulator.optics.disc_bank import added_blur
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 FOLDER = Path(str(resources.files("simulator").joinpath("pretrained")))

@@ -23,7 +23,7 @@ from simulator import (
 )
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import Exposure
-from simulator.capture.record import add_noise, clip_and_quantise, sensor_light
+from simulator.capture.sensor import add_noise, clip_and_quantise, sensor_light
 from simulator.noise.generator import FrameNoise, bank_normals, noise_keys, sweep_keys
 from simulator.raw.image import unpack_mosaic
 from tests.strategies import (

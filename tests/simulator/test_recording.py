@@ -8,21 +8,31 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.camera import NoiseLevelFunction, get_camera
+from simulator.camera import get_camera
 from simulator.capture import kernels
 from simulator.capture.exposure import Exposure
-from simulator.capture.record import (
+from simulator.capture.sensor import (
+    Transitions,
     add_noise,
     clip_and_quantise,
     exposed_light,
     noise_balance,
     record,
-    top_up,
 )
-from simulator.noise.generator import FrameNoise
+from simulator.noise.generator import FrameNoise, Noise
+from simulator.noise.noise_level_function import NoiseLevelFunction
 
 Z6 = get_camera("nikon_z6")
 SPAN = 14512
+
+
+def recorded(
+    light: torch.Tensor, exposure: Exposure, key: int, noise: Noise = "exact"
+) -> torch.Tensor:
+    """One frame (4, H, W) by the fused kernel."""
+    frame, keys = torch.empty(1, *light.shape), np.array([key], np.uint64)
+    record(Transitions.of([light], [exposure]), Z6, keys=keys, noise=noise, signals=frame)
+    return frame[0]
 
 
 @pytest.mark.parametrize("noisy_source", [False, True])
@@ -38,10 +48,9 @@ def test_recording_equals_the_steps_one_by_one(
     source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
     remaining = torch.rand(96, 96, generator=torch.Generator().manual_seed(1))
     exposure = Exposure(
-        1.3, source, Z6.nlf(iso), motion_px=3.0, remaining=remaining if blurred_noise else None
+        1.3, source, Z6.nlf(iso), motion_px=3.0, remaining_variance=remaining if blurred_noise else None
     )
-    frame = torch.empty_like(light)
-    record(light, exposure, Z6, FrameNoise(3), out=frame)
+    frame = recorded(light, exposure, 3)
     signal = exposed_light(light, exposure)
     noisy, _ = add_noise(signal[None], [exposure], [FrameNoise(3)])
     expected = clip_and_quantise(noisy[0], Z6)
@@ -53,10 +62,8 @@ def test_recording_equals_the_steps_one_by_one(
 def test_noise_from_the_bank_is_what_the_bank_reads() -> None:
     light = torch.full((4, 40, 50), 0.2)
     exposure = Exposure(1.0, NoiseLevelFunction.zero(), Z6.nlf(800))
-    frame = torch.empty_like(light)
-    record(light, exposure, Z6, FrameNoise(12345, "bank"), out=frame)
-    normals = torch.from_numpy(FrameNoise(12345, "bank").normals((4, 40, 50)))
-    noisy, _ = top_up(light[None], [exposure], normals[None])
+    frame = recorded(light, exposure, 12345, "bank")
+    noisy, _ = add_noise(light[None], [exposure], [FrameNoise(12345, "bank")])
     difference = ((frame - clip_and_quantise(noisy[0], Z6)).double() * SPAN).abs().round()
     assert difference.max() <= 1
     assert float((difference > 0).double().mean()) <= 1e-4
@@ -72,7 +79,7 @@ def test_balance_of_noise_pixel_by_pixel(iso: float, blurred_noise: bool) -> Non
         2.0,
         Z6.nlf(800),
         Z6.nlf(iso),
-        remaining=torch.from_numpy(share.astype(np.float32)) if blurred_noise else None,
+        remaining_variance=torch.from_numpy(share.astype(np.float32)) if blurred_noise else None,
     )
     balance = noise_balance(torch.from_numpy(light.astype(np.float32)), exposure)
     first, second = Z6.nlf(800), Z6.nlf(iso)
@@ -83,17 +90,17 @@ def test_balance_of_noise_pixel_by_pixel(iso: float, blurred_noise: bool) -> Non
     given = share * (4 * read1[..., None] + 2 * shot1[..., None] * signal)
     wanted = read2[..., None] + shot2[..., None] * signal
     beyond = np.maximum(given - wanted, 0.0)
-    assert balance.relative_excess == pytest.approx((beyond / wanted).mean(), rel=1e-4, abs=1e-7)
-    assert balance.excess == pytest.approx(beyond.mean(), rel=1e-4, abs=1e-12)
-    assert balance.is_short == bool((wanted > given).any())
+    assert balance.relative_excess_variance == pytest.approx((beyond / wanted).mean(), rel=1e-4, abs=1e-7)
+    assert balance.excess_variance == pytest.approx(beyond.mean(), rel=1e-4, abs=1e-12)
+    assert balance.lacks_noise == bool((wanted > given).any())
 
 
 def test_a_source_without_noise_lacks_all_of_it() -> None:
     zero = NoiseLevelFunction.zero()
     light = torch.full((4, 4, 4), 0.5)
     balance = noise_balance(light, Exposure(1.0, zero, Z6.nlf(100)))
-    assert (balance.relative_excess, balance.excess, balance.is_short) == (0.0, 0.0, True)
-    assert not noise_balance(light, Exposure(1.0, zero, zero)).is_short
+    assert (balance.relative_excess_variance, balance.excess_variance, balance.lacks_noise) == (0.0, 0.0, True)
+    assert not noise_balance(light, Exposure(1.0, zero, zero)).lacks_noise
 
 
 @pytest.mark.parametrize("source", [100, 6400])
@@ -110,6 +117,6 @@ def test_noise_is_made_only_where_the_source_lacks_some(
     monkeypatch.setattr(kernels, "record_frames", watched)
     light = torch.full((4, 8, 8), 0.2)
     exposure = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
-    record(light, exposure, Z6, FrameNoise(3), out=torch.empty_like(light))
-    record(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), Z6, FrameNoise(3), out=light)
+    recorded(light, exposure, 3)
+    recorded(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), 3)
     assert [keys is None for keys in made] == [True, False]

@@ -15,13 +15,14 @@ import torch
 
 import ae_env  # noqa: F401  (registers the environment)
 from ae_env.episodes import core as core_module
-from ae_env.episodes import recorder as recorder_module
 from ae_env.observation import encode_observation
 from ae_env.options import EnvOptions
 from ae_env.scorers.score_table import prepare_scene
 from simulator import get_camera
-from simulator.capture.record import exposed_light
+from simulator.capture import batch as batch_module
+from simulator.capture.sensor import exposed_light
 from simulator.noise.generator import FrameNoise, noise_keys
+from simulator.optics import blur_kernels
 
 ID = "ae_env/AutoExposure-v0"
 SMALL = {"scenes": "bundled:small", "resolution": 40}
@@ -168,15 +169,15 @@ def test_tolerance_zero_and_small_blur() -> None:
 def test_held_state_of_a_scene_at_rest_needs_no_memory_of_its_own() -> None:
     envs = _vector(motion="none", depth="far", tolerance=0.0)
     envs.reset(seed=0)
-    episodes, plans = envs.core.episodes, envs.core.recorder._plans
-    for row, scene in zip(episodes.slot * 64 + episodes.state, episodes.scene, strict=True):
+    episodes, plans = envs.core.episodes, envs.core._captures._rows
+    for row, scene in zip(episodes.light_index * 64 + episodes.state, episodes.scene, strict=True):
         assert plans.light[row].data_ptr() == envs.core.scenes[scene].light.data_ptr()
 
 
 def test_memory_of_ended_episodes_is_used_again() -> None:
     envs = _vector(4, autoreset_mode="SAME_STEP", motion=0.5, depth=2.0, tolerance=0.0)
     _frames(envs, steps=40)
-    assert len(envs.core.recorder._buffers._free) <= 4 * 5
+    assert len(envs.core._captures._buffers._free) <= 4 * 5
 
 
 def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
@@ -189,11 +190,11 @@ def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
         with pytest.raises(ValueError, match="options"):
             envs.reset(options=wrong)
         assert [envs.core.episode(i) for i in range(3)] == before
-    assert not envs.core.recorder._buffers._free
+    assert not envs.core._captures._buffers._free
     for actions in (np.full(3, 10), np.full(3, 21)):
         np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
-    envs.core.recorder.end(np.array([1]))
-    assert len(envs.core.recorder._buffers._free) == 2 + 1  # two apertures and a streak
+    envs.core._forget(np.array([1]))
+    assert len(envs.core._captures._buffers._free) == 2 + 1  # two apertures and a streak
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
@@ -207,7 +208,7 @@ def test_an_interrupted_frame_is_made_again(
     for env in (envs, plain):
         env.reset(seed=0, options={"state": 10})
     calls: list[Any] = []
-    original = getattr(recorder_module, stage)
+    original = getattr(batch_module, stage)
 
     def fail(*args: Any, **kwargs: Any) -> Any:
         calls.append(args)
@@ -216,7 +217,7 @@ def test_an_interrupted_frame_is_made_again(
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr(recorder_module, stage, fail)
+        patch.setattr(batch_module, stage, fail)
         with pytest.raises(error):
             envs.step(np.full(3, 27))
     plain.step(np.full(3, 27))
@@ -230,12 +231,12 @@ def test_wide_discs_are_those_of_the_sum(monkeypatch: pytest.MonkeyPatch, motion
     arguments = {"resolution": 64, "motion": motion, "depth": 48.0, "noise": False}
     options = {"state": 0}  # f/4
     fourier, direct = _vector(2, **arguments), _vector(2, **arguments)
-    wide = recorder_module._WIDE_PX
+    wide = blur_kernels._WIDE_PX
     fourier.reset(seed=0, options=options)
-    monkeypatch.setattr(recorder_module, "_WIDE_PX", 1e9)
+    monkeypatch.setattr(blur_kernels, "_WIDE_PX", 1e9)
     direct.reset(seed=0, options=options)
-    plans = [env.core.recorder._plans for env in (fourier, direct)]
-    rows = fourier.core.recorder._shown
+    plans = [env.core._captures._rows for env in (fourier, direct)]
+    rows = fourier.core._captures._blurred_row[-2:]
     assert all(exposure.defocus_px > wide for exposure in plans[0].exposure[rows])
     for mine, wanted in zip(plans[0].light[rows], plans[1].light[rows], strict=True):
         torch.testing.assert_close(mine, wanted, rtol=1e-4, atol=1e-6)

@@ -30,8 +30,7 @@ def _columns(*numbers: int) -> dict[str, np.ndarray]:
 
 def _filled(count: int, delay: int = 0) -> Episodes:
     episodes = Episodes(count, delay)
-    places = np.arange(count)
-    episodes.begin(places, _columns(*range(count)), places)
+    episodes.begin(np.arange(count), _columns(*range(count)))
     return episodes
 
 
@@ -42,7 +41,7 @@ def test_an_episode_comes_back_as_it_was_put_in() -> None:
     assert type(episodes[1].speed) is float
 
 
-def test_only_the_episodes_at_the_given_places_go_on_or_begin() -> None:
+def test_only_the_given_episodes_advance_or_begin() -> None:
     episodes = _filled(4)
     earlier = episodes[2]
     episodes.act(np.array([0, 2]), np.array([5, 6]))
@@ -50,9 +49,9 @@ def test_only_the_episodes_at_the_given_places_go_on_or_begin() -> None:
     assert episodes.frame.tolist() == [1, 100, 201, 300]
     assert episodes.previous.tolist() == [10, -1, 12, -1]
     assert earlier == _episode(2)  # a copy
-    episodes.begin(np.array([2]), _columns(3), np.array([9]))
+    episodes.begin(np.array([2]), _columns(3))
     assert episodes[2] == _episode(3)
-    assert (episodes.slot[2], episodes.previous[2]) == (9, -1)
+    assert episodes.previous[2] == -1
     assert episodes.state.tolist() == [5, 11, 13, 13]
 
 

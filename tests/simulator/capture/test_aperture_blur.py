@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.denoised import Denoised
-from simulator.networks.aperture_module import ApertureModule, added_blur
+from simulator.capture.blurred_light import Denoised
+from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.blur import disc_blur
-from simulator.optics.disc_bank import DIAMETERS, HALO, DiscBank
+from simulator.optics.disc_bank import DIAMETERS, HALO, DiscBank, added_blur
 from simulator.utils.tiles import make_tiles
 
 
@@ -57,7 +57,7 @@ def test_remaining_is_the_energy_of_the_added_blur() -> None:
     kernel = torch.zeros(9, 9)
     kernel[4, 4] = 1.0
     energy = float(disc_blur(kernel, 2.0).square().sum())
-    remaining = aperture_blur().remaining(4.0)
+    remaining = aperture_blur().remaining_variance(4.0)
     assert remaining.shape == (24, 24)
     torch.testing.assert_close(remaining, torch.full((24, 24), energy), rtol=1e-5, atol=0)
 
@@ -85,7 +85,7 @@ def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> No
     assert made.needs_denoised
     assert made.extent(4.0) == math.inf
     assert made.extent(8.0) == made.extent(11.0) == 0.0
-    assert made.remaining(4.0) is None
+    assert made.remaining_variance(4.0) is None
     result = made.opened(4.0)
     assert made.opened(4.0, denoised=True) is result
     f_source, f_target = torch.tensor([8.0]), torch.tensor([4.0])
@@ -151,5 +151,5 @@ def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
     assert not calls
     assert made.extent(4.0) == pytest.approx(2 * math.sqrt(3))
     made.opened(4.0, denoised=False)
-    made.remaining(5.6)
+    made.remaining_variance(5.6)
     assert calls == [1]

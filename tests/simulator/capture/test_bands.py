@@ -18,7 +18,6 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from simulator import CameraSettings, get_camera
-from simulator.capture.batch import expose_in_bands
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.generator import noise_keys
 from simulator.optics.lamps import MainsLamp, PulsedLamp
@@ -61,7 +60,7 @@ def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any)
     rate = lighting.get("frame_rate", 30.0)
     for frame, state in enumerate((0, 17, 22, 37, 50, 63), start=1):
         observation, *_ = env.step(state)
-        lamp = make_lamp(env.core.episode(0).phase)
+        lamp = make_lamp(env.episode().phase)
         wanted = reference.capture(before, env.grid[state], 0, lamp=lamp, start=frame / rate).mean
         step = 1.0 / min(CAMERA.span)  # the mean is not rounded to digital numbers
         np.testing.assert_allclose(observation["raw"], wanted, atol=0.51 * step)
@@ -73,7 +72,7 @@ def test_rows_are_those_of_the_lamp() -> None:
     for made in (env, steady):
         made.reset(seed=4)
     raw, plain = env.step(16)[0]["raw"], steady.step(16)[0]["raw"]  # 1/1000 s
-    lamp = MainsLamp(100.0, 0.8, env.core.episode(0).phase)
+    lamp = MainsLamp(100.0, 0.8, env.episode().phase)
     # Eight sensor rows of 11 us are in each row of the frame.
     bands = lamp.row_light(1 / 30, 1e-3, 40, CAMERA.row_time, 8)
     measured = raw.mean(axis=(0, 2)) / plain.mean(axis=(0, 2))
@@ -93,7 +92,7 @@ def test_noise_is_that_of_the_banded_signal(source_iso: float | None) -> None:
         light = light + normals * (shot * 0.3 + read).sqrt()
     rows = np.array([[0.4, 1.0, 1.6]])
     prepared = PreparedScene(light, reference, CAMERA, nlf if source_iso else nlf.zero())
-    frame = expose_in_bands([prepared], [target], rows, seed=1)[0].double()
+    frame = prepared.expose([target], row_gain=rows, seed=1)[0].double()
     goal = CAMERA.nlf(800)
     for row, gain in enumerate(rows[0]):
         mean, variance = frame[1, row].mean(), frame[1, row].var()
@@ -103,7 +102,7 @@ def test_noise_is_that_of_the_banded_signal(source_iso: float | None) -> None:
 
 
 def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bit for bit what `expose_in_bands`, tested above, makes of the same noise."""
+    """Bit for bit what `PreparedScene.expose`, tested above, makes of the same noise."""
     scene = replace(_scene(), nlf=CAMERA.nlf(100).scaled(1 / 16))
     env = _env(
         scenes=[scene],
@@ -116,14 +115,14 @@ def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPa
     env.reset(seed=4)
     for state in (52, 53, 37):
         observation, *_ = env.step(state)
-        episode, settings = env.core.episode(0), env.grid[state]
+        episode, settings = env.episode(), env.grid[state]
         keys = noise_keys(episode.noise_seed, episode.frame)
-        monkeypatch.setattr("simulator.capture.batch.sweep_keys", lambda *_, keys=keys: keys)
+        monkeypatch.setattr("simulator.capture.prepared_scene.sweep_keys", lambda *_, keys=keys: keys)
         lamp = MainsLamp(100.0, 0.8, episode.phase)
         rows = lamp.row_light(episode.frame / 30, settings.exposure_time, 40, CAMERA.row_time, 8)
         prepared = prepare_scene(scene, CAMERA, gain=float(rows.mean()))
         prepared = replace(prepared, tolerance=0.0)
-        wanted = expose_in_bands([prepared], [settings], rows[None] / rows.mean(), seed=0)[0]
+        wanted = prepared.expose([settings], row_gain=rows[None] / rows.mean())[0]
         wanted = wanted.clamp(-1 / 1024, 1.0).numpy()
         different = observation["raw"] != wanted  # the rounding of the lamp's light
         assert different.mean() < 1e-3
@@ -170,7 +169,7 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> Non
     env = _env(lighting=LED, scorer=scorer, with_oracle=True, motion=0.05, depth=0.5)
     env.reset(seed=0)
     _, reward, _, _, info = env.step(18)
-    lamp, scene = PulsedLamp(250.0, 0.3, env.core.episode(0).phase), _scene()
+    lamp, scene = PulsedLamp(250.0, 0.3, env.episode().phase), _scene()
     q = env.expected_scores()
     for state in (0, 9, 18, 30, 63):
         settings = env.grid[state]

@@ -6,11 +6,11 @@ import pickle
 
 import numpy as np
 
-from simulator.capture.batch import Buffers, Plans
+from simulator.capture.batch import _Buffers, _Rows
 
 
-def test_forgetting_a_slot_leaves_the_others() -> None:
-    plans = Plans(3, 4)
+def test_forgetting_a_scene_leaves_the_others() -> None:
+    plans = _Rows(3, 4)
     plans.gain[:] = 1.0
     plans.light[:] = "light"
     plans.forget(1)
@@ -20,17 +20,17 @@ def test_forgetting_a_slot_leaves_the_others() -> None:
 
 
 def test_nothing_is_known_at_first_or_in_a_pickled_copy() -> None:
-    plans, buffers = Plans(2, 3), Buffers((1, 2))
+    plans, buffers = _Rows(2, 3), _Buffers((1, 2))
     plans.gain[:] = 1.0
     buffers.give_back(buffers.take())
-    for empty in (Plans(2, 3), pickle.loads(pickle.dumps(plans))):
+    for empty in (_Rows(2, 3), pickle.loads(pickle.dumps(plans))):
         assert np.isnan(empty.gain).all()
         assert len(empty.gain) == 6
     assert pickle.loads(pickle.dumps(buffers)).take().shape == (1, 2)
 
 
 def test_an_image_that_was_given_back_is_taken_again() -> None:
-    buffers = Buffers((4, 2, 2))
+    buffers = _Buffers((4, 2, 2))
     first, second = buffers.take(), buffers.take()
     assert first.data_ptr() != second.data_ptr()
     buffers.give_back(second)

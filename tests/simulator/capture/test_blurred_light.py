@@ -8,12 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from simulator.camera import NoiseLevelFunction
 from simulator.capture import blurred_light as optics_module
 from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.blurred_light import BlurredLight, blur_key
-from simulator.capture.denoised import Denoised
+from simulator.capture.blurred_light import BlurredLight, Denoised
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.blur import disc_blur, motion_blur
 
 ZERO = NoiseLevelFunction.zero()
@@ -69,12 +68,12 @@ def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
 def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(
     made: list[tuple[str, float]],
 ) -> None:
-    blurred_light = BlurredLight(LIGHT, None, None, kept_bytes=2 * LIGHT.nbytes)
+    blurred_light = BlurredLight(LIGHT, None, None, cache_bytes=2 * LIGHT.nbytes)
     for disc in (1.0, 2.0, 1.0, 3.0, 1.0, 2.0):
         found = blurred_light.blurred(replace(STILL, defocus_px=disc))
         assert torch.equal(found, disc_blur(LIGHT, disc))
     assert [d for _, d in made] == [1.0, 2.0, 3.0, 2.0]
-    none = BlurredLight(LIGHT, None, None, kept_bytes=0)
+    none = BlurredLight(LIGHT, None, None, cache_bytes=0)
     for _ in range(2):
         none.blurred(replace(STILL, defocus_px=7.0))
     assert [d for _, d in made][-2:] == [7.0, 7.0]
@@ -102,18 +101,18 @@ def test_blur_that_opening_adds() -> None:
 def test_noise_that_opening_leaves() -> None:
     aperture_blur = MapApertureBlur(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
     blurred_light = BlurredLight(LIGHT, None, aperture_blur)
-    alone = aperture_blur.remaining(4.0)
-    assert torch.equal(blurred_light.remaining(4.0, 1.0), alone)
-    torch.testing.assert_close(blurred_light.remaining(4.0, 0.5), (2 * alone).clamp(max=1.0))
-    assert blurred_light.remaining(4.0, 0.5) is blurred_light.remaining(4.0, 0.5)
-    assert BlurredLight(LIGHT, None, None).remaining(4.0, 1.0) is None
+    alone = aperture_blur.remaining_variance(4.0)
+    assert torch.equal(blurred_light.remaining_variance(4.0, 1.0), alone)
+    torch.testing.assert_close(blurred_light.remaining_variance(4.0, 0.5), (2 * alone).clamp(max=1.0))
+    assert blurred_light.remaining_variance(4.0, 0.5) is blurred_light.remaining_variance(4.0, 0.5)
+    assert BlurredLight(LIGHT, None, None).remaining_variance(4.0, 1.0) is None
 
 
 def test_keys_tell_blurs_apart_and_nothing_else() -> None:
     changes = [{}, {"denoised": True}, {"opened_to": 4.0}, {"defocus_px": 1.0}, {"motion_px": 1.0}]
-    keys = {blur_key(replace(STILL, **change)) for change in changes}
+    keys = {replace(STILL, **change).blur for change in changes}
     assert len(keys) == 5
-    assert blur_key(replace(STILL, ratio=9.0)) == blur_key(STILL)
+    assert replace(STILL, ratio=9.0).blur == STILL.blur
 
 
 def test_only_the_very_same_light_is_its_own() -> None:

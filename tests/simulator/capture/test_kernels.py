@@ -1,4 +1,4 @@
-"""The fused capture against the steps of `simulator.capture.record`, and against hand-made numbers."""
+"""The fused kernel against the steps of `simulator.capture.sensor`, and hand-made numbers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import pytest
 import torch
 
 from ae_env.observation import encode_observation
-from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera, list_cameras
-from simulator.capture.exposure import Exposure
-from simulator.capture.kernels import exposure_table, record_capture, record_frames, sensor_table
-from simulator.capture.record import clip_and_quantise
+from simulator.camera import CameraProfile, get_camera, list_cameras
+from simulator.capture.exposure import Exposure, exposure_table
+from simulator.capture.kernels import record_frames, sensor_table
+from simulator.capture.sensor import Transitions, clip_and_quantise, record
 from simulator.noise.generator import FrameNoise, Noise, noise_keys
+from simulator.noise.noise_level_function import NoiseLevelFunction
 
 Z6 = get_camera("nikon_z6")
 CLEAN = NoiseLevelFunction.zero()
@@ -23,6 +24,20 @@ CLEAN = NoiseLevelFunction.zero()
 
 def random_light(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(shape, generator=torch.Generator().manual_seed(seed)) * 1.5 - 0.01
+
+
+def captured(
+    light: torch.Tensor,
+    exposure: Exposure,
+    camera: CameraProfile = Z6,
+    key: int | None = None,
+    kind: Noise = "exact",
+) -> torch.Tensor:
+    """One frame (4, H, W)."""
+    frame = torch.empty(1, *light.shape)
+    keys = None if key is None else np.array([key], np.uint64)
+    record(Transitions.of([light], [exposure]), camera, keys=keys, noise=kind, signals=frame)
+    return frame[0]
 
 
 def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) -> torch.Tensor:
@@ -34,7 +49,8 @@ def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) ->
         shot, read = (torch.tensor(v, dtype=torch.float64) for v in (nlf.shot, nlf.read))
         return read[:, None, None] + shot[:, None, None] * x.clamp(min=0.0)
 
-    left = 1.0 if exposure.remaining is None else exposure.remaining.double()
+    share = exposure.remaining_variance
+    left = 1.0 if share is None else share.double()
     missing = (variance(target) - left * variance(source)).clamp(min=0.0)
     return in_numbers(x + missing.sqrt() * normals.double()).clamp(0.0, Z6.white_level)
 
@@ -57,11 +73,11 @@ def test_captures_are_those_of_the_reference(
         ratio=0.4,
         source=Z6.nlf(1600) if noisy_source else CLEAN,
         target=Z6.nlf(400),
-        remaining=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
+        remaining_variance=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
     )
-    noise = FrameNoise(int(noise_keys(5, 3)[0]), kind)
-    normals = torch.from_numpy(noise.normals((4, *size)))
-    numbers = in_numbers(record_capture(light, exposure, Z6, noise=noise))
+    key = int(noise_keys(5, 3)[0])
+    normals = torch.from_numpy(FrameNoise(key, kind).normals((4, *size)))
+    numbers = in_numbers(captured(light, exposure, key=key, kind=kind))
     assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 holds 14 bits to 0.001
     # The nearest number, where float32 may be off by a hundredth of one before it rounds.
     rounding = (numbers.round() - reference(light, exposure, normals)).abs()
@@ -80,8 +96,7 @@ def test_every_digital_number_is_written_exactly(camera: str) -> None:
         "signals": np.empty((1, 4, len(numbers)), np.float32),
     }
     counts = record_frames(
-        np.array([light.data_ptr()], np.uintp),
-        len(numbers),
+        [light[:, None]],
         exposure_table([Exposure(1.0, CLEAN, CLEAN)]),
         body,
         **outputs,
@@ -97,12 +112,12 @@ def test_every_digital_number_is_written_exactly(camera: str) -> None:
 def test_clipping_and_extreme_light() -> None:
     light = torch.tensor([3e38, 1e9, 2.0, 1.0, 0.5, 0.0, -0.01, -3e38]).repeat(4, 1)[:, None]
     exposure = Exposure(1e3, CLEAN, Z6.nlf(6400))
-    found = record_capture(light.contiguous(), exposure, Z6, noise=FrameNoise(1))
+    found = captured(light, exposure, key=1)
     assert bool(torch.isfinite(found).all())
     assert (found[:, 0, :5] == 1.0).all()
     pedestal = -1008.0 / 14512.0
     assert found[:, 0, 6:].numpy() == pytest.approx(pedestal, rel=1e-6)
-    dark = record_capture(torch.full((4, 8, 8), 0.3), Exposure(1e-30, CLEAN, CLEAN), Z6)
+    dark = captured(torch.full((4, 8, 8), 0.3), Exposure(1e-30, CLEAN, CLEAN))
     assert (dark == 0.0).all()
 
 
@@ -111,7 +126,7 @@ def test_noise_has_the_variance_of_the_camera(kind: Noise) -> None:
     """Mean and variance of a flat patch, 5 standard errors; quantisation adds 1 / 12."""
     nlf, n = Z6.nlf(6400), 4 * 512 * 512
     flat, exposure = torch.full((4, 512, 512), 0.2), Exposure(1.0, CLEAN, nlf)
-    signal = record_capture(flat, exposure, Z6, noise=FrameNoise(3, kind))
+    signal = captured(flat, exposure, key=3, kind=kind)
     for plane in range(4):
         variance = nlf.read[plane] + 0.2 * nlf.shot[plane] + 1.0 / 12.0 / 14512.0**2
         values = signal[plane].double()
@@ -124,16 +139,15 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind:
     lights = [random_light(4, 70, 90, seed=i) for i in range(5)]
     isos = (100, 400, 1600, 6400, 400)
     exposures = [Exposure(0.1 * (i + 1), CLEAN, Z6.nlf(iso)) for i, iso in enumerate(isos)]
-    addresses = np.array([light.data_ptr() for light in lights], np.uintp)
     keys, frames = noise_keys(np.arange(5), 2), []
     for threads in (1, 2, 3):
         codes = np.empty((5, 4, 6300), np.uint8)
         table = exposure_table(exposures)
         drawn = {"keys": keys, "noise": kind}
-        record_frames(addresses, 6300, table, Z6, **drawn, codes=codes, threads=threads)
+        record_frames(lights, table, Z6, **drawn, codes=codes, threads=threads)
         frames.append(codes)
     for i, (light, exposure) in enumerate(zip(lights, exposures, strict=True)):
-        frame = record_capture(light, exposure, Z6, noise=FrameNoise(int(keys[i]), kind))
+        frame = captured(light, exposure, key=int(keys[i]), kind=kind)
         alone = encode_observation(frame)
         for codes in frames:
             np.testing.assert_array_equal(codes[i], alone.reshape(4, -1).numpy())
@@ -154,7 +168,7 @@ def test_black_level_may_be_zero_or_odd() -> None:
     for black, white in itertools.product((0.0, 64.5), (255.0, 65535.0)):
         body = CameraProfile("x", "RGGB", (black,) * 4, white, 16)  # type: ignore[arg-type]
         light = random_light(4, 9, 9)
-        found = record_capture(light, Exposure(1.0, CLEAN, CLEAN), body)
+        found = captured(light, Exposure(1.0, CLEAN, CLEAN), body)
         assert torch.equal(found, clip_and_quantise(light, body))
 
 

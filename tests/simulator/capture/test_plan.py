@@ -10,8 +10,17 @@ import torch
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.denoised import Denoised
-from simulator.capture.plan import BIAS, GAMMA
+from simulator.capture.blurred_light import Denoised
+from simulator.capture.exposure import Step
+from simulator.capture.light_statistics import LightStatistics
+from simulator.capture.plan import (
+    BIAS,
+    DEFAULT_TOLERANCE,
+    GAMMA,
+    Situation,
+    check_tolerance,
+    decide,
+)
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)
@@ -69,7 +78,7 @@ def test_the_networks_run_where_they_are_needed() -> None:
         ({}, CLEANER, "aperture", "does not open"),
         ({"aperture_blur": None}, CLEANER, "defocus", "far or in focus"),
         ({}, CLEANER, "defocus", "each pixel's was estimated"),
-        ({"nlf": Z6.nlf(100).scaled(0.1)}, BRIGHTER, "noise_reduction", "err as much"),
+        ({"nlf": Z6.nlf(100).scaled(0.1)}, BRIGHTER, "noise_reduction", "network's own error is as large"),
         ({"defocus": 1e-4}, CLEANER, "defocus", "pixel wide, which would hardly show"),
         ({}, CLEANER, "motion_blur", "does not move"),
         ({"image_speed": 1e-6}, CLEANER, "motion_blur", "which would hardly show"),
@@ -113,6 +122,102 @@ def test_operations_add_up() -> None:
     assert large.plan(target).operations == 4 * small.plan(target).operations
 
 
+# Deciding on numbers alone
+
+
+class Statistics(LightStatistics):
+    """Errors by hand: of noise, and of a disc and a streak of one pixel."""
+
+    def __init__(self, noise: float = 0.0, disc: float = 0.0, streak: float = 0.0) -> None:
+        self.noise, self.blur = noise, (disc, streak)
+
+    @property
+    def median(self) -> float:  # type: ignore[override]
+        return 1.0
+
+    def excess_error(self, *_: object) -> float:
+        return self.noise
+
+    def curvature(self, *_: object) -> tuple[float, float]:
+        return self.blur
+
+
+def steps(tolerance: float, found: Statistics, noise: float = 1.0, **given: object) -> list[Step]:
+    """What is decided where the deviation of the source's noise is `noise` times the light."""
+    source = NoiseLevelFunction((0.0,) * 4, (noise**2,) * 4)
+    situation = Situation(1.0, source, source, tolerance, True, found, lambda: found, **given)  # type: ignore[arg-type]
+    return list(decide(situation))
+
+
+def left_out(made: list[Step]) -> list[str]:
+    return [step.name for step in made if not step.runs and step.error]
+
+
+def test_noise_and_blur_add_as_squares() -> None:
+    """3, 4, 5: a blur of 0.4 fits beside noise of 0.3 within 0.5, and nothing more does."""
+    found = Statistics(0.3, disc=0.4, streak=1e-3)
+    assert left_out(steps(0.5, found, defocus_px=1.0)) == ["noise_reduction", "defocus"]
+    made = steps(0.5, found, defocus_px=1.0, motion_px=1.0)
+    assert [step.runs for step in made] == [False, False, False, True]
+    assert left_out(steps(0.29, found, defocus_px=1.0)) == []
+    assert left_out(steps(0.4999, Statistics(0.5))) == []
+
+
+def test_missing_blurs_add_up_in_the_mean() -> None:
+    """0.3 and 0.4 shift a pixel by up to 0.7; the second adds sqrt(0.49 - 0.09) to the square."""
+    found = Statistics(disc=0.1, streak=0.4)
+    made = steps(0.7, found, aperture_px=3**0.5, opens=True, motion_px=1.0)
+    assert left_out(made) == ["aperture", "motion_blur"]
+    assert made[3].error == pytest.approx(math.sqrt(0.4))
+    assert math.hypot(*(step.error for step in made)) == pytest.approx(0.7)
+    # Errors go with the square of the extent: 0.9 does not fit.
+    assert left_out(steps(0.7, found, aperture_px=3.0, opens=True)) == []
+
+
+def test_a_blur_that_runs_takes_nothing_of_the_tolerance() -> None:
+    made = steps(0.2, Statistics(disc=0.05, streak=0.2), aperture_px=10, defocus_px=2, opens=True)
+    assert left_out(made) == ["defocus"]
+    assert [step.error for step in made] == [0.0, pytest.approx(5.0), pytest.approx(0.2), 0.0]
+    assert [step.extent for step in made] == [0.0, 10, 2, 0.0]
+
+
+def test_noise_too_small_for_the_network_is_left_out_but_leaves_nothing_over() -> None:
+    """Half a percent of the light: the network's own error is 0.6 %."""
+    found = Statistics(0.3, streak=1e-6)
+    assert left_out(steps(0.1, found, 0.005)) == ["noise_reduction"]
+    assert left_out(steps(0.1, found, 0.007)) == []
+    assert steps(0.1, found, 0.005, motion_px=1.0)[3].runs
+
+
+def test_tolerance_0_leaves_nothing_out() -> None:
+    blurs = {"aperture_px": 1.0, "opens": True, "defocus_px": 1e-200, "motion_px": 1.0}
+    made = steps(0.0, Statistics(), 1e-9, **blurs)
+    assert all(step.runs for step in made)
+    assert [step.error for step in made] == [0.0] + [math.inf] * 3
+
+
+def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
+    """The paper's aperture module needs the denoised light; its own blur is not known before."""
+    situation = Situation(
+        1.0, Z6.nlf(6400), Z6.nlf(100), 0.1, True, Statistics(5.0), lambda: pytest.fail("it ran")
+    )
+    made = decide(situation._replace(aperture_px=math.inf, opens=True, opens_denoised=True))
+    assert [step.runs for step in made] == [True, True, False, False]
+    assert "works on the noise-reduced light only" in made[0].reason
+    assert made[1].reason == "the aperture opens and adds blur"
+    assert decide(situation)[0].runs
+
+
+def test_tolerances() -> None:
+    assert DEFAULT_TOLERANCE == 0.1
+    for value in (0, 1e-9, 3, 1e6):
+        assert check_tolerance(value) == value
+        assert isinstance(check_tolerance(value), float)
+    for wrong in (-1e-9, math.inf, math.nan, None, "0.1", True):
+        with pytest.raises(ValueError, match=r"`tolerance` \(=.*\) must be a finite number >= 0"):
+            check_tolerance(wrong)  # type: ignore[arg-type]
+
+
 # Steps and errors
 
 
@@ -149,7 +254,7 @@ def test_each_decision_says_what_it_costs() -> None:
     )
     strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.2, 0.3))
     assert "noise_reduction" in strict.modules
-    assert "leaving it out would err by 0.25" in strict.steps[1].reason
+    assert "leaving it out would be an error of 0.25" in strict.steps[1].reason
     assert (strict.predicted_error, loose.predicted_error) == (0.0, pytest.approx(0.25))
     assert "hardly noisier" in loose.left_out["noise_reduction"]
     assert "(error 0.25)" in loose.explain()
@@ -170,7 +275,7 @@ def test_blur_that_hardly_shows_is_left_out_with_its_error() -> None:
     assert "which would hardly show" in moving.left_out["motion_blur"]
     strict = replace(made, image_speed=0.02, tolerance=error * 0.99).plan(SOURCE)
     assert "motion_blur" in strict.modules
-    assert f"would err by {error:.2g}" in strict.steps[4].reason
+    assert f"would be an error of {error:.2g}" in strict.steps[4].reason
 
 
 def test_the_light_alone_takes_neither_noise_nor_clip() -> None:

@@ -14,11 +14,12 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from simulator.camera import CameraProfile, NoiseLevelFunction, get_camera
+from simulator.camera import CameraProfile, get_camera
 from simulator.capture.exposure import Exposure
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.record import add_noise, clip_and_quantise, sensor_light
+from simulator.capture.sensor import add_noise, clip_and_quantise, sensor_light
 from simulator.noise.generator import FrameNoise
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
 STATES = [

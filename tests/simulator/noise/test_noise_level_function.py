@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.camera import NoiseLevelFunction
-from simulator.noise.noise_level_function import (
-    nlf_tensors,
-    noise_generator,
-    noise_variance,
-    top_up_variance,
-)
+from simulator.noise.generator import noise_generator
+from simulator.noise.noise_level_function import NoiseLevelFunction, nlf_tensors, noise_variance
+from simulator.noise.top_up import top_up_variance
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))
 NOISY = NoiseLevelFunction((5e-4, 4e-4, 4e-4, 3e-4), (5e-7, 4e-7, 4e-7, 3e-7))

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.camera import BayerPattern, CameraProfile, NoiseLevelFunction, get_camera
+from simulator.camera import BayerPattern, CameraProfile, get_camera
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.lamps import PulsedLamp
 from simulator.optics.thin_lens import Lens
 from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene

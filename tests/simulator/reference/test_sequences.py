@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.camera import BayerPattern, CameraProfile, NoiseLevelFunction, get_camera
+from simulator.camera import BayerPattern, CameraProfile, get_camera
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.reference.reference_camera import ReferenceScene
 from simulator.reference.sequences import (
     EXPOSURE_TIMES,
