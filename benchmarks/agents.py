@@ -1,26 +1,29 @@
 """The long training: both agents over several seeds, against every light meter, on unseen scenes.
 
-Run ``ae-env bench agents`` in a clone of the repository. Trained agents are kept under
-``runs/bench_agents``, so that a second run goes on where the first was stopped; what it writes to
-``agents/`` under the output folder is the table that the documentation quotes.
+    ae-env bench agents
+
+Trained agents lie under ``runs/bench_agents``, so that a second run continues where the first was
+stopped. It writes the report of an evaluation to ``agents/`` under the output folder. Trainings run
+side by side and show their own progress, so this one is no `benchmarks.harness.Benchmark`.
 """
 
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
-from rich.console import Console
-from rich.progress import Progress
-
+from agents.cli.console import print_files, progress_bars
 from agents.episodes import make_envs
 from agents.evaluation.engine import evaluate
 from agents.evaluation.running import cache_score_tables, fit_policies
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
 from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
 from agents.report.evaluation_report import write_report
+from benchmarks.isolated import ROOT
 
-CONFIGS = {"regression": Path("configs/regression.yaml"), "ppo": Path("configs/ppo.yaml")}
+CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}
 SEEDS = (0, 1, 2)
 EPISODES = 8
 QUICK = {"regression": {"frames": 2_000}, "ppo": {"total_timesteps": 2_048}}
@@ -35,7 +38,7 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
         quick: A few frames of training, to see that everything runs.
     """
     jobs: dict[str, list[TrainingJob]] = {}
-    folder = Path("runs/bench_agents_quick" if quick else "runs/bench_agents")
+    folder = ROOT / "runs" / ("bench_agents_quick" if quick else "bench_agents")
     for name, path in CONFIGS.items():
         config = load_config(path)
         if quick:
@@ -54,28 +57,17 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     programs = [program for program in PROGRAMS if program != "M"]
     meters = [f"{meter}:{program}" for meter in CLASSIC_METERS for program in programs]
     names = ["random", "best_fixed", *(meters if not quick else meters[:1])]
-    policies = {name: make_policy(name, context) for name in names}
-    with Progress() as display:
-        task = display.add_task("light meters learn their programs")
-        fit_policies(  # on the same scenes as the agents
-            policies,
-            jobs["regression"][0].config.environment,
-            seed=seed,
-            progress=lambda done, total, _: display.update(task, completed=done, total=total),
-        )
-        learnt = {
-            name: [make_policy(f"{name}:{job.out}", context) for job in own]
-            for name, own in jobs.items()
-        }
-        oracle = {"oracle": make_policy("oracle", context)}
-        task = display.add_task("evaluation")
-        result = evaluate(
-            {**policies, **learnt, **oracle},
-            test,
-            episodes_per_scene=1 if quick else EPISODES,
-            seed=seed,
-            progress=lambda done, total, _: display.update(task, completed=done, total=total),
-        )
+    policies: dict[str, Any] = {name: make_policy(name, context) for name in names}
+    with progress_bars() as progress:
+        with progress("light meters learn their programs") as task:  # on the agents' scenes
+            environment = jobs["regression"][0].config.environment
+            fit_policies(policies, environment, seed=seed, progress=task)
+        for name, own in jobs.items():
+            policies[name] = [make_policy(f"{name}:{job.out}", context) for job in own]
+        policies["oracle"] = make_policy("oracle", context)
+        episodes = 1 if quick else EPISODES
+        with progress("evaluation") as task:
+            result = evaluate(policies, test, episodes_per_scene=episodes, seed=seed, progress=task)
     files = write_report(
         result,
         out / "agents",
@@ -88,22 +80,17 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
             "training_seconds_this_run": seconds,
         },
     )
-    for path in files.values():
-        Console().print(f"wrote {path}")
+    print_files(files)
 
 
 def _train(jobs: dict[str, list[TrainingJob]]) -> None:
-    first = next(iter(jobs.values()))[0].config
-    with Progress() as display:
-        task = display.add_task("score tables")
-        cache_score_tables(
-            first.environment,
-            lambda done, total, note="": display.update(task, completed=done, total=total),
-        )
-        everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
-        tasks = {job.name: display.add_task(job.name, total=None) for job in everything}
+    everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
+    with progress_bars() as progress, ExitStack() as bars:
+        with progress("score tables") as task:
+            cache_score_tables(everything[0].config.environment, task)
+        tasks = {job.name: bars.enter_context(progress(job.name)) for job in everything}
 
         def report(name: str, done: int, total: int, values: dict[str, float]) -> None:
-            display.update(tasks[name], completed=done, total=total)
+            tasks[name](done, total)
 
         train_in_parallel(everything, progress=report)

@@ -4,13 +4,14 @@
 
 Measures, per plane, the ratio between consecutive exposures against `simulator.exposure_ratio`,
 then simulates the 2 to 32 ms frames from the 1 ms frame and the 1 ms frame from each of them, and
-compares with the real ones. Writes the JSON and, beside it, the same as Markdown.
+compares with the real ones.
 """
 
 from __future__ import annotations
 
 import itertools
-import time
+import statistics
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,10 @@ from skimage.io import imread
 from skimage.metrics import structural_similarity
 from skimage.registration import phase_cross_correlation
 
-from benchmarks.data import data_folder
+from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, pivot, sections, table
+from benchmarks.isolated import timed
 from simulator import (
+    BayerPattern,
     CameraProfile,
     CameraSettings,
     CameraSimulator,
@@ -32,8 +35,6 @@ from simulator import (
     exposure_ratio,
 )
 from simulator.raw.image import PLANES
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
 
 SCENES = {"left_c0": "static", "left_c5": "moving"}
 #: Timed runs of each simulation.
@@ -44,16 +45,15 @@ LINEAR_BELOW = 0.4
 #: Green saturates at 0.86 of the largest code, smeared by 0.03, and red at 1: no further up than
 #: this is any plane surely unsaturated.
 UNSATURATED_BELOW = 0.8
+_SOURCE = "measurement only: BorealHDR, left camera"
 #: The largest code that the files hold is 4094: saturation, 4089 after linearising.
-CAMERA = CameraProfile(
-    "boreal_left", "RGGB", 0, 4089, 12, source="measurement only: BorealHDR, left camera"
-)
+CAMERA = CameraProfile("boreal_left", BayerPattern.RGGB, (0.0,) * 4, 4089, 12, source=_SOURCE)
 BLOCK = 8
 
 
 @dataclass
 class Pair:
-    """One transition: the real source and target, and what the simulator makes of the source."""
+    """One transition between two real frames."""
 
     scene: str
     source_ms: int
@@ -93,12 +93,7 @@ def load(folder: Path, scene: str, milliseconds: int) -> tuple[RawImage, float]:
 
 
 def load_pairs(folder: Path, scene: str) -> tuple[list[Pair], dict[str, Any]]:
-    """Every transition from and to 1 ms, and the blind noise estimates of green.
-
-    Args:
-        folder: Of the data set.
-        scene: One of `SCENES`.
-    """
+    """Every transition from and to 1 ms, and the blind noise estimates of green."""
     loaded = {t: load(folder, scene, t) for t in TIMES_MS}
     frames, estimates = calibrated({t: raw for t, (raw, _) in loaded.items()})
     steps = [(1, t) for t in TIMES_MS[1:]] + [(t, 1) for t in TIMES_MS[1:]]
@@ -113,13 +108,13 @@ def calibrated(frames: dict[int, RawImage]) -> tuple[dict[int, RawImage], dict[s
     """The frames of one gain with one NLF: the median of their blind estimates."""
     estimates = [estimate_nlf(frame.data) for frame in frames.values()]
     values = {key: np.array([getattr(e, key) for e in estimates]) for key in ("shot", "read")}
-    median = {key: tuple(np.median(value, axis=0)) for key, value in values.items()}
-    camera = CAMERA.with_nlf(100, NoiseLevelFunction(**median, source="blind, median of 6 frames"))
+    shot, read = (tuple(np.median(values[key], axis=0).tolist()) for key in ("shot", "read"))
+    camera = CAMERA.with_nlf(100, NoiseLevelFunction(shot, read, source="blind, median of 6"))
     green = {key: [float(f"{v:.3g}") for v in value[:, 1]] for key, value in values.items()}
     return {t: RawImage(f.data, f.settings, camera) for t, f in frames.items()}, green
 
 
-def ratio_rows(scene: str, frames: dict[int, RawImage]) -> list[dict[str, Any]]:
+def ratio_rows(scene: str, frames: dict[int, RawImage]) -> list[Row]:
     """Exposure ratio of consecutive frames, per plane, on block means.
 
     Averaging blocks of 8 x 8 packed pixels takes out noise and the frames' small shifts; blocks are
@@ -135,22 +130,10 @@ def ratio_rows(scene: str, frames: dict[int, RawImage]) -> list[dict[str, Any]]:
             use = (level > 0.02) & (level < top) & (peak < UNSATURATED_BELOW)
             for plane, name in enumerate(PLANES):
                 a, b = x[plane][use[plane]], y[plane][use[plane]]
-                low, median, high = np.percentile(b / a, (25, 50, 75))
-                rows.append(
-                    {
-                        "kind": "ratio",
-                        "scene": scene,
-                        "source_ms": shorter,
-                        "target_ms": longer,
-                        "plane": name,
-                        "levels": [0.02, top],
-                        "blocks": len(a),
-                        "nominal": nominal,
-                        "median": round(float(median), 4),
-                        "quartiles": [round(float(low), 4), round(float(high), 4)],
-                        "least_squares": round(float(a @ b / (a @ a)), 4),
-                    }
-                )
+                row = {"kind": "ratio", "scene": scene, "source_ms": shorter, "target_ms": longer}
+                row |= {"plane": name, "levels": [0.02, top], "blocks": len(a), "nominal": nominal}
+                row |= {"median": float(np.median(b / a))}
+                rows.append(row | {"least_squares": float(a @ b / (a @ a))})
     return rows
 
 
@@ -161,53 +144,41 @@ def _blocks(data: np.ndarray, reduce: Any = np.mean) -> np.ndarray:
     return reduce(cut.reshape(planes, h, BLOCK, w, BLOCK), axis=(2, 4))
 
 
-def transition_rows(pair: Pair, repeats: int, seed: int) -> list[dict[str, Any]]:
+def transition_rows(pair: Pair, networks: CameraSimulator, repeats: int, seed: int) -> list[Row]:
     """Simulated and real frame of one transition, beside the baselines that bound the figures."""
-    simulator = CameraSimulator(device="cpu")
-    target = pair.target.settings
-    out, simulate_ms = timed(lambda: simulator.simulate(pair.source, target, seed=seed), repeats)
-
-    def expose() -> torch.Tensor:
-        return simulator.prepare(pair.source).expected(target).clamp(0.0, 1.0)
-
-    exposed, expose_ms = timed(expose, repeats)
-    real, simulated = pair.target.data.numpy(), out.data.numpy()
+    target, bare = pair.target.settings, CameraSimulator(device="cpu")
+    real, noise = pair.target.data.numpy(), pair.target.noise
+    found: dict[str, tuple[torch.Tensor, float]] = {
+        "simulated": timed_result(
+            lambda: bare.simulate(pair.source, target, seed=seed).data, repeats
+        ),
+        "exposure only": timed_result(lambda: _expected(bare, pair), repeats),
+        "exposure and noise module": timed_result(lambda: _expected(networks, pair), 1),
+    }
+    exposed = found["exposure only"][0]
     shift = image_shift(real, exposed.numpy())
-    noise = pair.target.noise
+    whole = round(float(shift[0])), round(float(shift[1]))
     source_variance = exposed_variance(pair.source, exposure_ratio(pair.source.settings, target))
     target_variance = variance(real, noise)
     top_up = np.maximum(source_variance, variance(exposed.numpy(), pair.source.noise))
-    renoised = renoise(real, target_variance, seed)
-
-    def row(variant: str, image: np.ndarray, limit: np.ndarray | None, ms: Any) -> dict[str, Any]:
-        registered = variant.endswith("registered")
-        moved = [round(float(v)) for v in shift] if registered else [0, 0]
-        scores = compare(image, real, pair, (moved[0], moved[1]))
-        usable = np.broadcast_to(~pair.masked, real.shape)
-        if limit is not None:
+    usable = np.broadcast_to(~pair.masked, real.shape)
+    limits = {"simulated": top_up + target_variance}
+    head = {"kind": "transition", "scene": pair.scene, "source_ms": pair.source_ms}
+    head |= {"target_ms": pair.target_ms, "masked_share": float(pair.masked.mean())}
+    head |= {"seconds_apart": pair.seconds_apart, "image_shift": shift.tolist()}
+    rows = []
+    for variant, (image, ms) in found.items():
+        for moved in ((0, 0), whole) if variant != "simulated" else ((0, 0),):
+            scores = compare(image.numpy(), real, pair, moved)
+            limit = limits.get(variant, source_variance + target_variance)
             scores["psnr_noise_limit_db"] = decibel(float(limit[usable].mean()))
-        return {
-            "kind": "transition",
-            "scene": pair.scene,
-            "source_ms": pair.source_ms,
-            "target_ms": pair.target_ms,
-            "variant": variant,
-            **scores,
-            "ms": ms,
-            "masked_share": round(float(pair.masked.mean()), 5),
-            "seconds_apart": round(pair.seconds_apart, 3),
-            "image_shift": [round(float(v), 2) for v in shift],
-            "excess_noise": round(out.metadata["excess_noise"], 4),
-        }
+            name = variant + ", registered" * (moved is whole)
+            rows.append({**head, "variant": name, **scores, "ms": ms})
+    return rows
 
-    clean_limit = source_variance + target_variance
-    return [
-        row("simulated", simulated, top_up + target_variance, simulate_ms),
-        row("exposure only", exposed.numpy(), clean_limit, expose_ms),
-        row("exposure only, registered", exposed.numpy(), clean_limit, expose_ms),
-        row("real, noise added again", renoised, target_variance, None),
-        row("no simulation", pair.source.data.numpy(), None, None),
-    ]
+
+def _expected(simulator: CameraSimulator, pair: Pair) -> torch.Tensor:
+    return simulator.prepare(pair.source).expected(pair.target.settings).clamp(0.0, 1.0)
 
 
 def variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
@@ -219,13 +190,6 @@ def variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
 def exposed_variance(source: RawImage, ratio: float) -> np.ndarray:
     """Noise variance that the source brings after its exposure was multiplied by `ratio`."""
     return ratio**2 * variance(source.data.numpy(), source.noise)
-
-
-def renoise(real: np.ndarray, noise_variance: np.ndarray, seed: int) -> np.ndarray:
-    """The real frame with fresh noise of its own strength: no simulation can agree better."""
-    normals = np.random.default_rng(seed).standard_normal(real.shape)
-    noisy = np.clip(real + np.sqrt(noise_variance) * normals, 0.0, 1.0)
-    return np.round(noisy * CAMERA.white_level) / CAMERA.white_level
 
 
 def image_shift(real: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -258,13 +222,10 @@ def compare(
         full=True,
     )
     error, power = square[use].mean(), (real[use].astype(np.float64) ** 2).mean()
-    return {
-        "psnr_db": decibel(float(error)),
-        "psnr_linear_range_db": decibel(float(square[linear].mean())),
-        "ssim": round(float(similarity[use].mean()), 4),
-        "relative_rmse": round(float(np.sqrt(error / power)), 4),
-        "texture_ratio": round(_texture(image, use) / _texture(real, use), 3),
-    }
+    scores = {"psnr_db": decibel(float(error)), "ssim": float(similarity[use].mean())}
+    scores |= {"psnr_linear_range_db": decibel(float(square[linear].mean()))}
+    scores |= {"relative_rmse": float(np.sqrt(error / power))}
+    return scores | {"texture_ratio": _texture(image, use) / _texture(real, use)}
 
 
 def _texture(image: np.ndarray, use: np.ndarray) -> float:
@@ -275,92 +236,83 @@ def _texture(image: np.ndarray, use: np.ndarray) -> float:
 
 def decibel(mean_square: float) -> float | None:
     """PSNR against 1, None for a perfect match."""
-    return round(-10 * float(np.log10(mean_square)), 2) if mean_square > 0 else None
+    return -10 * float(np.log10(mean_square)) if mean_square > 0 else None
 
 
-def timed(call: Any, repeats: int) -> tuple[Any, float]:
+def timed_result(call: Callable[[], torch.Tensor], repeats: int) -> tuple[torch.Tensor, float]:
     """Result of `call` and the median time of `repeats` runs after one to warm up [ms]."""
     result = call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return result, round(1000 * float(np.median(times)), 2)
+    return result, 1e3 * statistics.median(timed(call) for _ in range(repeats))
 
 
-def report(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
-    """The rows as Markdown."""
-    machine = meta["machine"]
-    lines = [
-        "# Real brackets against the exposure step",
-        "",
-        f"Written by `{meta['command']}` on {meta['date'][:10]}: {machine['cpu']}, "
-        f"{machine['threads']} thread(s), torch {meta['versions']['torch']}, seed {meta['seed']}, "
-        f"frames of {' x '.join(map(str, meta['frame']))} packed.",
-        "`docs/colour.md` says how to read it.",
-        "",
-        "## Exposure ratio between consecutive frames (`exposure_ratio` says 2)",
-        "",
-        "Median over blocks (least squares through the origin), per plane.",
-        "",
-        "| scene | frames | levels | " + " | ".join(PLANES) + " |",
-        "|---|---|---|" + "---|" * 4,
+def measure(scene: str, repeats: int, seed: int) -> dict[str, Any]:
+    """Rows of one scene, the blind noise estimates of green, and the frames' shape."""
+    pairs, estimates = load_pairs(data_folder("boreal_brackets"), scene)
+    frames = {pair.source_ms: pair.source for pair in pairs}
+    rows = ratio_rows(scene, frames)
+    networks = CameraSimulator.from_pretrained(device="cpu")  # denoises each source once
+    for pair in pairs if repeats > 1 else pairs[3:6]:
+        rows += transition_rows(pair, networks, repeats, seed)
+    return {"rows": rows, "estimates": estimates, "frame": list(frames[1].data.shape)}
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One part for each scene; only the static one, each simulation timed once, if `quick`."""
+    repeats = 1 if quick else REPEATS
+    return [
+        Part(scene, measure, {"scene": scene, "repeats": repeats, "seed": seed}, threads=1)
+        for scene in list(SCENES)[: 1 if quick else None]
     ]
-    ratios = [r for r in rows if r["kind"] == "ratio"]
-    for first in range(0, len(ratios), 4):
-        group = ratios[first : first + 4]
-        cells = [f"{r['median']:.3f} ({r['least_squares']:.3f})" for r in group]
-        head = group[0]
-        name = f"{head['scene']} | {head['source_ms']} to {head['target_ms']} ms"
-        lines.append(
-            f"| {name} | {head['levels'][0]} to {head['levels'][1]} | {' | '.join(cells)} |"
-        )
-    for scene, kind in SCENES.items():
-        lines += [
-            "",
-            f"## Simulated against real frames: {scene} ({kind})",
-            "",
-            "| from | to | variant | PSNR dB | noise limit dB | "
-            f"PSNR below {LINEAR_BELOW} dB | SSIM | "
-            "relative RMSE | texture ratio | ms | masked | shift | s apart |",
-            "|---|---|---|" + "---|" * 10,
-        ]
-        for r in rows:
-            if r["kind"] != "transition" or r["scene"] != scene:
-                continue
-            cells = [r["psnr_db"], r.get("psnr_noise_limit_db"), r["psnr_linear_range_db"]]
-            cells += [r["ssim"], r["relative_rmse"], r["texture_ratio"], r["ms"]]
-            text = " | ".join("" if c is None else f"{c:g}" for c in cells)
-            shift = ", ".join(f"{v:g}" for v in r["image_shift"])
-            lines.append(
-                f"| {r['source_ms']} | {r['target_ms']} | {r['variant']} | {text} | "
-                f"{r['masked_share']:.2%} | {shift} | {r['seconds_apart']:.3f} |"
-            )
-    return "\n".join(lines) + "\n"
 
 
-def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
-    """Measures and writes ``brackets.json`` and ``brackets.md`` into `out`.
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the results by scene."""
+    rows = [row for own in results.values() for row in own["rows"]]
+    first = next(iter(results.values()))
+    estimates = {scene: own["estimates"] for scene, own in results.items()}
+    more = {"blind_nlf_of_green": {"exposure_ms": list(TIMES_MS), **estimates}}
+    more["frame"] = first["frame"]
+    ratios = [row for row in rows if row["kind"] == "ratio"]
+    transitions = [row for row in rows if row["kind"] == "transition"]
+    page = [
+        f"Frames of {' x '.join(map(str, first['frame']))} packed, one thread. `docs/colour.md` "
+        "says how to read it.",
+        "## Exposure ratio between consecutive frames (`exposure_ratio` says 2)",
+        "Median over blocks (least squares through the origin), per plane.",
+        pivot(
+            ratios,
+            line=("scene, frames, levels", "{scene}, {source_ms} to {target_ms} ms, {levels}"),
+            columns="{plane}",
+            contents={"": "{median:.3f} ({least_squares:.3f})"},
+        ),
+        "## Simulated against real frames",
+        *sections(
+            transitions,
+            lambda row: f"{row['scene']} ({SCENES[row['scene']]})",
+            lambda own: table(own, _COLUMNS),
+        ),
+    ]
+    return Report(rows, page, more)
 
-    Args:
-        out: Folder of results.
-        seed: Of the simulated noise.
-        quick: Only the static scene, each simulation timed once.
-    """
-    folder = data_folder("boreal_brackets")
-    rows: list[dict[str, Any]] = []
-    estimates: dict[str, Any] = {}
-    for scene in list(SCENES)[: 1 if quick else None]:
-        pairs, estimates[scene] = load_pairs(folder, scene)
-        frames = {pair.source_ms: pair.source for pair in pairs}
-        rows += ratio_rows(scene, frames)
-        for pair in pairs:
-            rows += transition_rows(pair, 1 if quick else REPEATS, seed)
-            best, step = rows[-5], f"{pair.source_ms} -> {pair.target_ms} ms"
-            print(f"{scene}: {step}: {best['psnr_db']} dB, {best['ms']} ms")
-    meta = result_meta("ae-env bench brackets" + (" --quick" if quick else ""), seed)
-    meta["blind_nlf_of_green"] = {"exposure_ms": list(TIMES_MS), **estimates}
-    meta["frame"] = list(frames[1].data.shape)
-    print(f"wrote {write_results(out / 'brackets.json', rows, meta)}")
-    print(f"wrote {write_atomically(out / 'brackets.md', report(rows, meta))}")
+
+_COLUMNS: dict[str, Any] = {
+    "transition": "{source_ms} to {target_ms} ms: {variant}",
+    "PSNR [dB]": "{psnr_db:.2f}",
+    "noise limit [dB]": "{psnr_noise_limit_db:.2f}",
+    f"PSNR below {LINEAR_BELOW} [dB]": "{psnr_linear_range_db:.2f}",
+    "SSIM": "{ssim:.4f}",
+    "relative RMSE": "{relative_rmse:.4f}",
+    "texture ratio": "{texture_ratio:.3f}",
+    "ms": "{ms:.1f}",
+    "masked": "{masked_share:.2%}",
+    "shift": "{image_shift[0]:.2f}, {image_shift[1]:.2f}",
+    "s apart": "{seconds_apart:.3f}",
+}
+BENCHMARK = Benchmark(
+    name="brackets",
+    title="Real brackets against the exposure step",
+    parts=parts,
+    report=report,
+    code=("simulator", "benchmarks/brackets"),
+)
+run = BENCHMARK.run

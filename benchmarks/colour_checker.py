@@ -8,19 +8,17 @@ Every patch is averaged on the packed raw, brought to the chart's exposure by on
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from scipy.stats import linregress
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
 
-from benchmarks.data import data_folder
+from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, pivot, rounded, table
 from simulator import RawImage, develop, read_raw
-from simulator.raw.develop import TONES, XYZ_FROM_SRGB, srgb_from_camera
-from simulator.utils.results import result_meta, write_results
+from simulator.raw.develop import XYZ_FROM_SRGB, srgb_from_camera
 
 #: X-Rite, "New color specifications for ColorChecker SG and Classic charts" (2016): CIE L*a*b*,
 #: D50, 2 degree, charts made after November 2014.
@@ -50,22 +48,7 @@ XRITE_2014 = {
     "neutral 3.5": (35.63, -0.46, -0.48),
     "black 2": (20.64, 0.07, -0.46),
 }
-#: D. Pascale, "RGB coordinates of the Macbeth ColorChecker" (BabelColor), average of 30 charts,
-#: mostly made before November 2014, on the same scale and in the same order.
-BABELCOLOR_AVERAGE = (
-    (38.446, 13.602, 14.526), (65.943, 17.883, 17.864), (50.061, -4.510, -22.278),
-    (43.286, -13.232, 21.933), (55.319, 8.831, -24.617), (70.691, -33.032, -0.133),
-    (62.651, 35.354, 57.838), (40.246, 9.759, -44.384), (51.599, 47.798, 16.877),
-    (30.496, 21.062, -20.041), (72.462, -23.286, 56.992), (71.947, 19.478, 68.130),
-    (28.876, 14.797, -50.153), (55.144, -37.811, 31.630), (42.277, 54.104, 28.670),
-    (82.276, 4.028, 80.007), (51.916, 49.801, -13.846), (50.722, -28.103, -27.962),
-    (96.529, -0.468, 2.379), (81.209, -0.656, 0.252), (66.482, -0.531, -0.042),
-    (50.827, -0.626, -0.161), (35.849, -0.541, -0.514), (20.828, 0.025, -0.395),
-)  # fmt: skip
-CHARTS = {
-    "x-rite after 2014": np.array(list(XRITE_2014.values())),
-    "babelcolor average": np.array(BABELCOLOR_AVERAGE),
-}
+PUBLISHED = np.array(list(XRITE_2014.values()))
 NAMES = tuple(XRITE_2014)
 GREY = NAMES.index("neutral 5")
 
@@ -106,7 +89,7 @@ class Chart:
                 v, u = i / down, j / across
                 weights = np.array([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])
                 x, y = weights @ corners
-                found[6 * (self.rows[0] + i) + self.columns[0] + j] = (x, y, half)
+                found[6 * (self.rows[0] + i) + self.columns[0] + j] = (x, y, float(half))
         return found
 
 
@@ -159,12 +142,12 @@ def patch_means(raw: RawImage, chart: Chart) -> dict[int, np.ndarray]:
     return means
 
 
-def measure(raw: RawImage, chart: Chart, white_balance: str, reference: str) -> list[dict]:
-    """One row per patch, for one file, white balance (``"camera"`` or ``"chart"``) and table."""
+def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
+    """One row per patch, for one file and white balance (``"camera"`` or ``"chart"``)."""
     means = patch_means(raw, chart)
     order = sorted(means)
     planes = np.stack([means[i] for i in order])  # (N, 4)
-    lab = CHARTS[reference][order]
+    lab = PUBLISHED[order]
     gains = np.array(raw.white_balance)
     if white_balance == "chart":
         r, g1, g2, b = means[GREY]
@@ -188,22 +171,15 @@ def measure(raw: RawImage, chart: Chart, white_balance: str, reference: str) -> 
     error_unclipped = deltaE_ciede2000(unclipped, lab)
     even = unclipped_at_published_luminance(linear, lab)
     error_even = deltaE_ciede2000(even, lab)
-    return [
-        {
-            "file": raw.metadata["path"],
-            "white_balance": white_balance,
-            "reference": reference,
-            "patch": NAMES[i],
-            "delta_e_2000": round(float(error[k]), 3),
-            "delta_e_2000_without_gamut_clip": round(float(error_unclipped[k]), 3),
-            "delta_e_2000_at_published_luminance": round(float(error_even[k]), 3),
-            "lab_measured": [round(float(v), 2) for v in shown[k]],
-            "lab_published": [round(float(v), 2) for v in lab[k]],
-            "linear_srgb": [round(float(v), 5) for v in linear[k] * scale],
-            "exposure_scale": round(scale, 4),
-        }
-        for k, i in enumerate(order)
-    ]
+    rows = []
+    for k, i in enumerate(order):
+        row: Row = {"file": raw.metadata["path"], "white_balance": white_balance}
+        row |= {"patch": NAMES[i], "delta_e_2000": error[k]}
+        row |= {"delta_e_2000_without_gamut_clip": error_unclipped[k]}
+        row |= {"delta_e_2000_at_published_luminance": error_even[k]}
+        row |= {"lab_measured": shown[k].round(2), "lab_published": lab[k]}
+        rows.append(rounded(row | {"linear_srgb": linear[k] * scale, "exposure_scale": scale}))
+    return rows
 
 
 def unclipped_at_published_luminance(linear: np.ndarray, lab: np.ndarray) -> np.ndarray:
@@ -215,7 +191,7 @@ def unclipped_at_published_luminance(linear: np.ndarray, lab: np.ndarray) -> np.
     return linear_srgb_to_lab(linear * (lab_to_luminance(lab) / luminance)[:, None])
 
 
-def paper_range(raw: RawImage) -> dict:
+def paper_range(raw: RawImage) -> Row:
     """Darkest and brightest block of green along the picture's edge: white paper, evenly meant."""
     green = raw.data[1:3].mean(dim=0)
     blocks = green.unfold(0, 20, 20).unfold(1, 20, 20).mean(dim=(2, 3))
@@ -223,136 +199,91 @@ def paper_range(raw: RawImage) -> dict:
     return {"darkest": round(float(edge.min()), 3), "brightest": round(float(edge.max()), 3)}
 
 
-def linearity(raw: RawImage, chart: Chart, reference: str) -> list[dict]:
+def linearity(raw: RawImage, chart: Chart) -> list[Row]:
     """Per channel: how straight the neutral row's raw values lie over the published luminance."""
     means = patch_means(raw, chart)
     order = [i for i in sorted(means) if i >= 18]
-    published = lab_to_luminance(CHARTS[reference][order])
+    published = lab_to_luminance(PUBLISHED[order])
     rows = []
     for name, planes in (("R", [0]), ("G", [1, 2]), ("B", [3])):
         values = np.array([means[i][planes].mean() for i in order])
-        slope, offset = np.polyfit(published, values, 1)
-        residual = values - (slope * published + offset)
-        r2 = 1 - residual @ residual / ((values - values.mean()) ** 2).sum()
-        rows.append(
-            {
-                "file": raw.metadata["path"],
-                "channel": name,
-                "patches": len(order),
-                "slope": round(float(slope), 5),
-                "offset_percent_of_white": round(100 * float(offset / slope), 3),
-                "r_squared": round(float(r2), 6),
-                "largest_residual_percent_of_white": round(
-                    100 * float(np.abs(residual).max() / slope), 3
-                ),
-            }
-        )
+        fit = linregress(published, values)
+        residual = np.abs(values - (fit.slope * published + fit.intercept)).max()
+        row: Row = {"file": raw.metadata["path"], "channel": name, "patches": len(order)}
+        row |= {"slope": fit.slope, "offset_percent_of_white": 100 * fit.intercept / fit.slope}
+        row |= {"r_squared": fit.rvalue**2}
+        rows.append(rounded(row | {"residual_percent_of_white": 100 * residual / fit.slope}))
     return rows
 
 
-def develop_times(matrix: np.ndarray, repeats: int = 25) -> list[dict]:
-    """Median time of `develop` on the reward's batches, beside one power over its output."""
-    generator = torch.Generator().manual_seed(0)
-    rows = []
-    for size in (64, 128):
-        images = torch.rand(64, 4, size, size, generator=generator)
-        gains = 1 + torch.rand(64, 3, generator=generator)
-        colours = images[:, :3].contiguous()
-        power = timed(lambda x=colours: x ** (1 / 2.4), repeats)
-        for name, chosen in (("none", None), ("camera's", matrix)):
-            for tone in TONES:
-
-                def run(x=images, g=gains, m=chosen, t=tone):
-                    return develop(x, g, m, tone=t)
-
-                times = timed(run, repeats)
-                row = {"batch": f"64 x 4 x {size} x {size}", "matrix": name, "tone": tone}
-                row["ms"] = round(float(np.median(times)), 2)
-                row["ms_quartiles"] = [round(float(v), 2) for v in np.percentile(times, (25, 75))]
-                row["ratio_to_power"] = round(float(np.median(times) / np.median(power)), 2)
-                rows.append(row)
-    return rows
-
-
-def timed(call: Callable[[], object], repeats: int) -> list[float]:
-    """Times of `repeats` runs after two to warm up [ms]."""
-    times = []
-    for _ in range(repeats + 2):
-        start = time.perf_counter()
-        call()
-        times.append(1000 * (time.perf_counter() - start))
-    return times[2:]
-
-
-def summary(rows: list[dict]) -> dict:
+def summary(rows: list[Row]) -> Row:
     """Mean, median and maximum of dE2000 over `rows`."""
-    errors = np.array([row["delta_e_2000"] for row in rows])
-    unclipped = np.array([row["delta_e_2000_without_gamut_clip"] for row in rows])
-    even = np.array([row["delta_e_2000_at_published_luminance"] for row in rows])
-    return {
-        "patches": len(rows),
-        "mean": round(float(errors.mean()), 2),
-        "median": round(float(np.median(errors)), 2),
-        "max": round(float(errors.max()), 2),
-        "worst": rows[int(errors.argmax())]["patch"],
-        "mean_without_gamut_clip": round(float(unclipped.mean()), 2),
-        "mean_at_published_luminance": round(float(even.mean()), 2),
-    }
+    names = ("", "_without_gamut_clip", "_at_published_luminance")
+    errors, *others = (np.array([row[f"delta_e_2000{name}"] for row in rows]) for name in names)
+    found: Row = {"patches": len(rows), "mean": errors.mean(), "median": np.median(errors)}
+    found |= {"max": errors.max(), "worst": rows[int(errors.argmax())]["patch"]}
+    found |= {f"mean{name}": own.mean() for name, own in zip(names[1:], others, strict=True)}
+    return {k: round(float(v), 2) if isinstance(v, float) else v for k, v in found.items()}
 
 
-def print_tables(rows: list[dict], summaries: list[dict], lines: list[dict]) -> None:
-    keys = ("white_balance", "reference", "patches", "mean", "median", "max", "worst")
-    keys = ("file", *keys, "mean_without_gamut_clip", "mean_at_published_luminance")
-    print("| " + " | ".join(keys) + " |\n|" + "---|" * len(keys))
-    for row in summaries:
-        print("| " + " | ".join(str(row[k]) for k in keys) + " |")
-    print("\n| patch | published L* a* b* | camera balance | dE2000 | chart balance | dE2000 |")
-    print("|---|---|---|---|---|---|")
-    first = [r for r in rows if r["file"] == next(iter(FILES))]
-    first = [r for r in first if r["reference"] == next(iter(CHARTS))]
-    for name in NAMES:
-        camera, chart = (r for r in first if r["patch"] == name)
-        cells = [name, camera["lab_published"], camera["lab_measured"], camera["delta_e_2000"]]
-        cells += [chart["lab_measured"], chart["delta_e_2000"]]
-        print("| " + " | ".join(str(c).strip("[]") for c in cells) + " |")
-    print_table(lines)
+def measure_file(file: str) -> dict[str, Any]:
+    """Rows of one raw, their summaries, its linearity, and its white paper."""
+    raw, chart = read_raw(data_folder("canon_crw_cc0") / file), FILES[file]
+    rows, summaries = [], []
+    for white_balance in ("camera", "chart"):
+        own = measure(raw, chart, white_balance)
+        rows += own
+        summaries.append({"file": file, "white_balance": white_balance} | summary(own))
+    whole = chart.rows == (0, 3) and chart.columns == (0, 5)  # the close-ups show little paper
+    lines = linearity(raw, chart)
+    paper = paper_range(raw) if whole else None
+    return {"rows": rows, "summary": summaries, "linearity": lines, "paper": paper}
 
 
-def print_table(rows: list[dict]) -> None:
-    print("\n| " + " | ".join(rows[0]) + " |\n|" + "---|" * len(rows[0]))
-    for row in rows:
-        print("| " + " | ".join(map(str, row.values())) + " |")
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One part for each raw; only the first if `quick`."""
+    files = list(FILES)[: 1 if quick else None]
+    return [Part(file, measure_file, {"file": file}) for file in files]
 
 
-def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
-    """Measures, prints the tables and writes ``colour_checker.json`` into `out`.
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the results by file."""
+    rows = [row for own in results.values() for row in own["rows"]]
+    summaries = [row for own in results.values() for row in own["summary"]]
+    lines = [row for own in results.values() for row in own["linearity"]]
+    paper = {file: own["paper"] for file, own in results.items() if own["paper"]}
+    more = {"summary": summaries, "linearity": lines, "paper": paper}
+    first = [row for row in rows if row["file"] == next(iter(FILES))]
+    page = [
+        "How to read it: [colour](../colour.md). Colour difference dE2000 of whole charts:",
+        _plain_table(summaries),
+        "Patches of the first file, L* a* b* by white balance:",
+        pivot(
+            first,
+            line=("patch", "{patch}"),
+            columns="{white_balance}",
+            contents={
+                "published": lambda row: " ".join(map(str, row["lab_published"])),
+                "measured": lambda row: " ".join(map(str, row["lab_measured"])),
+                "dE2000": "{delta_e_2000:.2f}",
+            },
+        ),
+        "Linearity of the neutral row:",
+        _plain_table(lines),
+        f"White paper around the chart, share of sensor white: {paper}.",
+    ]
+    return Report(rows, page, more)
 
-    Args:
-        out: Folder of results.
-        seed: Nothing here is random; only noted in the file.
-        quick: Only the first raw.
-    """
-    folder = data_folder("canon_crw_cc0")
-    rows, summaries, lines, paper = [], [], [], {}
-    for file, chart in list(FILES.items())[: 1 if quick else None]:
-        raw = read_raw(folder / file)
-        for reference in CHARTS:
-            for white_balance in ("camera", "chart"):
-                part = measure(raw, chart, white_balance, reference)
-                rows += part
-                case = {"file": file, "white_balance": white_balance, "reference": reference}
-                summaries.append(case | summary(part))
-        lines += linearity(raw, chart, next(iter(CHARTS)))
-        if chart.rows == (0, 3) and chart.columns == (0, 5):
-            paper[file] = paper_range(raw)  # the close-ups show little paper
-    print_tables(rows, summaries, lines)
-    print(f"\nwhite paper around the chart, share of sensor white: {paper}")
-    times = develop_times(np.array(raw.camera.colour_matrix))
-    print_table(times)
-    meta = result_meta("ae-env bench colour_checker" + (" --quick" if quick else ""), seed) | {
-        "summary": summaries,
-        "linearity": lines,
-        "paper": paper,
-        "develop_ms": times,
-    }
-    print(f"\nwrote {write_results(out / 'colour_checker.json', rows, meta)}")
+
+def _plain_table(rows: list[Row]) -> str:
+    return table(rows, {key.replace("_", " "): f"{{{key}}}" for key in rows[0]})
+
+
+BENCHMARK = Benchmark(
+    name="colour_checker",
+    title="Colour accuracy on real raws of a ColorChecker",
+    parts=parts,
+    report=report,
+    code=("simulator", "benchmarks/colour_checker"),
+)
+run = BENCHMARK.run

@@ -9,13 +9,11 @@ stays within a third of a stop of a state whose expected score is within 0.01 of
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import track
+from matplotlib.figure import Figure
 
 from agents import PolicyContext, evaluate, make_policy
 from agents.episodes import make_envs
@@ -23,9 +21,7 @@ from agents.evaluation.metrics import THIRD_EV
 from agents.evaluation.result import EvaluationResult
 from agents.metering.rpi_agc import ExposureFilter
 from agents.policy import METERS
-from benchmarks.markdown import table
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from benchmarks.harness import Benchmark, Part, Report, Row, table
 
 #: Policies that are watched.
 POLICIES = ("rpi_agc", *(f"{meter}:P" for meter in METERS), "regression", "ppo")
@@ -40,20 +36,18 @@ _COLOURS = {"rpi_agc": "black", "regression": "tab:red", "ppo": "tab:blue"}
 _FOLLOWS_EV = 0.5
 
 
-def run(out: Path, seed: int = 0, quick: bool = False) -> None:
-    """Measures and writes ``convergence.json``, ``.md`` and ``.png`` under `out`."""
-    rows: list[dict[str, Any]] = []
-    curves: dict[float, dict[str, np.ndarray]] = {}
-    for stops in track(STOPS[1::3] if quick else STOPS, "steps of the light"):
-        result = _watched(stops, seed)
-        curves[stops] = {name: _departure(result, name) for name in POLICIES}
-        rows += _rows(result, stops)
-    meta = result_meta(f"ae-env bench convergence{' --quick' * quick}", seed)
-    meta |= {"grid": "third_stop", "frames": FRAMES, "step": STEP}
-    meta |= {"scenes": len(set(result.scene_ids.tolist())), "filter": _filter_rows()}
-    write_results(out / "convergence.json", rows, meta)
-    write_atomically(out / "convergence.png", _plot(curves))
-    write_atomically(out / "convergence.md", _markdown(rows, meta))
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One part for each step of the light."""
+    steps = STOPS[1::3] if quick else STOPS
+    return [Part(f"{stops:+g}", watch, {"stops": stops, "seed": seed}) for stops in steps]
+
+
+def watch(stops: float, seed: int) -> dict[str, Any]:
+    """Rows of all policies at one step of the light, and the median curve of each."""
+    result = _watched(stops, seed)
+    curves = {name: np.median(_departure(result, name), axis=0).tolist() for name in POLICIES}
+    scenes = len(set(result.scene_ids.tolist()))
+    return {"rows": list(_rows(result, stops)), "curves": curves, "scenes": scenes}
 
 
 def _watched(stops: float, seed: int) -> EvaluationResult:
@@ -85,22 +79,20 @@ def _since_step(outside: np.ndarray) -> np.ndarray:
     return np.where(after.any(axis=1), last, 0)
 
 
-def _filter_rows() -> list[dict[str, Any]]:
+def _filter_rows() -> list[Row]:
     """Frames that the AGC's filter takes by itself: to 2 % of its target, to a third of a stop."""
     rows = []
     for stops in STOPS:
-        follow, distances = ExposureFilter(1, startup_frames=0), []
+        follow, target = ExposureFilter(1, startup_frames=0), np.full(1, 2.0**-stops)
         follow.update(np.ones(1))
-        for _ in range(FRAMES):
-            distances.append(abs(np.log2(follow.update(np.full(1, 2.0**-stops))[0]) + stops))
-        far = np.array(distances)
-        near = {"2 %": np.log2(1.02), "1/3 EV": THIRD_EV}
-        frames = {name: int(np.flatnonzero(far > limit)[-1]) + 2 for name, limit in near.items()}
-        rows.append({"stops": stops, "published": PUBLISHED_FRAMES.get(stops), "frames": frames})
+        far = np.array([abs(np.log2(follow.update(target)[0]) + stops) for _ in range(FRAMES)])
+        two, third = (int(np.flatnonzero(far > x)[-1]) + 2 for x in (np.log2(1.02), THIRD_EV))
+        published = PUBLISHED_FRAMES.get(stops)
+        rows.append({"stops": stops, "published": published, "two": two, "third": third})
     return rows
 
 
-def _rows(result: EvaluationResult, stops: float) -> Iterator[dict[str, Any]]:
+def _rows(result: EvaluationResult, stops: float) -> Iterator[Row]:
     for policy in result.tracks:
         evs = result.grid.ev100[result.tracks[policy].states[0]]
         moved = evs[:, -_LAST:].mean(axis=1) - evs[:, STEP - 2]
@@ -125,84 +117,72 @@ def _rows(result: EvaluationResult, stops: float) -> Iterator[dict[str, Any]]:
         }
 
 
-def _plot(curves: dict[float, dict[str, np.ndarray]]) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    columns = min(3, len(curves))
-    lines = -(-len(curves) // columns)
-    figure = Figure(figsize=(3.6 * columns, 3.0 * lines), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
+def _draw(results: dict[str, Any]) -> Figure:
+    columns = min(3, len(results))
+    lines = -(-len(results) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.0 * lines), dpi=90, layout="constrained")
     panels = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for axes, (stops, by_policy) in zip(panels, curves.items(), strict=True):
-        for name, departure in by_policy.items():
+    for axes, (stops, result) in zip(panels, results.items(), strict=True):
+        for name, departure in result["curves"].items():
             frames = np.arange(1, FRAMES + 1) - STEP
             colour = _COLOURS.get(name)  # the others': matplotlib's own, dashed
             style = "--" if colour is None else "-"
-            axes.plot(frames, np.median(departure, axis=0), style, color=colour, label=name)
+            axes.plot(frames, departure, style, color=colour, label=name)
         axes.axhspan(-THIRD_EV, THIRD_EV, color="0.92")
-        axes.set(title=f"light {stops:+g} EV", xlabel="frames since the step", xlim=(-5, 40))
+        axes.set(title=f"light {stops} EV", xlabel="frames since the step", xlim=(-5, 40))
     for axes in panels[::columns]:
         axes.set_ylabel("EV100 less the final one (median)", fontsize=8)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=7)
-    buffer = io.BytesIO()
-    canvas.print_png(buffer)
-    return buffer.getvalue()
+    return figure
 
 
-def _markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
-    body = [
-        [
-            f"{row['stops']:+g}",
-            f"`{row['policy']}`",
-            f"{row['frames_to_settle_median']:.0f}",
-            f"{row['frames_to_settle_p90']:.0f}",
-            f"{row['follows']:.0%}",
-            _cell(row["frames_to_settle_following"]),
-            f"{row['right_at_last']:.0%}",
-            _cell(row["frames_to_be_right_median"]),
-            f"{row['final_ev_error']:.2f}",
-        ]
-        for row in rows
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the results by step of the light."""
+    rows = [row for result in results.values() for row in result["rows"]]
+    scenes, filtered = next(iter(results.values()))["scenes"], _filter_rows()
+    page = [
+        f"{scenes} small bundled test scenes with motion and defocus as in an episode, a grid of "
+        f"third stops (2128 states), {FRAMES} frames, the light jumps at frame {STEP}. *Settled*: "
+        "EV100 stays within a third of a stop of its mean over the last 12 frames. *Right*: it "
+        "stays within a third of a stop of a state whose expected score is within 0.01 of the "
+        "best; its frames are those of the scenes in which the policy is right at last. *Follows "
+        f"the whole step*: it ends within {_FOLLOWS_EV:g} EV of where the light went; in the other "
+        "scenes it meets the end of the grid or of its ladder, or bright and dark parts of the "
+        "scene count otherwise. Times per decision are in the [evaluation](evaluation/report.md).",
+        "![EV100 over time](convergence.png)",
+        table(
+            rows,
+            {
+                "light [EV]": "{stops:+g}",
+                "policy": "`{policy}`",
+                "frames to settle (median)": "{frames_to_settle_median:.0f}",
+                "P90": "{frames_to_settle_p90:.0f}",
+                "follows the whole step": "{follows:.0%}",
+                "frames to settle where it does": "{frames_to_settle_following:.0f}",
+                "right at last": "{right_at_last:.0%}",
+                "frames to be right (median)": "{frames_to_be_right_median:.0f}",
+                "final EV error": "{final_ev_error:.2f}",
+            },
+        ),
+        "## What the filter of the Raspberry Pi's AGC implies",
+        "Frames that the filter takes by itself, without a camera: speed 0.2, its square root "
+        "within 20 % of the target. `rpi_agc` above is to be compared with the frames to a third "
+        "of a stop.",
+        table(filtered, _FILTER_COLUMNS),
     ]
-    filtered = [
-        [f"{own['stops']:+g}", str(own["published"] or "-"), *map(str, own["frames"].values())]
-        for own in meta["filter"]
-    ]
-    head = ["light [EV]", "policy", "frames to settle (median)", "P90", "follows the whole step"]
-    head += ["frames to settle where it does", "right at last", "frames to be right (median)"]
-    head += ["final EV error"]
-    return "\n".join(
-        [
-            "# Convergence after a jump of the light",
-            "",
-            f"`{meta['command']}`, {meta['date'][:10]}. {meta['scenes']} small bundled test "
-            f"scenes with motion and defocus as in an episode, a grid of third stops (2128 "
-            f"states), {FRAMES} frames, the light jumps at frame {STEP}. *Settled*: EV100 stays "
-            "within a third of a stop of its mean over the last 12 frames. *Right*: it stays "
-            "within a third of a stop of a state whose expected score is within 0.01 of the best; "
-            "its frames are those of the scenes in which the policy is right at last. *Follows the "
-            f"whole step*: where it ends is within {_FOLLOWS_EV:g} EV of where the light went; in "
-            "the other scenes it meets the end of the grid or of its ladder, or bright and dark "
-            "parts of the scene count otherwise. Times per decision are in the [evaluation]"
-            "(evaluation/report.md).",
-            "",
-            "![EV100 over time](convergence.png)",
-            "",
-            table(head, body),
-            "",
-            "## What the filter of the Raspberry Pi's AGC implies",
-            "",
-            "Frames that the filter takes by itself, without a camera: speed 0.2, its square root "
-            "within 20 % of the target. `rpi_agc` above is to be compared with the frames to a "
-            "third of a stop.",
-            "",
-            table(["light [EV]", "published, to 2 %", "to 2 %", "to 1/3 EV"], filtered),
-            "",
-        ]
-    )
+    more = {"grid": "third_stop", "frames": FRAMES, "step": STEP, "scenes": scenes}
+    more["filter"] = filtered
+    return Report(rows, page, more, {"convergence.png": _draw(results)})
 
 
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}"
+_FILTER_COLUMNS = {"light [EV]": "{stops:+g}", "published, to 2 %": "{published}"}
+_FILTER_COLUMNS |= {"to 2 %": "{two}", "to 1/3 EV": "{third}"}
+BENCHMARK = Benchmark(
+    name="convergence",
+    title="Convergence after a jump of the light",
+    parts=parts,
+    report=report,
+    code=("simulator", "ae_env", "agents", "benchmarks/convergence"),
+)
+run = BENCHMARK.run

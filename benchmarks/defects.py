@@ -9,7 +9,6 @@ scenes and tested on test scenes; the constants that `ae_env/scorers/defects.py`
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,13 +20,10 @@ from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.luma import luma_of
 from agents.cli.console import console
-from benchmarks.markdown import table
-from simulator import develop, get_camera
+from benchmarks.harness import Benchmark, Part, Report, Row, bullets, cell, pivot, table
+from simulator import develop, exposure_ratio, get_camera
 from simulator.optics.blur import disc_blur
 from simulator.raw.develop import GREY_CARD_SIGNAL
-from simulator.settings import exposure_ratio
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
 
 CAMERA = "nikon_z6"
 #: Packed pixels a side of the renderings that the maps are fitted on, and of those tested on.
@@ -107,12 +103,7 @@ def signs_of(
 
 
 def fit_map(sign: np.ndarray, severity: np.ndarray) -> list[list[float]]:
-    """Knots [sign, severity] of the monotone, piecewise straight map of least squares.
-
-    Args:
-        sign: (N,) what was measured.
-        severity: (N,) what was rendered.
-    """
+    """Knots [sign, severity] of the monotone, piecewise straight map of least squares."""
     x = np.unique(np.round(np.quantile(sign, np.linspace(0.0, 1.0, NUM_KNOTS)), 4))
     low = severity.min()
     steps = np.clip((sign[:, None] - x[:-1]) / np.diff(x), 0.0, 1.0)  # each adds what it rises by
@@ -156,14 +147,12 @@ def severities_of(scenes: list[Scene], defect: str, seed: int) -> dict[str, np.n
     return {"exposure": np.maximum(*sides)} | values
 
 
-def own_row(
-    defect: str, estimated: np.ndarray, scenes: list[Scene], which: str, seed: int
-) -> dict[str, Any]:
+def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str, seed: int) -> Row:
     """How well the severity of its own defect is read, over ``"all"`` scenes or a part of them."""
-    kept = [which == "all" or s.hard == (which == "hard") for s in scenes]
-    rendered = np.broadcast_to(levels(defect), estimated.shape)[kept]
-    values = estimated[kept]
-    groups = [s.group for s, is_kept in zip(scenes, kept, strict=True) if is_kept]
+    chosen = [which == "all" or s.hard == (which == "hard") for s in scenes]
+    rendered = np.broadcast_to(levels(defect), estimated.shape)[chosen]
+    values = estimated[chosen]
+    groups = [s.group for s, is_chosen in zip(scenes, chosen, strict=True) if is_chosen]
     errors = by_group(np.abs(values - rendered).mean(axis=1), groups)
     guesses = np.abs(rendered - np.median(levels(defect))).mean()
     draws = np.random.default_rng(seed).integers(len(errors), size=(RESAMPLES, len(errors)))
@@ -196,7 +185,7 @@ def _spearman(first: np.ndarray, second: np.ndarray) -> float:
     return float(spearmanr(first, second).statistic)
 
 
-def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:
     """Mean |severity| that each measure gives with and without `defect` at its worst."""
     clean = int(np.flatnonzero(levels(defect) == 0.0)[0])
     ends = {"": -1} | ({"too weak": 0} if defect == "saturation" else {})
@@ -229,31 +218,32 @@ def scenes_of(split: str, resolution: int, per_kind: int, quick: bool) -> list[S
     return [scene for own in kept.values() for scene in own]
 
 
-def run(out: Path, seed: int = 0, quick: bool = False) -> None:
-    """Fits, tests and writes ``defects.json`` and ``defects.md`` under `out`; prints the knots."""
-    training = scenes_of("train", RESOLUTION, TRAINING_SCENES, quick)
-    maps = fit(training, seed)
-    print_knots(maps)
-    rows: list[dict[str, Any]] = [
-        {"part": "map", "name": name, "knots": knots, "in_use": KNOTS[name]}
-        for name, knots in maps.items()
-    ]
-    counts = []
+def parts(seed: int, quick: bool) -> list[Part]:
+    """The maps are fitted in one part, and the constants in use tested in others."""
+    found = [Part("maps", fitted, {"seed": seed, "quick": quick})]
     for resolution in (RESOLUTION, OTHER_RESOLUTION):
-        scenes = scenes_of("test", resolution, TEST_SCENES, quick)
-        counts.append(len(scenes))
-        for defect in DEFECTS:
-            estimated = severities_of(scenes, defect, seed)
-            both = len({scene.hard for scene in scenes}) == 2
-            for which in ("all", "ordinary", "hard") if both else ("all",):
-                rows.append(own_row(defect, estimated[defect], scenes, which, seed))
-            if resolution == RESOLUTION:
-                rows += cross_rows(defect, estimated)
-    meta = result_meta(f"ae-env bench defects{' --quick' * quick}", seed)
-    meta |= {"training_scenes": len(training), "test_scenes": counts[0], "rendered": RENDERED}
-    meta |= {"in_use_is_fitted": _same(maps), "camera": CAMERA}
-    write_results(out / "defects.json", rows, meta)
-    write_atomically(out / "defects.md", markdown(rows, meta))
+        arguments = {"resolution": resolution, "seed": seed, "quick": quick}
+        found.append(Part(f"test {resolution}", tested, arguments))
+    return found
+
+
+def fitted(seed: int, quick: bool) -> dict[str, Any]:
+    """The maps of this run, and on how many scenes they were fitted."""
+    training = scenes_of("train", RESOLUTION, TRAINING_SCENES, quick)
+    return {"maps": fit(training, seed), "scenes": len(training)}
+
+
+def tested(resolution: int, seed: int, quick: bool) -> dict[str, Any]:
+    """Rows of the test scenes at one resolution."""
+    scenes, rows = scenes_of("test", resolution, TEST_SCENES, quick), []
+    for defect in DEFECTS:
+        estimated = severities_of(scenes, defect, seed)
+        both = len({scene.hard for scene in scenes}) == 2
+        for which in ("all", "ordinary", "hard") if both else ("all",):
+            rows.append(own_row(defect, estimated[defect], scenes, which, seed))
+        if resolution == RESOLUTION:
+            rows += cross_rows(defect, estimated)
+    return {"rows": rows, "scenes": len(scenes)}
 
 
 def _same(maps: dict[str, list[list[float]]]) -> bool:
@@ -263,72 +253,68 @@ def _same(maps: dict[str, list[list[float]]]) -> bool:
     )
 
 
-def print_knots(maps: dict[str, list[list[float]]]) -> None:
-    """Prints the maps as the scorers' source has them."""
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report; prints the maps as the scorers' source has them."""
+    maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
     for name, knots in maps.items():
-        columns = ", ".join(repr(column) for column in zip(*knots, strict=True))
-        console.print(f'"{name}": ({columns}),', soft_wrap=True, highlight=False, markup=False)
-
-
-def markdown(rows: list[dict[str, Any]], meta: dict[str, Any]) -> str:
-    """The page of results."""
-    same = "the ones in use" if meta["in_use_is_fitted"] else "other than those in use"
-    lines = [
-        "# Do the analytic measures of defects read the severity?",
-        "",
-        f"`{meta['command']}`, {meta['date'][:10]}. Bundled scenes, well exposed, noise-free and "
-        "sharp, are rendered with one defect at 11 severities (saturation: 21). Maps are fitted on "
-        f"{meta['training_scenes']} training scenes and tested, with the constants in use, on "
-        f"{meta['test_scenes']} test scenes; the constants that this run fitted are {same}.",
-        "",
+        pairs = ", ".join(f"({x!r}, {y!r})" for x, y in knots)
+        console.print(f'"{name}": ({pairs}),', soft_wrap=True, highlight=False, markup=False)
+    rows = [row for test in tests for row in test["rows"]]
+    fits = [
+        {"part": "map", "name": n, "knots": knots, "in_use": KNOTS[n]} for n, knots in maps.items()
+    ]
+    more = {"training_scenes": results["maps"]["scenes"], "test_scenes": tests[0]["scenes"]}
+    more |= {"rendered": RENDERED, "in_use_is_fitted": _same(maps), "camera": CAMERA}
+    own = [row for row in rows if row["part"] == "own"]
+    cross = [row for row in rows if row["part"] == "cross_talk"]
+    clean = [row | {"defect": "no defect"} for row in cross if row["defect"] == DEFECTS[0]]
+    page = [
+        "Bundled scenes, well exposed, noise-free and sharp, are rendered with one defect at 11 "
+        f"severities (saturation: 21). Maps are fitted on {more['training_scenes']} training "
+        f"scenes and tested, with the constants in use, on {more['test_scenes']} test scenes; the "
+        f"constants that this run fitted are {'' if _same(maps) else 'not '}those in use.",
         "Severity 1 is:",
-        "",
-        *(f"- {defect.replace('_', ' ')}: {text}" for defect, text in meta["rendered"].items()),
-        "",
+        bullets(f"{defect.replace('_', ' ')}: {text}" for defect, text in RENDERED.items()),
         "## Own defect",
-        "",
         "*Rank correlation*: Spearman, over all scenes and severities together, and within a scene "
         "(mean over scenes). *Error*: mean absolute error of the severity, with its 95 % bootstrap "
         "interval over source groups. *Constant*: the error of always saying the middle severity; "
         "a measure that is no better cannot tell a defect from another scene. *Hard*: back light, "
         "snow, night, spot light and motion.",
-        "",
-        _own_table(rows),
-        "",
+        table(
+            [r for r in own if r["scenes"] == "all" or r["resolution"] == RESOLUTION],
+            {
+                "measure": "`{measure}`",
+                "pixels": "{resolution}",
+                "scenes": "{num_scenes} {scenes}",
+                "rank correlation": "{spearman:.2f}",
+                "within a scene": "{spearman_within_scene:.2f}",
+                "error": "{mae:.3f} [{mae_ci95[0]:.3f}, {mae_ci95[1]:.3f}]",
+                "constant": "{mae_of_a_constant:.3f}",
+            },
+        ),
         "## Cross-talk",
-        "",
         f"Mean |severity| at {RESOLUTION} x {RESOLUTION} without a defect, and how much each "
         "defect at severity 1 (row) changes each measure (column). Ideally only its own changes.",
-        "",
-        _cross_table(rows),
+        pivot(
+            [*clean, *cross],
+            line=("defect", "{defect}"),
+            columns="`{measure}`",
+            contents={"": _cross_cell},
+        ),
     ]
-    return "\n".join(lines) + "\n"
+    return Report([*fits, *rows], page, more)
 
 
-def _own_table(rows: list[dict[str, Any]]) -> str:
-    head = ["measure", "pixels", "scenes", "rank correlation", "within a scene"]
-    body = [
-        [
-            f"`{row['measure']}`",
-            f"{row['resolution']}",
-            f"{row['num_scenes']} {row['scenes']}",
-            f"{row['spearman']:.2f}",
-            f"{row['spearman_within_scene']:.2f}",
-            f"{row['mae']:.3f} [{row['mae_ci95'][0]:.3f}, {row['mae_ci95'][1]:.3f}]",
-            f"{row['mae_of_a_constant']:.3f}",
-        ]
-        for row in rows
-        if row["part"] == "own" and (row["scenes"] == "all" or row["resolution"] == RESOLUTION)
-    ]
-    return table([*head, "error", "constant"], body)
+def _cross_cell(row: Row) -> str:
+    return cell(row, "{clean:.2f}" if row["defect"] == "no defect" else "{change:+.2f}")
 
 
-def _cross_table(rows: list[dict[str, Any]]) -> str:
-    cross = [row for row in rows if row["part"] == "cross_talk"]
-    measures = list(dict.fromkeys(row["measure"] for row in cross))
-    cells = {(row["defect"], row["measure"]): row for row in cross}
-    clean = [f"{cells[DEFECTS[0], m]['clean']:.2f}" for m in measures]
-    body = [["no defect", *clean]]
-    for defect in dict.fromkeys(row["defect"] for row in cross):
-        body.append([defect, *(f"{cells[defect, m]['change']:+.2f}" for m in measures)])
-    return table(["defect", *(f"`{m}`" for m in measures)], body)
+BENCHMARK = Benchmark(
+    name="defects",
+    title="Do the analytic measures of defects read the severity?",
+    parts=parts,
+    report=report,
+    code=("simulator", "ae_env", "benchmarks/defects"),
+)
+run = BENCHMARK.run

@@ -19,7 +19,7 @@ from simulator.utils.cache import CACHE_VARIABLE
 
 ROOT = Path(__file__).absolute().parents[1]
 MIB = 2.0**20
-#: Threads of all that is not measured on one: the cores, of which two are what is aimed at.
+#: Threads of everything that is not measured on one: targets are stated for two cores.
 CORES = min(2, os.cpu_count() or 1)
 
 
@@ -31,12 +31,12 @@ def isolated(
     timeout: float = 1800.0,
     **arguments: Any,
 ) -> Any:
-    """What `task` returns, run by a fresh Python.
+    """The result of `task`, run by a fresh Python.
 
     Args:
         task: Function of a module of this package; takes and returns what JSON can hold.
         num_threads: Threads that torch and the kernels may use.
-        fresh_cache: Whether it finds nothing on disk that earlier runs have worked out.
+        fresh_cache: Whether it finds nothing on disk that earlier runs computed.
         timeout: Seconds after which it is stopped.
         arguments: Of `task`.
 
@@ -75,7 +75,7 @@ def peak_memory() -> float:
 
 
 def forget_peak() -> None:
-    """Lets `peak_memory` start anew from what is held now, where the system can."""
+    """Lets `peak_memory` count from what is held now, where the system can."""
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:

@@ -25,12 +25,19 @@ def bench(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("docs/results"),
     seed: Seed = 0,
     quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
+    against: Annotated[
+        Path | None, typer.Option(help="Of throughput: another checkout, timed in turns with this.")
+    ] = None,
 ) -> None:
     """Run one of the measurements whose results are in docs/results.
 
     Example: `ae-env bench throughput --quick --out /tmp/results`
     """
     check_word("name", name, BENCHMARKS)
+    if against is not None and (name != "throughput" or not against.is_dir()):
+        raise ValueError(
+            f"`against` (={str(against)!r}) must be a checkout's folder, of throughput"
+        )
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
         raise ValueError(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
@@ -38,4 +45,6 @@ def bench(
         )
     make_folder(out)
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
-    importlib.import_module(f"benchmarks.{name.replace('-', '_')}").run(out, seed=seed, quick=quick)
+    stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
+    options = {} if against is None else {"against": against}
+    importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)

@@ -1,101 +1,99 @@
-"""Stiff and extreme cases: errors against float64, declared limits, bad input, long runs.
+"""Stiff and extreme cases that have a curve or a figure to read: error over what is varied.
 
     ae-env bench stability
 
-Each group of cases yields rows (`benchmarks.stability.case.Row`); a row that is not ok is a defect.
-A run that was stopped goes on with the group where it was.
+What can only be right or wrong (bad input, damaged files, single extreme values) is in the tests.
+Each group of cases yields rows (`benchmarks.stability.case.row`); a row that is not ok is a defect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
-from agents.cli.console import print_files, progress_bars
-from benchmarks.keeping import Kept
-from benchmarks.stability import (
-    control,
-    draws,
-    exposures,
-    fuzz,
-    lamps,
-    long_runs,
-    networks,
-    noise_levels,
-    scores,
-    signals,
-)
-from benchmarks.stability.case import Row
-from benchmarks.stability.plots import draw
-from benchmarks.stability.report import markdown
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from matplotlib.figure import Figure
 
-#: Groups of a run that was stopped.
-FOLDER = Path("runs/stability")
-#: The code that is measured.
-MEASURED = ("simulator", "ae_env", "agents", "benchmarks/stability")
-#: ``rows(seed, quick)`` of each group, in the order of the page.
-GROUPS: dict[str, Callable[[int, bool], Iterator[Row]]] = {
-    "exposure ratios": exposures.rows,
-    "signals": signals.rows,
-    "noise level functions": noise_levels.rows,
-    "noise draws": draws.rows,
-    "networks": networks.rows,
-    "stiff light": lamps.rows,
-    "stiff control": control.rows,
-    "scores": scores.rows,
-    "fuzzing": fuzz.rows,
-    "long runs": long_runs.rows,
+from benchmarks.harness import Benchmark, Part, Report, Row, bullets, cell, sections, table
+from benchmarks.stability import light, loops, noise
+
+#: Groups, in the order of the page: what measures them, and the label of what is varied.
+GROUPS: dict[str, tuple[Any, str]] = {
+    "exposure ratios": (light.exposures, "exposure [stops]; transitions of a chain"),
+    "signals": (light.signals, "exposure [stops]"),
+    "stiff light": (light.lamps, "exposure time [s]"),
+    "noise level functions": (noise.level_functions, "ISO"),
+    "few electrons": (noise.electrons, "electrons"),
+    "noise over signal": (noise.statistics, "signal [of white]"),
+    "networks": (noise.networks, "exposure [stops]"),
+    "stiff control": (loops.control, "delay [frames]"),
+    "long runs": (loops.long_runs, "steps"),
 }
 
 
-def run(out: Path, seed: int = 0, quick: bool = False) -> None:
-    """Measures and writes ``stability.json``, ``.md`` and ``.png`` under `out`.
-
-    Args:
-        out: Folder of results.
-        seed: Of every random number.
-        quick: Fewer points, inputs and steps, about two minutes.
-    """
-    kept = Kept(FOLDER / ("quick" if quick else "full"), seed, code=MEASURED)
-    meta = result_meta(f"ae-env bench stability{' --quick' * quick}", seed)
-    rows: list[dict[str, Any]] = []
-    with progress_bars() as progress, progress("cases") as task:
-        for i, (name, measure) in enumerate(GROUPS.items()):
-            task(i, len(GROUPS), name)
-            rows += _measured(name, measure, seed, quick, kept)
-        task(1, 1)
-    files = {
-        "numbers": write_results(out / "stability.json", rows, meta),
-        "report": write_atomically(out / "stability.md", markdown(rows, meta)),
-        "plot": draw(out / "stability.png", rows),
-    }
-    kept.forget()
-    print_files(files)
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One part for each group."""
+    arguments = {"seed": seed, "quick": quick}
+    return [Part(name, measure, arguments) for name, (measure, _) in GROUPS.items()]
 
 
-def _measured(
-    name: str,
-    measure: Callable[[int, bool], Iterator[Row]],
-    seed: int,
-    quick: bool,
-    kept: Callable[[str, Callable[[], list[dict[str, Any]]]], list[dict[str, Any]]],
-) -> list[dict[str, Any]]:
-    """The rows of a group; one that fails has those until then and the failure, and is not kept."""
-    rows: list[dict[str, Any]] = []
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the results by group."""
+    rows = [{"group": group, **row} for group, own in results.items() for row in own]
+    wrong = [cell(row, "Defect: {group}, {case}.") for row in rows if not row["ok"]]
+    page = [
+        "![Error over what is varied](stability.png)",
+        "## Findings",
+        bullets([f"{len(rows)} cases, {len(rows) - len(wrong)} of them right.", *wrong]),
+        "Errors are the largest of a curve, against closed forms, exact fractions, SciPy or the "
+        "same steps in float64, unless the case names another reference. Curves are in the JSON. A "
+        "case that cannot be right says how the result is declared.",
+        *sections(rows, "{group}", lambda own: table(own, _COLUMNS)),
+    ]
+    return Report(rows, page, figures={"stability.png": _draw(results)})
 
-    def collect() -> list[dict[str, Any]]:
-        for row in measure(seed, quick):
-            rows.append(row.json())
-        return rows
 
-    try:
-        return kept(name, collect)
-    except Exception as error:
-        note = " ".join(f"{type(error).__name__}: {error}".split())
-        return [
-            *rows,
-            Row(name, "the group itself", None, dtype="", finite=False, note=note).json(),
-        ]
+_COLUMNS: dict[str, Any] = {
+    "case": "{case}",
+    "dtype": "{dtype}",
+    "largest error": "{max_error:.3g} {error}",
+    "allowed": "{limit:.3g}",
+    "finite": lambda row: "yes" if row["finite"] else "**no**",
+    "right": lambda row: "yes" if row["ok"] else "**no**",
+    "note": "{note}",
+}
+
+
+def _draw(results: dict[str, list[Row]]) -> Figure:
+    """A panel for each group: the curves of its cases, their limits dotted."""
+    columns = 3
+    figure = Figure(figsize=(14.0, 4.0 * -(-len(results) // columns)), dpi=80, layout="constrained")
+    panels = figure.subplots(-(-len(results) // columns), columns, squeeze=False).ravel()
+    for axis, (group, rows) in zip(panels, results.items(), strict=False):
+        xs: list[float] = []
+        ys: list[float] = []
+        for row in rows:
+            x, y = row["curve"]["x"], row["curve"]["y"]
+            (line,) = axis.plot(x, y, ".-", ms=3, lw=0.9, label=row["case"][:56])
+            if row["limit"]:
+                axis.axhline(row["limit"], color=line.get_color(), ls=":", lw=0.8)
+            xs, ys = [*xs, *x], [*ys, *y]
+        axis.set(title=group, xlabel=GROUPS[group][1], ylabel=rows[0]["error"])
+        if min(xs) > 0 and max(xs) > 50 * min(xs):
+            axis.set_xscale("log")
+        if max(ys) > 50 * min([y for y in ys if y > 0], default=1.0):
+            axis.set_yscale("symlog", linthresh=min(y for y in ys if y > 0))
+        axis.grid(alpha=0.3)
+        if len(rows) <= 12:
+            axis.legend(fontsize=5.5)
+    for axis in panels[len(results) :]:
+        axis.set_axis_off()
+    return figure
+
+
+BENCHMARK = Benchmark(
+    name="stability",
+    title="Stability",
+    parts=parts,
+    report=report,
+    code=("simulator", "ae_env", "agents", "benchmarks/stability"),
+)
+run = BENCHMARK.run

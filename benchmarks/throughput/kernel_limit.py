@@ -1,9 +1,8 @@
-"""What the machine can do: the arithmetic of a frame in one loop, on arrays that are there already.
+"""The machine's limit: the arithmetic of a frame in one loop, on arrays that are there already.
 
-Multiply by the exposure ratio, add noise of the signal's variance, clip, and (for an observation)
-compand. Nothing else: no scene, no blur, no digital numbers, no score, no info. Written for this
-comparison, with nothing of the library in it but what draws its normals: nothing else at hand draws
-them as fast (torch's generator takes three times as long, numpy's six).
+Multiply by the exposure ratio, add noise of the signal's variance, clip, compand. Nothing else: no
+scene, no blur, no score, no info. Nothing of the library is in it but what draws exact normals:
+nothing else at hand draws them as fast (torch's generator takes three times as long).
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import Any
 
 import numba
 import numpy as np
-import torch
 
 from simulator.noise.generator import draw_block
 
@@ -26,47 +24,10 @@ _CODES = _F(255 / math.sqrt(1 + 1 / 1024))
 #: Samples that are worked on at a time, and to which the start of each such run is rounded.
 _RUN, _GRAIN = 256, 16
 _BANK = 2**20
-#: Black level and distance to white of a 14-bit sensor [digital number].
-_BLACK, _SPAN = _F(1008), _F(14_512)
 _FAST = {"nnan", "ninf", "nsz", "contract"}
 
 
 _compiled = numba.njit(nogil=True, fastmath=_FAST, error_model="numpy")
-
-
-def _loop(run: Callable[..., None]) -> Callable[..., Any]:
-    """The loop over the samples of a frame (4, N), `_RUN` at a time, for what is done to each."""
-
-    @_compiled
-    def loop(light, ratio, shot, read, bank, exact, state, out):  # type: ignore[no-untyped-def]
-        planes, samples = light.shape
-        starts = np.uint64(bank.size - _RUN - 1)
-        words, drawn = np.empty((4, _RUN // 4), np.uint32), np.empty(_RUN, np.float32)
-        for p in range(planes):
-            for first in range(0, samples, _RUN):
-                size = min(_RUN, samples - first)
-                state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-                normals = drawn[:size]
-                if exact:
-                    draw_block(state, 0, words, drawn)
-                else:  # anywhere in the bank
-                    start = np.int64(((state >> np.uint64(20)) % starts) & ~np.uint64(_GRAIN - 1))
-                    normals = bank[start : start + size]
-                x, y = light[p, first : first + size], out[p, first : first + size]
-                run(x, ratio, shot[p], read[p], normals, y)
-        return state
-
-    return loop
-
-
-@_compiled
-def _raw(x, ratio, shot, read, z, y):  # type: ignore[no-untyped-def]
-    for i in range(x.size):
-        signal = x[i] * ratio
-        bright = signal if signal > _ZERO else _ZERO
-        signal += np.sqrt(bright * shot + read) * z[i]
-        signal = signal if signal > -_PEDESTAL else -_PEDESTAL
-        y[i] = signal if signal < _ONE else _ONE
 
 
 @_compiled
@@ -81,20 +42,24 @@ def _codes(x, ratio, shot, read, z, y):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _digital_codes(x, ratio, shot, read, z, y):  # type: ignore[no-untyped-def]
-    for i in range(x.size):
-        signal = x[i] * ratio
-        bright = signal if signal > _ZERO else _ZERO
-        signal += np.sqrt(bright * shot + read) * z[i]
-        number = np.rint(signal * _SPAN + _BLACK)
-        number = number if number > _BLACK - _PEDESTAL * _SPAN else _BLACK - _PEDESTAL * _SPAN
-        number = number if number < _SPAN + _BLACK else _SPAN + _BLACK
-        signal = (number - _BLACK) * (_ONE / _SPAN) + _PEDESTAL
-        y[i] = np.uint8(np.int32(np.sqrt(signal) * _CODES + _HALF))
-
-
-#: By what becomes of a frame: float32, uint8 codes, or codes of whole digital numbers.
-_LOOPS = {"raw": _loop(_raw), "codes": _loop(_codes), "digital codes": _loop(_digital_codes)}
+def _loop(light, ratio, shot, read, bank, exact, state, out):  # type: ignore[no-untyped-def]
+    """A frame (4, N), `_RUN` samples at a time."""
+    planes, samples = light.shape
+    starts = np.uint64(bank.size - _RUN - 1)
+    words, drawn = np.empty((4, _RUN // 4), np.uint32), np.empty(_RUN, np.float32)
+    for p in range(planes):
+        for first in range(0, samples, _RUN):
+            size = min(_RUN, samples - first)
+            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            normals = drawn[:size]
+            if exact:
+                draw_block(state, 0, words, drawn)
+            else:  # anywhere in the bank
+                start = np.int64(((state >> np.uint64(20)) % starts) & ~np.uint64(_GRAIN - 1))
+                normals = bank[start : start + size]
+            x, y = light[p, first : first + size], out[p, first : first + size]
+            _codes(x, ratio, shot[p], read[p], normals, y)
+    return state
 
 
 class KernelLimit:
@@ -103,9 +68,7 @@ class KernelLimit:
     Args:
         lights: (S, 4, H, W) float32, what frames are exposed from.
         num_frames: Frames of a step, each of a light drawn at random.
-        noise: ``"bank"`` reads normals from a table, ``"exact"`` draws them anew.
-        result: ``"codes"`` (uint8), ``"digital codes"`` (after rounding to whole digital numbers,
-            as a camera does), or ``"raw"`` (float32, not companded).
+        noise: ``"bank"`` reads normals from a table, ``"exact"`` draws new ones.
         threads: Among which the frames of a step are shared out.
         seed: Of lights, exposure ratios and noise.
     """
@@ -116,14 +79,13 @@ class KernelLimit:
         num_frames: int,
         *,
         noise: str,
-        result: str = "codes",
         threads: int = 1,
         seed: int = 0,
     ) -> None:
         self._rng = np.random.default_rng(seed)
         self._lights = np.ascontiguousarray(lights.reshape(*lights.shape[:2], -1))
-        self._exact, self._loop = noise == "exact", _LOOPS[result]
-        self._out = np.empty((num_frames, *lights.shape[1:]), _F if result == "raw" else np.uint8)
+        self._exact = noise == "exact"
+        self._out = np.empty((num_frames, *lights.shape[1:]), np.uint8)
         self._flat = self._out.reshape(num_frames, 4, -1)
         self._bank = self._rng.standard_normal(_BANK, dtype=_F)
         self._states = [np.uint64(seed + i + 1) for i in range(threads)]
@@ -133,7 +95,7 @@ class KernelLimit:
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
     def step(self) -> np.ndarray:
-        """Makes all frames, (B, 4, H, W), in an array that the next step writes again."""
+        """Makes all frames, (B, 4, H, W), in an array that the next step overwrites."""
         count = len(self._flat)
         self._chosen = self._rng.integers(len(self._lights), size=count)
         self._ratios = self._rng.uniform(0.1, 2.0, count).astype(_F)
@@ -147,28 +109,8 @@ class KernelLimit:
         state = self._states[thread]
         for i in range(thread, len(self._flat), self._threads):
             args = (self._lights[self._chosen[i]], self._ratios[i], self._shot, self._read)
-            state = np.uint64(self._loop(*args, self._bank, self._exact, state, self._flat[i]))
+            state = np.uint64(_loop(*args, self._bank, self._exact, state, self._flat[i]))
         self._states[thread] = state
-
-
-def torch_loop(lights: np.ndarray, num_frames: int, seed: int) -> Callable[[], Any]:
-    """The same arithmetic as one torch operation after the other, fresh normals, uint8 codes."""
-    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
-    light = torch.from_numpy(lights)
-    frame, noise = (torch.empty(light.shape[1:]) for _ in range(2))
-    codes = torch.empty(num_frames, *light.shape[1:], dtype=torch.uint8)
-
-    def step() -> torch.Tensor:
-        ratios = rng.uniform(0.1, 2.0, num_frames).tolist()
-        for i, number in enumerate(rng.integers(len(light), size=num_frames).tolist()):
-            torch.mul(light[number], ratios[i], out=frame)
-            torch.clamp(frame, min=0.0, out=noise).mul_(1e-4).add_(1e-6).sqrt_()
-            frame.addcmul_(noise, torch.empty_like(frame).normal_(generator=generator))
-            frame.add_(float(_PEDESTAL)).clamp_(0.0, 1.0 + float(_PEDESTAL))
-            codes[i].copy_(frame.sqrt_().mul_(float(_CODES)).round_())
-        return codes
-
-    return step
 
 
 def lookup(frames: tuple[int, ...], num_frames: int, seed: int) -> Callable[[], Any]:

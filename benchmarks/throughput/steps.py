@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import multiprocessing
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,26 +13,26 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 
 import ae_env  # noqa: F401  registers the environment
 from ae_env.scorers import Captures
-from benchmarks.throughput.copies import in_one_process, in_subprocesses, memory_of_children
-from benchmarks.throughput.kernel_limit import KernelLimit, lookup, torch_loop
+from benchmarks.harness import Row, quartiles
+from benchmarks.throughput.kernel_limit import KernelLimit, lookup
 
 ID = "ae_env/AutoExposure-v0"
 SCENES = "bundled:small"
 #: Neither motion nor defocus: every frame is exposed from the scene's own light.
-CACHED = {"motion": "none", "depth": "far"}
+CACHED: dict[str, Any] = {"motion": "none", "depth": "far"}
 #: Rounds, and seconds that a case takes in each.
 QUICK, FULL = (3, 0.08), (9, 0.3)
 #: Names of the limits that others are compared with.
 KERNEL = {"bank": "fused kernel, noise bank", "exact": "fused kernel, exact noise"}
-DIGITAL_KERNEL = "fused kernel, noise bank, whole digital numbers"
 LOOKUP = "lookup"
 
 
 class LiveScore:
-    """Well-exposedness of the recorded pixels (Mertens 2007), in encoded light: looks at all."""
+    """Well-exposedness of the recorded pixels (Mertens 2007), in encoded light."""
 
     domain = "raw"
 
@@ -40,42 +42,35 @@ class LiveScore:
         return away.square_().mul_(-1 / (2 * 0.2**2)).exp_().mean(dim=(1, 2, 3))
 
 
-class LiveSrgbScore(LiveScore):
-    """The same of the developed picture."""
-
-    domain = "srgb"
-
-
 @dataclass
 class Case:
     """One thing to time: `step` makes `num_envs` frames.
 
-    `noise` names the kernel that it is compared with.
+    Args:
+        name: In the table.
+        num_envs: Frames of one step.
+        step: What is timed.
+        noise: Names the kernel that it is compared with.
+        observation: What the environment shows.
+        error: Largest difference of a code between an episode in the batch and the same one alone.
+        close: Called at the end.
+        seconds: Time per frame, one for each round.
     """
 
     name: str
     num_envs: int
     step: Callable[[], Any]
     noise: str = "bank"
-    error: int | None = None
-    memory: float | None = None
+    observation: str = "uint8"
+    error: float | None = None
     close: Callable[[], Any] = lambda: None
-    seconds: list[float] = field(default_factory=list)  # per frame, one for each round
+    seconds: list[float] = field(default_factory=list)
 
 
-def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[dict[str, Any]]:
-    """Rows of results at one frame size and number of threads.
-
-    Args:
-        threads: Threads of torch and of the kernels.
-        size: Height and width of a frame [packed pixel].
-        seed: Of episodes, actions and noise.
-        quick: Fewer cases, rounds and copies.
-    """
+def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
+    """Rows of results at one frame size and number of threads."""
     torch.set_num_threads(1)  # while children are forked: threads would not come along
-    cases: list[Case] = []
-    if threads > 1:
-        cases += _copies(8 if quick else 64, size, seed)
+    cases = [_copies(8 if quick else 64, size, seed)] if threads > 1 else []
     torch.set_num_threads(threads)
     cases += [*_limits(threads, size, seed), *_environments(size, seed, quick, threads > 1)]
     try:
@@ -94,11 +89,6 @@ def _limits(threads: int, size: int, seed: int) -> Iterator[Case]:
     for noise, name in KERNEL.items():
         kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
         yield Case(name, 64, kernel.step, noise)
-    kernel = KernelLimit(
-        lights, 64, noise="bank", result="digital codes", threads=threads, seed=seed
-    )
-    yield Case(DIGITAL_KERNEL, 64, kernel.step)
-    yield Case("torch loop, exact noise", 64, torch_loop(lights, 64, seed), "exact")
     yield Case(LOOKUP, 64, lookup((4, size, size), 64, seed))
 
 
@@ -110,33 +100,35 @@ def _lights(size: int) -> np.ndarray:
 
 def _environments(size: int, seed: int, quick: bool, full: bool) -> Iterator[Case]:
     """Cases of the environment itself; without `full` only the chief ones."""
-    live = {"scorer": f"{__name__}:LiveScore"}
-    cached = "cached scene"
-    yield _single(f"one environment, {cached}", size, seed, **CACHED)
-    yield _batch(f"vector env, {cached}", 64, size, seed, **CACHED)
+    live, exact = {"scorer": f"{__name__}:LiveScore"}, {"noise": "exact"}
     # An episode of 8 steps takes 9 frames; the kernel takes one per step.
-    endless = f"vector env, {cached}, endless episodes"
-    yield _batch(endless, 64, size, seed, max_episode_steps=None, **CACHED)
-    yield _batch(f"vector env, {cached}, live scoring", 64, size, seed, **CACHED, **live)
-    yield _batch("vector env, motion and defocus", 64, size, seed)
-    yield _batch("vector env, motion and defocus, held states", 64, size, seed, hold=True)
-    yield _batch(f"vector env, {cached}, exact noise", 64, size, seed, noise="exact", **CACHED)
-    if not full:
-        return
-    yield _single(f"one environment, {cached}, live scoring", size, seed, **CACHED, **live)
-    yield _single("one environment, motion and defocus", size, seed)
-    yield _batch(f"vector env, {cached}", 8, size, seed, **CACHED)
-    yield _batch("vector env, motion and defocus", 8, size, seed)
-    if not quick:
-        srgb = {"scorer": f"{__name__}:LiveSrgbScore"}
-        name = f"vector env, {cached}, live scoring in sRGB"
-        yield _batch(name, 64, size, seed, **CACHED, **srgb)
-        name = "vector env, motion and defocus, exact noise"
-        yield _batch(name, 64, size, seed, noise="exact")
+    endless: dict[str, Any] = {"max_episode_steps": None}
+    cases: list[tuple[str, int, dict[str, Any]]] = [
+        ("one environment, cached scene", 1, CACHED),
+        ("vector env, cached scene", 64, CACHED),
+        ("vector env, cached scene, endless episodes", 64, CACHED | endless),
+        ("vector env, cached scene, live scoring", 64, CACHED | live),
+        ("vector env, cached scene, exact noise", 64, CACHED | exact),
+        ("vector env, motion and defocus", 64, {}),
+    ]
+    if full:
+        for observation in ("linear", "dn"):
+            name = f"vector env, cached scene, {observation}"
+            cases.append((name, 64, CACHED | {"observation": observation}))
+        for lighting in ("sine", "flicker"):
+            name = f"vector env, motion and defocus, {lighting} light"
+            cases.append((name, 64, {"lighting": lighting}))
+        cases.append(("one environment, motion and defocus", 1, {}))
+        for count in (8, 512):
+            cases.append(("vector env, cached scene", count, CACHED))
+            cases.append(("vector env, motion and defocus", count, {}))
+    for name, count, options in cases:
+        make: dict[str, Any] = {"scenes": SCENES, "resolution": size} | options
+        yield _single(name, make, seed) if count == 1 else _batch(name, count, make, seed)
 
 
-def _single(name: str, size: int, seed: int, **options: Any) -> Case:
-    env = gym.make(ID, scenes=SCENES, resolution=size, **options)
+def _single(name: str, make: dict[str, Any], seed: int) -> Case:
+    env = gym.make(ID, **make)
     for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
         env.reset(seed=seed, options={"scene": number})
     rng = np.random.default_rng(seed)
@@ -145,59 +137,61 @@ def _single(name: str, size: int, seed: int, **options: Any) -> Case:
         if env.step(rng.integers(64))[3]:
             env.reset()
 
-    return Case(name, 1, step, options.get("noise", "bank"))
+    return Case(name, 1, step, make.get("noise", "bank"))
 
 
-def _batch(
-    name: str, num_envs: int, size: int, seed: int, *, hold: bool = False, **options: Any
-) -> Case:
-    make = {"scenes": SCENES, "resolution": size, "autoreset_mode": "SAME_STEP"} | options
-    envs = gym.make_vec(ID, num_envs=num_envs, **make)
+def _batch(name: str, num_envs: int, make: dict[str, Any], seed: int) -> Case:
+    envs = gym.make_vec(ID, num_envs=num_envs, autoreset_mode="SAME_STEP", **make)
     scenes = len(envs.unwrapped.scenes)  # type: ignore[attr-defined]
-    for first in range(0, scenes, num_envs):  # works out what is kept for each scene
+    for first in range(0, scenes, num_envs):  # everything that is computed once for a scene
         chosen = [(first + i) % scenes for i in range(num_envs)]
         envs.reset(seed=seed, options={"scene": chosen})
-    error = largest_difference(envs, size, seed, options)
-    step = stepper(envs, seed, hold=hold)
-    return Case(name, num_envs, step, options.get("noise", "bank"), error)
+    error, shown = _largest_difference(envs, make, seed), make.get("observation", "uint8")
+    return Case(name, num_envs, _stepper(envs, seed), make.get("noise", "bank"), shown, error)
 
 
-def _copies(count: int, size: int, seed: int) -> Iterator[Case]:
-    options = {"scenes": SCENES, "resolution": size, **CACHED}
-    for make, where in (
-        (in_subprocesses, "in subprocesses (AsyncVectorEnv)"),
-        (in_one_process, "in one process (SyncVectorEnv)"),
-    ):
-        envs = make(ID, count, options)
-        error = largest_difference(envs, size, seed, CACHED)
-        case = Case(f"copies {where}, cached scene", count, stepper(envs, seed), error=error)
-        if make is in_subprocesses:
-            case.memory, case.close = memory_of_children(), envs.close
-        yield case
+def _copies(count: int, size: int, seed: int) -> Case:
+    """The single environment many times: what users have who do not batch.
+
+    They are forked, so that they share the scenes and the libraries that are loaded once; nothing
+    may have run on several threads before.
+    """
+    options: dict[str, Any] = {"scenes": SCENES, "resolution": size, **CACHED}
+    make = functools.partial(_prepared, options)
+    make().close()
+    context = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+    mode = AutoresetMode.SAME_STEP
+    envs = AsyncVectorEnv([make] * count, context=context, autoreset_mode=mode)
+    error, name = _largest_difference(envs, options, seed), "copies in subprocesses, cached scene"
+    return Case(name, count, _stepper(envs, seed), error=error, close=envs.close)
 
 
-def stepper(envs: gym.vector.VectorEnv, seed: int, *, hold: bool = False) -> Callable[[], Any]:
-    """A step of `envs` with random actions, or with the same ones again and again."""
+def _prepared(options: dict[str, Any]) -> gym.Env:
+    """An environment on one thread that has seen every scene."""
+    torch.set_num_threads(1)
+    env = gym.make(ID, **options)
+    for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
+        env.reset(seed=0, options={"scene": number})
+    return env
+
+
+def _stepper(envs: gym.vector.VectorEnv, seed: int) -> Callable[[], Any]:
+    """A step of `envs` with random actions."""
     envs.reset(seed=seed)
     rng = np.random.default_rng(seed)
-    held = rng.integers(64, size=envs.num_envs)
-    if hold:
-        return lambda: envs.step(held)
     return lambda: envs.step(rng.integers(64, size=envs.num_envs))
 
 
-def largest_difference(
-    envs: gym.vector.VectorEnv, size: int, seed: int, options: dict[str, Any]
-) -> int:
+def _largest_difference(envs: gym.vector.VectorEnv, make: dict[str, Any], seed: int) -> float:
     """Largest difference of a code between the last environment and the same episode alone."""
     last = envs.num_envs - 1
-    alone = gym.make(ID, scenes=SCENES, resolution=size, **options)
+    alone = gym.make(ID, **make)
     pairs = [(envs.reset(seed=seed)[0], alone.reset(seed=seed + last)[0])]
     for action in (0, 21, 42, 63):
         actions = np.full(envs.num_envs, action)
         pairs.append((envs.step(actions)[0], alone.step(action)[0]))
     return max(
-        int(np.abs(many["raw"][last].astype(int) - one["raw"].astype(int)).max())
+        float(np.abs(many["raw"][last].astype(float) - one["raw"].astype(float)).max())
         for many, one in pairs
     )
 
@@ -224,7 +218,7 @@ def _measure(cases: Sequence[Case], rounds: int, slice_seconds: float) -> None:
             repeats[k] = 8 * max(1, round(count / 8))
 
 
-def _rows(cases: Sequence[Case], threads: int, size: int) -> list[dict[str, Any]]:
+def _rows(cases: Sequence[Case], threads: int, size: int) -> list[Row]:
     limits = {case.name: case.seconds for case in cases}
 
     def ratio(case: Case, limit: str) -> float:
@@ -233,17 +227,17 @@ def _rows(cases: Sequence[Case], threads: int, size: int) -> list[dict[str, Any]
 
     rows = []
     for case in cases:
-        low, middle, high = np.quantile(case.seconds, (0.25, 0.5, 0.75))
+        low, middle, high = quartiles(case.seconds)
         rows.append(
             {
                 "case": case.name,
                 "num_envs": case.num_envs,
+                "observation": case.observation,
                 "steps_per_second": 1.0 / middle,
                 "ratio_to_kernel": ratio(case, KERNEL[case.noise]),
                 "ratio_to_lookup": ratio(case, LOOKUP),
                 "spread": (high - low) / middle,
                 "error_codes": case.error,
-                "memory_mib": case.memory,
                 "size": size,
                 "threads": threads,
             }

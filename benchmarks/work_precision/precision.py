@@ -6,205 +6,179 @@ methods take their turn, in another order each time.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from benchmarks.simulator.models import Models
-from benchmarks.simulator.scenes import Progress
-from benchmarks.work_precision.measures import (
-    MeanError,
-    capture_square,
-    noise_ratios,
-    pareto_front,
-    quartiles,
-    timed,
-)
-from benchmarks.work_precision.methods import Method, Prepared, all_methods
-from benchmarks.work_precision.trials import GRID, SIZES, Size, Trial, trials
-from simulator import CameraSettings, RawImage
+from benchmarks.captures import clipped, psnr
+from benchmarks.harness import Row, quartiles
+from benchmarks.isolated import timed
+from benchmarks.work_precision.methods import Method, all_methods
+from benchmarks.work_precision.trials import GRID, Trial, trials
+from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage
+from simulator.noise.noise_level_function import noise_variance
 
-#: Scenes and, of each, states at which all methods are compared; None for all scenes.
-COUNTS: dict[Size, tuple[int | None, int]] = {
-    (64, 64): (None, 4),
-    (128, 128): (None, 4),
-    (256, 256): (None, 3),
-    (512, 768): (None, 2),
-}
-QUICK_COUNTS: dict[Size, tuple[int | None, int]] = {
-    (64, 64): (3, 2),
-    (128, 128): (3, 2),
-    (256, 256): (1, 1),
-    (512, 768): (1, 1),
-}
-#: How long a round takes, by size, for the progress bar only.
-_WEIGHTS = {(64, 64): 1.0, (128, 128): 4.0, (256, 256): 16.0, (512, 768): 96.0}
-#: Name of the rows of the reference camera itself: what its own noise measures as.
+#: States of each scene at which all methods are compared, by height; quick: scenes and states.
+STATES, QUICK = {128: 4, 512: 2}, {128: (2, 2), 512: (1, 1)}
+#: Name of what the reference camera's own captures measure as.
 REFERENCE = "reference camera"
+#: Pixels whose mean is this many deviations from either clip show all of their noise.
+_CLEAR = 4.0
+#: Levels of the signal, each with as many pixels, and the fewest pixels of one.
+_LEVELS, _FEWEST = 8, 200
+#: PSNRs that differ by less are the same [dB].
+_SAME_DB = 0.01
 
 
-def measure(
-    models: Models, *, seed: int, quick: bool, progress: Progress | None = None
-) -> list[dict[str, Any]]:
-    """One row per size and method.
-
-    Args:
-        models: What is measured.
-        seed: Of all noise.
-        quick: Few scenes and states.
-        progress: Called with the size and the share that is done.
-    """
-    every = all_methods(models)
-    counts = QUICK_COUNTS if quick else COUNTS
-    rounds = {size: len(trials(size, counts[size][0])) for size in SIZES}
-    total = sum(_WEIGHTS[size] * (n + 1) for size, n in rounds.items())
-    done, rows = 0.0, []
-    for size in SIZES:
-        number, states = counts[size]
-        chosen = trials(size, number)
-        name = f"{size[0]} x {size[1]}"
-        methods = [m for m in every if m.dtype == "float32"] if quick and size[0] > 128 else every
-        if progress is not None:
-            progress(f"{name}, warming up", done / total)
-        if not quick or size[0] <= 128:
-            _warm_up(methods, chosen[0], seed)
-        done += _WEIGHTS[size]
-        records = _Records(methods)
-        for index, trial in enumerate(chosen):
-            if progress is not None:
-                progress(f"{name}, {trial.scene.scene_id}", done / total)
-            _one_trial(records, methods, trial, trial.states(states), seed + 1000 * index, index)
-            done += _WEIGHTS[size]
-        rows += records.rows(size, len(chosen), states)
+def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
+    """One row per method."""
+    height, width = size
+    chosen, count = trials((height, width)), STATES[height]
+    methods = all_methods()
+    if quick:
+        scenes, count = QUICK[height]
+        chosen, methods = chosen[:scenes], methods[: None if height < 512 else 9]
+    records: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+    for method in methods:  # warm-up
+        _captured(method, chosen[0].raw(seed), chosen[0].states(1), seed)
+    for index, trial in enumerate(chosen):
+        _one_trial(records, methods, trial, trial.states(count), seed + 1000 * index, index)
+    floor = records.pop(REFERENCE)
+    rows: list[Row] = []
+    for method in methods:
+        own = records[method.key]
+        low, middle, high = quartiles(own["ms"])
+        rows.append(
+            {
+                "part": "precision",
+                "method": method.name,
+                "height": height,
+                "width": width,
+                "dtype": method.dtype,
+                "tolerance": method.tolerance,
+                "mode": method.mode,
+                "ms_per_state": middle,
+                "ms_spread": (high - low) / 2,
+                "ms_per_sweep": len(GRID) * middle,
+                "psnr_db": float(np.mean(own["psnr"])),
+                "psnr_db_10_percent": float(np.quantile(own["psnr"], 0.1)),
+                "psnr_db_90_percent": float(np.quantile(own["psnr"], 0.9)),
+                "relative_rmse": float(np.mean(own["rmse"])),
+                "noise_variance_error": _median(own["noise"]),
+                "noise_variance_floor": _median(floor["noise"]),
+                "scenes": len(chosen),
+                "states_per_scene": count,
+            }
+        )
+    points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
+    for row, best in zip(rows, pareto_front(points), strict=True):
+        row["pareto"] = best
     return rows
 
 
-class _Records:
-    """Times and errors by method."""
-
-    def __init__(self, methods: Sequence[Method]) -> None:
-        self.methods = {m.key: m for m in methods}
-        self.milliseconds: dict[tuple[str, str], list[float]] = {k: [] for k in self.methods}
-        self.errors: dict[tuple[str, str], list[MeanError]] = {k: [] for k in self.methods}
-        own = [*self.methods, (REFERENCE, "")]
-        self.noise: dict[tuple[str, str], list[float]] = {k: [] for k in own}
-        self.squares: dict[tuple[str, str], list[float]] = {k: [] for k in own}
-
-    def rows(self, size: Size, scenes: int, states: int) -> list[dict[str, Any]]:
-        """One row per method, and one of the reference camera's own noise."""
-        rows = [self._row(method, size, scenes, states) for method in self.methods.values()]
-        points = [(row["ms_per_state"], row["psnr_db"]) for row in rows]
-        for row, best in zip(rows, pareto_front(points), strict=True):
-            row["pareto"] = best
-        own = self.noise[REFERENCE, ""]
-        floors = {
-            "noise_variance_floor": float(np.median(own)) if own else None,
-            "capture_error_floor": _root_median(self.squares[REFERENCE, ""]),
-        }
-        return [row | floors for row in rows]
-
-    def _row(self, method: Method, size: Size, scenes: int, states: int) -> dict[str, Any]:
-        key = method.key
-        middle, low, high = quartiles(self.milliseconds[key])
-        levels = [error.psnr_db for error in self.errors[key]]
-        noise = self.noise[key]
-        return {
-            "part": "precision",
-            "method": method.name,
-            "height": size[0],
-            "width": size[1],
-            "dtype": method.dtype,
-            "tolerance": method.tolerance,
-            "mode": method.mode,
-            "ms_per_state": middle,
-            "ms_per_state_25_percent": low,
-            "ms_per_state_75_percent": high,
-            "ms_per_sweep": len(GRID) * middle,
-            "sweep_timed_whole": method.mode == "shared",
-            "timings": len(self.milliseconds[key]),
-            "psnr_db": float(np.mean(levels)),
-            "psnr_db_10_percent": float(np.quantile(levels, 0.1)),
-            "psnr_db_90_percent": float(np.quantile(levels, 0.9)),
-            "relative_rmse": float(np.mean([e.relative_rmse for e in self.errors[key]])),
-            "noise_variance_error": float(np.median(noise)) if noise else None,
-            "noise_variance_error_mean": float(np.mean(noise)) if noise else None,
-            "capture_error": _root_median(self.squares[key]),
-            "capture_error_90_percent": _root(float(np.quantile(self.squares[key], 0.9))),
-            "scenes": scenes,
-            "states_per_scene": states,
-        }
-
-
-def _root_median(squares: Sequence[float]) -> float:
-    return _root(float(np.median(squares)))
-
-
-def _root(square: float) -> float:
-    return max(0.0, square) ** 0.5
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if len(values) else None
 
 
 def _one_trial(
-    records: _Records,
+    records: dict[str, dict[str, list[Any]]],
     methods: Sequence[Method],
     trial: Trial,
     states: Sequence[CameraSettings],
     seed: int,
     turn: int,
 ) -> None:
-    means = {s: trial.mean(s) for s in states}
-    camera = trial.camera.camera
-    captures: dict[tuple[str, str], list[list[Tensor]]] = {m.key: [] for m in methods}
+    means, camera = {s: trial.mean(s) for s in states}, trial.camera.camera
+    captures: dict[str, list[list[Tensor]]] = {m.key: [] for m in methods}
     for photograph in range(2):
         raw = trial.raw(seed + photograph)
         first = (2 * turn + photograph) * 5 % len(methods)
         for method in (*methods[first:], *methods[:first]):
-            own = list(_captured(method, raw, states, seed + photograph, records))
-            captures[method.key].append([capture for capture, _ in own])
-            records.errors[method.key] += [
-                MeanError.of(expected, means[s], camera)
-                for (_, expected), s in zip(own, states, strict=True)
-            ]
-    pairs = {key: list(zip(*own, strict=True)) for key, own in captures.items()}
-    pairs[REFERENCE, ""] = [
-        (trial.sample(s, seed + 500), trial.sample(s, seed + 501)) for s in states
-    ]
-    for key, own_pairs in pairs.items():
-        for pair, s in zip(own_pairs, states, strict=True):
-            nlf = camera.nlf(s.iso)
-            ratios = noise_ratios(pair, means[s], nlf, camera)
-            records.squares[key].append(capture_square(pair, means[s], nlf, ratios))
+            frames, expected, times = _captured(method, raw, states, seed + photograph)
+            captures[method.key].append(frames)
+            records[method.key]["ms"] += times
+            for image, s in zip(expected, states, strict=True):
+                for name, value in mean_error(image, means[s], camera).items():
+                    records[method.key][name].append(value)
+    captures[REFERENCE] = [[trial.sample(s, seed + 500 + i) for s in states] for i in range(2)]
+    for key, (one, other) in captures.items():
+        for pair, s in zip(zip(one, other, strict=True), states, strict=True):
+            ratios = noise_ratios(pair, means[s], camera.nlf(s.iso), camera)
             if ratios:
-                records.noise[key].append(float(np.abs(np.array(ratios) - 1.0).mean()))
+                records[key]["noise"].append(float(np.abs(np.array(ratios) - 1.0).mean()))
 
 
 def _captured(
-    method: Method, raw: RawImage, states: Sequence[CameraSettings], seed: int, records: _Records
-) -> Iterator[tuple[Tensor, Tensor]]:
-    """Captures at `states` and what they are without noise; the time goes to `records`."""
-    times = records.milliseconds[method.key]
+    method: Method, raw: RawImage, states: Sequence[CameraSettings], seed: int
+) -> tuple[list[Tensor], list[Tensor], list[float]]:
+    """Captures at `states`, the same without noise, and times per state [ms]."""
+    found: list[Any] = []
     if method.prepare is not None:
-        (prepared, frames), milliseconds = timed(_swept, method, raw, seed)
-        times.append(milliseconds / len(GRID))
-        for s in states:
-            yield frames[GRID.states.index(s)], prepared.expected(s)
-        return
-    assert method.shoot is not None
-    for s in states:
-        shot, milliseconds = timed(method.shoot, raw, s, seed)
-        times.append(milliseconds)
-        yield shot.capture, shot.expected()
+        prepare = method.prepare
+
+        def whole_sweep() -> None:
+            found.append(prepare(raw))
+            found.append(found[0].expose(GRID, seed=seed))
+
+        times = [1e3 * timed(whole_sweep) / len(GRID)]
+        prepared, frames = found
+        images = [frames[GRID.states.index(s)] for s in states]
+        return images, [prepared.expected(s) for s in states], times
+    shoot = method.shoot
+    assert shoot is not None
+    times = [1e3 * timed(lambda s=s: found.append(shoot(raw, s, seed))) for s in states]  # type: ignore[misc]
+    return [capture for capture, _ in found], [light for _, light in found], times
 
 
-def _swept(method: Method, raw: RawImage, seed: int) -> tuple[Prepared, Tensor]:
-    assert method.prepare is not None
-    prepared = method.prepare(raw)
-    return prepared, prepared.expose(GRID, seed=seed)
+# -- measures -------------------------------------------------------------------------------------
 
 
-def _warm_up(methods: Sequence[Method], trial: Trial, seed: int) -> None:
-    raw, states = trial.raw(seed), trial.states(1)
-    for method in methods:
-        for _ in _captured(method, raw, states, seed, _Records([method])):
-            pass
+def mean_error(expected: Tensor, mean: Tensor, camera: CameraProfile) -> dict[str, float]:
+    """``psnr`` [dB] against white and ``rmse`` over the RMS signal, of an expected value."""
+    image, truth = clipped(expected, camera).double(), mean.double()
+    rmse = (image - truth).square().mean().sqrt()
+    scale = truth.square().mean().sqrt().clamp(min=1e-12)
+    return {"psnr": psnr(image, truth), "rmse": float(rmse / scale)}
+
+
+def noise_ratios(
+    captures: tuple[Tensor, Tensor], mean: Tensor, nlf: NoiseLevelFunction, camera: CameraProfile
+) -> list[float]:
+    """Variance of the noise over the noise level function's, at every level of the signal.
+
+
+    Returns:
+        One number per level with enough pixels; of pixels that are clear of both clips.
+    """
+    wanted = noise_variance(mean, nlf)
+    margin = _CLEAR * wanted.sqrt()
+    black = torch.tensor(camera.pedestal).to(mean)[:, None, None]
+    clear = (mean + margin < 1.0) & (mean - margin > -black)
+    first, second = captures
+    found = 0.5 * (first - second).double().square()[clear]
+    wanted = wanted[clear].double()
+    levels = wanted.argsort().tensor_split(_LEVELS)
+    return [float(found[at].mean() / wanted[at].mean()) for at in levels if len(at) >= _FEWEST]
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[bool]:
+    """Which of (milliseconds, PSNR [dB]) no other beats in both.
+
+    One that is faster and, to a hundredth of a decibel, as good beats another.
+
+    >>> pareto_front([(1.0, 30.0), (2.0, 35.0), (3.0, 34.0), (4.0, 35.004)])
+    [True, True, False, False]
+    """
+
+    def beaten(own: int) -> bool:
+        ms, db = points[own]
+        return any(
+            other != own and a <= ms and b >= db - _SAME_DB and (a < ms or b > db or other < own)
+            for other, (a, b) in enumerate(points)
+        )
+
+    return [not beaten(i) for i in range(len(points))]

@@ -1,0 +1,92 @@
+"""The trained networks that are measured, and the held-out scenes that they are measured on."""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from ae_env.scenes.reference_scenes import reference_scenes
+from benchmarks.harness import data_root
+from benchmarks.isolated import ROOT
+from simulator import CameraSimulator, get_camera
+from simulator.networks.weights import load_modules
+from simulator.reference.reference_camera import ReferenceScene
+
+#: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
+FOLDER, CONFIGS = ROOT / "runs" / "simulator", ROOT / "configs" / "simulator"
+PRESETS, BASELINES = ("compact", "paper"), ("pc", "dl")
+#: Procedural groups of the test split, size of its scenes and of crops of them [packed pixel];
+#: scenes without depth, photographs apart, are half the size.
+FULL, QUICK = (64, 256, 128), (6, 128, 64)
+
+
+@dataclass(frozen=True, eq=False)
+class Models:
+    """Trained networks; None for what was not trained.
+
+    Args:
+        simulators: By preset.
+        corrected: The same with the w and b that the exposure module learnt for the body that was
+            trained on, as the paper uses them.
+        baselines: The paper's, by name: parameter concatenation, decoupled learning.
+        cards: Model card of each, by name.
+    """
+
+    simulators: dict[str, CameraSimulator]
+    corrected: dict[str, CameraSimulator]
+    baselines: dict[str, nn.Module]
+    cards: dict[str, dict[str, Any]]
+
+
+def weights(name: str) -> str | Path | None:
+    """Name or path of a model for `load_modules`; None if it was not trained."""
+    if name == "compact":  # comes with the package
+        return name
+    path = FOLDER / name / f"{name}.safetensors"
+    return path if path.is_file() else None
+
+
+def train_missing() -> None:
+    """Trains what is not there by its configuration; a training that was stopped continues."""
+    for name in (*PRESETS, *BASELINES):
+        if weights(name) is None:
+            command = [sys.executable, "-m", "agents.cli", "train-simulator"]
+            subprocess.run([*command, str(CONFIGS / f"{name}.yaml")], cwd=ROOT, check=True)
+
+
+def checksums() -> dict[str, str]:
+    """Checksum of the weights of each model that is there."""
+    return {name: card["sha256"] for name, card in load_models().cards.items()}
+
+
+@functools.cache
+def load_models() -> Models:
+    """All models that are there."""
+    found = {n: w for n in (*PRESETS, *BASELINES) if (w := weights(n)) is not None}
+    loaded = {name: load_modules(path) for name, path in found.items()}
+    own, corrected = (
+        {
+            name: CameraSimulator.from_pretrained(
+                found[name], device="cpu", body_correction=correct, cache=None
+            )
+            for name in PRESETS
+            if name in found
+        }
+        for correct in (False, True)
+    )
+    baselines = {name: loaded[name][0]["baseline"] for name in BASELINES if name in loaded}
+    return Models(own, corrected, baselines, {name: card for name, (_, card) in loaded.items()})
+
+
+@functools.cache
+def held_out_scenes(camera: str, quick: bool) -> tuple[ReferenceScene, ...]:
+    """The test split: procedural groups, photographs and, where present, radiance maps."""
+    number, size, _ = QUICK if quick else FULL
+    profile, folder = get_camera(camera), data_root()
+    return tuple(reference_scenes("test", profile, number=number, size=size, radiance=folder))

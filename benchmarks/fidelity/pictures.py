@@ -1,0 +1,129 @@
+"""Pictures of every stage: input, EXP, NS, Full and the ground truth, side by side.
+
+The three situations that the paper shows: low light, high light, and a close shot out of focus.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from ae_env.scenes.reference_scenes import depth_photographs, reference_scenes
+from benchmarks.captures import clipped, psnr
+from benchmarks.fidelity.defocus import equal_exposure
+from benchmarks.fidelity.models import load_models
+from benchmarks.harness import RUNS, Row, data_root, table, write_picture
+from benchmarks.isolated import ROOT
+from simulator import CameraSettings, RawImage, get_camera, render_srgb
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+
+CAMERA = "nikon_z6"
+#: The published picture; a quick run leaves it alone.
+IMAGE = ROOT / "docs" / "images" / "simulator_stages.png"
+QUICK_IMAGE = RUNS / "simulator" / "simulator_stages.png"
+#: Height and width of the crops [packed pixel].
+CROP = 72
+COLUMNS = ("whole picture", "input", "EXP", "NS", "Full", "ground truth")
+#: By situation: scenes that can show it, of which the first that is there is taken, with the middle
+#: of the crop as a share of height and width; then ISO, f-number and exposure relative to incident
+#: light [EV] of input and target. Times are rounded to whole stops.
+CASES: dict[str, tuple[dict[str, tuple[float, float]], Any, Any]] = {
+    "low light": (
+        {"Desk": (0.75, 0.45), "chelsea-0": (0.4, 0.5)},
+        (6400, 4, -1.5),
+        (800, 4, 1.5),
+    ),
+    "high light": (
+        {"warehouse-090": (0.35, 0.7), "grass-0": (0.5, 0.5)},
+        (1600, 8, -2.0),
+        (100, 4, 0.0),
+    ),
+    "close shot": ({"motorcycle-front": (0.25, 0.72)}, (800, 11, 0.0), (100, 4, 0.0)),
+}
+
+
+def measure(seed: int, quick: bool) -> list[Row]:
+    """Draws the picture; one row per situation with its settings and PSNR."""
+    profile = get_camera(CAMERA)
+    scenes = {
+        scene.scene_id: scene
+        for scene in (
+            *reference_scenes("test", profile, number=0, radiance=data_root()),
+            *depth_photographs(profile, data=None),
+        )
+    }
+    figure = Figure(figsize=(13.0, 2.5 * len(CASES)), dpi=80, layout="constrained")
+    axes, rows = figure.subplots(len(CASES), len(COLUMNS), squeeze=False), []
+    for line, (case, (crops, source, target)) in zip(axes, CASES.items(), strict=True):
+        name = next(name for name in crops if name in scenes)
+        row, pictures = _photographed(scenes[name], source, target, seed)
+        rows.append({"part": "pictures", "case": case, **row})
+        _draw(line, rows[-1], pictures, crops[name])
+    write_picture(QUICK_IMAGE if quick else IMAGE, figure, colours=256)
+    return rows
+
+
+def _photographed(
+    scene: ReferenceScene, source_at: Any, target_at: Any, seed: int
+) -> tuple[Row, list[np.ndarray]]:
+    """Settings and PSNR, and the developed pictures (H, W, 3) in the order of `COLUMNS`."""
+    profile = get_camera(CAMERA)
+    camera = ReferenceCamera(profile)
+    settings = [_settings(scene, *wanted) for wanted in (source_at, target_at)]
+    captures = [camera.capture(scene, s, seed + i) for i, s in enumerate(settings)]
+    source = RawImage(captures[0].sample, settings[0], profile, white_balance=scene.white_balance)
+    stages = load_models().simulators["compact"].stages(source, settings[1], seed=seed + 2)
+    before = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
+    row: Row = {"scene": scene.scene_id, "illuminance": scene.illuminance}
+    row |= {"source": str(settings[0]), "target": str(settings[1])}
+    row["psnr_db"] = {k: psnr(clipped(v, profile), captures[1].mean) for k, v in before.items()}
+    sample = captures[1].sample
+    shown = (sample, source.data, stages.exposed, stages.denoised, stages.capture, sample)
+    return row, [_developed(data, source) for data in shown]
+
+
+def _settings(scene: ReferenceScene, iso: float, f_number: float, ev: float) -> CameraSettings:
+    right = equal_exposure(scene.reference, iso, f_number).exposure_time
+    return CameraSettings(iso, 2.0 ** round(math.log2(right) + ev), f_number)
+
+
+def _developed(data: torch.Tensor, like: RawImage) -> np.ndarray:
+    raw = RawImage(data, like.settings, like.camera, white_balance=like.white_balance)
+    # Light that lies at one place for all four planes: interpolation would colour its edges.
+    return render_srgb(raw, demosaic="half").permute(1, 2, 0).numpy()
+
+
+def _draw(axes: Any, row: Row, pictures: list[np.ndarray], middle: tuple[float, float]) -> None:
+    """One line: the whole picture with a frame, then the crop at every stage."""
+    top, left = (
+        min(max(round(share * n - CROP / 2), 0), n - CROP)
+        for share, n in zip(middle, pictures[0].shape[:2], strict=True)
+    )
+    crops = [picture[top : top + CROP, left : left + CROP] for picture in pictures[1:]]
+    for axis, picture, title in zip(axes, [pictures[0], *crops], COLUMNS, strict=True):
+        axis.imshow(picture, interpolation="nearest")
+        axis.set(xticks=[], yticks=[])
+        value = row["psnr_db"].get(title)
+        axis.set_title(title if value is None else f"{title}, {value:.1f} dB", fontsize=10)
+    axes[0].add_patch(Rectangle((left, top), CROP, CROP, fill=False, color="red", lw=1.5))
+    axes[0].set_ylabel(row["case"], fontsize=11)
+    axes[1].set_xlabel(row["source"], fontsize=8)
+    axes[-1].set_xlabel(row["target"], fontsize=8)
+
+
+def section(rows: list[Row]) -> list[str]:
+    """The picture and its figures."""
+    columns = {"situation": "{case}", "scene": "{scene}", "light [lux]": "{illuminance:g}"}
+    columns |= {"input": "{source}", "simulated": "{target}"}
+    return [
+        f"![Input, EXP, NS, Full and ground truth](../images/{IMAGE.name})",
+        f"Crops of {CROP} x {CROP} packed pixels, developed alike and not corrected for exposure; "
+        "Full with the target's noise, the ground truth a noisy capture. PSNR [dB] of the whole "
+        "picture before output noise, against the noise-free mean.",
+        table(rows, columns | {n: f"{{psnr_db[{n}]:.2f}}" for n in ("EXP", "NS", "Full")}),
+    ]

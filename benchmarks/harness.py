@@ -1,0 +1,344 @@
+"""One way to run a benchmark: parts in processes of their own, rows, a page with tables, plots.
+
+A benchmark is a module or a folder with a `Benchmark`, whose method `run` is what `ae-env bench`
+calls. It names its parts (`Part`); each part is a function that returns JSON values and runs in a
+fresh Python (`benchmarks.isolated`). A part that is done is kept on disk until the whole run is,
+so that a run that was stopped continues. A function of all results then writes the `Report`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import string
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from agents.cli.console import print_files, progress_bars
+from benchmarks.isolated import CORES, ROOT, isolated
+from simulator.utils.files import data_folder as data_root
+from simulator.utils.files import write_atomically
+from simulator.utils.results import result_meta, write_results
+
+Row = dict[str, Any]
+#: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function.
+Cell = str | Callable[[Row], object]
+#: Significant digits of numbers in result files.
+DIGITS = 6
+#: Folder of what unfinished runs have measured.
+RUNS = ROOT / "runs" / "bench"
+
+
+# -- parts ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Part:
+    """One piece of a benchmark, measured in a process of its own.
+
+    Args:
+        name: Key of its result.
+        task: Function of a module; takes and returns what JSON can hold.
+        arguments: Of `task`.
+        threads: Threads that torch and the kernels may use.
+        fresh_cache: Whether it finds nothing on disk that earlier runs computed.
+        timeout: Seconds after which it is stopped.
+        depends: Other things that its result depends on, such as checksums of weights.
+    """
+
+    name: str
+    task: Callable[..., Any]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    threads: int = CORES
+    fresh_cache: bool = False
+    timeout: float = 4 * 3600.0
+    depends: Mapping[str, Any] = field(default_factory=dict)
+
+    def run(self) -> Any:
+        """The result of `task`, of a process of its own."""
+        options: dict[str, Any] = {"fresh_cache": self.fresh_cache, "timeout": self.timeout}
+        return isolated(self.task, num_threads=self.threads, **options, **self.arguments)
+
+
+class FinishedParts:
+    """Results of parts on disk, one file each.
+
+    Args:
+        folder: Where they lie.
+        words: Values that all of them depend on besides the code.
+        code: Files and folders of the checkout whose code they depend on; a result counts for the
+            very same code only. Modules named ``report`` present results and do not count.
+    """
+
+    def __init__(self, folder: Path, *words: Any, code: Sequence[str] = ()) -> None:
+        files: list[Path] = []
+        for name in code:
+            path = ROOT / name
+            files += path.rglob("*.py") if path.is_dir() else [path.with_suffix(".py")]
+        checksum = 0
+        for path in sorted(file for file in files if file.stem != "report"):
+            checksum = zlib.crc32(path.read_bytes(), checksum)
+        self._folder, self._words = folder, [checksum, *words]
+
+    def get(self, name: str, measure: Callable[[], Any]) -> Any:
+        """The result under `name`: of an earlier run, or what `measure` returns."""
+        key = zlib.crc32(json.dumps([*self._words, name]).encode())
+        stem = "".join(c if c.isalnum() else "_" for c in name)[:48]
+        path = self._folder / f"{stem}-{key:08x}.json"
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # not there, or damaged
+            text = json.dumps(measure())
+        write_atomically(path, text)
+        return json.loads(text)
+
+    def forget(self) -> None:
+        """Removes all results, those of earlier code too: the next run measures everything."""
+        for path in self._folder.glob("*.json"):
+            path.unlink(missing_ok=True)
+
+
+# -- a benchmark ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Report:
+    """Result of a benchmark.
+
+    Args:
+        rows: Rows of the result file.
+        page: Blocks of the Markdown page below its heading; none for no page.
+        meta: Entries of the result file besides its origin.
+        figures: Pictures by file name beside the page (``"throughput.png"``), or by path.
+    """
+
+    rows: Sequence[Row]
+    page: Sequence[str] = ()
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    figures: Mapping[str | Path, Figure] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A measurement whose results are in ``docs/results``.
+
+    Args:
+        name: Of its command; files are named after it.
+        title: Heading of the page.
+        parts: ``parts(seed, quick)``: what is measured, in order.
+        report: ``report(results, meta)``: what is written, of the results by name of the part.
+        code: Files and folders of the checkout that its results depend on.
+        file: Stem of the files, if not `name`.
+    """
+
+    name: str
+    title: str
+    parts: Callable[..., Sequence[Part]]
+    report: Callable[[dict[str, Any], dict[str, Any]], Report]
+    code: Sequence[str]
+    file: str = ""
+
+    def run(self, out: Path, *, seed: int = 0, quick: bool = False, **options: Any) -> None:
+        """Measures what no earlier run has, and writes ``.json``, ``.md`` and pictures.
+
+        Args:
+            out: Folder of results.
+            seed: Of everything random.
+            quick: A short version, to see that everything runs.
+            options: Further arguments of `parts`.
+        """
+        words = [seed, quick, {name: str(value) for name, value in options.items()}]
+        finished = FinishedParts(RUNS / self.name, *words, code=self.code)
+        shown = "".join(f" --{name} {value}" for name, value in options.items())
+        command = f"ae-env bench {self.name}{shown}{' --quick' * quick}"
+        meta = result_meta(command, seed) | {"quick": quick}
+        parts = self.parts(seed, quick, **options)
+        results = {}
+        with progress_bars() as progress, progress(self.name) as task:
+            for number, part in enumerate(parts):
+                task(number, len(parts), part.name)
+                key = f"{part.name} {part.arguments} {part.depends}"
+                results[part.name] = finished.get(key, part.run)
+            task(1, 1)
+        stem = self.file or self.name
+        files = write_report(self.report(results, meta), out, stem, self.title, meta)
+        finished.forget()
+        print_files(files)
+
+
+def write_report(
+    report: Report, out: Path, stem: str, title: str, meta: Mapping[str, Any]
+) -> dict[str, Path]:
+    """Writes the files of a report; their paths by what they hold."""
+    rows, more = rounded(list(report.rows)), rounded(dict(report.meta))
+    files = {"numbers": write_results(out / f"{stem}.json", rows, {**meta, **more})}
+    for name, figure in report.figures.items():
+        path = name if isinstance(name, Path) else out / name
+        files[f"picture {path.stem}"] = write_picture(path, figure)
+    if report.page:
+        blocks = [f"# {title}", origin(meta), *report.page]
+        text = "\n\n".join(block.strip() for block in blocks if block.strip()) + "\n"
+        files["page"] = write_atomically(out / f"{stem}.md", text)
+    return files
+
+
+def origin(meta: Mapping[str, Any]) -> str:
+    """First block of a page: command, commit, date, seed, machine."""
+    machine, commit = meta["machine"], meta["commit"] or "unknown"
+    commit = commit[:12] + "+changes" * commit.endswith("+changes")
+    quick = " **A quick run: its numbers are rough.**" if meta.get("quick") else ""
+    return (
+        f"`{meta['command']}`, commit {commit}, {meta['date'][:10]}, seed {meta['seed']}, "
+        f"{machine['cpu']}, {machine['cores']} cores, GPU: {machine['gpu'] or 'none'}.{quick}"
+    )
+
+
+def rounded(value: Any) -> Any:
+    """`value` with numbers of `DIGITS` significant digits; None for numbers that are not finite.
+
+    >>> rounded({"a": [1 / 3, float("nan"), 10**9], "b": True})
+    {'a': [0.333333, None, 1000000000], 'b': True}
+    """
+    if isinstance(value, Mapping):
+        return {key: rounded(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [rounded(entry) for entry in value]
+    if isinstance(value, np.generic | np.ndarray):
+        return rounded(value.tolist())
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+    return value
+
+
+def write_picture(path: Path, figure: Figure, colours: int = 128) -> Path:
+    """Writes a figure as a PNG with a palette of at most 256 colours: a third of the size."""
+    from PIL import Image
+
+    buffer, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(buffer, format="png")
+    picture = Image.open(buffer).convert("RGB").quantize(colours, dither=Image.Dither.NONE)
+    picture.save(small, format="PNG", optimize=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return write_atomically(path, small.getvalue())
+
+
+def data_folder(name: str) -> Path:
+    """Sub-folder `name` of the folder of real files.
+
+    Raises:
+        FileNotFoundError: If it is not there.
+    """
+    root = data_root()
+    if root is None or not (root / name).is_dir():
+        raise FileNotFoundError(
+            f"there is no folder {name!r} of real files: set AE_ENV_DATA to the one that holds it"
+        )
+    return root / name
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+class _Format(string.Formatter):
+    """Formats of rows, in which ``{a[b]}`` is an entry of an entry; a missing one is None."""
+
+    def get_field(self, name: str, args: Any, kwargs: Any) -> Any:
+        try:
+            value, used = super().get_field(name, args, kwargs)
+        except (KeyError, IndexError, TypeError):
+            return _Missing(), name
+        return (_Missing() if value is None else value), used
+
+
+class _Missing:
+    """Stands for a value that is not there: its cell stays empty."""
+
+    def __format__(self, spec: str) -> str:
+        raise LookupError
+
+
+def cell(row: Row, content: Cell) -> str:
+    """Text of a cell; empty where a value of its format is missing or None.
+
+    >>> cell({"ms": 1.25, "error": None}, "{ms:.1f} ms"), cell({"error": None}, "{error:.2f}")
+    ('1.2 ms', '')
+    """
+    if callable(content):
+        value = content(row)
+        return "" if value is None else str(value)
+    try:
+        return _Format().vformat(content, (), row)
+    except LookupError:
+        return ""
+
+
+def table(rows: Iterable[Row], columns: Mapping[str, Cell]) -> str:
+    """A Markdown table with a line for each row; columns but the first are aligned to the right.
+
+    `columns` maps headings to content; columns that are empty in every row are left out.
+    """
+    rows = list(rows)
+    cells = {heading: [cell(row, content) for row in rows] for heading, content in columns.items()}
+    first = next(iter(columns))
+    cells = {h: column for h, column in cells.items() if h == first or any(column)}
+    head = [_line(cells), "|---|" + "--:|" * (len(cells) - 1)]
+    return "\n".join([*head, *(_line(line) for line in zip(*cells.values(), strict=True))])
+
+
+def pivot(
+    rows: Iterable[Row], *, line: tuple[str, Cell], columns: Cell, contents: Mapping[str, Cell]
+) -> str:
+    """A Markdown table with a line for each value of one thing and columns for those of another.
+
+    Args:
+        rows: Rows to show, one of each pair.
+        line: Heading of the first column, and name of a row's line.
+        columns: Name of a row's column, or group of columns.
+        contents: Content of each column of a group by its heading; an empty heading for one alone.
+    """
+    heading, named = line
+    rows, groups = list(rows), dict[str, None]()
+    lines: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        group = cell(row, columns)
+        groups[group] = None
+        lines.setdefault(cell(row, named), {}).setdefault(group, row)
+    shown: dict[str, Cell] = {heading: "{line}"}
+    for group in groups:
+        for name, content in contents.items():
+            shown[": ".join(filter(None, (group, name)))] = _of_group(group, content)
+    return table(({"line": name, "groups": own} for name, own in lines.items()), shown)
+
+
+def _of_group(group: str, content: Cell) -> Cell:
+    return lambda row: cell(row["groups"][group], content) if group in row["groups"] else ""
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """A Markdown list."""
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str]) -> list[str]:
+    """A heading of the third level and a block for each group of rows with the same title."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(cell(row, title), []).append(row)
+    return [block for name, own in groups.items() for block in (f"### {name}", show(own))]
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(text.replace('|', chr(92) + '|') for text in cells)} |"
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Lower quartile, median and upper quartile."""
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return float(low), float(middle), float(high)

@@ -1,0 +1,176 @@
+"""One side of a comparison of two checkouts: times what it is asked to, one case after another.
+
+A script that imports nothing of this package: the checkout that it measures is the one that
+``PYTHONPATH`` names, and an older one has other modules. It uses the public API alone. Requests
+come as lines of JSON on standard input, answers go as lines of JSON to standard output.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+import ae_env
+import simulator
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
+
+#: Steps of an episode; cases run whole episodes, so that resets have their share.
+_EPISODE = 8
+_CACHED = {"motion": "none", "depth": "far"}
+_SINE = {"lighting": "sine"}
+#: Name -> number of environments and arguments of the environment.
+STEPS: dict[str, tuple[int, dict[str, Any]]] = {
+    "steps, cached scene": (64, _CACHED),
+    "steps, motion and defocus": (64, {}),
+    "steps, cached scene, sine lighting": (64, _CACHED | _SINE),
+    "steps, motion and defocus, sine lighting": (64, _SINE),
+    "steps, cached scene, exact noise": (64, {"noise": "exact"} | _CACHED),
+    "steps, cached scene, linear observation": (64, {"observation": "linear"} | _CACHED),
+    "steps, motion and defocus, flicker": (64, {"lighting": "flicker"}),
+    "steps, one environment, cached scene": (1, _CACHED),
+    "steps, one environment, motion and defocus": (1, {}),
+}
+#: Name -> height and width of the raw, kind of noise, and what is repeated.
+SWEEPS: dict[str, tuple[int, str, str]] = {
+    f"sweep, {side} x {side}, {noise} noise{more}": (side, noise, kind)
+    for kind, more, sides in (
+        ("expose", "", (128, 256)),
+        ("simulate", ", state by state", (128,)),
+        ("blurred", ", prepared with motion and defocus", (128,)),
+    )
+    for side in sides
+    for noise in ("exact", "bank")
+}
+
+
+@dataclass
+class Case:
+    """One thing to time.
+
+    Args:
+        run: Makes `frames` frames.
+        frames: Environment steps, or sweeps, of one call.
+        first: Frames that two checkouts must agree on, made before anything is timed.
+    """
+
+    run: Callable[[], Any]
+    frames: int
+    first: np.ndarray
+
+    def time(self, seconds: float) -> dict[str, float]:
+        """Wall and processor time per frame [s], over `seconds` or a little more."""
+        begin, begin_cpu, calls = time.perf_counter(), time.process_time(), 0
+        while (elapsed := time.perf_counter() - begin) < seconds or not calls:
+            self.run()
+            calls += 1
+        frames = calls * self.frames
+        return {"wall": elapsed / frames, "cpu": (time.process_time() - begin_cpu) / frames}
+
+
+def _steps(num_envs: int, options: dict[str, Any]) -> Case:
+    """Steps of `num_envs` environments of 64 x 64 with random actions."""
+    make: dict[str, Any] = {"scenes": "bundled:small", "resolution": 64} | options
+    rng = np.random.default_rng(0)
+    if num_envs == 1:
+        env = gym.make("ae_env/AutoExposure-v0", **make)
+        for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
+            env.reset(seed=0, options={"scene": number})
+        frames = [env.reset(seed=1)[0]["raw"], *(env.step(a)[0]["raw"] for a in (0, 21, 42, 63))]
+
+        def episode() -> None:
+            env.reset()
+            for _ in range(_EPISODE):
+                env.step(rng.integers(64))
+
+        return Case(episode, _EPISODE, np.stack(frames))
+    make["autoreset_mode"] = "SAME_STEP"
+    envs = gym.make_vec("ae_env/AutoExposure-v0", num_envs=num_envs, **make)
+    scenes = len(envs.unwrapped.scenes)  # type: ignore[attr-defined]
+    for first in range(0, scenes, num_envs):  # everything that is computed once for a scene
+        chosen = [(first + i) % scenes for i in range(num_envs)]
+        envs.reset(seed=0, options={"scene": chosen})
+    frames = [envs.reset(seed=1)[0]["raw"]]
+    frames += [envs.step(np.full(num_envs, a))[0]["raw"] for a in (0, 21, 42, 63)]
+    envs.reset(seed=2)
+
+    def episodes() -> None:
+        for _ in range(_EPISODE):
+            envs.step(rng.integers(64, size=num_envs))
+
+    return Case(episodes, _EPISODE * num_envs, np.stack(frames))
+
+
+def _sweep(side: int, noise: Any, kind: str) -> Case:
+    """The 64 states of the default grid, of a raw of `side` x `side` packed pixels."""
+    raw, camera_simulator = _raw(side), CameraSimulator(device="cpu")
+    grid = [
+        CameraSettings(iso, seconds, f_number)
+        for iso in (100, 400, 1600, 6400)
+        for seconds in (1 / 1024, 1 / 128, 1 / 16, 1 / 2)
+        for f_number in (4, 5.6, 8, 11)
+    ]
+    prepared = camera_simulator.prepare(raw)
+
+    def expose() -> torch.Tensor:
+        return prepared.expose(grid, noise=noise)
+
+    def simulate() -> torch.Tensor:
+        return torch.stack(
+            [camera_simulator.simulate(raw, settings, noise=noise).data for settings in grid]
+        )
+
+    def blurred() -> torch.Tensor:
+        again = camera_simulator.prepare(raw, image_speed=0.2, defocus=6.0)
+        return again.expose(grid, noise=noise)
+
+    run = {"expose": expose, "simulate": simulate, "blurred": blurred}[kind]
+    return Case(run, 1, run().numpy())
+
+
+def _raw(side: int) -> RawImage:
+    """A smooth picture with the noise of ISO 400 on it."""
+    generator = torch.Generator().manual_seed(0)
+    coarse = torch.rand(1, 4, 9, 9, generator=generator)
+    light = torch.nn.functional.interpolate(coarse, (side, side), mode="bilinear")[0] * 0.3
+    camera, settings = get_camera("nikon_z6"), CameraSettings(400, 1 / 64, 8.0)
+    nlf = camera.nlf(settings.iso)
+    shot, read = (torch.tensor(values).view(4, 1, 1) for values in (nlf.shot, nlf.read))
+    noise = torch.randn(light.shape, generator=generator)
+    data = (light + (light * shot + read).sqrt() * noise).clamp(-0.05, 1.0)
+    return RawImage(data.contiguous(), settings, camera)
+
+
+def _answers(folder: Path) -> Iterator[dict[str, Any]]:
+    """An answer to every request: which packages run, or how long a case takes."""
+    cases: dict[str, Case] = {}
+    yield {"simulator": simulator.__file__, "ae_env": ae_env.__file__}
+    for line in sys.stdin:
+        request = json.loads(line)
+        name = request["case"]
+        if name not in cases:
+            cases[name] = _steps(*STEPS[name]) if name in STEPS else _sweep(*SWEEPS[name])
+            np.save(folder / "first.npy", cases[name].first)
+        yield cases[name].time(request["seconds"])
+
+
+def main() -> None:
+    """Answers until standard input ends; argument: threads, folder to write first frames to."""
+    torch.set_num_threads(int(sys.argv[1]))
+    answers = sys.stdout
+    with contextlib.redirect_stdout(sys.stderr):  # nothing else may come between the answers
+        for answer in _answers(Path(sys.argv[2])):
+            print(json.dumps(answer), file=answers, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""The plan's prediction against the measured distance to a full run; and what is left out.
+
+The distance of two captures is that of their distributions, given the scene: per pixel the mean m
+and the standard deviation s over source and target noise, as
+``sqrt(mean((dm)^2 + (ds)^2) / s_target^2)``, the 2-Wasserstein distance of two normal distributions
+in units of the target's noise. The scene is photographed several times; both runs get the same
+photographs. The noise that is added last is known in closed form and not drawn. What the finite
+number of photographs adds to a square is subtracted: from dm by the usual correction, from ds by
+multiplying the differences of two halves of the photographs. Pixels that are white in the scene at
+these settings count as equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from benchmarks.fidelity.models import load_models
+from benchmarks.harness import Row
+from benchmarks.isolated import timed
+from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
+from benchmarks.work_precision.trials import GRID, Trial, all_trials, source_settings, trials
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, RawImage
+from simulator.capture.sensor import exposed_light
+from simulator.noise.noise_level_function import noise_variance
+from simulator.noise.top_up import top_up_variance
+
+#: Photographs of each scene, and fair states of it; one more is any other of the grid.
+DRAWS, FAIR = 8, 3
+#: Standard deviations are pooled over squares of this side [pixel].
+_WINDOW = 9
+#: Light from here on is white in every capture: what differs above cannot show.
+_WHITE = 1.0 - 1e-6
+#: A measured distance counts as beyond the prediction from here on: rounding.
+_ROUNDING = 0.005
+
+
+def bound(seed: int, share: int, shares: int, quick: bool) -> list[Row]:
+    """One row per scene, state and tolerance, of every `shares`-th scene from `share` on."""
+    own, rows = load_models().simulators["compact"], []
+    known = trials((128, 128))[:3] if quick else all_trials()
+    for number, trial in list(enumerate(known))[share::shares]:
+        raws = [trial.raw(seed + 100 * number + i) for i in range(DRAWS)]
+        prepared = {
+            t: [own.prepare(raw, depth="unknown", tolerance=t) for raw in raws] for t in TOLERANCES
+        }
+        rest = [s for s in GRID if s not in trial.states()]
+        other = [rest[7 * number % len(rest)]] if rest else []
+        for settings in (*trial.states(1 if quick else FAIR), *other):
+            truth, target = trial.mean(settings), raws[0].camera.nlf(settings.iso)
+            light = torch.stack([own.stages(raw, settings).light for raw in raws])
+            full = _Draws(light, noise_variance(light, target))
+            # White in both captures, whatever its light: no difference of theirs can show.
+            shows = torch.where(truth < _WHITE, noise_variance(truth, target), torch.inf)
+            for tolerance in TOLERANCES:
+                plan = prepared[tolerance][0].plan(settings)
+                pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
+                planned = _Draws(*(torch.stack(own) for own in zip(*pairs, strict=True)))
+                distance, error = planned.distance(full, shows)
+                limit = float(plan.predicted_difference)
+                row: Row = {
+                    "part": "bound",
+                    "scene": trial.scene.scene_id,
+                    "source": str(trial.source),
+                }
+                row |= {"settings": str(settings), "tolerance": tolerance, "measured": distance}
+                row |= {"predicted_error": float(plan.predicted_error)}
+                row |= {"predicted_difference": limit}
+                broken = distance**2 - 2.0 * error > (limit + _ROUNDING) ** 2
+                rows.append(row | {"violated": broken})
+    return rows
+
+
+def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Tensor, Tensor]:
+    """Light (4, H, W) of a planned capture, and the variance that is added to it."""
+    exposure = prepared.exposure(settings)
+    light = exposed_light(prepared.blurred_light.blurred(exposure), exposure)
+    return light, top_up_variance(
+        light, exposure.source_noise, exposure.target, exposure.remaining_variance
+    )[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """Captures of one scene at the same settings before their noise is drawn.
+
+    Args:
+        light: (K, 4, H, W) light of each photograph's capture.
+        added: (K, 4, H, W) variance of the noise that is added to it.
+    """
+
+    light: Tensor
+    added: Tensor
+
+    def deviation(self) -> Tensor:
+        """(4, H, W) standard deviation of the capture, pooled over a neighbourhood."""
+        variance = _variance(self.light.double()) + self.added.double().mean(dim=0)
+        padded = F.pad(variance[None], (_WINDOW // 2,) * 4, mode="reflect")
+        return F.avg_pool2d(padded, _WINDOW, stride=1)[0].clamp(min=0.0).sqrt()
+
+    def distance(self, other: _Draws, variance: Tensor) -> tuple[float, float]:
+        """Distance to `other`, of the same photographs, and the standard error of its square."""
+        count = len(self.light)
+        difference = self.light.double() - other.light.double()
+        spread = _variance(difference) / variance
+        means = difference.mean(dim=0).square() / variance - spread / count
+        first, second = (
+            _Draws(self.light[half], self.added[half]).deviation()
+            - _Draws(other.light[half], other.added[half]).deviation()
+            for half in (slice(0, None, 2), slice(1, None, 2))
+        )
+        square = float((means + first * second / variance).mean())
+        pairs = count * (count - 1) / 2
+        error = float((spread.square().mean() / (pairs * spread.numel())).sqrt())
+        return max(0.0, square) ** 0.5, error
+
+
+def _variance(draws: Tensor) -> Tensor:
+    """Variance over the first dimension; torch's own takes twenty times as long there."""
+    return (draws - draws.mean(dim=0)).square_().sum(dim=0) / (len(draws) - 1)
+
+
+# -- what is left out -----------------------------------------------------------------------------
+
+#: Scenes of a kind, runs of each sweep, and states of a full run that are timed of each scene.
+SCENES, REPEATS, FULL_STATES = 3, 5, 8
+_ORDINARY = ("dead_leaves", "indoor", "photograph")
+#: By kind of scene: what is photographed, ISO and exposure relative to incident light [EV] of the
+#: source, None for the scene's own clean light, and what the simulator is told. The close-up's disc
+#: is given at f/4 [pixel], the speed of what moves in frame heights per second.
+KINDS: dict[str, tuple[Sequence[str], tuple[float, float] | None, dict[str, Any]]] = {
+    "radiance map": (("radiance",), None, {"depth": "unknown"}),
+    "clean raw": (("photograph",), (100, 0.0), {"depth": "unknown"}),
+    "noisy raw": (_ORDINARY, (6400, -2.0), {"depth": "unknown"}),
+    "flat scene": (("dead_leaves", "indoor", "radiance"), (400, 0.0), {"depth": "far"}),
+    "close-up, disc known": (_ORDINARY, (400, 0.0), {"defocus": 4.0}),
+    "close-up, depth unknown": (("depth",), (400, 0.0), {"depth": "unknown"}),
+    "moving scene": (_ORDINARY, (400, 0.0), {"image_speed": 0.125}),
+}
+
+
+def left_out(kind: str, seed: int, quick: bool) -> Row:
+    """Share of the 64 states that run each module, and the time of a sweep, of a kind of scene."""
+    own, names, (scenes, taken, told) = simulator("compact"), dict[str, float](), KINDS[kind]
+    known = [t for t in all_trials() if t.scene.kind in scenes]
+    known = known or [t for t in all_trials() if t.scene.depth is None]
+    predicted, times, every = [], [], []
+    examples = [_source(t, taken, seed) for t in known[: 1 if quick else SCENES]]
+    for source in examples:
+
+        def prepared(source: Any = source) -> PreparedScene:
+            return own.prepare(source, tolerance=DEFAULT, **told)
+
+        for plan in map(prepared().plan, GRID):
+            for step in plan.steps:
+                share = int(step.runs) / (len(examples) * len(GRID))
+                names[step.name] = names.get(step.name, 0.0) + share
+            predicted.append(float(plan.predicted_difference))
+        some = [GRID[(i * len(GRID) // FULL_STATES + i) % len(GRID)] for i in range(FULL_STATES)]
+        for _ in range(1 if quick else REPEATS):
+            times.append(timed(lambda p=prepared: p().expose(GRID)))  # type: ignore[misc]
+            every += [
+                timed(lambda s=source, x=x: own.simulate(s, x, tolerance=None, **told))  # type: ignore[misc]
+                for x in some
+            ]
+    sweep, full = 1e3 * float(np.median(times)), 1e3 * float(np.mean(every)) * len(GRID)
+    row = {"part": "left_out", "kind": kind, "scenes": len(examples), "share": names}
+    row |= {"predicted_mean": float(np.mean(predicted)), "predicted_largest": max(predicted)}
+    return row | {"ms_per_sweep": sweep, "full_ms_per_sweep": full, "times": full / sweep}
+
+
+def _source(trial: Trial, taken: tuple[float, float] | None, seed: int) -> RawImage | PreparedScene:
+    if taken is not None:
+        return replace(trial, source=source_settings(trial.scene, *taken)).raw(seed)
+    scene, clean = trial.scene, NoiseLevelFunction.zero()
+    return PreparedScene(scene.light, scene.reference, trial.camera.camera, clean)

@@ -1,0 +1,62 @@
+"""Light and exposures far beyond any camera's: captures against exact float64 arithmetic."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
+
+CAMERA = get_camera("nikon_z6")
+CLEAN = replace(CAMERA, nlf_by_iso={100.0: NoiseLevelFunction.zero()}, segments=())
+REFERENCE = CameraSettings(iso=100.0, exposure_time=1.0, f_number=4.0)
+STOPS = (-30.0, -10.0, -1.0, 0.0, 1.0, 10.0, 30.0)
+#: `STOPS` brighter than the reference, shared out to ISO and shutter.
+STATES = [CameraSettings(100.0 * 2 ** (s / 2), 2 ** (s / 2), 4.0) for s in STOPS]
+SHAPE = (4, 48, 48)
+
+
+def hot_pixel() -> torch.Tensor:
+    light = torch.zeros(SHAPE)
+    light[:, 24, 24] = 1e6
+    return light
+
+
+SIGNALS = {
+    "zero": torch.zeros(SHAPE),
+    "one digital number": torch.ones(SHAPE) / torch.tensor(CAMERA.span)[:, None, None],
+    "as dark as black goes": -torch.tensor(CAMERA.pedestal)[:, None, None].expand(SHAPE),
+    "white": torch.ones(SHAPE),
+    "hot pixel": hot_pixel(),
+    "checkerboard": (torch.arange(48)[:, None] + torch.arange(48)).remainder(2).expand(SHAPE),
+    "30 stops": torch.from_numpy(2.0 ** np.random.default_rng(0).uniform(-30, 0, SHAPE)),
+    "light of 1e6": torch.full(SHAPE, 1e6),
+}
+
+
+def captures(light: torch.Tensor) -> np.ndarray:
+    prepared = PreparedScene(
+        light.float().contiguous(), REFERENCE, CLEAN, NoiseLevelFunction.zero()
+    )
+    return prepared.expose(STATES).double().numpy()
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_extreme_signals_are_recorded_to_half_a_digital_number(name: str) -> None:
+    light = SIGNALS[name].float().double().numpy()
+    span, black = (np.array(v)[:, None, None] for v in (CAMERA.span, CAMERA.black_level))
+    for stops, frame in zip(STOPS, captures(SIGNALS[name]), strict=True):
+        exact = np.clip(light * 2.0**stops * span + black, 0.0, CAMERA.white_level)
+        # Rounding to whole numbers, and float32 products of numbers of 14 bits.
+        assert np.abs(frame * span + black - exact).max() <= 0.5 + 4 * 2.0**-24 * 2**14
+
+
+def test_more_light_never_gives_less_from_below_black_to_2_to_the_30() -> None:
+    dark = -(2.0 ** torch.linspace(-4, -30, 500))
+    levels = torch.cat([dark, torch.zeros(1), 2.0 ** torch.linspace(-30, 30, 1803)])
+    frames = captures(levels.reshape(1, 48, 48).expand(SHAPE)).reshape(len(STOPS), 4, -1)
+    assert (np.diff(frames, axis=-1) >= 0).all()
+    assert np.isfinite(frames).all()
