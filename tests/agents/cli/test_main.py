@@ -76,7 +76,7 @@ def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
         (("quickstart", "--scenes", "empty.dng"), "must hold raws"),
         (("train", "none.yaml"), "there is no such file"),
         (("train", "wrong.yaml"), "training.frame (=3): unknown, the entries"),
-        (("train", "agent.yaml", "--seed", 2**40), "`seed` (=1099511627776) must be in"),
+        (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
