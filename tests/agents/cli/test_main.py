@@ -136,20 +136,6 @@ def test_policies_that_fail(ae_env, tmp_path: Path, name: str, status: int, mess
     assert "own.py:" in error
 
 
-def test_a_scorer_that_fails_in_a_training(ae_env, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "failing_scorer.py").write_text(
-        "class Mine:\n    domain = 'raw'\n    def __call__(self, *_):\n        return 1 / 0\n"
-    )
-    (tmp_path / "a.yaml").write_text(
-        "agent: regression\nnum_envs: 2\ntraining: {frames: 4}\nenvironment: "
-        "{scenes: 'bundled:small', resolution: 36, scorer: 'failing_scorer:Mine'}\n"
-    )
-    code, _, error = ae_env("train", "a.yaml")
-    assert code == 1
-    assert error == "error scorer 'Mine' raised ZeroDivisionError: division by zero\n"
-
-
 @pytest.mark.parametrize(
     ("raised", "status", "message"),
     [

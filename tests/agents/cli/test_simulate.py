@@ -119,16 +119,9 @@ def test_networks_run_once_for_a_raw(
         (("--depth", "near", "--weights", "none"), "`depth` (='near') must be one of"),
     ],
 )
-def test_errors_of_simulated(ae_env, noisy: Path, options, message: str, tmp_path: Path) -> None:
+def test_errors_of_simulate(ae_env, noisy: Path, options, message: str, tmp_path: Path) -> None:
     code, _, error = simulated(ae_env, noisy, *options)
     assert code == 2
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out.dng").exists()
-
-
-def test_a_baseline_cannot_simulated(ae_env, noisy: Path, tmp_path: Path) -> None:
-    save_modules(tmp_path / "pc", build_modules("pc"), "pc", {})
-    code, _, error = simulated(ae_env, noisy, "--weights", tmp_path / "pc.safetensors")
-    assert code == 2
-    assert "holds the baseline 'pc'" in error
