@@ -61,21 +61,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_settings_are_replayed_in_the_order_of_names(context, photograph, folder):
-    policy = make_policy(f"recorded:{folder}", context)
-    assert policy.name == f"recorded:{folder}"
-    frame = photograph(np.ones((64, 64)), 9.0, [0, 1])
-    for _ in range(2):  # a second episode begins anew
-        policy.reset(2)
-        path = [policy.act(frame) for _ in range(5)]
-        assert all(states[0] == states[1] for states in path)
-        found = [context.grid[int(states[0])] for states in path]
-        # The first decision exposes frame 1: frame 0 is the one that a reset returns.
-        assert (found[0].iso, found[0].exposure_time, found[0].f_number) == SETTINGS[1]
-        assert (found[1].exposure_time, found[1].f_number) == (1 / 15, 11.0)
-        assert found[1] == found[2] == found[3] == found[4]
-
-
 @pytest.mark.parametrize("delay", [0, 1])
 def test_a_recording_is_replayed_on_its_own_raws(folder, delay):
     """Every frame of the sequence is shot at the settings that its raw was recorded at."""

@@ -50,12 +50,6 @@ def test_bad_names_say_what_is_wrong(context, name, message):
         make_policy(name, context)
 
 
-@pytest.mark.parametrize("name", [3, None, ["spot"], b"spot"])
-def test_what_is_no_name_is_refused(context, name):
-    with pytest.raises(ValueError, match=r"`policy` \(=.*must be a name, such as 'matrix:P'"):
-        make_policy(name, context)
-
-
 def test_options_in_a_name(context):
     policy = make_policy("centre_weighted:P?compensation=-1&damping=0.5&shutter_cap=1/60", context)
     assert policy.name == "centre_weighted:P?compensation=-1&damping=0.5&shutter_cap=1/60"

@@ -116,39 +116,7 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     assert code == 0
     again = json.loads((folder / "results.json").read_text())
     assert again["rows"] == content["rows"]  # even times: nothing was run
-    code, _, _ = ae_env("evaluate", "--preset", preset, "--out", "second")
-    other = json.loads((tmp_path / "second" / "results.json").read_text())
-    for first, second in zip(content["rows"], other["rows"], strict=True):
-        first.pop("ms_per_decision"), second.pop("ms_per_decision")
-        assert first == second
-
-
-def test_options_end_to_end(ae_env, tmp_path: Path) -> None:
-    code, text, _ = ae_env(
-        *("evaluate", "--policy", "random", "--policy", "centre_weighted:P"),
-        *("--scenes", "bundled:small", "--resolution", 36, "--frames", 4, "--out", "result"),
-    )
-    assert code == 0
-    assert "centre_weighted:P" in text
-    folder = tmp_path / "result"
-    names = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html"}
-    names |= {"scores.png", "ev_error.png", "cost.png", "contact_sheet.png", "parts"}
-    assert {path.name for path in folder.iterdir()} == names
-    content = json.loads((folder / "results.json").read_text())
-    assert set(content) == {"meta", "rows"}
-    assert content["meta"]["command"].startswith("ae-env evaluate --policy random")
+    assert [list(row) for row in content["rows"]] == [COLUMNS] * len(content["rows"])
     assert {"commit", "seed", "date", "machine", "versions"} <= set(content["meta"])
-    for row in content["rows"]:
-        assert list(row) == COLUMNS
-        assert (row["source"], row["split"]) == ("bundled:small", "test")
-    scores = {
-        row["policy"]: row["normalised_score"]
-        for row in content["rows"]
-        if row["condition"] == "all"
-    }
-    assert scores["random"] < 0.2 < scores["centre_weighted:P"] < 1.0
-    with (folder / "scenes.csv").open() as stream:
-        assert len(list(csv.reader(stream))) > 10
-    assert "centre_weighted:P" in (folder / "report.md").read_text()
     with Image.open(folder / "scores.png") as picture:
         assert min(picture.size) > 100

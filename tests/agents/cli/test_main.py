@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 import runpy
 from pathlib import Path
@@ -76,7 +75,7 @@ def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
         (("quickstart", "--scenes", "empty.dng"), "must hold raws"),
         (("train", "none.yaml"), "there is no such file"),
         (("train", "wrong.yaml"), "training.frame (=3): unknown, the entries"),
-        (("train", "agent.yaml", "--seed", 2**40), "`seed` (=1099511627776) must be in"),
+        (("train", "agent.yaml", "--seed", 2**40), "seed (=1099511627776): Input should be"),
         (("train", "agent.yaml", "--out", "/proc/a"), "`out` (='/proc/a.json') cannot be written"),
         (("train-simulator", "agent.yaml"), "agent (='ppo'): unknown"),
         (("bench", "thruput"), "did you mean 'throughput'?"),
@@ -137,26 +136,11 @@ def test_policies_that_fail(ae_env, tmp_path: Path, name: str, status: int, mess
     assert "own.py:" in error
 
 
-def test_a_scorer_that_fails_in_a_training(ae_env, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "failing_scorer.py").write_text(
-        "class Mine:\n    domain = 'raw'\n    def __call__(self, *_):\n        return 1 / 0\n"
-    )
-    (tmp_path / "a.yaml").write_text(
-        "agent: regression\nnum_envs: 2\ntraining: {frames: 4}\nenvironment: "
-        "{scenes: 'bundled:small', resolution: 36, scorer: 'failing_scorer:Mine'}\n"
-    )
-    code, _, error = ae_env("train", "a.yaml")
-    assert code == 1
-    assert error == "error scorer 'Mine' raised ZeroDivisionError: division by zero\n"
-
-
 @pytest.mark.parametrize(
     ("raised", "status", "message"),
     [
         (OSError(28, "No space left on device"), 1, "error [Errno 28] No space left on device"),
         (RuntimeError("out of\nmemory"), 1, "error RuntimeError: out of memory; `ae-env --debug`"),
-        (ImportError("needs: pip install x"), 1, "error needs: pip install x"),
         (FileNotFoundError(2, "No such file", "a.dng"), 2, "No such file: 'a.dng'"),
     ],
 )
@@ -169,16 +153,6 @@ def test_failures_while_running(ae_env, dng, monkeypatch, raised, status, messag
     assert code == status
     assert error.count("\n") == 1
     assert message in error
-
-
-def test_unwritable_folder(ae_env, dng: Path, tmp_path: Path, monkeypatch) -> None:
-    def refuse(*args: object, **kwargs: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", refuse)  # root may write anywhere
-    code, _, error = ae_env("sweep", dng, "--out", "locked")
-    assert code == 2
-    assert "`out` (='locked') cannot be written: Permission denied" in error
 
 
 @pytest.mark.parametrize(
@@ -197,14 +171,6 @@ def test_usage_errors(ae_env, arguments: tuple[str, ...]) -> None:
     code, _, error = ae_env(*arguments)
     assert code == 2
     assert "Usage: ae-env" in error
-
-
-def test_debug_shows_the_traceback(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
-    monkeypatch.setattr("sys.argv", ["ae-env", "--debug", "sweep", "none.dng"])
-    with pytest.raises((ValueError, FileNotFoundError)):
-        cli.main()
 
 
 def test_ctrl_c(ae_env, dng: Path, monkeypatch) -> None:

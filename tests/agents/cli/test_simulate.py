@@ -111,35 +111,6 @@ def test_networks_run_once_for_a_raw(
     assert first == second
 
 
-def test_simulate_within_a_tolerance(ae_env, noisy: Path, networks: Path, tmp_path: Path) -> None:
-    """A target as noisy as the source: denoised only where nothing is to be left in."""
-    written = {}
-    for tolerance in (0, 0.1):
-        options = ("--weights", networks, "--tolerance", tolerance, "--shutter", "1/100")
-        code, text, _ = simulated(ae_env, noisy, *options, iso=6400)
-        assert code == 0
-        assert f"(tolerance {tolerance})" in text
-        assert ("runs      exposure -> noise_reduction" in text) == (tolerance == 0)
-        simulator = CameraSimulator.from_pretrained(networks, device="cpu")
-        settings = CameraSettings(6400, 1 / 100, 8)
-        expected = simulator.simulate(read_raw(noisy), settings, tolerance=tolerance).data
-        written[tolerance] = read_raw(tmp_path / "out.dng").data
-        torch.testing.assert_close(written[tolerance], expected, atol=1e-6, rtol=0)
-    assert not torch.equal(written[0], written[0.1])
-
-
-def test_simulate_with_unknown_depth(ae_env, noisy: Path, networks: Path, tmp_path: Path) -> None:
-    code, text, _ = simulated(
-        ae_env, noisy, "--weights", networks, "--depth", "unknown", aperture=4
-    )
-    assert code == 0
-    assert re.search(r"runs .*noise_reduction -> aperture", text)
-    blurred = read_raw(tmp_path / "out.dng").data
-    simulated(ae_env, noisy, "--weights", networks, aperture=4)
-    sharp = read_raw(tmp_path / "out.dng").data
-    assert blurred.diff(dim=-1).abs().mean() < 0.9 * sharp.diff(dim=-1).abs().mean()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -148,16 +119,9 @@ def test_simulate_with_unknown_depth(ae_env, noisy: Path, networks: Path, tmp_pa
         (("--depth", "near", "--weights", "none"), "`depth` (='near') must be one of"),
     ],
 )
-def test_errors_of_simulated(ae_env, noisy: Path, options, message: str, tmp_path: Path) -> None:
+def test_errors_of_simulate(ae_env, noisy: Path, options, message: str, tmp_path: Path) -> None:
     code, _, error = simulated(ae_env, noisy, *options)
     assert code == 2
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "out.dng").exists()
-
-
-def test_a_baseline_cannot_simulated(ae_env, noisy: Path, tmp_path: Path) -> None:
-    save_modules(tmp_path / "pc", build_modules("pc"), "pc", {})
-    code, _, error = simulated(ae_env, noisy, "--weights", tmp_path / "pc.safetensors")
-    assert code == 2
-    assert "holds the baseline 'pc'" in error

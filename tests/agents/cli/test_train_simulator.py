@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from pathlib import Path
 
@@ -61,19 +60,6 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert card["command"] == "ae-env train-simulator tiny.yaml --device cpu"
     assert [stage["steps"] for stage in card["stages"].values()] == [2, 2, 2]
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
-
-
-def test_options_of_a_training(ae_env, tmp_path: Path) -> None:
-    (tmp_path / "pc.yaml").write_text(
-        "preset: pc\nscenes: {procedural: 2, size: 32}\nbaseline: {steps: 1, batch: 2, crop: 16}\n"
-    )
-    arguments = ("pc.yaml", "--out", "here", "--seed", 5, "--no-tensorboard", "--device", "cpu")
-    code, text, _ = ae_env("train-simulator", *arguments)
-    assert code == 0
-    assert "next:" not in text  # a baseline simulates nothing
-    names = {p.name for p in (tmp_path / "here").iterdir()}
-    assert names == {"baseline.checkpoint", "pc.json", "pc.safetensors"}
-    assert json.loads((tmp_path / "here" / "pc.json").read_text())["training"]["seed"] == 5
 
 
 def config(**scenes: object) -> SimulatorConfig:

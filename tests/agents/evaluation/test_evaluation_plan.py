@@ -9,7 +9,6 @@ from agents.evaluation.evaluation_plan import (
     Condition,
     EvaluationPlan,
     digest,
-    groups_in_turn,
     load_plan,
     plan_episodes,
     plan_scenes,
@@ -106,11 +105,3 @@ def test_episodes_of_another_start_share_everything_but_the_start():
     assert episodes.seeds[5] == 7 * 2**20
     assert episodes.starts[:10] != episodes.starts[10:]
     assert episodes.scene.tolist() == [0, 1, 2, 3, 4] * 4
-
-
-def test_fewer_scenes_take_kinds_and_groups_in_turn():
-    scenes = plan_scenes(PLAN.changed(max_scenes=None))
-    kinds = {scene.kind for scene in scenes}
-    few = groups_in_turn(scenes, len(kinds))
-    assert {scene.kind for scene in few} == kinds
-    assert [s.scene_id for s in few] == [s.scene_id for s in scenes if s in few]

@@ -74,6 +74,9 @@ def test_overshoot_and_reversals(evs, over, turns):
     evs = np.array([evs], float)
     np.testing.assert_allclose(metrics.overshoot(evs), [over], atol=1e-12)
     assert metrics.reversals(evs).tolist() == [turns]
+    seeds = np.stack([evs, evs])  # (K, E, T)
+    np.testing.assert_allclose(metrics.overshoot(seeds), [[over]] * 2, atol=1e-12)
+    assert metrics.reversals(seeds).tolist() == [[turns]] * 2
 
 
 def test_convergence_after_a_step_counts_from_the_step():
@@ -103,7 +106,7 @@ def test_convergence_after_a_step_counts_from_the_step():
     ],
 )
 def test_settling_is_the_frame_after_the_last_change(light, since):
-    scores = np.array(light, float)[None, :, None] * np.array([0.1, 0.2])
+    scores = np.array(light, float)[None, :, None] * np.array([0.0, 0.2])  # one state stays
     assert metrics.settling(scores).tolist() == [since]
 
 
@@ -148,6 +151,8 @@ def test_flicker_counts_frames_of_the_same_light_only():
     np.testing.assert_allclose(metrics.flicker(means, np.array([True])), [0.4 / 3, 0.0])
     static = np.array([[True, True, False], [False, False, False]])
     np.testing.assert_allclose(metrics.flicker(means, static), [0.05, 0.0])
+    once = metrics.flicker(np.stack([means, means]), np.array([False, False, True]))
+    np.testing.assert_allclose(once, [[0.3, 0.0]] * 2)
 
 
 def test_delayed_oracle_acts_on_what_it_saw_earlier():

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.evaluation import engine, plan_run
+from agents.evaluation import engine
 from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
-from agents.evaluation.plan_run import StoredRun, run_plan
+from agents.evaluation.plan_run import run_plan
 
 STEP = Condition(lighting={"kind": "step", "stops": 4, "at": 3})
 PLAN = EvaluationPlan(
@@ -129,12 +129,3 @@ def test_mistakes_are_told_before_any_work(tmp_path):
         with pytest.raises(ValueError, match=message):
             run_plan(PLAN.changed(**entries), tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-def test_keys_change_with_the_plan_and_not_with_who_runs(tmp_path):
-    keys = set()
-    for entries in ({}, {"frames": 9}, {"seeds": (1,)}, {"max_scenes": 4}, {"policies": ("spot",)}):
-        run = StoredRun(PLAN.changed(**entries), tmp_path)
-        keys.add(run.light_key(Condition()))
-    assert len(keys) == 4
-    assert plan_run.TRACK_ARRAYS[0] == "states"

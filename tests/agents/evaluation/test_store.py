@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from agents.evaluation.store import EvaluationStore, file_content, part_key, policy_content
+from agents.evaluation.store import EvaluationStore, part_key, policy_content
 
 ARRAYS = {"x": np.arange(300).reshape(3, 100), "y": np.linspace(0.0, 1.0, 50)}
 
@@ -88,13 +88,3 @@ def test_modules_beside_a_file_count_and_nothing_else(tmp_path):
     assert policy_content(f"{file}:Mine") != before
     assert policy_content("matrix:P") == ""
     assert policy_content("ppo") != policy_content("regression")
-
-
-def test_files_of_scorers_and_lightings_count(tmp_path):
-    file = tmp_path / "mine.py"
-    for spec in (f"{file}:Half", {f"{file}:Half": 1.0}, {"kind": "schedule", "file": str(file)}):
-        file.write_text("1")
-        before = file_content(spec)
-        file.write_text("2")
-        assert file_content(spec) != before
-    assert file_content(None) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 from typing import Any
 
 import numpy as np
@@ -30,22 +29,6 @@ RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
 
 def _reading(ev, saturated=0.0, black=False):
     return Reading(np.array([ev]), np.array([saturated]), np.array([black]))
-
-
-@pytest.mark.parametrize("compensation", [0.0, 3.0])
-def test_damping_does_not_wind_up_in_the_dark(compensation):
-    """A range of 0 to 10: of 40 frames that read -9, at most the last one counts beyond it."""
-    tracker = EVTracker(1, (0.0, 10.0), 0.5, compensation)
-
-    def read(ev):
-        return Reading(np.array([ev]), np.zeros(1), np.zeros(1, bool))
-
-    for _ in range(40):
-        tracker.update(read(-9.0))
-    low = compensation
-    # 0.5 * -9 + 0.5 * low in the dark; that is clipped to low, and half of the way to 8 is left.
-    assert tracker.damped[0] == pytest.approx(0.5 * (low - 9.0))
-    assert tracker.update(read(8.0))[0] == pytest.approx(0.5 * (low + 8.0))
 
 
 def test_tracker_jumps_far_averages_near_and_respects_bounds():
@@ -180,28 +163,6 @@ def test_a_policy_that_was_not_reset_says_so(context, photograph):
             policy.act(frame)
 
 
-def test_p_keeps_a_state_while_the_sensors_waver(context):
-    """Of two states of one exposure the better one may change with every look at the motion."""
-    policy = make_policy("average:P", context)
-
-    def choose(speed):
-        readings = np.array([[7.0, speed, -1.0]])
-        return int(policy._program_utility(readings).argmax())
-
-    policy.reset(1)
-    speeds = np.arange(-8.0, 3.0, 0.01)
-    chosen = [choose(speed) for speed in speeds]
-    borders = [s for s, (a, b) in zip(speeds, itertools.pairwise(chosen), strict=False) if a != b]
-    assert len(borders) >= 2
-    for border in borders:
-        policy.reset(1)
-        path = []
-        for k in range(6):
-            path.append(choose(border + (0.02 if k % 2 else -0.02)))
-            policy._previous = np.array(path[-1:])
-        assert len(set(path)) == 1
-
-
 # -- with the environment -------------------------------------------------------------------------
 
 
@@ -265,20 +226,6 @@ def test_comes_to_rest_after_a_step_with_delay(name, stops):
     end = 5.6 if name == "rpi_agc" else grid.ev100.min() + 0.6  # of its ladder
     inside = (after > end) & (after < grid.ev100.max() - 0.6)
     assert np.median((after - before)[inside]) == pytest.approx(stops, abs=1.5)
-
-
-@pytest.mark.parametrize("name", ["centre_weighted", "rpi_agc"])
-def test_damped_controllers_converge_on_whole_stops(name):
-    """A controller that took its EV back from the settings would stay: its first step is short."""
-    lighting = (("kind", "step"), ("stops", -3.0), ("at", 6))
-    grid, damped, _ = _loop(f"{name}:P?damping=0.9", 90, lighting=lighting)
-    _, free, _ = _loop(f"{name}:P", 90, lighting=lighting)
-    ev_damped, ev_free = grid.ev100[damped], grid.ev100[free]
-    assert np.abs(ev_damped[:, -1] - ev_free[:, -1]).max() < 1.1
-    assert np.mean(np.abs(ev_damped[:, -1] - ev_free[:, -1]) < 0.1) > 0.6
-    # 3 EV * 0.9^n falls below half a stop after 17 frames.
-    late = np.abs(ev_damped[:, 12] - ev_damped[:, 5]) <= 2.1
-    assert late.mean() > 0.9
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

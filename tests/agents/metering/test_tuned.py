@@ -33,14 +33,6 @@ def test_outside_the_training_range_it_does_not_extrapolate():
     assert ((far > -0.2) & (far < 1.2)).all()
 
 
-def test_in_a_gap_between_samples_it_falls_back_to_the_mean():
-    rng = np.random.default_rng(0)
-    features = np.concatenate([rng.uniform(-9, -8, (300, 1)), rng.uniform(8, 9, (300, 1))])
-    scores = np.repeat(np.eye(2), 300, axis=0)
-    found = ScoreRegression(features, scores, np.array([0.5])).predict(np.zeros((1, 1)))
-    np.testing.assert_allclose(found, [[0.5, 0.5]], atol=1e-3)
-
-
 def test_fit_picks_nearly_the_best_state_of_unseen_samples():
     model = ScoreRegression.fit(*_samples())
     features, scores, _ = _samples(seed=7)

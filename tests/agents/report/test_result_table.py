@@ -17,7 +17,6 @@ from agents.report.result_table import (
     ranking_rows,
     scenes_csv,
     training_seed_rows,
-    weighted_quantile,
 )
 from tests.agents.report.results import COLUMNS, made_result
 
@@ -100,11 +99,3 @@ def test_training_seed_rows_average_to_the_policys_score():
     ppo = next(r for r in result_rows(result, resamples=10) if r["policy"] == "ppo")
     mean = np.mean([r["normalised_score"] for r in rows])
     assert mean == pytest.approx(ppo["normalised_score"])
-
-
-def test_weighted_quantile_of_equal_weights_is_a_plain_one():
-    values = np.random.default_rng(0).normal(size=101)
-    weights = np.full(101, 1 / 101)
-    for q in (0.05, 0.5, 0.95):
-        expected = np.quantile(values, q, method="inverted_cdf")
-        assert weighted_quantile(values, weights, q) == pytest.approx(expected)
