@@ -89,7 +89,7 @@ def evaluate(
     workers: Workers = None,
     device: Device = "cpu",
 ) -> None:
-    """Compare policies on the same episodes; a second run goes on where the first stopped.
+    """Compare policies on the same episodes; a second run resumes the first.
 
     Without `--preset`, one condition: 2 episodes per scene of 8 frames, from states drawn at
     random.

@@ -93,7 +93,7 @@ class QuickstartResult:
 def run_quickstart(
     scenes: str, out: Path, *, seed: int, progress: Progress, command: str, device: str = "cpu"
 ) -> QuickstartResult:
-    """Score tables, trainings, evaluation, report; a second run goes on where the first stopped.
+    """Score tables, trainings, evaluation, report; a second run resumes the first.
 
     Args:
         scenes: ``"bundled"``, or a folder of raws or radiance maps.

@@ -28,7 +28,7 @@ def train(
     device: Device = "cpu",
     tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
 ) -> None:
-    """Train an agent; a second run goes on where the first was stopped.
+    """Train an agent; a second run resumes the first.
 
     Example: `ae-env train configs/ppo.yaml --out runs/ppo`
     """

@@ -40,7 +40,7 @@ def train_simulator(
     device: Device = "auto",
     tensorboard: Annotated[bool, typer.Option(help="Log to OUT/tensorboard.")] = True,
 ) -> None:
-    """Train the simulator's modules stage by stage; a second run goes on where it was stopped.
+    """Train the simulator's modules stage by stage; a second run resumes the first.
 
     Example: `ae-env train-simulator configs/simulator/compact.yaml`
 

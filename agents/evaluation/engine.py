@@ -357,7 +357,7 @@ class EvaluationRun:
 def best_states(scores: NDArray[np.float64], allowed: NDArray[np.bool_]) -> Ints:
     """The oracle's states: the best allowed one, ties to the lower ISO, ````(...)````.
 
-    >>> best_states(np.array([0.5, 0.9, 0.9]), np.array([True, False, True]))
+    >>> int(best_states(np.array([0.5, 0.9, 0.9]), np.array([True, False, True])))
     2
     """
     known = np.where(allowed, scores, -np.inf)

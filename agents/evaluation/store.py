@@ -1,4 +1,4 @@
-"""Finished parts of an evaluation in files, so that a run that was stopped goes on.
+"""Finished parts of an evaluation in files, so that a stopped run can resume.
 
 A part's name is a hash of everything that decides its content: the version of this package, the
 plan's entries, the scenes' light, and the files of policies, scorers and lightings of a user's own.

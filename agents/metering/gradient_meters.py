@@ -1,7 +1,7 @@
 """Meters that look for the exposure of the strongest gradients: Shim's and Zhang's.
 
 Both improve on the estimate that the controller holds, a step at each frame. The frame in hand is
-first exposed anew, in simulation, at that estimate: so the steps add up on a grid of whole stops,
+exposed again, in simulation, at that estimate first: so the steps add up on a grid of whole stops,
 and with a delay no step is taken twice.
 """
 
@@ -42,7 +42,7 @@ SHIM_LEAST = 0.125
 ZHANG_RATE, ZHANG_LIMIT_EV, ZHANG_DELTA_EV = 3.0, 2.0, 0.25
 #: How often a step that lowers the metric is halved before it is given up.
 HALVINGS = 4
-#: The frame in hand is exposed anew by at most so many EV.
+#: The frame in hand is exposed again by at most so many EV.
 SIMULATED_EV = 4.0
 #: Saturated share from which a frame hides something.
 SATURATED_SEEN = 0.01
@@ -119,7 +119,7 @@ def zhang_reading(
 
 
 class _Frame:
-    """The frames in hand, to be exposed anew at the controller's estimate."""
+    """The frames in hand, to be exposed again at the controller's estimate."""
 
     def __init__(
         self, observations: Observations, estimate: Floats | None, camera: CameraProfile

@@ -1,9 +1,9 @@
 """Meters that look at the histogram: of the frame, or of the frame exposed in another way.
 
 Another exposure of the frame in hand is simulated on its histogram: the signal is multiplied,
-clipped at white, encoded as sRGB and counted anew. A code of the observation stands for all signals
-that round to it, so its pixels are spread evenly over them: brightening does not tear holes into
-the histogram.
+clipped at white, encoded as sRGB and counted again. A code of the observation stands for all
+signals that round to it, so its pixels are spread evenly over them: brightening does not tear holes
+into the histogram.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def _exposed(shares: Floats, evs: Floats, gain: float = 1.0) -> Floats:
     Args:
         shares: Share of each code of the observation, ``(N, 256)``.
         evs: Exposures relative to the frame's [EV], ``(K,)``.
-        gain: Applied to the signal besides.
+        gain: Factor that is also applied to the signal.
     """
     below, rest = _edges(tuple(evs), gain)
     cumulated = np.concatenate([np.zeros((len(shares), 1)), np.cumsum(shares, axis=1)], axis=1)

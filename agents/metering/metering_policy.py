@@ -72,7 +72,7 @@ class MeteringPolicy(Policy):
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
         compensation: Exposure compensation [EV], positive is brighter.
-        damping: Share of the distance to the metered EV that is kept per frame, in [0, 1).
+        damping: Share of the distance to the metered EV that remains after a frame, in [0, 1).
         shutter_cap: Longest exposure time that may be used [s].
         f_number: Aperture that A and M keep; None: f/8.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
@@ -239,18 +239,18 @@ class EVTracker:
     A reading far from the estimate replaces it; within a stop the two are averaged, which settles
     what would otherwise flip between neighbouring states. A mostly saturated frame only says that
     the light is not below a bound, a black one that it is not above: an estimate that agrees with
-    the bound is kept. A frame that is all white or all black moves any other estimate half of the
+    the bound stays. A frame that is all white or all black moves any other estimate half of the
     way to the end of the range.
 
     With damping the EV that is handed out follows that estimate, keeping `damping` of its distance
     to it at every frame. It is a number of its own and never read back from the settings: a grid of
-    whole stops does not hold it up. What is kept of it is never beyond the range: light that comes
-    back after a long night is followed at once.
+    whole stops does not hold it up. Its past never counts as lying beyond the range: light that
+    comes back after a long night is followed at once.
 
     Args:
         num_envs: Cameras.
         ev_range: Lowest and highest EV100 of the camera's exposure states.
-        damping: Share of the distance to the estimate, in EV, that is kept per frame, in [0, 1).
+        damping: Share of the distance to the estimate [EV] that remains after a frame, in [0, 1).
         compensation: Exposure compensation [EV] that is taken off what is handed out: the range of
             that is so much higher.
     """
@@ -290,7 +290,7 @@ class ReferenceFrames:
 
     What a search finds on a saturated frame and on a dark one of the same scene differs, because
     neither shows what the other does: a controller that follows the frame in hand may go to and fro
-    between the two for ever. So it goes on searching on the better one for as long as new frames
+    between the two for ever. So it continues to search on the better one for as long as new frames
     look as that one predicts. Of two frames the less saturated is better; of two that are not
     saturated, the brighter.
 
@@ -313,8 +313,8 @@ class ReferenceFrames:
         ev = frame_ev100(observations)
         green = raw[:, GREEN].reshape(len(raw), -1)
         ordered = np.sort(green, axis=1)
-        places = np.rint(_QUANTILES * (green.shape[1] - 1)).astype(np.intp)
-        quantiles = CODE_SIGNALS[ordered[:, places]]
+        ranks = np.rint(_QUANTILES * (green.shape[1] - 1)).astype(np.intp)
+        quantiles = CODE_SIGNALS[ordered[:, ranks]]
         white = np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)
         saturated = (green >= white).mean(axis=1)
         if self._raw is None or self._settings is None:

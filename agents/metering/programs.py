@@ -54,8 +54,8 @@ class ProgramOptions:
 
     Args:
         compensation: Exposure compensation [EV], positive is brighter, in [-32, 32].
-        damping: Share of the distance to the metered EV that is kept per frame, in [0, 1).
-        shutter_cap: Longest exposure time that may be used, whatever the meter says, where there is
+        damping: Share of the distance to the metered EV that remains after a frame, in [0, 1).
+        shutter_cap: Longest exposure time that may be used, for any reading, where there is
             a shorter one [s]; None: no limit.
         f_number: Aperture that A and M keep.
         exposure_time: Shutter that S and M keep [s].
@@ -162,7 +162,7 @@ class StateChooser:
 
         Args:
             target: EV100 wanted, ``(N,)``.
-            preference: Cost of each state besides, well below 1000, ``(S,)`` or ``(N, S)``.
+            preference: Further cost of each state, well below 1000, ``(S,)`` or ``(N, S)``.
         """
         distance = self._distance(target)
         # Nominal values are rounded (1/15 s for 1/16 s): states this near are the same exposure.

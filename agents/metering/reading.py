@@ -1,4 +1,4 @@
-"""What a meter makes of a frame, and the light that a frame shows."""
+"""The reading of a light meter, and the light that a frame shows."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CODE_SIGNALS = (1.0 + PEDESTAL) * (np.arange(CODES) / (CODES - 1.0)) ** 2 - PEDE
 
 @dataclass(frozen=True)
 class Reading:
-    """What a meter makes of one frame of each camera.
+    """A meter's result for one frame of each camera.
 
     Args:
         ev100: Metered EV100, shape ``(N,)``.
@@ -56,7 +56,7 @@ class Meter(Protocol):
         Args:
             observations: Of N cameras.
             estimate: EV100 that the controller holds, ``(N,)``, NaN in the first frame: where a
-                meter that improves on it step by step goes on. The others do not look at it.
+                meter that improves on it step by step continues. The others ignore it.
         """
 
 
@@ -74,7 +74,7 @@ def frame_ev100(observations: Observations) -> NDArray[np.float64]:
 def linear_signal(
     raw: NDArray[Any], camera: CameraProfile, planes: slice = slice(None)
 ) -> NDArray[np.float32]:
-    """Signal of observed frames, white is 1, whatever the kind of observation.
+    """Signal of observed frames, white is 1, from any kind of observation.
 
     Args:
         raw: ``(N, 4, h, w)``: uint8 codes, float32 signal, or the camera's uint16 numbers.
@@ -94,7 +94,7 @@ def linear_signal(
 def signal_codes(
     raw: NDArray[Any], camera: CameraProfile, planes: slice = slice(None)
 ) -> NDArray[np.uint8]:
-    """The 8-bit codes of observed frames, whatever the kind of observation.
+    """The 8-bit codes of observed frames, from any kind of observation.
 
     Args:
         raw: As for `linear_signal`.

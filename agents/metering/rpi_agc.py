@@ -121,7 +121,7 @@ class RpiAgc(Policy):
         mode: ``"normal"``, ``"short"`` or ``"long"``: the ladder.
         constraint: ``"normal"``, ``"highlight"`` or ``"shadows"``.
         compensation: Exposure compensation [EV], positive is brighter.
-        damping: Share of the distance to the filtered EV that is kept per frame besides, in [0, 1).
+        damping: Share of the distance to the filtered EV that remains after a frame, in [0, 1).
         shutter_cap: Longest exposure time that may be used [s].
         f_number: Aperture of the lens.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
@@ -198,8 +198,8 @@ class RpiAgc(Policy):
         ev = -np.log2(filtered * np.where(reduce, FAST_REDUCE, 1.0))
         states = self.context.grid.ev100
         before = np.clip(self._damped, states.min(), states.max())
-        kept = self.options.damping * (before - ev)
-        self._damped = ev + np.where(np.isnan(kept), 0.0, kept)
+        distance = self.options.damping * (before - ev)
+        self._damped = ev + np.where(np.isnan(distance), 0.0, distance)
         self._previous = masked_argmax(self._utility(self._damped), action_masks)
         return self._previous.copy()
 
