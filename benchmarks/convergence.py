@@ -101,20 +101,14 @@ def _rows(result: EvaluationResult, stops: float) -> Iterator[Row]:
         error = result.episode_metrics(policy)["ev_error"][0]
         right = _since_step(error > THIRD_EV)
         known = right <= FRAMES - STEP  # right at last
-        yield {
-            "policy": policy,
-            "stops": stops,
-            "frames_to_settle_median": float(np.median(settled)),
-            "frames_to_settle_p90": float(np.percentile(settled, 90)),
-            "follows": float(follows.mean()),
-            "frames_to_settle_following": (
-                float(np.median(settled[follows])) if follows.any() else None
-            ),
-            "right_at_last": float(known.mean()),
-            "frames_to_be_right_median": float(np.median(right[known])) if known.any() else None,
-            "final_ev_error": float(error[:, -_LAST:].mean()),
-            "num_scenes": len(settled),
-        }
+        row: Row = {"policy": policy, "stops": stops, "num_scenes": len(settled)}
+        row |= {"frames_to_settle_median": float(np.median(settled))}
+        row |= {"frames_to_settle_p90": float(np.percentile(settled, 90))}
+        row |= {"follows": float(follows.mean()), "right_at_last": float(known.mean())}
+        where = {"frames_to_settle_following": settled[follows]}
+        where["frames_to_be_right_median"] = right[known]
+        row |= {name: float(np.median(own)) if len(own) else None for name, own in where.items()}
+        yield row | {"final_ev_error": float(error[:, -_LAST:].mean())}
 
 
 def _draw(results: dict[str, Any]) -> Figure:

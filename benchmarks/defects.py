@@ -157,19 +157,12 @@ def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str,
     guesses = np.abs(rendered - np.median(levels(defect))).mean()
     draws = np.random.default_rng(seed).integers(len(errors), size=(RESAMPLES, len(errors)))
     within = [_spearman(v, r) for v, r in zip(values, rendered, strict=True)]
-    return {
-        "part": "own",
-        "measure": f"analytic_{defect}",
-        "resolution": scenes[0].light.shape[-1],
-        "scenes": which,
-        "num_scenes": len(values),
-        "num_groups": len(errors),
-        "spearman": _spearman(values.ravel(), rendered.ravel()),
-        "spearman_within_scene": float(np.mean(within)),
-        "mae": float(errors.mean()),
-        "mae_ci95": np.quantile(errors[draws].mean(axis=1), [0.025, 0.975]).tolist(),
-        "mae_of_a_constant": float(guesses),
-    }
+    row: Row = {"part": "own", "measure": f"analytic_{defect}", "scenes": which}
+    row |= {"resolution": scenes[0].light.shape[-1], "num_scenes": len(values)}
+    row |= {"num_groups": len(errors), "spearman": _spearman(values.ravel(), rendered.ravel())}
+    row |= {"spearman_within_scene": float(np.mean(within)), "mae": float(errors.mean())}
+    row |= {"mae_ci95": np.quantile(errors[draws].mean(axis=1), [0.025, 0.975]).tolist()}
+    return row | {"mae_of_a_constant": float(guesses)}
 
 
 def by_group(values: np.ndarray, groups: list[str]) -> np.ndarray:
@@ -193,16 +186,10 @@ def cross_rows(defect: str, estimated: dict[str, np.ndarray]) -> list[Row]:
     for end, last in ends.items():
         for measure, values in estimated.items():
             means = np.abs(values).mean(axis=0)
-            rows.append(
-                {
-                    "part": "cross_talk",
-                    "defect": f"{defect}{f' ({end})' * bool(end)}",
-                    "measure": f"analytic_{measure}",
-                    "clean": float(means[clean]),
-                    "at_severity_1": float(means[last]),
-                    "change": float(means[last] - means[clean]),
-                }
-            )
+            row: Row = {"part": "cross_talk", "defect": f"{defect}{f' ({end})' * bool(end)}"}
+            row |= {"measure": f"analytic_{measure}", "clean": float(means[clean])}
+            row |= {"at_severity_1": float(means[last])}
+            rows.append(row | {"change": float(means[last] - means[clean])})
     return rows
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from agents.cli.console import print_files, progress_bars
+from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator.utils.files import data_folder as data_root
 from simulator.utils.files import write_atomically
@@ -217,16 +218,14 @@ def rounded(value: Any) -> Any:
     return value
 
 
-def write_picture(path: Path, figure: Figure, colours: int = 128) -> Path:
-    """Writes a figure as a PNG with a palette of at most 256 colours: a third of the size."""
+def write_picture(path: Path, figure: Figure) -> Path:
+    """Writes a figure as a PNG with a palette: a third of the bytes."""
     from PIL import Image
 
-    buffer, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(buffer, format="png")
-    picture = Image.open(buffer).convert("RGB").quantize(colours, dither=Image.Dither.NONE)
-    picture.save(small, format="PNG", optimize=True)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
     path.parent.mkdir(parents=True, exist_ok=True)
-    return write_atomically(path, small.getvalue())
+    return write_palette_png(path, Image.open(stream))
 
 
 def data_folder(name: str) -> Path:

@@ -15,6 +15,7 @@ from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from PIL import Image
 
 #: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
@@ -213,10 +214,8 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
             speed=speed,
             defocus=defocus,
         )
-        stream = io.BytesIO()
-        picture.save(stream, format="PNG")
         name = "contact_sheet.png" if k == 0 else f"contact_sheet_{k + 1}.png"
-        files[name] = write_atomically(folder / name, stream.getvalue())
+        files[name] = write_palette_png(folder / name, picture)
     return files
 
 
@@ -232,6 +231,26 @@ def _text(name: str) -> str:
 
 
 def _write(path: Path, figure: Figure) -> Path:
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png")
-    return write_atomically(path, picture.getvalue())
+    from PIL.Image import open as opened
+
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return write_palette_png(path, opened(stream))
+
+
+def write_palette_png(path: Path, picture: Image.Image) -> Path:
+    """Write a picture as PNG with a palette of 256 colours: a third of the bytes, no visible loss.
+
+    Args:
+        path: File to write; its folder must exist.
+        picture: The picture.
+
+    Returns:
+        `path`.
+    """
+    from PIL.Image import Dither
+
+    stream = io.BytesIO()
+    indexed = picture.convert("RGB").quantize(256, dither=Dither.NONE)
+    indexed.save(stream, format="PNG", optimize=True)
+    return write_atomically(path, stream.getvalue())

@@ -64,7 +64,7 @@ def measure(seed: int, quick: bool) -> list[Row]:
         row, pictures = _photographed(scenes[name], source, target, seed)
         rows.append({"part": "pictures", "case": case, **row})
         _draw(line, rows[-1], pictures, crops[name])
-    write_picture(QUICK_IMAGE if quick else IMAGE, figure, colours=256)
+    write_picture(QUICK_IMAGE if quick else IMAGE, figure)
     return rows
 
 
