@@ -97,12 +97,6 @@ def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level() -> None:
     assert 0.3 * card.shot[0] == pytest.approx(1e-4, rel=0.1)
 
 
-def test_noise_free_is_zero_on_a_slope() -> None:
-    light = np.broadcast_to(np.linspace(0.1, 0.9, 128), (4, 128, 128))
-    estimate = estimate_nlf(light.astype(np.float32))
-    assert max(estimate.shot) < 1e-10
-
-
 def test_large_raws_are_sampled() -> None:
     nlf = get_camera("canon_70d").nlf(800)
     light = np.tile(ramp(), (1, 6, 4))  # 1536 x 1536 a plane
