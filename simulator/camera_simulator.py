@@ -1,13 +1,13 @@
 """The camera simulator: plans which steps a change of settings needs, and runs those.
 
 A raw or a scene is prepared once (`CameraSimulator.prepare`): everything that does not depend on
-the target settings, the networks included, is in the `PreparedScene`. Exposing it at any settings is then
-a few element-wise steps.
+the target settings, the networks included, is in the `PreparedScene`. Exposing it at any settings
+is then a few element-wise steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,9 +30,14 @@ from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.tiles import in_tiles, varying
 
-# What the simulator photographs: raws, prepared scenes and scenes, as light on a device.
 #: What is known of a scene's depth: it is far or in focus throughout, or not known.
 Depth = Literal["far", "unknown"]
+#: What can be simulated from.
+Source = RawImage | PreparedScene | HasPrepared
+#: What the compact networks see around a pixel [pixel]; tiles overlap by it.
+_NOISE_HALO, _MAP_HALO = 36, 56
+#: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
+_DISC_REACH = 16
 
 
 def check_depth(depth: str) -> None:
@@ -41,9 +46,7 @@ def check_depth(depth: str) -> None:
         raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
 
 
-def prepared_of(
-    source: RawImage | PreparedScene | HasPrepared, device: torch.device
-) -> PreparedScene:
+def prepared_of(source: Source, device: torch.device) -> PreparedScene:
     """The light of `source` as it was recorded, or a prepared scene as it is, on `device`.
 
     Raises:
@@ -77,12 +80,6 @@ def _recorded(raw: RawImage, device: torch.device) -> PreparedScene:
         white_balance=raw.white_balance,
         box_factor=raw.box_factor,
     )
-
-
-#: What the compact networks see around a pixel [pixel]; tiles overlap by it.
-_NOISE_HALO, _MAP_HALO = 36, 56
-#: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
-_DISC_REACH = 16
 
 
 class CameraSimulator:
@@ -172,7 +169,7 @@ class CameraSimulator:
 
     def prepare(
         self,
-        source: RawImage | PreparedScene | HasPrepared,
+        source: Source,
         *,
         image_speed: float | None = None,
         defocus: float | None = None,
@@ -211,7 +208,7 @@ class CameraSimulator:
         prepared = self._seen(source, image_speed, defocus)
         if tolerance != "source":
             prepared = replace(prepared, tolerance=tolerance)
-        # A prepared scene may come from here, corrected already; a scene is no recording of this body.
+        # A prepared scene may be corrected already; a scene is no recording of this body.
         if isinstance(source, RawImage) and not self.exposure.is_identity:
             noise = prepared.nlf.exposed(float(self.exposure.w))
             prepared = replace(prepared, light=self.exposure(prepared.light, 1.0), nlf=noise)
@@ -219,7 +216,7 @@ class CameraSimulator:
         known, aperture_blur = prepared.denoised, prepared.aperture_blur
         if self.noise is not None and not prepared.nlf.is_zero and _lacks(known, whole):
             every = whole or self.noise.preset == "paper"
-            light = partial(self._kept_light, replace(prepared, denoised=None))
+            light = partial(self._denoised, replace(prepared, denoised=None))
             prepared = replace(prepared, denoised=Denoised(light, everywhere=every))
         if depth == "unknown" or (
             aperture_blur is not None and self.aperture and _lacks(aperture_blur, whole)
@@ -228,18 +225,13 @@ class CameraSimulator:
         return prepared
 
     def _seen(
-        self,
-        source: RawImage | PreparedScene | HasPrepared,
-        image_speed: float | None,
-        defocus: float | None,
+        self, source: Source, image_speed: float | None, defocus: float | None
     ) -> PreparedScene:
         """The source's light, with its motion and blur where they are given."""
-        prepared = self._prepared(source)
-        given = {"image_speed": image_speed, "defocus": defocus}
-        return replace(prepared, **{k: v for k, v in given.items() if v is not None})  # type: ignore[arg-type]
-
-    def _prepared(self, source: RawImage | PreparedScene | HasPrepared) -> PreparedScene:
-        return prepared_of(source, self.device)
+        prepared = prepared_of(source, self.device)
+        if image_speed is not None:
+            prepared = replace(prepared, image_speed=image_speed)
+        return prepared if defocus is None else replace(prepared, defocus=defocus)
 
     @torch.no_grad()
     def denoise(self, prepared: PreparedScene) -> torch.Tensor:
@@ -297,30 +289,40 @@ class CameraSimulator:
         if self.aperture.preset == "paper":
             opened = partial(self._results.called, "opened", self.aperture)
             return NetworkApertureBlur(denoised, opened, f_number)
-        find, every = partial(self._kept_map, prepared), prepared.tolerance == 0.0
-        return MapApertureBlur(prepared.light, denoised, find, f_number, everywhere=every)
+        estimate, everywhere = partial(self._defocus_map, prepared), prepared.tolerance == 0.0
+        return MapApertureBlur(prepared.light, denoised, estimate, f_number, everywhere=everywhere)
 
-    def _kept_light(self, prepared: PreparedScene) -> torch.Tensor:
-        return self._kept("denoised", self.noise, prepared, partial(self.denoise, prepared))
+    def _denoised(self, prepared: PreparedScene) -> torch.Tensor:
+        """`denoise`, cached."""
+        assert self.noise is not None
+        make = partial(self.denoise, prepared)
+        return self._cached("denoised", self.noise, prepared, make, prepared.light.shape)
 
-    def _kept_map(self, prepared: PreparedScene) -> torch.Tensor:
+    def _defocus_map(self, prepared: PreparedScene) -> torch.Tensor:
+        """`estimate_defocus`, cached."""
+        assert self.aperture is not None
         estimate = partial(self.estimate_defocus, prepared)
-        return self._kept("defocus_maps", self.aperture, prepared, estimate)
+        shape = prepared.light.shape[-2:]
+        return self._cached("defocus_maps", self.aperture, prepared, estimate, shape)
 
-    def _kept(
+    def _cached(
         self,
         kind: str,
-        module: nn.Module | None,
+        module: nn.Module,
         prepared: PreparedScene,
         make: Callable[[], torch.Tensor],
+        shape: Sequence[int],
     ) -> torch.Tensor:
-        """What `make` finds out about the prepared scene, or found when everything was the same."""
+        """The result of `make`, or that of an earlier call where everything was the same."""
         denoised = None if prepared.denoised is None else prepared.denoised.light
         inputs = {"light": prepared.light, "denoised": denoised, "saturated": prepared.saturated}
-        nlf = [prepared.nlf.shot, prepared.nlf.read]
         return self._results.result(
-            *(kind, [] if module is None else [module], inputs, make),
-            nlf=nlf,
+            kind,
+            [module],
+            inputs,
+            make,
+            shape=shape,
+            nlf=[prepared.nlf.shot, prepared.nlf.read],
             precision=self.precision,
             everywhere=prepared.tolerance == 0,
         )
@@ -335,11 +337,14 @@ class CameraSimulator:
 
     def plan(
         self,
-        source: RawImage | PreparedScene | HasPrepared,
+        source: Source,
         settings: CameraSettings,
         *,
         noise: bool = True,
-        **scene: Any,
+        image_speed: float | None = None,
+        defocus: float | None = None,
+        depth: Depth = "far",
+        tolerance: float | Literal["source"] = "source",
     ) -> SimulationPlan:
         """Which steps the change to `settings` takes, why others are left out, error and cost.
 
@@ -347,14 +352,19 @@ class CameraSimulator:
             source: A raw, a prepared scene, or a scene.
             settings: Target settings.
             noise: False plans the light on the sensor alone (`PreparedScene.expected`).
-            scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``,
-                ``tolerance``.
+            image_speed: See `prepare`.
+            defocus: See `prepare`.
+            depth: See `prepare`.
+            tolerance: See `prepare`.
         """
-        return self.prepare(source, **scene).plan(settings, noise=noise)
+        prepared = self.prepare(
+            source, image_speed=image_speed, defocus=defocus, depth=depth, tolerance=tolerance
+        )
+        return prepared.plan(settings, noise=noise)
 
     def stages(
         self,
-        source: RawImage | PreparedScene | HasPrepared,
+        source: Source,
         settings: CameraSettings,
         *,
         seed: int = 0,
@@ -384,7 +394,7 @@ class CameraSimulator:
         check_depth(depth)
         prepared = self._seen(source, image_speed, defocus)
         opens = depth == "unknown" or prepared.aperture_blur is not None
-        # A prepared scene may come from `prepare`, corrected already; a scene is no recording of this body.
+        # A prepared scene may be corrected already; a scene is no recording of this body.
         exposure = self.exposure
         if not isinstance(source, RawImage):
             exposure = ExposureModule().requires_grad_(False).to(self.device)
@@ -393,13 +403,15 @@ class CameraSimulator:
 
     def simulate(
         self,
-        source: RawImage | PreparedScene | HasPrepared,
+        source: Source,
         settings: CameraSettings,
         *,
         seed: int = 0,
-        tolerance: float | Literal["source"] | None = "source",
         noise: Noise = "exact",
-        **scene: Any,
+        image_speed: float | None = None,
+        defocus: float | None = None,
+        depth: Depth = "far",
+        tolerance: float | Literal["source"] | None = "source",
     ) -> RawImage:
         """The raw that the camera would have recorded at `settings`.
 
@@ -407,11 +419,13 @@ class CameraSimulator:
             source: A raw, a prepared scene, or a scene.
             settings: Target ISO, exposure time and f-number.
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster (see
+                `PreparedScene.capture`); the full run draws it.
+            image_speed: See `prepare`.
+            defocus: See `prepare`.
+            depth: See `prepare`.
             tolerance: See `prepare`; None runs every module for this very transition (`stages`),
                 and shares and leaves out nothing.
-            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster (see `PreparedScene.capture`); the
-                full run draws it.
-            scene: Further arguments of `prepare`: ``image_speed``, ``defocus``, ``depth``.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
@@ -419,25 +433,29 @@ class CameraSimulator:
         """
         check_noise(noise)
         if tolerance is None and self.noise is not None:
-            scene = {"depth": "far", **scene}
-            data, excess_noise = self.stages(source, settings, seed=seed, **scene).capture, 0.0
-            prepared = self._prepared(source)
+            stages = self.stages(
+                source, settings, seed=seed, image_speed=image_speed, defocus=defocus, depth=depth
+            )
+            data, excess_noise = stages.capture, 0.0
+            prepared = prepared_of(source, self.device)
             clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=None, aperture_blur=None)
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
             prepared = self.prepare(
-                source, tolerance=0.0 if tolerance is None else tolerance, **scene
+                source,
+                image_speed=image_speed,
+                defocus=defocus,
+                depth=depth,
+                tolerance=0.0 if tolerance is None else tolerance,
             )
             data, excess_noise = prepared.capture(settings, seed, noise=noise)
             output_noise = prepared.output_noise(settings)
-        marks = prepared.saturated
-        clipped = 0.0 if marks is None else int(marks.count_nonzero()) / marks.numel()
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}
         metadata |= {
             "simulated_from": str(prepared.reference),
             "seed": seed,
             "excess_noise": excess_noise,
-            "clipped_source": clipped,
+            "clipped_source": prepared.saturated_share,
         }
         return RawImage(
             data=data,

@@ -103,15 +103,14 @@ class EpisodeCore:
         self._part_scores = PartScores(self.tables, self.scenes, self.episodes, static=self._static)
         self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
         self._at_rest: dict[int, PreparedScene] = {}
-        size = options.resolution
+        frame_bytes = 16 * options.resolution**2
         self._captures = CaptureBatch(
             self._prepared,
             len(self.scenes) + num_envs,
             states,
             self.camera,
-            (size, size),
             noise=_NOISES[options.noise],
-            keep_light=num_envs * self._cached_frames() * 16 * size**2 <= LIGHT_CACHE_BYTES,
+            keep_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
         )
 
     def _cached_frames(self) -> int:

@@ -8,6 +8,7 @@ standard error.
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -211,14 +212,22 @@ class ScoreTables:
         names = [] if self.others is None else self.others.names("light")
         key = self._key(scene) if names or self.fused.reads_pixels else None
         stored = None if key is None else self._disk.get("score_tables", key)
-        if stored is not None and set(stored) == {"means", *(f"score:{name}" for name in names)}:
+        if stored is not None and self._is_whole(stored, names):
             parts = {name: stored[f"score:{name}"].numpy() for name in names}
             return _LightParts(weakref.ref(scene), stored["means"].numpy(), parts)
         found = self._of_light(scene, keep=False)  # its means are kept, its pixels not needed again
         if key is not None:
-            kept = {f"score:{name}": torch.from_numpy(v) for name, v in found.parts.items()}
-            self._disk.put("score_tables", key, {"means": torch.from_numpy(found.means), **kept})
+            scores = {f"score:{name}": torch.from_numpy(v) for name, v in found.parts.items()}
+            self._disk.put("score_tables", key, {"means": torch.from_numpy(found.means), **scores})
         return found
+
+    def _is_whole(self, stored: dict[str, torch.Tensor], names: Sequence[str]) -> bool:
+        """Whether a cached table has the shapes that are due, and finite numbers only."""
+        count = len(self.grid)
+        shapes: dict[str, list[int]] = {f"score:{name}": [count] for name in names}
+        shapes["means"] = [count if self.fused.reads_pixels else 0, 3]
+        found = {name: list(part.shape) for name, part in stored.items()}
+        return found == shapes and all(bool(part.isfinite().all()) for part in stored.values())
 
     def _of_light(
         self,

@@ -55,14 +55,13 @@ class CaptureBatch:
     """Photographs n scenes, each at any of S states, on the CPU.
 
     For each batch of frames, call `prepare`, then `record`. When another scene is to be shown under
-    an index, call `forget` first.
+    an index, call `forget` first. A pickled copy works everything out again.
 
     Args:
-        prepared: Gives the scene of an index, in its own light; asked for when it is first needed.
+        prepared: Gives the scene of an index, in its own light; called when it is first needed.
         num_scenes: Number of scenes, n.
         states: The settings of the S states.
         camera: The body.
-        shape: Height and width of every scene's light.
         noise: How the noise is made; None for no noise.
         keep_light: Whether the defocused light of every f-number is kept until a scene is
             forgotten; else only that of the latest.
@@ -74,26 +73,35 @@ class CaptureBatch:
         num_scenes: int,
         states: Sequence[CameraSettings],
         camera: CameraProfile,
-        shape: tuple[int, int],
         *,
         noise: Noise | None,
         keep_light: bool,
     ) -> None:
-        self.states, self.camera, self.noise = states, camera, noise
-        self._prepared, self._keep_light = prepared, keep_light
-        self._rows = _Rows(num_scenes, len(states))
-        self._buffers = _Buffers((4, *shape))
+        self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
+        self.camera, self.noise, self._keep_light = camera, noise, keep_light
+        self._forget_all()
+
+    def _forget_all(self) -> None:
+        self._rows = _Rows(self.num_scenes * len(self.states))
         self._lights: dict[int, _SceneLight] = {}
+        # Images that are used again: new memory costs more than what is written to it.
+        self._free: list[torch.Tensor] = []
         # Row of the blurred light that each scene has at present.
-        self._blurred_row = np.full(num_scenes, -1)
+        self._blurred_row = np.full(self.num_scenes, -1)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_lights": {}}  # a pickled copy works everything out again
+        cached = ("_rows", "_lights", "_free", "_blurred_row")
+        return {name: value for name, value in vars(self).items() if name not in cached}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._forget_all()
 
     def forget(self, indices: np.ndarray) -> None:
         """Lets go of all that is known of the scenes `indices`; their memory is used again."""
+        count = len(self.states)
         for index in indices.tolist():
-            self._rows.forget(index)
+            self._rows.forget(slice(index * count, (index + 1) * count))
             light = self._lights.pop(index, None)
             if light is not None:
                 light.give_back()
@@ -107,7 +115,7 @@ class CaptureBatch:
             states: (B,) at which each is photographed.
             gains: (B,) light of each exposure relative to the scene's own.
         """
-        rows = self._rows.of(indices, states)
+        rows = indices * len(self.states) + states
         stale = self._rows.gain[rows] != gains
         if stale.any():
             self._plan(indices[stale], rows[stale], gains[stale])
@@ -140,7 +148,7 @@ class CaptureBatch:
             numbers: (B, 4, H, W) uint16, digital numbers.
             signals: (B, 4, H, W) float32, on the scale where white is 1.
         """
-        rows, columns = self._rows.of(indices, states), self._rows
+        rows, columns = indices * len(self.states) + states, self._rows
         keys = noise_keys(seeds, frames)
         light, remaining = columns.light[rows], None
         if columns.blurs[rows].any():  # else all of the source's variance remains
@@ -156,7 +164,7 @@ class CaptureBatch:
             signals=None if signals is None else torch.from_numpy(signals),
             count=True,
         )
-        samples = math.prod(self._buffers.shape)
+        samples = light[0].numel()
         return FrameStatistics(
             clipped_low=counts[:, 0] / samples,
             clipped_high=counts[:, 1] / samples,
@@ -188,7 +196,7 @@ class CaptureBatch:
     def _light(self, index: int) -> _SceneLight:
         light = self._lights.get(index)
         if light is None:
-            light = _SceneLight(self._prepared(index), self._buffers, self._keep_light)
+            light = _SceneLight(self._prepared(index), self._free, self._keep_light)
             self._lights[index] = light
         return light
 
@@ -259,8 +267,7 @@ def _modules(exposure: Exposure, noise: bool) -> str:
 class _Rows:
     """Captures that were planned: all that a frame depends on but for its noise, as columns.
 
-    A row takes some 40 bytes from the start, the rest of its memory when it is used. A pickled
-    copy is empty.
+    A row takes some 40 bytes from the start, the rest of its memory when it is used.
 
     Attributes:
         gain: Light that the row was planned for; NaN where it was not planned.
@@ -274,57 +281,16 @@ class _Rows:
         exposure: `Exposure` of light that must be blurred; else None.
     """
 
-    def __init__(self, num_scenes: int, num_states: int) -> None:
-        rows = num_scenes * num_states
-        self.num_scenes, self.num_states = num_scenes, num_states
-        self.gain = np.full(rows, np.nan)
-        self.table = np.zeros((rows, 5, 4), np.float32)
-        self.excess_variance = np.zeros(rows)
-        self.blurs = np.zeros(rows, bool)
-        self.modules, self.light, self.remaining_variance, self.exposure = np.empty(
-            (4, rows), object
-        )
+    def __init__(self, count: int) -> None:
+        self.gain, self.excess_variance = np.full(count, np.nan), np.zeros(count)
+        self.table, self.blurs = np.zeros((count, 5, 4), np.float32), np.zeros(count, bool)
+        objects = np.empty((4, count), object)
+        self.modules, self.light, self.remaining_variance, self.exposure = objects
 
-    def of(self, indices: np.ndarray, states: np.ndarray) -> np.ndarray:
-        """(B,) rows of scenes at states."""
-        return indices * self.num_states + states
-
-    def forget(self, index: int) -> None:
-        """Makes every state of a scene unknown."""
-        rows = slice(index * self.num_states, (index + 1) * self.num_states)
+    def forget(self, rows: slice) -> None:
+        """Makes `rows` unknown."""
         self.gain[rows] = np.nan
         self.light[rows] = self.remaining_variance[rows] = self.exposure[rows] = None
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.num_scenes, self.num_states)
-
-
-class _Buffers:
-    """Images to write to that are used again: new memory costs more than what is written to it.
-
-    A pickled copy is empty.
-
-    Args:
-        shape: Shape of each image.
-    """
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.shape = shape
-        self._free: list[torch.Tensor] = []
-
-    def take(self) -> torch.Tensor:
-        """A float32 image with any content."""
-        try:
-            return self._free.pop()  # atomic: threads share the list
-        except IndexError:
-            return torch.empty(self.shape)
-
-    def give_back(self, image: torch.Tensor) -> None:
-        """Lets `image` be taken again."""
-        self._free.append(image)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.shape,)
 
 
 class _SceneLight:
@@ -336,12 +302,12 @@ class _SceneLight:
 
     Args:
         prepared: The scene in its own light.
-        buffers: Where images are taken from.
+        free: Images that may be written to, and to give back to.
         keep: Whether the defocused light of every f-number is kept.
     """
 
-    def __init__(self, prepared: PreparedScene, buffers: _Buffers, keep: bool) -> None:
-        self.prepared, self._buffers, self._keep = prepared, buffers, keep
+    def __init__(self, prepared: PreparedScene, free: list[torch.Tensor], keep: bool) -> None:
+        self.prepared, self._free, self._keep = prepared, free, keep
         self._defocused: dict[tuple[Any, ...], torch.Tensor] = {}  # by aperture
         self._blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
         self._streak: torch.Tensor | None = None
@@ -362,11 +328,11 @@ class _SceneLight:
             if exposure.defocus_px:
                 if not self._keep:
                     self._drop_defocused()
-                light = defocused = self._defocused[exposure.lens_blur] = self._buffers.take()
+                light = defocused = self._defocused[exposure.lens_blur] = self._take(light)
         if exposure.motion_px:
             source = light if source is None else source
             if self._streak is None:
-                self._streak = self._buffers.take()
+                self._streak = self._take(light)
             light = moved = self._streak
         self._blurred = (exposure.blur, light)
         if defocused is None and moved is None:
@@ -374,13 +340,15 @@ class _SceneLight:
         assert source is not None
         return light, Blur(source, exposure.defocus_px, defocused, exposure.motion_px, moved)
 
+    def _take(self, like: torch.Tensor) -> torch.Tensor:
+        return self._free.pop() if self._free else torch.empty(like.shape)
+
     def give_back(self) -> None:
         """Gives all memory back; the light is not to be used afterwards."""
         self._drop_defocused()
         if self._streak is not None:
-            self._buffers.give_back(self._streak)
+            self._free.append(self._streak)
 
     def _drop_defocused(self) -> None:
-        for image in self._defocused.values():
-            self._buffers.give_back(image)
+        self._free.extend(self._defocused.values())
         self._defocused.clear()

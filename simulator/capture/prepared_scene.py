@@ -126,6 +126,12 @@ class PreparedScene:
         """Statistics of `light`."""
         return self.blurred_light.statistics
 
+    @property
+    def saturated_share(self) -> float:
+        """Share of the pixels that are saturated in the source."""
+        marks = self.saturated
+        return 0.0 if marks is None else int(marks.count_nonzero()) / marks.numel()
+
     # -- what a change of settings takes ------------------------------------------------------
 
     def exposure(
@@ -177,8 +183,8 @@ class PreparedScene:
         diameter = self.defocus * 4.0 / f_number
         if diameter > MAX_DISC_PX and diameter > max(self.light.shape[-2:]):
             raise ValueError(
-                f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel at "
-                f"f/{f_number:.3g}: it must not be wider than the frame ({max(self.light.shape)} "
+                f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel "
+                f"at f/{f_number:.3g}: it must not be wider than the frame ({max(self.light.shape)} "
                 f"pixel) and {MAX_DISC_PX:g} pixel"
             )
         return diameter
@@ -217,15 +223,8 @@ class PreparedScene:
         exposure = self._exposure(settings, given)
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.source_light(exposure)
-        marks = self.saturated
-        return make_plan(
-            settings,
-            exposure,
-            given,
-            noise_balance(light, exposure),
-            self.light,
-            clipped_source=0.0 if marks is None else int(marks.count_nonzero()) / marks.numel(),
-        )
+        balance = noise_balance(light, exposure)
+        return make_plan(settings, exposure, given, balance, self.light, self.saturated_share)
 
     def source_light(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
@@ -320,9 +319,7 @@ class PreparedScene:
         frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed raises before any work
         gains = np.ones(len(states)) if gain is None else gain
-        exposures = [
-            self.exposure(s, gain=g) for s, g in zip(states, gains.tolist(), strict=True)
-        ]
+        exposures = [self.exposure(s, gain=g) for s, g in zip(states, gains.tolist(), strict=True)]
         groups: dict[tuple[object, ...], list[int]] = {}
         for index, exposure in enumerate(exposures):
             groups.setdefault(exposure.blur, []).append(index)

@@ -19,7 +19,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import LIGHT_LIMIT, SIGNAL_LIMIT, Exposure, exposure_table
-from simulator.noise.generator import FrameNoise, Noise
+from simulator.noise.generator import Noise, frame_normals
 from simulator.noise.noise_level_function import VARIANCE_LIMIT
 from simulator.noise.top_up import missing_variance, top_up_table
 from simulator.optics.blur import disc_blur, motion_blur
@@ -148,14 +148,7 @@ def record(
             count=count,
         )
     assert signals is not None
-    shares = transitions.shares()
-    for i, (light, table) in enumerate(zip(transitions.light, transitions.table, strict=True)):
-        signal = _limited(light * table[0, 0].item())
-        if keys is not None:
-            normals = FrameNoise(int(keys[i]), noise).normals(tuple(light.shape))
-            missing = missing_variance(signal, table[1:], shares[i])
-            signal = _with_noise(signal, missing, normals)
-        signals[i] = clip_and_quantise(signal, camera)
+    record_stepwise(transitions, camera, keys, noise, signals)
     return np.zeros((len(transitions.light), 2), np.int64)
 
 
@@ -188,30 +181,22 @@ def _limited(signal: torch.Tensor) -> torch.Tensor:
     return signal.clamp_(-SIGNAL_LIMIT, SIGNAL_LIMIT)
 
 
-def add_noise(
-    light: torch.Tensor, exposures: Sequence[Exposure], noises: Sequence[FrameNoise]
-) -> tuple[torch.Tensor, np.ndarray]:
-    """Adds to each image of `light` (B, 4, H, W) the noise that it lacks.
-
-    Each image has its own noise, so that it comes out the same alone or in a batch.
-
-    Returns:
-        The noisy signal, and per image the excess variance (B,): mean over the pixels of the
-        variance that the source brings beyond the target's, relative to the target's; 0 where the
-        source is clean enough.
-    """
-    noisy, excess = torch.empty_like(light), np.zeros(len(light))
-    for i, (signal, exposure, noise) in enumerate(zip(light, exposures, noises, strict=True)):
-        (table,) = top_up_table([exposure.source_noise], [exposure.target])
-        missing = missing_variance(signal, table, exposure.remaining_variance)
-        noisy[i] = _with_noise(signal, missing, noise.normals(tuple(signal.shape)))
-        excess[i] = noise_balance(signal, exposure, ratio=1.0).relative_excess_variance
-    return noisy, excess
-
-
-def _with_noise(signal: torch.Tensor, missing: torch.Tensor, normals: np.ndarray) -> torch.Tensor:
-    drawn = torch.from_numpy(normals).to(signal.device)
-    return missing.clamp_(min=0.0).sqrt_().mul_(drawn).add_(signal)
+def record_stepwise(
+    transitions: Transitions,
+    camera: CameraProfile,
+    keys: np.ndarray | None,
+    noise: Noise,
+    signals: torch.Tensor,
+) -> None:
+    """`record` on any device: what the fused kernel is held against. Fills `signals`."""
+    for i, (light, table) in enumerate(zip(transitions.light, transitions.table, strict=True)):
+        signal = _limited(light * table[0, 0].item())
+        if keys is not None:
+            missing = missing_variance(signal, table[1:], transitions.shares()[i])
+            normals = frame_normals(int(keys[i]), tuple(light.shape), noise)
+            drawn = torch.from_numpy(normals).to(signal.device)
+            signal = missing.clamp_(min=0.0).sqrt_().mul_(drawn).add_(signal)
+        signals[i] = clip_and_quantise(signal, camera)
 
 
 def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tensor:
@@ -242,21 +227,17 @@ class NoiseBalance:
     lacks_noise: bool
 
 
-def noise_balance(
-    light: torch.Tensor, exposure: Exposure, *, ratio: float | None = None
-) -> NoiseBalance:
-    """What the noise top-up of one image finds.
+def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
+    """Compares the noise that one image brings with the target's.
 
     Args:
         light: (4, H, W) at the exposure of the prepared scene.
         exposure: What happens to it; neither its ratio nor its noise are in `light` yet.
-        ratio: What `light` is to be multiplied by, where that is not the ratio of `exposure`.
     """
     source, target = exposure.source_noise, exposure.target
     if source.is_zero:
         return NoiseBalance(0.0, 0.0, not target.is_zero)
     (table,), remaining = top_up_table([source], [target]), exposure.remaining_variance
-    gain = exposure.ratio if ratio is None else ratio
     height, width = light.shape[-2:]
     rows = max(1, _BALANCED // width)
     parts = [slice(top, top + rows) for top in range(0, height, rows)]
@@ -268,7 +249,7 @@ def noise_balance(
                 lacks[plane] = True  # at every pixel, whatever its light
                 continue
             for part in parts:
-                signal = (light[plane, part] * gain).clamp_(0.0, SIGNAL_LIMIT)
+                signal = (light[plane, part] * exposure.ratio).clamp_(0.0, SIGNAL_LIMIT)
                 share = None if remaining is None else remaining[part]
                 missing = missing_variance(signal, table[:, plane], share)
                 lacks[plane] |= bool((missing > 0).any())

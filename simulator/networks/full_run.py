@@ -1,6 +1,6 @@
 """The full run: every module for one transition alone, nothing shared and nothing left out.
 
-`simulator.capture.plan` predicts the distance to this; its cost is what others are measured against.
+`simulator.capture.plan` predicts the distance to it, and other costs are measured against its own.
 """
 
 from __future__ import annotations

@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from numbers import Integral
 from typing import Any, Literal, get_args
 
@@ -35,25 +34,19 @@ def check_noise(noise: str) -> None:
         raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
 
 
-@dataclass(frozen=True)
-class FrameNoise:
-    """Standard normals of a frame, as an array: what `simulator.capture.kernels` adds.
+def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
+    """Standard normals of a frame of `shape` (P, H, W), float32.
 
-    For devices without those kernels, for the steps one by one, and for tests.
+    They are what `simulator.capture.kernels` adds, as an array: for other devices and for tests.
 
     Args:
         key: 64 bits, from `noise_keys`.
-        kind: How the key becomes normals.
+        shape: Planes, height and width.
+        noise: How the key becomes normals.
     """
-
-    key: int
-    kind: Noise = "exact"
-
-    def normals(self, shape: tuple[int, ...]) -> np.ndarray:
-        """(P, H, W) float32."""
-        planes, height, width = shape
-        make = bank_normals if self.kind == "bank" else drawn_normals
-        return make(self.key, (planes, height, width))
+    planes, height, width = shape
+    make = bank_normals if noise == "bank" else drawn_normals
+    return make(key, (planes, height, width))
 
 
 def noise_generator(seed: int, *key: int | float) -> torch.Generator:
@@ -184,10 +177,7 @@ def single_normals(keys: np.ndarray, count: int) -> np.ndarray:
 
 
 def bank_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
-    """The standard normals that a frame of `shape` (P, H, W) reads, float32.
-
-    What `simulator.capture.kernels` adds, as an array of its own.
-    """
+    """`frame_normals` from the bank."""
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     turns = np.arange(1, planes * blocks + 1, dtype=np.uint64) * KEY_STEP
@@ -315,10 +305,7 @@ def _draw(first, last, key, blocks, out):  # type: ignore[no-untyped-def]
 
 
 def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
-    """The standard normals of a frame of `shape` (P, H, W), float32.
-
-    What `simulator.capture.kernels` adds, as an array of its own.
-    """
+    """`frame_normals` drawn."""
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     out = np.empty((planes, samples), np.float32)

@@ -7,13 +7,11 @@ The shapes are those of `simulator.optics.shapes`.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.optics.shapes import disc_kernel, motion_kernel, streak_share
+from simulator.optics.shapes import disc_kernel, streak_share
 
-_SUM_TAPS = 13  # streaks longer than this are cheaper as a running sum
 _FFT_TAPS = 11  # kernels wider than this are applied in the Fourier domain
 _DIRECT_TAPS = 25  # the same where `simulator.optics.blur_kernels` does the sum
 
@@ -46,9 +44,6 @@ def motion_blur(light: torch.Tensor, extent_px: float) -> torch.Tensor:
         total = rows.sum(-1, keepdim=True) + rows[..., :1] * left + rows[..., -1:] * right
         return (total * full).to(light.dtype)
     padded = F.pad(light.reshape(-1, 1, width), (radius, radius), mode="replicate")
-    if 2 * radius + 1 <= _SUM_TAPS and light.device.type == "cpu":
-        weights = motion_kernel(extent_px)[None]
-        return _shifted_sum(padded.transpose(0, 1), weights).reshape(light.shape)
     sums = F.pad(padded.double().cumsum(-1), (1, 0))
     inner = sums[..., 2 * radius : 2 * radius + width] - sums[..., 1 : 1 + width]
     ends = padded[..., :width] + padded[..., 2 * radius :]
@@ -76,8 +71,6 @@ def disc_blur(light: torch.Tensor, diameter_px: float) -> torch.Tensor:
     height, width = light.shape[-2:]
     radius = taps // 2
     padded = F.pad(light.reshape(-1, 1, height, width), (radius,) * 4, mode="replicate")
-    if taps <= _FFT_TAPS and light.device.type == "cpu":
-        return _shifted_sum(padded[:, 0], weights).reshape(light.shape)
     kernel = torch.from_numpy(weights).to(light.device)
     if taps <= _FFT_TAPS:
         return F.conv2d(padded, kernel[None, None].to(light.dtype)).reshape(light.shape)
@@ -90,29 +83,6 @@ def disc_blur(light: torch.Tensor, diameter_px: float) -> torch.Tensor:
 
 def _has_kernels(light: torch.Tensor) -> bool:
     return light.device.type == "cpu" and light.dtype == torch.float32 and not light.requires_grad
-
-
-def _shifted_sum(padded: torch.Tensor, weights: np.ndarray) -> torch.Tensor:
-    """Correlation of `padded` (B, H + 2r, W + 2s) with symmetric `weights` (2r + 1, 2s + 1).
-
-    A sum of shifted copies, rows of equal weights added first: on a CPU 2 to 8 times as fast as a
-    convolution of a single channel.
-    """
-    half_rows, half_columns = (size // 2 for size in weights.shape)
-    height, width = padded.shape[1] - 2 * half_rows, padded.shape[2] - 2 * half_columns
-    total: torch.Tensor | None = None
-    for i in range(half_rows + 1):
-        rows = padded[:, half_rows - i : half_rows - i + height]
-        if i:
-            rows = rows + padded[:, half_rows + i : half_rows + i + height]
-        for shift, weight in enumerate(weights[half_rows + i].tolist()):
-            columns = rows[:, :, shift : shift + width]
-            if total is None:
-                total = columns * weight
-            elif weight:
-                total.add_(columns, alpha=weight)
-    assert total is not None
-    return total
 
 
 def box_mean(x: torch.Tensor, window: int) -> torch.Tensor:

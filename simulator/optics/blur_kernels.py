@@ -250,9 +250,7 @@ def blur_many(
     )
 
 
-def _without_wide_discs(
-    blurs: Sequence[Blur], limit: float, threads: int | None
-) -> Sequence[Blur]:
+def _without_wide_discs(blurs: Sequence[Blur], limit: float, threads: int | None) -> Sequence[Blur]:
     """The blurs that are left once the discs that are wide are done."""
     wide = [b for b in blurs if b.defocused is not None and b.diameter_px > _WIDE_PX]
     if not wide:

@@ -6,9 +6,14 @@ import math
 from dataclasses import replace
 
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from tests.strategies import (
+    log_uniform,
+)
 
 # Retyped from the published table (shot and read of R, G, B): the Z6's DNG NoiseProfile tags.
 Z6 = {
@@ -112,24 +117,6 @@ def test_one_measurement_calibrates_a_camera() -> None:
     assert camera.nlf(800).extrapolated
 
 
-def test_noise_level_function_arithmetic() -> None:
-    nlf = NoiseLevelFunction((4e-5, 3e-5, 3e-5, 2e-5), (4e-8, 3e-8, 3e-8, 2e-8))
-    assert nlf.exposed(8).shot == pytest.approx((32e-5, 24e-5, 24e-5, 16e-5))
-    assert nlf.exposed(8).read == pytest.approx((256e-8, 192e-8, 192e-8, 128e-8))
-    assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
-    assert NoiseLevelFunction.zero().is_zero
-    assert not nlf.is_zero
-    assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
-
-
-@pytest.mark.parametrize("value", [(1e-5,) * 3, (-1e-9,) * 4, (math.nan,) * 4, (math.inf,) * 4])
-@pytest.mark.parametrize("name", ["shot", "read"])
-def test_bad_noise_level_function(name: str, value: tuple[float, ...]) -> None:
-    arguments = {"shot": (1e-5,) * 4, "read": (1e-8,) * 4, name: value}
-    with pytest.raises(ValueError, match=f"`{name}`"):
-        NoiseLevelFunction(**arguments)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
     ("pattern", "offsets"),
     [
@@ -209,3 +196,18 @@ def test_profiles_are_hashable_values() -> None:
     assert hash(camera) == hash(replace(camera))
     assert camera == replace(camera)
     assert camera != replace(camera, white_level=16383)
+
+
+# -- for any input --------------------------------------------------------------------
+
+
+@given(st.sampled_from(["nikon_z6", "canon_70d"]), log_uniform(1e-3, 1e8), log_uniform(1, 4))
+def test_noise_grows_with_iso_within_a_conversion_gain(name: str, iso: float, more: float) -> None:
+    camera = get_camera(name)
+    higher = iso * more
+    assume(not any(iso < start <= higher for start in camera.segments))
+    nlf, noisier = camera.nlf(iso), camera.nlf(higher)
+    assert nlf.extrapolated == (not min(camera.nlf_by_iso) <= iso <= max(camera.nlf_by_iso))
+    for low, high in zip((*nlf.shot, *nlf.read), (*noisier.shot, *noisier.read), strict=True):
+        assert 0.0 < low <= high * (1 + 1e-12)
+    assert nlf.exposed(more).scaled(1 / 4).shot == pytest.approx([s * more / 4 for s in nlf.shot])

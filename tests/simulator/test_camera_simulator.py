@@ -1,4 +1,4 @@
-"""The simulator's plan, its seeds, its limits, and what it says about its own errors."""
+"""The simulator: sources, seeds, limits; with networks, what it prepares, and its stages."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ import itertools
 import math
 import weakref
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from simulator import (
     CameraProfile,
@@ -19,7 +25,23 @@ from simulator import (
     NoiseLevelFunction,
     PreparedScene,
     RawImage,
+    camera_simulator,
+    exposure_ratio,
     get_camera,
+)
+from simulator.camera_simulator import prepared_of
+from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
+from simulator.networks.exposure_module import ExposureModule
+from simulator.networks.weights import save_modules
+from simulator.utils.tiles import in_tiles
+from tests.strategies import (
+    SEEDS,
+    Mosaic,
+    cameras,
+    log_uniform,
+    mosaics,
+    prepared,
+    settings_within,
 )
 
 Z6 = get_camera("nikon_z6")
@@ -78,19 +100,6 @@ def test_other_seeds_and_settings_draw_independent_noise() -> None:
     assert np.abs(correlation - np.eye(len(frames))).max() < 5 / math.sqrt(frames[0].numel())
 
 
-def test_planes_and_pixels_are_independent() -> None:
-    frame = (
-        PreparedScene(torch.full((4, 128, 128), 0.3), BASE, Z6, ZERO).capture(BASE, 0)[0].double()
-    )
-    frame = frame - frame.mean((1, 2), keepdim=True)
-    frame = frame / frame.std((1, 2), keepdim=True)
-    bound = 5 / math.sqrt(128 * 128)
-    planes = (frame[:, None] * frame[None]).mean((2, 3)) - torch.eye(4)
-    assert float(planes.abs().max()) < bound
-    assert float((frame[:, :, 1:] * frame[:, :, :-1]).mean((1, 2)).abs().max()) < bound
-    assert float((frame[:, 1:] * frame[:, :-1]).mean((1, 2)).abs().max()) < bound
-
-
 def test_global_random_state_is_neither_read_nor_written(simulator: CameraSimulator) -> None:
     raw = RawImage(picture(), BASE, Z6)
     torch.manual_seed(0)
@@ -102,42 +111,6 @@ def test_global_random_state_is_neither_read_nor_written(simulator: CameraSimula
 
 
 # The plan
-
-
-def test_plan_of_a_still_far_scene(simulator: CameraSimulator) -> None:
-    raw = RawImage(picture(scale=0.5), BASE, Z6)
-    plan = simulator.plan(raw, CameraSettings(1600, 1 / 64, 8))
-    assert plan.exposure_ratio == pytest.approx(4.0)
-    assert plan.modules == ("exposure", "noise", "clip_and_quantise")
-    assert set(plan.left_out) == {"noise_reduction", "aperture", "defocus", "motion_blur"}
-    assert "far or in focus" in plan.left_out["defocus"]
-    assert "does not move" in plan.left_out["motion_blur"]
-    assert plan.excess_noise == 0.0
-    assert plan.predicted_rmse == 0.0
-    assert plan.clipped_source == 0.0
-    assert not plan.extrapolated_noise
-    assert plan.operations > 0
-
-
-def test_plan_names_what_a_moving_near_scene_needs(simulator: CameraSimulator) -> None:
-    raw = RawImage(picture(), BASE, Z6)
-    target = CameraSettings(1600, 1 / 8, 11)  # 16 * 8 / 8 = 16 times the light
-    near = simulator.plan(raw, target, image_speed=0.5, defocus=3.0)
-    assert near.modules == ("exposure", "defocus", "motion_blur", "noise", "clip_and_quantise")
-    assert set(near.left_out) == {"noise_reduction", "aperture"}
-    assert near.operations > simulator.plan(raw, target).operations
-    fast = simulator.plan(raw, CameraSettings(1600, 1 / 100_000, 4), image_speed=0.5)
-    assert "which would hardly show" in fast.left_out["motion_blur"]
-
-
-def test_plan_without_noise_to_add(simulator: CameraSimulator) -> None:
-    raw = RawImage(picture(), CameraSettings(6400, 1 / 64, 4), Z6)
-    plan = simulator.plan(raw, CameraSettings(100, 1 / 64, 4))  # darker by the gain alone
-    assert "noise" in plan.modules  # 64 times less signal: the target's shot noise is larger
-    plan = simulator.plan(raw, CameraSettings(100, 1.0, 4))  # the same light on the sensor
-    assert "noise" in plan.left_out
-    assert "noise" not in plan.modules
-    assert plan.excess_noise > 10
 
 
 def test_declared_excess_and_error_in_closed_form(simulator: CameraSimulator) -> None:
@@ -171,27 +144,7 @@ def test_saturated_source_is_declared(simulator: CameraSimulator) -> None:
     assert not prepared.saturated[3:].any()
 
 
-def test_extrapolated_noise_is_declared(simulator: CameraSimulator) -> None:
-    raw = RawImage(picture(), BASE, Z6)
-    assert simulator.plan(raw, CameraSettings(25_600, 1 / 64, 4)).extrapolated_noise
-    assert not simulator.plan(raw, CameraSettings(600, 1 / 64, 4)).extrapolated_noise
-
-
-def test_plan_prints_itself(simulator: CameraSimulator) -> None:
-    text = str(simulator.plan(RawImage(picture(), BASE, Z6), CameraSettings(25_600, 1 / 64, 4)))
-    assert text.startswith("ISO 25600, 1/64 s, f/4: 256 x the light of the source")
-    assert "exposure -> noise -> clip_and_quantise" in text
-    assert "left out  motion_blur: the image does not move" in text
-    assert "outside the camera's noise calibration" in text
-
-
 # prepare and simulate
-
-
-def test_same_settings_give_the_same_digital_numbers(simulator: CameraSimulator) -> None:
-    mosaic = np.random.default_rng(0).integers(0, 15521, (18, 22))
-    raw = RawImage.from_mosaic(mosaic, BASE, Z6)
-    np.testing.assert_array_equal(simulator.simulate(raw, BASE, seed=5).to_mosaic(), mosaic)
 
 
 def test_simulate_keeps_what_is_known(simulator: CameraSimulator) -> None:
@@ -225,15 +178,6 @@ def test_scene_arguments_replace_only_themselves(simulator: CameraSimulator) -> 
     assert simulator.prepare(prepared, image_speed=0.0).image_speed == 0.0
     assert simulator.prepare(prepared, image_speed=0.0).defocus == 2.0
     assert simulator.prepare(prepared, defocus=1.0).image_speed == 0.5
-
-
-def test_anything_with_a_prepared_scene_is_a_source(simulator: CameraSimulator) -> None:
-    prepared = PreparedScene(picture(), BASE, Z6, ZERO)
-    scene = SimpleNamespace(prepared=prepared)
-    assert torch.equal(
-        simulator.simulate(scene, STATES[9], seed=1).data,
-        simulator.simulate(prepared, STATES[9], seed=1).data,
-    )
 
 
 def test_an_uncalibrated_camera_uses_the_raws_own_noise(simulator: CameraSimulator) -> None:
@@ -325,21 +269,16 @@ def test_the_mean_is_right_at_extreme_ratios(exponent: int) -> None:
     assert np.unique(np.rint(numbers(capture))).tolist() == [round(0.3 * 14512 + 1008)]
 
 
-@pytest.mark.parametrize("iso", [25, 50, 25_600, 409_600])
-def test_isos_far_outside_the_table(iso: float) -> None:
-    prepared = PreparedScene(torch.full((4, 64, 64), 0.2), CameraSettings(iso, 1 / 64, 4), Z6, ZERO)
-    capture, _ = prepared.capture(CameraSettings(iso, 1 / 64, 4), 0)
-    assert torch.isfinite(capture).all()
-    if iso < 100:
-        variance = 5.73712214136873e-09 * (iso / 100) ** 2 + 0.2 * 7.47234302281224e-06 * iso / 100
-        measured = float(capture[1].double().var()) - 1 / 12 / 14512**2
-        assert measured == pytest.approx(variance, rel=5 * math.sqrt(2 / 64**2))
-
-
-def test_a_streak_longer_than_the_frame_by_far() -> None:
-    prepared = PreparedScene(picture(8, 8), BASE, Z6, ZERO, image_speed=8.0)
-    capture, _ = prepared.capture(CameraSettings(100, 1000.0, 1024.0), 0)
-    assert torch.isfinite(capture).all()
+@pytest.mark.parametrize("nlf", [ZERO, Z6.nlf(100)])
+def test_the_longest_streak_takes_no_memory_of_its_length(nlf: NoiseLevelFunction) -> None:
+    """1000 frame heights a second for 1e5 s: 3 billion pixels, which leave the rows' ends alone."""
+    light = picture(8, 8)
+    prepared = PreparedScene(light, BASE, Z6, nlf, image_speed=1000.0, defocus=2.0)
+    settings = CameraSettings(100, 1e5, 1024.0)
+    ends = (light[..., :1] + light[..., -1:]) / 2
+    expected = prepared.expected(settings) / prepared.exposure(settings).ratio
+    torch.testing.assert_close(expected, ends.expand_as(expected), rtol=1e-4, atol=1e-4)
+    assert torch.isfinite(prepared.capture(settings, 0)[0]).all()
 
 
 def test_a_large_sweep_streams_one_frame_at_a_time() -> None:
@@ -377,6 +316,12 @@ def test_a_large_sweep_streams_one_frame_at_a_time() -> None:
         (lambda s, raw: s.simulate(raw, BASE, image_speed=-1.0), "`image_speed`"),
         (lambda s, raw: s.simulate(raw, BASE, image_speed=math.nan), "`image_speed`"),
         (lambda s, raw: s.simulate(raw, BASE, defocus=math.inf), "`defocus`"),
+        (lambda s, raw: s.prepare(raw, defocus=513.0), "`defocus` .* not be wider than the frame"),
+        (
+            lambda s, raw: s.simulate(raw, CameraSettings(100, 1, 1), defocus=200.0),
+            "`defocus` .* a disc of 800 pixel at f/1: .*frame",
+        ),
+        (lambda s, raw: s.prepare(raw, image_speed=1001.0), r"`image_speed` .* in \[0, 1000\]"),
         (lambda s, raw: PreparedScene(raw.data[:3], BASE, Z6, ZERO), "`light`"),
         (lambda s, raw: PreparedScene(raw.data * math.nan, BASE, Z6, ZERO), "`light`"),
         (lambda s, raw: CameraSimulator(device="abacus"), "`device`"),
@@ -412,3 +357,371 @@ def test_a_noisy_source_is_stated_in_the_result() -> None:
     assert stated.shot == pytest.approx([max(ratio * a, b) for a, b in pairs])
     pairs = zip(camera.nlf(6400).read, camera.nlf(100).read, strict=True)
     assert stated.read == pytest.approx([max(ratio**2 * a, b) for a, b in pairs])
+
+
+CPU = torch.device("cpu")
+
+
+def clean_raw(**changes: object) -> RawImage:
+    data = torch.rand(4, 6, 8, generator=torch.Generator().manual_seed(0)) * 0.9
+    return replace(RawImage(data, BASE, get_camera("nikon_z6")), **changes)  # type: ignore[arg-type]
+
+
+def test_a_raw_keeps_its_light_and_noise() -> None:
+    source = clean_raw(white_balance=(2.0, 1.0, 1.5), box_factor=2)
+    prepared = prepared_of(source, CPU)
+    assert torch.equal(prepared.light, source.data)
+    assert (prepared.reference, prepared.camera) == (BASE, source.camera)
+    assert prepared.nlf == source.noise
+    assert (prepared.white_balance, prepared.box_factor) == ((2.0, 1.0, 1.5), 2)
+    assert prepared.saturated is None
+    assert prepared.denoised is None
+
+
+def test_saturated_pixels_are_marked() -> None:
+    data = clean_raw().data.clone()
+    data[2, 1, 3] = 1.0
+    saturated = prepared_of(clean_raw(data=data), CPU).saturated
+    assert saturated is not None
+    assert saturated.nonzero().tolist() == [[1, 3]]
+
+
+def test_prepared_scenes_and_scenes_share_what_is_known() -> None:
+    prepared = replace(prepared_of(clean_raw(), CPU), image_speed=0.5, tolerance=0.0)
+    for source in (prepared, SimpleNamespace(prepared=prepared)):
+        found = prepared_of(source, CPU)
+        assert found.light is prepared.light
+        assert found.statistics is prepared.statistics
+        assert found.blurred_light is prepared.blurred_light
+        assert (found.image_speed, found.tolerance) == (0.5, 0.0)
+
+
+SOURCE = CameraSettings(6400, 1 / 64, 8)
+CLEANER = CameraSettings(100, 1, 8)
+OPENER = CameraSettings(6400, 1 / 256, 4)
+
+
+def noisy_raw(height: int = 18, width: int = 21) -> RawImage:
+    data = np.random.default_rng(0).uniform(0.02, 0.5, (4, height, width)).astype(np.float32)
+    return RawImage(torch.from_numpy(data), SOURCE, Z6)
+
+
+def with_networks(preset: Literal["compact", "paper"] = "compact") -> CameraSimulator:
+    torch.manual_seed(0)
+    made = CameraSimulator(preset, device="cpu")
+    if preset == "compact":
+        made.noise.network.tail.weight.mul_(3)
+        made.aperture.network.tail.bias.fill_(1.2)  # about 3 px, well above the dead zone
+    return made
+
+
+@pytest.fixture(scope="module")
+def compact() -> CameraSimulator:
+    return with_networks()
+
+
+@pytest.fixture(scope="module")
+def paper() -> CameraSimulator:
+    return with_networks("paper")
+
+
+# Preparation
+
+
+def test_preparing_denoises_once(compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    denoise = compact.denoise
+    monkeypatch.setattr(compact, "denoise", lambda prepared: calls.append(1) or denoise(prepared))
+    prepared = compact.prepare(noisy_raw())
+    for settings in (CLEANER, SOURCE, OPENER):
+        compact.simulate(prepared, settings)
+    assert len(calls) == 1
+    assert prepared.denoised is not None
+    assert not torch.equal(prepared.denoised.light, prepared.light)
+
+
+def test_a_source_without_noise_needs_no_network(compact: CameraSimulator) -> None:
+    clean = replace(compact.prepare(noisy_raw()), nlf=Z6.nlf(100).zero(), denoised=None)
+    assert compact.prepare(clean).denoised is None
+
+
+def test_without_networks_nothing_is_denoised() -> None:
+    plain = CameraSimulator(device="cpu")
+    assert plain.prepare(noisy_raw()).denoised is None
+    with pytest.raises(ValueError, match="there is no noise module"):
+        plain.denoise(plain.prepare(noisy_raw()))
+    with pytest.raises(ValueError, match="there is no aperture module"):
+        plain.estimate_defocus(plain.prepare(noisy_raw()))
+    with pytest.raises(ValueError, match=r"`depth` \(='unknown'\) needs an aperture module"):
+        plain.prepare(noisy_raw(), depth="unknown")
+    with pytest.raises(ValueError, match="there are no modules to run"):
+        plain.stages(noisy_raw(), CLEANER)
+
+
+def test_depth_must_be_known(compact: CameraSimulator) -> None:
+    with pytest.raises(
+        ValueError, match=r"`depth` \(='near'\) must be one of \['far', 'unknown'\]"
+    ):
+        compact.prepare(noisy_raw(), depth="near")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind"), [("compact", MapApertureBlur), ("paper", NetworkApertureBlur)]
+)
+def test_unknown_depth_prepares_an_opening(preset, kind, request) -> None:
+    made = request.getfixturevalue(preset)
+    assert made.prepare(noisy_raw()).aperture_blur is None
+    prepared = made.prepare(noisy_raw(), depth="unknown")
+    assert isinstance(prepared.aperture_blur, kind)
+    assert prepared.aperture_blur.f_number == 8.0
+    assert (
+        made.prepare(prepared).aperture_blur is prepared.aperture_blur
+    )  # simulate() prepares again
+    assert made.simulate(prepared, OPENER).data.isfinite().all()
+
+
+def test_frames_are_denoised_and_mapped_in_tiles(
+    compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than one tile gives what one gives, whatever the tile."""
+    prepared = compact.prepare(noisy_raw(170, 131))
+    defocus = compact.estimate_defocus(prepared)
+    assert defocus.shape == (170, 131)
+
+    small = partial(in_tiles, tile=64)
+
+    monkeypatch.setattr(camera_simulator, "in_tiles", small)
+    assert prepared.denoised is not None
+    torch.testing.assert_close(
+        compact.denoise(prepared), prepared.denoised.light, atol=1e-4, rtol=0
+    )
+    torch.testing.assert_close(compact.estimate_defocus(prepared), defocus, atol=1e-3, rtol=0)
+
+
+def test_saturated_and_black_parts_need_no_network(
+    compact: CameraSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was clipped stays as it is, all else is as with the whole frame through the networks."""
+    data = noisy_raw(320, 400).data.clone()
+    data[:, :192, :256], data[:, 256:, :] = 1.0, 0.0
+    source = RawImage(data, SOURCE, Z6)
+    everywhere, tolerant = (compact.prepare(source, tolerance=t) for t in (0.0, 0.1))
+    seen = []
+    forward = compact.noise.forward
+    monkeypatch.setattr(
+        compact.noise,
+        "forward",
+        lambda x, *noise: seen.append(x[0, 0].numel()) or forward(x, *noise),
+    )
+    expected, result = compact.denoise(everywhere), compact.denoise(tolerant)
+    assert seen[0] == 320 * 400
+    assert sum(seen[1:]) < 0.8 * seen[0]
+    clipped = torch.zeros(320, 400, dtype=torch.bool)
+    clipped[:192, :256] = clipped[256:] = True
+    assert torch.equal(result[:, clipped], data[:, clipped])
+    torch.testing.assert_close(result[:, ~clipped], expected[:, ~clipped], rtol=0, atol=1e-4)
+    assert not torch.equal(expected[:, clipped], data[:, clipped])
+    tolerant = replace(tolerant, denoised=everywhere.denoised)
+    found = [compact.estimate_defocus(prepared) for prepared in (everywhere, tolerant)]
+    assert float(found[1][:176, :240].max()) == 0.0  # no disc of 32 px reaches anything from here
+    near = ~clipped
+    torch.testing.assert_close(found[1][near], found[0][near], rtol=0, atol=1e-3)
+
+
+def test_the_papers_aperture_has_no_map(paper: CameraSimulator) -> None:
+    with pytest.raises(ValueError, match="must be 'compact' to have a defocus map"):
+        paper.estimate_defocus(paper.prepare(noisy_raw()))
+
+
+def test_bfloat16_is_close_to_float32(compact: CameraSimulator) -> None:
+    half = CameraSimulator("compact", device="cpu", precision="bfloat16")
+    half.noise, half.aperture = compact.noise, compact.aperture
+    exact, rounded = (s.denoise(s.prepare(noisy_raw())) for s in (compact, half))
+    assert rounded.dtype == torch.float32
+    assert not torch.equal(exact, rounded)
+    assert (exact - rounded).abs().mean() < 0.02 * (exact - noisy_raw().data).abs().mean()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"precision": "float16"}, r"`precision` \(='float16'\)"),
+        ({"device": "tpu9"}, r"`device` \(='tpu9'\)"),
+        ({"preset": "tiny"}, r"`preset` \(='tiny'\)"),
+    ],
+)
+def test_bad_arguments(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CameraSimulator(**{"device": "cpu", **arguments})
+
+
+# Stages
+
+
+def test_stages_follow_one_another(compact: CameraSimulator) -> None:
+    source, target = noisy_raw(), CameraSettings(100, 1 / 4, 4)
+    stages = compact.stages(source, target, seed=5)
+    assert torch.equal(stages.exposed, source.data)  # 1/64 of the ISO, 16 x the time, 4 x the area
+    assert not torch.equal(stages.denoised, stages.exposed)
+    assert not torch.equal(stages.opened, stages.denoised)
+    # The output's noise: the target's around the last stage, whole digital numbers.
+    numbers = stages.capture.double() * 14512 + 1008
+    assert (numbers - numbers.round()).abs().max() < 1e-2
+    nlf = Z6.nlf(100)
+    read, shot = (torch.tensor(v)[:, None, None] for v in (nlf.read, nlf.shot))
+    error = (stages.capture - stages.opened) / (read + shot * stages.opened.clamp(min=0)).sqrt()
+    inside = (stages.opened < 0.95) & (stages.opened > 0)
+    assert float(error[inside].std()) == pytest.approx(1.0, abs=0.1)
+    assert torch.equal(stages.capture, compact.stages(source, target, seed=5).capture)
+    assert not torch.equal(stages.capture, compact.stages(source, target, seed=6).capture)
+
+
+def test_compact_stages_agree_with_the_prepared_prepared_scene(compact: CameraSimulator) -> None:
+    """Denoise, expose = expose, denoise: one preparation serves every target."""
+    source = noisy_raw()
+    prepared = compact.prepare(source, depth="unknown")
+    for target in (CLEANER, CameraSettings(100, 1 / 16, 8), CameraSettings(100, 1 / 4, 4)):
+        stages = compact.stages(source, target)
+        expected = prepared.expected(target)
+        scale = float(expected.abs().max())
+        torch.testing.assert_close(stages.opened, expected, rtol=0, atol=1e-4 * scale)
+
+
+def test_only_the_paper_clips_after_the_exposure(
+    compact: CameraSimulator, paper: CameraSimulator
+) -> None:
+    target = CameraSettings(6400, 1 / 8, 8)  # eight times the light
+    assert compact.stages(noisy_raw(), target).exposed.max() > 2
+    exposed = paper.stages(noisy_raw(), target).exposed
+    assert float(exposed.max()) == 1.0
+    torch.testing.assert_close(exposed, (noisy_raw().data * 8).clamp(0, 1))
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_a_smaller_aperture_leaves_the_picture_as_denoised(preset, request) -> None:
+    stages = request.getfixturevalue(preset).stages(noisy_raw(), CameraSettings(6400, 1 / 64, 11))
+    assert torch.equal(stages.opened, stages.denoised)
+
+
+# The body's correction
+
+
+def corrected() -> CameraSimulator:
+    made = with_networks()
+    with torch.no_grad():
+        made.exposure.w.fill_(1.25)
+        made.exposure.b.fill_(0.01)
+    return made
+
+
+def test_the_correction_reaches_light_and_noise_once() -> None:
+    made, source = corrected(), noisy_raw()
+    prepared = made.prepare(source)
+    torch.testing.assert_close(prepared.light, 1.25 * (source.data + 0.01))
+    again = made.prepare(prepared)
+    assert torch.equal(again.light, prepared.light)
+    nlf = Z6.nlf(6400)
+    assert prepared.nlf.shot == pytest.approx([1.25 * s for s in nlf.shot])
+    assert prepared.nlf.read == pytest.approx([1.25**2 * r for r in nlf.read])
+    frames = [made.simulate(s, CLEANER, seed=1).data for s in (source, prepared)]
+    assert torch.equal(*frames)
+
+
+def test_the_correction_in_the_stages() -> None:
+    stages = corrected().stages(noisy_raw(), SOURCE)
+    torch.testing.assert_close(stages.exposed, 1.25 * (noisy_raw().data + 0.01))
+
+
+def test_pretrained_weights_and_their_correction(tmp_path: Path) -> None:
+    made = corrected()
+    parts = {"exposure": made.exposure, "noise": made.noise, "aperture": made.aperture}
+    save_modules(tmp_path / "net", torch.nn.ModuleDict(parts), "compact", {})
+    plain = CameraSimulator.from_pretrained(tmp_path / "net", device="cpu")
+    assert plain.exposure.is_identity
+    assert torch.equal(plain.prepare(noisy_raw()).light, noisy_raw().data)
+    body = CameraSimulator.from_pretrained(tmp_path / "net", device="cpu", body_correction=True)
+    assert isinstance(body.exposure, ExposureModule)
+    for settings in (CLEANER, OPENER):
+        expected = made.simulate(noisy_raw(), settings, seed=2, depth="unknown").data
+        result = body.simulate(noisy_raw(), settings, seed=2, depth="unknown").data
+        assert torch.equal(result, expected)
+
+
+@pytest.mark.parametrize("depth", ["far", "unknown"])
+def test_tolerance_nought_forgets_what_another_one_left_out(
+    compact: CameraSimulator, depth: str
+) -> None:
+    """A saturated quarter needs no network at tolerance 0.1; the full run denoises it, too."""
+    data = noisy_raw(96, 96).data.clone()
+    data[:, :48, :48] = 1.0
+    source = RawImage(data, SOURCE, Z6)
+    prepared = compact.prepare(source, depth=depth)  # type: ignore[arg-type]
+    prepared.capture(CLEANER)
+    shared = compact.simulate(prepared, CLEANER, tolerance=0.0)
+    full = compact.simulate(source, CLEANER, tolerance=None, depth=depth)
+    torch.testing.assert_close(shared.data, full.data, rtol=0, atol=1.01 / 14512)
+
+
+SETTINGS = settings_within()
+NOISES = st.sampled_from(["exact", "bank"])
+
+
+# -- for any input --------------------------------------------------------------------
+
+
+@given(mosaics(cameras()), SETTINGS, SEEDS, NOISES)
+def test_simulating_the_own_settings_changes_nothing(
+    mosaic: Mosaic, settings: CameraSettings, seed: int, noise: Any
+) -> None:
+    """A raw has its noise already; its digital numbers come back, and noise-free light as it is."""
+    camera, numbers = mosaic
+    raw = RawImage.from_mosaic(numbers, settings, camera)
+    again = CameraSimulator(device="cpu").simulate(raw, settings, seed=seed, noise=noise)
+    np.testing.assert_array_equal(again.to_mosaic(), numbers)
+    assert torch.equal(prepared(raw.data, settings, camera).expected(settings), raw.data)
+
+
+@given(
+    st.floats(0.2, 0.6),
+    st.tuples(*[st.tuples(st.floats(0.5, 0.95), st.floats(1.2, 4.0))] * 2),
+    log_uniform(1e-6, 1e-4),
+    log_uniform(1e-9, 1e-7),
+    st.sampled_from([1, 2, 5]),
+    SEEDS,
+)
+def test_two_hops_have_the_noise_of_one(
+    level: float,
+    hops: tuple[tuple[float, float], tuple[float, float]],
+    shot: float,
+    read: float,
+    box_factor: int,
+    seed: int,
+) -> None:
+    """Each hop is a share of the light at a higher ISO: the source never has too much noise.
+
+    All levels are more than ten standard deviations from both clips.
+    """
+    nlf = NoiseLevelFunction((shot,) * 4, (read,) * 4)
+    camera = CameraProfile("fine", "RGGB", 8192.0, 2**16 - 1, 16, nlf_by_iso={100.0: nlf})  # type: ignore[arg-type]
+    start = CameraSettings(100, 1.0, 4)
+    (first, gain), (second, more) = hops
+    middle = CameraSettings(100 * gain, first / gain, 4)
+    last = CameraSettings(100 * gain * more, first * second / (gain * more), 4)
+    simulator = CameraSimulator(device="cpu")
+    clean = prepared(torch.full((4, 64, 64), level), start, camera, box_factor=box_factor)
+    source = simulator.simulate(clean, start, seed=seed)
+    one = simulator.simulate(source, last, seed=seed + 1)
+    two = simulator.simulate(simulator.simulate(source, middle, seed=seed + 2), last, seed=seed + 3)
+
+    ratio, wanted = exposure_ratio(start, last), camera.nlf(last.iso).scaled(1 / box_factor**2)
+    mean = level * ratio
+    variance = wanted.shot[0] * mean + wanted.read[0]
+    count = 4 * 64 * 64
+    rounding = (ratio**2 + exposure_ratio(middle, last) ** 2 + 1) / (12 * camera.span[0] ** 2)
+    for raw in (one, two):
+        data = raw.data.double()
+        assert abs(float(data.mean()) - mean) < 5 * math.sqrt(variance / count)
+        assert abs(float(data.var()) - variance) < 5 * variance * math.sqrt(2 / count) + rounding
+        assert raw.metadata["excess_noise"] < 1e-6
+        assert raw.noise.shot == pytest.approx(wanted.shot, rel=1e-6)
+        assert raw.noise.read == pytest.approx(wanted.read, rel=1e-6)

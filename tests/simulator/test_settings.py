@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
+from hypothesis import given
 
 from simulator.settings import (
     CameraSettings,
@@ -13,6 +15,9 @@ from simulator.settings import (
     incident_ev100,
     sensor_signal,
     snap_exposure_time,
+)
+from tests.strategies import (
+    settings_within,
 )
 
 
@@ -167,3 +172,34 @@ def test_settings_are_values() -> None:
 def test_format(exposure_time: float, text: str) -> None:
     assert format_exposure_time(exposure_time) == text
     assert str(CameraSettings(400, exposure_time, 5.6)) == f"ISO 400, {text}, f/5.6"
+
+
+SETTINGS = settings_within()
+
+
+# -- for any input --------------------------------------------------------------------
+
+
+@given(SETTINGS, SETTINGS, SETTINGS)
+def test_exposure_ratios_form_a_group(
+    a: CameraSettings, b: CameraSettings, c: CameraSettings
+) -> None:
+    # A stop is below 2**7, so each of three differences of stops is rounded by up to 2**-47; what
+    # that moves a power of 2 by is below it, as ln 2 is below 1, even with the power's own ulp.
+    bound = 3 * 2.0**-47
+    assert exposure_ratio(a, a) == 1.0
+    assert exposure_ratio(a, b) * exposure_ratio(b, a) == pytest.approx(1.0, rel=bound)
+    chained = exposure_ratio(a, b) * exposure_ratio(b, c)
+    assert chained == pytest.approx(exposure_ratio(a, c), rel=bound)
+
+
+@given(SETTINGS)
+def test_exact_stops_stand_for_themselves(settings: CameraSettings) -> None:
+    recorded = CameraSettings.from_exif(settings.iso, settings.exposure_time, settings.f_number)
+    thirds = -3 * recorded.time_value
+    assert recorded == settings or thirds == pytest.approx(round(thirds), abs=1e-12)
+    assert abs(thirds + 3 * settings.time_value) < 0.5  # never to the next one
+    again = CameraSettings.from_exif(recorded.iso, recorded.exposure_time, recorded.f_number)
+    assert again == recorded
+    exact = replace(settings, f_number=min(max(settings.effective_f_number, 0.5), 1024.0))
+    assert exposure_ratio(settings, exact) == 1.0

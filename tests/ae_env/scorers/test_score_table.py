@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import weakref
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from ae_env.scorers.terms import Highlights
 from simulator import get_camera
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.utils.cache import DiskCache
 
 CAMERA = get_camera("nikon_z6")
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
@@ -174,6 +176,30 @@ def test_a_truncated_file_is_made_anew(cache: Path) -> None:
     (path,) = _files(cache)
     path.write_bytes(path.read_bytes()[:-40])
     np.testing.assert_array_equal(_tables().table(scene).mean, expected)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda means: means[:-1],
+        lambda means: means.reshape(-1),
+        lambda means: means * float("nan"),
+        lambda means: torch.where(means == means.max(), float("inf"), means),
+    ],
+)
+def test_a_table_of_a_wrong_shape_or_without_numbers_is_made_again(
+    cache: Path, change: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    """The file is whole, and its digest is that of its content: only the content cannot be."""
+    expected, disk = _tables().table(_scene()).mean, DiskCache(cache)
+    key = _files(cache)[0].stem
+    stored = disk.get("score_tables", key)
+    assert stored is not None
+    disk.put("score_tables", key, stored | {"means": change(stored["means"])})
+    np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
+    mended = disk.get("score_tables", key)
+    assert mended is not None
+    assert torch.equal(mended["means"], stored["means"])
 
 
 def test_key_changes_with_everything_that_changes_the_scores(

@@ -103,7 +103,9 @@ def test_noise_that_opening_leaves() -> None:
     blurred_light = BlurredLight(LIGHT, None, aperture_blur)
     alone = aperture_blur.remaining_variance(4.0)
     assert torch.equal(blurred_light.remaining_variance(4.0, 1.0), alone)
-    torch.testing.assert_close(blurred_light.remaining_variance(4.0, 0.5), (2 * alone).clamp(max=1.0))
+    torch.testing.assert_close(
+        blurred_light.remaining_variance(4.0, 0.5), (2 * alone).clamp(max=1.0)
+    )
     assert blurred_light.remaining_variance(4.0, 0.5) is blurred_light.remaining_variance(4.0, 0.5)
     assert BlurredLight(LIGHT, None, None).remaining_variance(4.0, 1.0) is None
 

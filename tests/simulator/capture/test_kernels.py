@@ -15,7 +15,7 @@ from simulator.camera import CameraProfile, get_camera, list_cameras
 from simulator.capture.exposure import Exposure, exposure_table
 from simulator.capture.kernels import record_frames, sensor_table
 from simulator.capture.sensor import Transitions, clip_and_quantise, record
-from simulator.noise.generator import FrameNoise, Noise, noise_keys
+from simulator.noise.generator import Noise, frame_normals, noise_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
 Z6 = get_camera("nikon_z6")
@@ -76,7 +76,7 @@ def test_captures_are_those_of_the_reference(
         remaining_variance=random_light(*size, seed=1).clamp(0.0, 1.0) if blurred else None,
     )
     key = int(noise_keys(5, 3)[0])
-    normals = torch.from_numpy(FrameNoise(key, kind).normals((4, *size)))
+    normals = torch.from_numpy(frame_normals(key, (4, *size), kind))
     numbers = in_numbers(captured(light, exposure, key=key, kind=kind))
     assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 holds 14 bits to 0.001
     # The nearest number, where float32 may be off by a hundredth of one before it rounds.

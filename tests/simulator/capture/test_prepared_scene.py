@@ -5,18 +5,40 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from random import Random
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
 from torch import Tensor
 
-from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
+from simulator import (
+    CameraSettings,
+    NoiseLevelFunction,
+    PreparedScene,
+    exposure_ratio,
+    get_camera,
+)
 from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.blurred_light import Denoised
 from simulator.capture.exposure import Exposure
 from simulator.networks.aperture_module import ApertureModule
+from simulator.raw.image import unpack_mosaic
+from tests.strategies import (
+    LIGHT,
+    SEEDS,
+    USUAL_SETTINGS,
+    cameras,
+    lights,
+    settings_within,
+)
+from tests.strategies import (
+    prepared as any_prepared,
+)
 
 Z6 = get_camera("nikon_z6")
 LOW, HIGH = CameraSettings(100, 1 / 64, 8), CameraSettings(6400, 1 / 64, 8)
@@ -434,3 +456,105 @@ def test_only_settings_are_exposed_and_never_into_the_light() -> None:
         own.expose([HIGH], out=own.light[None])
     with pytest.raises(ValueError, match="without gradient"):
         own.expose([HIGH], out=torch.empty(1, 4, SIDE, SIDE, requires_grad=True))
+
+
+ANY_SETTINGS = settings_within()
+NOISES = st.sampled_from(["exact", "bank"])
+
+
+# -- for any input --------------------------------------------------------------------
+
+
+@given(lights(), lights(), ANY_SETTINGS, ANY_SETTINGS, cameras(noise=False))
+def test_more_light_never_lowers_the_raw(
+    first: torch.Tensor,
+    second: torch.Tensor,
+    reference: CameraSettings,
+    settings: CameraSettings,
+    camera: CameraProfile,
+) -> None:
+    second = torch.from_numpy(np.resize(second.numpy(), first.shape))
+    darker, brighter = (
+        any_prepared(f(first, second), reference, camera).expose([settings])
+        for f in (torch.minimum, torch.maximum)
+    )
+    assert bool((darker <= brighter).all())
+    numbers = np.stack([unpack_mosaic(frame[0], camera) for frame in (darker, brighter)])
+    assert numbers.max() <= camera.white_level
+
+
+@given(lights(LIGHT.map(abs)), ANY_SETTINGS, ANY_SETTINGS, ANY_SETTINGS, cameras(noise=False))
+def test_more_exposure_never_lowers_the_raw(
+    light: torch.Tensor,
+    reference: CameraSettings,
+    a: CameraSettings,
+    b: CameraSettings,
+    camera: CameraProfile,
+) -> None:
+    less = CameraSettings(
+        min(a.iso, b.iso), min(a.exposure_time, b.exposure_time), max(a.f_number, b.f_number)
+    )
+    more = CameraSettings(
+        max(a.iso, b.iso), max(a.exposure_time, b.exposure_time), min(a.f_number, b.f_number)
+    )
+    assume(exposure_ratio(less, more) >= 1.0)
+    darker, brighter = any_prepared(light, reference, camera).expose([less, more])
+    assert bool((darker <= brighter).all())
+
+
+@example(  # a variance beyond float32
+    torch.zeros(4, 1, 1),
+    get_camera("nikon_z6"),
+    CameraSettings(1e-3, 1e-9, 1024),
+    [CameraSettings(1e8, 1e5, 0.5)],
+    {"gain": 1e39},
+    True,
+    0,
+    "exact",
+    Random(0),
+)
+@given(
+    lights(),
+    cameras(),
+    ANY_SETTINGS,
+    st.lists(st.one_of(ANY_SETTINGS, USUAL_SETTINGS), min_size=1, max_size=5),
+    st.sampled_from(
+        [
+            {},
+            {"image_speed": 0.5},
+            {"defocus": 3.0, "tolerance": 0.0},
+            {"gain": 0.0},
+            {"gain": 1e39},
+        ]
+    ),
+    st.booleans(),
+    SEEDS,
+    NOISES,
+    st.randoms(use_true_random=False),
+)
+def test_a_frame_is_the_same_alone_in_a_sweep_and_in_any_order(
+    light: torch.Tensor,
+    camera: CameraProfile,
+    reference: CameraSettings,
+    states: list[CameraSettings],
+    fields: dict[str, float],
+    is_noisy: bool,
+    seed: int,
+    noise: Any,
+    random: Any,
+) -> None:
+    nlf = camera.nlf(reference.iso) if is_noisy else None
+    source = any_prepared(light, reference, camera, nlf, **fields)
+    sweep = source.expose(states, seed=seed, noise=noise)
+    span = torch.tensor(camera.pedestal)[:, None, None]
+    assert bool(((sweep >= -span * (1 + 1e-6) - 1e-6) & (sweep <= 1)).all())
+    order = random.sample(range(len(states)), len(states))
+    permuted = source.expose([states[i] for i in order], seed=seed, noise=noise)
+    assert torch.equal(permuted, sweep[order])
+    streamed = list(source.stream(states, seed=seed, noise=noise))
+    fresh = any_prepared(light, reference, camera, nlf, **fields)
+    for state, frame, in_stream in zip(states, sweep, streamed, strict=True):
+        again, excess = fresh.capture(state, seed, noise=noise)
+        assert torch.equal(again, frame)
+        assert 0.0 <= excess < math.inf
+        assert torch.equal(in_stream, frame)

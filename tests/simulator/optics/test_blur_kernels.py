@@ -1,4 +1,4 @@
-"""Row-by-row blur against the definitions in `simulator.optics.blur`, in float64, and brute force."""
+"""Row-by-row blur against the definitions in `simulator.optics.blur`, and brute force."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy import ndimage
 
+from simulator.optics import blur_kernels
 from simulator.optics.blur import disc_blur, motion_blur
 from simulator.optics.blur_kernels import Blur, blur_many, disc, streak
 from simulator.optics.shapes import coverage, disc_kernel, motion_kernel
@@ -125,3 +126,20 @@ def test_many_images_are_scipys_correlation(threads: int) -> None:
         if moved is not None:
             np.testing.assert_allclose(moved, wanted, rtol=1e-5)
     blur_many([])
+
+
+@pytest.mark.parametrize("extent", [0.0, 5.0])
+def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(
+    monkeypatch: pytest.MonkeyPatch, extent: float
+) -> None:
+    light = torch.rand(4, 64, 48, generator=torch.Generator().manual_seed(0))
+    light[:, 20, 20], results = 1e6, []
+    for widest in (blur_kernels._WIDE_PX, 1e9):
+        monkeypatch.setattr(blur_kernels, "_WIDE_PX", widest)
+        defocused, moved = torch.empty_like(light), torch.empty_like(light)
+        narrow = torch.empty_like(light)
+        blurs = [Blur(light, 48.0, defocused, extent, moved if extent else None)]
+        blur_many([*blurs, Blur(light, 3.0, narrow)], limit=1e3)
+        results.append([defocused, narrow] + [moved] * bool(extent))
+    for fourier, direct in zip(*results, strict=True):
+        torch.testing.assert_close(fourier, direct, rtol=1e-4, atol=1e-5)

@@ -1,4 +1,4 @@
-"""The statistics of a capture against closed forms, over every state of a 64-state grid.
+"""From light to digital numbers: statistics against closed forms, and the kernel against its steps.
 
 Tolerances are sampling errors: five standard errors, computed from the exact fourth moments.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,18 @@ import torch
 from scipy.stats import norm
 
 from simulator.camera import CameraProfile, get_camera
+from simulator.capture import kernels
 from simulator.capture.exposure import Exposure
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import add_noise, clip_and_quantise, sensor_light
-from simulator.noise.generator import FrameNoise
+from simulator.capture.sensor import (
+    Transitions,
+    clip_and_quantise,
+    noise_balance,
+    record,
+    record_stepwise,
+    sensor_light,
+)
+from simulator.noise.generator import Noise
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
@@ -138,25 +147,6 @@ def test_noise_free_source_over_all_states() -> None:
         recorded = np.array([e[1] for e in expected[-20:]]).reshape(4, 5)[:, 2]
         np.testing.assert_allclose(recorded, middle, rtol=1e-6)
     assert_moments(np.concatenate(samples), expected)
-
-
-def test_one_light_over_all_states_from_black_to_white() -> None:
-    """The same scene, 16 stops of it: most states clip some of it at one end or the other."""
-    reference = CameraSettings(100, 1 / 15, 5.6)
-    levels = 2.0 ** np.arange(-12, 5, 2)
-    light = patches(levels)
-    prepared = PreparedScene(light, reference, Z6, NoiseLevelFunction.zero())
-    samples, expected, white = [], [], 0
-    for state, capture in zip(STATES, prepared.stream(STATES, seed=2), strict=True):
-        ratio = exposure_of(state) / exposure_of(reference)
-        shot, read = table(state.iso)
-        samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
-        white += int((samples[-1] == WHITE).all(1).sum())
-        signals = levels * ratio
-        for row in read + shot * signals:
-            expected += [recorded_moments(x, v) for x, v in zip(signals, row, strict=True)]
-    assert_moments(np.concatenate(samples), expected)
-    assert white > 100  # patches without any noise left, every pixel at white
 
 
 def noisy_patches(
@@ -310,22 +300,6 @@ def test_blur_before_exposure_is_blur_after_it() -> None:
     np.testing.assert_allclose(bright.numpy(), 8 * dim.numpy(), rtol=1e-5)
 
 
-def test_noise_is_that_of_the_blurred_light() -> None:
-    """Half the frame at 0, half at 0.8: after a streak as wide as the frame the middle has 0.4, and
-    the shot noise of 0.4."""
-    light = torch.zeros(4, 2048, 9)
-    light[..., 5:] = 0.8
-    light[..., 4] = 0.4
-    target = NoiseLevelFunction((1e-4,) * 4, (0.0,) * 4)
-    exposure = Exposure(1.0, NoiseLevelFunction.zero(), target, motion_px=8.0)
-    blurred = sensor_light(light, exposure)
-    np.testing.assert_allclose(blurred[:, 0, 4].numpy(), 0.4, rtol=1e-5)
-    noisy, _ = add_noise(blurred[None], [exposure], [FrameNoise(0)])
-    middle = noisy[0, :, :, 4].double()
-    count = middle.numel()
-    assert float(middle.var()) == pytest.approx(0.4e-4, rel=5 * math.sqrt(2 / count))
-
-
 def test_blur_averages_the_noise_of_the_source() -> None:
     """Noise already in the light is blurred with it; the top-up makes up for what the blur took."""
     noise = NoiseLevelFunction((0.0,) * 4, (1e-4,) * 4)
@@ -346,30 +320,116 @@ def test_blur_averages_the_noise_of_the_source() -> None:
     assert float(capture.double().var()) == pytest.approx(expected, rel=5 * math.sqrt(2 / count))
 
 
+def recorded(
+    light: torch.Tensor, exposure: Exposure, key: int, noise: Noise = "exact"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """One frame (4, H, W) by the fused kernel, and by the steps one by one."""
+    transitions, keys = Transitions.of([light], [exposure]), np.array([key], np.uint64)
+    fused, steps = torch.empty(1, *light.shape), torch.empty(1, *light.shape)
+    record(transitions, Z6, keys=keys, noise=noise, signals=fused)
+    record_stepwise(transitions, Z6, keys, noise, steps)
+    return fused[0], steps[0]
+
+
+@pytest.mark.parametrize("noise", ["exact", "bank"])
 @pytest.mark.parametrize("noisy_source", [False, True])
-def test_a_capture_is_the_same_alone_and_in_a_batch(noisy_source: bool) -> None:
-    source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
-    generator = torch.Generator().manual_seed(0)
-    prepared_scenes = [torch.rand(4, 17, 23, generator=generator) for _ in range(5)]
-    exposures = [
-        Exposure(2.0 ** (i - 2), source if i % 2 else NoiseLevelFunction.zero(), Z6.nlf(100 * 4**i))
-        for i in range(4)
-    ] + [Exposure(1.0, source, Z6.nlf(100), motion_px=2.5, defocus_px=1.5)]
-    light = torch.stack(
-        [sensor_light(x, e) for x, e in zip(prepared_scenes, exposures, strict=True)]
-    )
-    together, excess = add_noise(light.clone(), exposures, [FrameNoise(i) for i in range(5)])
-    frames = clip_and_quantise(together, Z6)
-    for i, exposure in enumerate(exposures):
-        alone, one = add_noise(light[i : i + 1].clone(), [exposure], [FrameNoise(i)])
-        assert torch.equal(clip_and_quantise(alone[0], Z6), frames[i])
-        assert one[0] == excess[i]
-
-
-def test_the_prepared_scene_is_left_alone() -> None:
-    light = torch.rand(4, 8, 8, generator=torch.Generator().manual_seed(0))
+@pytest.mark.parametrize("blurred_noise", [False, True])
+@pytest.mark.parametrize("iso", [100, 6400])
+def test_the_kernel_has_the_missing_variance_of_the_steps(
+    iso: float, noisy_source: bool, blurred_noise: bool, noise: Noise
+) -> None:
+    """Within one digital number, where float32 decides a tie the other way."""
+    rng = np.random.default_rng(0)
+    light = torch.from_numpy(rng.normal(0.3, 0.4, (4, 96, 96)).astype(np.float32))
+    light[:, 0] = torch.tensor([-1e30, 1e30, 3e38, 0.0]).repeat(24)
     before = light.clone()
-    for motion, defocus in ((0.0, 0.0), (3.0, 0.0), (0.0, 3.0)):
-        exposure = Exposure(4.0, Z6.nlf(100), Z6.nlf(400), motion, defocus)
-        add_noise(sensor_light(light, exposure)[None], [exposure], [FrameNoise(0)])
-        assert torch.equal(light, before)
+    source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
+    remaining = torch.rand(96, 96, generator=torch.Generator().manual_seed(1))
+    share = remaining if blurred_noise else None
+    exposure = Exposure(1.3, source, Z6.nlf(iso), motion_px=3.0, remaining_variance=share)
+    fused, steps = recorded(light, exposure, 3, noise)
+    difference = ((fused - steps).double() * SPAN).abs().round()
+    assert difference.max() <= 1
+    assert float((difference > 0).double().mean()) <= 1e-4
+    assert torch.equal(light, before)
+
+
+def test_bands_come_before_the_noise() -> None:
+    """Each row's light, and of a noisy source each row's share of its variance, by both ways."""
+    light, rows = torch.full((4, 2, 5000), 0.3), np.array([[0.5, 1.5]])
+    exposure = Exposure(1.0, Z6.nlf(400), Z6.nlf(6400))
+    transitions, keys = Transitions.of([light], [exposure]), np.array([1], np.uint64)
+    banded = transitions.in_bands(rows)
+    assert banded.light[0][:, :, 0].tolist() == [[pytest.approx(0.15), pytest.approx(0.45)]] * 4
+    assert banded.shares()[0][:, 0].tolist() == [0.5, 1.5]
+    frame = torch.empty(1, 4, 2, 5000)
+    record(transitions, Z6, keys=keys, row_gain=rows, signals=frame)
+    target, source = Z6.nlf(6400), Z6.nlf(400)
+    for row, gain in enumerate(rows[0]):
+        wanted = target.read[1] + target.shot[1] * 0.3 * gain
+        taken = gain * (source.read[1] + source.shot[1] * 0.3 * gain)
+        measured = float(frame[0, 1, row].double().var())
+        assert measured == pytest.approx(wanted - taken, rel=5 * math.sqrt(2 / 5000))
+    plain = Transitions.of([light], [Exposure(1.0, NoiseLevelFunction.zero(), target)])
+    assert plain.in_bands(rows).shares() == [None]
+    assert plain.in_bands(np.ones((1, 2))).light[0] is plain.light[0]
+
+
+@pytest.mark.parametrize("iso", [100, 400, 6400])
+@pytest.mark.parametrize("blurred_noise", [False, True])
+def test_balance_of_noise_pixel_by_pixel(iso: float, blurred_noise: bool) -> None:
+    rng = np.random.default_rng(0)
+    light = rng.normal(0.2, 0.3, (4, 20, 20))
+    share = rng.random((20, 20)) if blurred_noise else np.ones((20, 20))
+    exposure = Exposure(
+        2.0,
+        Z6.nlf(800),
+        Z6.nlf(iso),
+        remaining_variance=torch.from_numpy(share.astype(np.float32)) if blurred_noise else None,
+    )
+    balance = noise_balance(torch.from_numpy(light.astype(np.float32)), exposure)
+    first, second = Z6.nlf(800), Z6.nlf(iso)
+    (shot1, read1), (shot2, read2) = (
+        (np.array(n.shot)[:, None], np.array(n.read)[:, None]) for n in (first, second)
+    )
+    signal = 2.0 * np.maximum(light, 0.0)
+    given = share * (4 * read1[..., None] + 2 * shot1[..., None] * signal)
+    wanted = read2[..., None] + shot2[..., None] * signal
+    beyond = np.maximum(given - wanted, 0.0)
+    assert balance.relative_excess_variance == pytest.approx(
+        (beyond / wanted).mean(), rel=1e-4, abs=1e-7
+    )
+    assert balance.excess_variance == pytest.approx(beyond.mean(), rel=1e-4, abs=1e-12)
+    assert balance.lacks_noise == bool((wanted > given).any())
+
+
+def test_a_source_without_noise_lacks_all_of_it() -> None:
+    zero = NoiseLevelFunction.zero()
+    light = torch.full((4, 4, 4), 0.5)
+    balance = noise_balance(light, Exposure(1.0, zero, Z6.nlf(100)))
+    assert (balance.relative_excess_variance, balance.excess_variance, balance.lacks_noise) == (
+        0.0,
+        0.0,
+        True,
+    )
+    assert not noise_balance(light, Exposure(1.0, zero, zero)).lacks_noise
+
+
+@pytest.mark.parametrize("source", [100, 6400])
+def test_noise_is_made_only_where_the_source_lacks_some(
+    source: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    original = kernels.record_frames
+
+    def watched(*args: Any, keys: Any, **options: Any) -> Any:
+        made.append(keys)
+        return original(*args, keys=keys, **options)
+
+    monkeypatch.setattr(kernels, "record_frames", watched)
+    light, share = torch.full((4, 8, 8), 0.2), torch.full((8, 8), 0.5)
+    exposure = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
+    recorded(light, exposure, 3)
+    recorded(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), 3)
+    recorded(light, replace(exposure, remaining_variance=share), 3)
+    assert [keys is None for keys in made] == [True, False, False]

@@ -1,10 +1,9 @@
-"""What the cameras record: the batched fast path against the simulator's own frames."""
+"""Running episodes: frames of the simulator, rewards, masks, and copies that go on alike."""
 
 from __future__ import annotations
 
 import copy
 import multiprocessing
-import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -17,14 +16,14 @@ import ae_env  # noqa: F401  (registers the environment)
 from ae_env.episodes import core as core_module
 from ae_env.observation import encode_observation
 from ae_env.options import EnvOptions
-from ae_env.scorers.score_table import prepare_scene
+from ae_env.scenes import Scene, reference_settings
+from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from simulator import get_camera
-from simulator.capture import batch as batch_module
 from simulator.capture.sensor import exposed_light
-from simulator.noise.generator import FrameNoise, noise_keys
-from simulator.optics import blur_kernels
+from simulator.noise.generator import frame_normals, noise_keys
 
 ID = "ae_env/AutoExposure-v0"
+CAMERA = get_camera("nikon_z6")
 SMALL = {"scenes": "bundled:small", "resolution": 40}
 
 
@@ -78,7 +77,7 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
             )
             key = int(noise_keys(episode.noise_seed, episode.frame)[0])
             kind = "exact" if noise == "exact" else "bank"
-            normals = FrameNoise(key, kind).normals((4, 40, 40))
+            normals = frame_normals(key, (4, 40, 40), kind)
             shot, read = (
                 np.array(v)[:, None, None] for v in (exposure.target.shot, exposure.target.read)
             )
@@ -142,17 +141,6 @@ def test_one_environment_or_many_on_one_thread_or_more(noise: Any) -> None:
     np.testing.assert_array_equal(np.stack(alone), together[0])
 
 
-def test_kinds_of_noise() -> None:
-    bank, named, exact, clean = (
-        _frames(_vector(noise=noise, motion="none", depth="far"), steps=1)[0].astype(int)
-        for noise in (True, "bank", "exact", False)
-    )
-    np.testing.assert_array_equal(bank, named)
-    assert (bank != exact).mean() > 0.1
-    for noisy in (bank, exact):  # the same light: the noise has no bias
-        assert abs((noisy - clean).mean()) < 1.0
-
-
 def test_tolerance_zero_and_small_blur() -> None:
     """A blur that a tolerance leaves out is named in `info`, and in none of the frames."""
     arguments = {"motion": 1e-3, "depth": "far"}
@@ -177,7 +165,7 @@ def test_held_state_of_a_scene_at_rest_needs_no_memory_of_its_own() -> None:
 def test_memory_of_ended_episodes_is_used_again() -> None:
     envs = _vector(4, autoreset_mode="SAME_STEP", motion=0.5, depth=2.0, tolerance=0.0)
     _frames(envs, steps=40)
-    assert len(envs.core._captures._buffers._free) <= 4 * 5
+    assert len(envs.core._captures._free) <= 4 * 5
 
 
 def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
@@ -190,56 +178,8 @@ def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
         with pytest.raises(ValueError, match="options"):
             envs.reset(options=wrong)
         assert [envs.core.episode(i) for i in range(3)] == before
-    assert not envs.core._captures._buffers._free
     for actions in (np.full(3, 10), np.full(3, 21)):
         np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
-    envs.core._forget(np.array([1]))
-    assert len(envs.core._captures._buffers._free) == 2 + 1  # two apertures and a streak
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError])
-@pytest.mark.parametrize("stage", ["blur_many", "_modules"])
-def test_an_interrupted_frame_is_made_again(
-    monkeypatch: pytest.MonkeyPatch, error: type[BaseException], stage: str
-) -> None:
-    """While the light is blurred, or while the plan of a later episode is made."""
-    arguments = {"motion": 0.5, "depth": 2.0, "tolerance": 0.0}
-    envs, plain = _vector(3, **arguments), _vector(3, **arguments)
-    for env in (envs, plain):
-        env.reset(seed=0, options={"state": 10})
-    calls: list[Any] = []
-    original = getattr(batch_module, stage)
-
-    def fail(*args: Any, **kwargs: Any) -> Any:
-        calls.append(args)
-        if stage == "_modules" and len(calls) < 3:
-            return original(*args, **kwargs)
-        raise error
-
-    with monkeypatch.context() as patch:
-        patch.setattr(batch_module, stage, fail)
-        with pytest.raises(error):
-            envs.step(np.full(3, 27))
-    plain.step(np.full(3, 27))
-    for state in (27, 10):
-        actions = np.full(3, state)
-        np.testing.assert_array_equal(envs.step(actions)[0]["raw"], plain.step(actions)[0]["raw"])
-
-
-@pytest.mark.parametrize("motion", ["none", 0.5])
-def test_wide_discs_are_those_of_the_sum(monkeypatch: pytest.MonkeyPatch, motion: Any) -> None:
-    arguments = {"resolution": 64, "motion": motion, "depth": 48.0, "noise": False}
-    options = {"state": 0}  # f/4
-    fourier, direct = _vector(2, **arguments), _vector(2, **arguments)
-    wide = blur_kernels._WIDE_PX
-    fourier.reset(seed=0, options=options)
-    monkeypatch.setattr(blur_kernels, "_WIDE_PX", 1e9)
-    direct.reset(seed=0, options=options)
-    plans = [env.core._captures._rows for env in (fourier, direct)]
-    rows = fourier.core._captures._blurred_row[-2:]
-    assert all(exposure.defocus_px > wide for exposure in plans[0].exposure[rows])
-    for mine, wanted in zip(plans[0].light[rows], plans[1].light[rows], strict=True):
-        torch.testing.assert_close(mine, wanted, rtol=1e-4, atol=1e-6)
 
 
 def test_white_is_1_whatever_the_black_level() -> None:
@@ -315,16 +255,6 @@ def test_a_copy_goes_on_like_the_original() -> None:
         np.testing.assert_array_equal(mine[1], theirs[1])
 
 
-def test_environment_survives_pickling_before_and_after_steps() -> None:
-    env = gym.make(ID, **SMALL).unwrapped
-    first, _ = env.reset(seed=1)
-    copy = pickle.loads(pickle.dumps(env))
-    again, _ = copy.reset(seed=1)
-    np.testing.assert_array_equal(first["raw"], again["raw"])
-    for _ in range(3):
-        np.testing.assert_array_equal(env.step(5)[0]["raw"], copy.step(5)[0]["raw"])
-
-
 def _step_twice(env: Any, queue: Any) -> None:
     queue.put([env.step(action)[0]["raw"] for action in (20, 33)])
 
@@ -363,3 +293,87 @@ def test_other_processes_give_the_same_frames(method: str) -> None:
     child.start()
     np.testing.assert_array_equal(queue.get(timeout=120), wanted)
     child.join(timeout=60)
+
+
+# -- states that a scene forbids --------------------------------------------------------------
+
+
+def _scene(allowed: Any, scene_id: str = "holes") -> Scene:
+    light = torch.full((4, 40, 40), 0.12)
+    return Scene.from_array(
+        light,
+        reference_settings(8.0),
+        CAMERA,
+        scene_id=scene_id,
+        illuminance=640.0,
+        allowed=allowed,
+    )
+
+
+def test_forbidden_states_are_masked_never_best_and_never_drawn() -> None:
+    free = _scene(None, "free")
+    best = int(np.argmax(_vector(1, scenes=[free]).core.tables.table(free).mean))
+    allowed = np.ones(64, bool)
+    allowed[[best, 0, 1, 2, 63]] = False
+    holes = _scene(allowed)
+    envs = _vector(64, scenes=[free, holes], motion="none", depth="far", split="all")
+    assert envs.action_masks().all()  # before the first reset
+    _, info = envs.reset(seed=0)
+    shows_holes = info["scene_id"] == "holes"
+    assert 10 < shows_holes.sum() < 54
+    wanted = np.where(shows_holes[:, None], allowed, True)
+    np.testing.assert_array_equal(envs.action_masks(), wanted)
+    assert allowed[envs.states[shows_holes]].all()
+    assert len(np.unique(envs.states[shows_holes])) > 5
+    table = envs.score_table(int(np.flatnonzero(shows_holes)[0]))
+    assert table.oracle != best
+    assert table.oracle == np.argmax(np.where(allowed, table.mean, -1.0))
+    assert envs.score_table(int(np.flatnonzero(~shows_holes)[0])).oracle == best
+    envs.step(np.zeros(64, np.int64))  # forbidden, but a mask is advice
+    assert (envs.states == 0).all()
+
+
+def test_the_only_allowed_state_is_where_episodes_start() -> None:
+    envs = _vector(5, scenes=[_scene(np.arange(64) == 37)])
+    envs.reset(seed=3)
+    assert envs.states.tolist() == [37] * 5
+
+
+@pytest.mark.parametrize(
+    ("allowed", "message"),
+    [
+        (np.ones(63, bool), r"`allowed` of scene 'holes' \(length 63\) .* the 64 states"),
+        (np.zeros(64, bool), "at least one state"),
+        (np.ones(64), "must be bool"),
+        (np.ones((4, 16), bool), "must be bool of shape"),
+    ],
+)
+def test_masks_that_cannot_be(allowed: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _vector(1, scenes=[_scene(allowed)])
+
+
+# -- scores -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lighting", ["sine", "flicker"])
+def test_expected_reward_of_a_closed_form_needs_no_table(
+    lighting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In changing light a table is 64 scores of which 63 are not asked for."""
+    env = gym.make(
+        ID, scenes="bundled:small", resolution=36, reward="expected", lighting=lighting
+    ).unwrapped
+    env.reset(seed=4)
+    table, asked = ScoreTables.table, []
+
+    def counted(*args: Any, **kwargs: Any) -> Any:
+        asked.append(kwargs)
+        return table(*args, **kwargs)
+
+    monkeypatch.setattr(ScoreTables, "table", counted)
+    for state in (3, 60, 21):
+        reward = env.step(state)[1]
+        assert asked == []
+        assert reward == pytest.approx(env.expected_scores()[state], abs=1e-9)
+        asked.clear()

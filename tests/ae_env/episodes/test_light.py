@@ -1,8 +1,7 @@
-"""Bands of flickering light, in frames, scores and tables, against the reference camera."""
+"""The light of frames: bands of flicker in captures, scores and tables."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -17,8 +16,7 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import ScoreTables, prepare_scene
-from simulator import CameraSettings, get_camera
-from simulator.capture.prepared_scene import PreparedScene
+from simulator import get_camera
 from simulator.noise.generator import noise_keys
 from simulator.optics.lamps import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
@@ -80,27 +78,6 @@ def test_rows_are_those_of_the_lamp() -> None:
     assert np.ptp(bands) > 0.5
 
 
-@pytest.mark.parametrize("source_iso", [None, 400.0])
-def test_noise_is_that_of_the_banded_signal(source_iso: float | None) -> None:
-    """Also where the source brings some, which the bands make more or less."""
-    reference, target = CameraSettings(400, 0.01, 4), CameraSettings(800, 0.005, 4)
-    light = torch.full((4, 3, 40_000), 0.3)
-    nlf = CAMERA.nlf(400)
-    if source_iso is not None:
-        shot, read = (torch.tensor(v)[:, None, None] for v in (nlf.shot, nlf.read))
-        normals = torch.randn(light.shape, generator=torch.Generator().manual_seed(0))
-        light = light + normals * (shot * 0.3 + read).sqrt()
-    rows = np.array([[0.4, 1.0, 1.6]])
-    prepared = PreparedScene(light, reference, CAMERA, nlf if source_iso else nlf.zero())
-    frame = prepared.expose([target], row_gain=rows, seed=1)[0].double()
-    goal = CAMERA.nlf(800)
-    for row, gain in enumerate(rows[0]):
-        mean, variance = frame[1, row].mean(), frame[1, row].var()
-        assert float(mean) == pytest.approx(0.3 * gain, rel=2e-3)
-        wanted = goal.shot[1] * 0.3 * gain + goal.read[1]
-        assert float(variance) == pytest.approx(wanted, rel=0.035)  # 5 sigma of 40,000 samples
-
-
 def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit what `PreparedScene.expose`, tested above, makes of the same noise."""
     scene = replace(_scene(), nlf=CAMERA.nlf(100).scaled(1 / 16))
@@ -117,7 +94,9 @@ def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPa
         observation, *_ = env.step(state)
         episode, settings = env.episode(), env.grid[state]
         keys = noise_keys(episode.noise_seed, episode.frame)
-        monkeypatch.setattr("simulator.capture.prepared_scene.sweep_keys", lambda *_, keys=keys: keys)
+        monkeypatch.setattr(
+            "simulator.capture.prepared_scene.sweep_keys", lambda *_, keys=keys: keys
+        )
         lamp = MainsLamp(100.0, 0.8, episode.phase)
         rows = lamp.row_light(episode.frame / 30, settings.exposure_time, 40, CAMERA.row_time, 8)
         prepared = prepare_scene(scene, CAMERA, gain=float(rows.mean()))
@@ -127,41 +106,6 @@ def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPa
         different = observation["raw"] != wanted  # the rounding of the lamp's light
         assert different.mean() < 1e-3
         np.testing.assert_allclose(observation["raw"], wanted, atol=1.1 / min(CAMERA.span))
-
-
-def _captures(row_gain: list[float] | None, stops: float) -> Any:
-    state = CameraSettings(100, 1 / 128, 8.0)  # EV100 13
-    light = torch.full((4, len(row_gain or [1, 1]), 40), 0.1)
-    scene = Scene.from_array(
-        light, state, CAMERA, scene_id="a", illuminance=2.5 * 2.0 ** (13 + stops)
-    )
-    rows = None if row_gain is None else np.array([row_gain])
-    nothing = np.zeros(1)
-    return describe_captures(
-        [scene], [state], CAMERA, speed=nothing, defocus=nothing, gain=np.ones(1), row_gain=rows
-    )
-
-
-def test_brightness_is_the_mean_over_the_rows() -> None:
-    """One stop over; rows half a stop less and more: exp(1 - sqrt(1 + e^2)) of e 0.5 and 1.5."""
-    score = make_scorer("brightness")(None, _captures([2.0**-0.5, 2.0**0.5], 1.0))
-    wanted = (math.exp(1 - math.sqrt(1.25)) + math.exp(1 - math.sqrt(3.25))) / 2
-    assert float(score) == pytest.approx(wanted, rel=1e-9)
-    plain = make_scorer("brightness")(None, _captures(None, 1.0))
-    assert float(plain) == pytest.approx(math.exp(1 - math.sqrt(2)), rel=1e-9)
-
-
-def test_banding_score() -> None:
-    """Rows half a stop below and above the mean of their logarithms: s = 0.5, s0 = 0.1."""
-    bands = make_scorer("banding")(None, _captures([1.0, 2.0, 2.0, 1.0], 0.0))
-    assert float(bands) == pytest.approx(1.0 / 26.0)
-    assert float(make_scorer("banding")(None, _captures(None, 0.0))) == 1.0
-
-
-def test_light_of_captures_has_the_bands() -> None:
-    captures = _captures([0.5, 1.5], 0.0)
-    np.testing.assert_allclose(captures.light[0, 2, :, 0], [0.05, 0.15], rtol=1e-6)
-    np.testing.assert_allclose(captures.log2_light.exp2(), captures.light, rtol=1e-5)
 
 
 @pytest.mark.parametrize("scorer", ["balanced", {"balanced": 0.7, "banding": 0.3}])
