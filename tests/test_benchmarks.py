@@ -1,0 +1,92 @@
+"""The harness of the benchmarks: tables, rounding, runs that continue where they were stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents.cli.bench import BENCHMARKS
+from benchmarks import harness
+from benchmarks.harness import Benchmark, FinishedParts, Part, Report, cell, pivot, rounded, table
+from benchmarks.work_precision.precision import pareto_front
+
+
+def test_cells_of_missing_values_are_empty_and_pipes_escaped() -> None:
+    row = {"ms": 1.234, "none": None, "deep": {"a": [3]}, "name": "a|b"}
+    assert cell(row, "{ms:.1f} ms") == "1.2 ms"
+    assert (
+        cell(row, "{ms:.1f} ± {none:.2f}") == cell(row, "{absent}") == cell(row, "{deep[b]}") == ""
+    )
+    assert cell(row, "{deep[a][0]}") == "3"
+    text = table([row], {"name": "{name}", "empty": "{none}", "ms": lambda r: 2 * r["ms"]})
+    assert text.splitlines() == ["| name | ms |", "|---|--:|", "| a\\|b | 2.468 |"]
+
+
+def test_a_pivot_has_a_line_for_each_value_and_gaps_where_there_is_no_row() -> None:
+    rows = [{"iso": i, "camera": c, "x": i + len(c)} for i, c in ((1, "a"), (1, "bb"), (2, "bb"))]
+    text = pivot(rows, line=("ISO", "{iso}"), columns="{camera}", contents={"": "{x}"})
+    assert text.splitlines()[0::2] == ["| ISO | a | bb |", "| 1 | 2 | 3 |"]
+    assert text.splitlines()[3] == "| 2 |  | 4 |"
+
+
+def test_numbers_keep_six_digits_and_none_for_what_json_cannot_hold() -> None:
+    given = {"a": [1 / 3, float("nan"), 10**9], "b": True, "c": 1.23456789e-12}
+    assert rounded(given) == {"a": [0.333333, None, 10**9], "b": True, "c": 1.23457e-12}
+
+
+def test_damaged_parts_of_a_stopped_run_are_measured_again(tmp_path: Path) -> None:
+    finished = FinishedParts(tmp_path, 0)
+    assert finished.get("part", lambda: [1, 2]) == [1, 2]
+    assert finished.get("part", lambda: [3]) == [1, 2]
+    assert FinishedParts(tmp_path, 1).get("part", lambda: [4]) == [4]  # of another seed
+    for path in tmp_path.iterdir():
+        path.write_text("[1, 2")
+    assert finished.get("part", lambda: [3]) == [3]
+    finished.forget()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+
+    def isolated(task: Any, **arguments: Any) -> Any:
+        calls.append(arguments["name"])
+        if len(calls) == 2:
+            raise RuntimeError("stopped")
+        return {"name": arguments["name"]}
+
+    monkeypatch.setattr(harness, "isolated", isolated)
+    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs")
+    parts = [Part(name, print, {"name": name}) for name in ("first", "second")]
+    benchmark = Benchmark(
+        name="mine",
+        title="Mine",
+        parts=lambda seed, quick: parts,
+        report=lambda results, meta: Report(list(results.values()), ["text"]),
+        code=("benchmarks/isolated",),
+    )
+    with pytest.raises(RuntimeError, match="stopped"):
+        benchmark.run(tmp_path)
+    benchmark.run(tmp_path)
+    assert calls == ["first", "second", "second"]
+    result = json.loads((tmp_path / "mine.json").read_text())
+    assert result["rows"] == [{"name": "first"}, {"name": "second"}]
+    assert {"command", "commit", "seed", "date", "machine", "versions"} <= result["meta"].keys()
+    assert (tmp_path / "mine.md").read_text().startswith("# Mine\n\n`ae-env bench mine`")
+    assert list((tmp_path / "runs" / "mine").iterdir()) == []
+
+
+def test_every_benchmark_of_the_command_can_be_imported() -> None:
+    import importlib
+
+    for name in BENCHMARKS:
+        stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
+        assert callable(importlib.import_module(f"benchmarks.{stem}").run)
+
+
+def test_the_front_of_time_and_error() -> None:
+    points = [(1.0, 30.0), (2.0, 35.0), (3.0, 34.0), (4.0, 35.004)]
+    assert pareto_front(points) == [True, True, False, False]
