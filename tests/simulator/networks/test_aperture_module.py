@@ -53,30 +53,21 @@ F4, F8, F11 = (torch.full((2,), f) for f in (4.0, 8.0, 8 * 2**0.5))
 
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
-@pytest.mark.parametrize("target", [F11, 2 * F11])
-def test_the_same_or_a_smaller_aperture_leaves_every_bit(preset: Preset, target: Tensor) -> None:
+def test_only_the_images_that_open_change(preset: Preset) -> None:
     image = picture(16, 19)
-    assert torch.equal(module(preset)(image, torch.full_like(image, 0.01), F11, target), image)
+    made = with_map(4.0) if preset == "compact" else module("paper")
+    for target in (F8, 2 * F8):
+        assert torch.equal(made(image, torch.full_like(image, 0.01), F8, target), image)
+    output = made(image, torch.zeros_like(image), F8, torch.tensor([4.0, 16.0]))
+    assert not torch.allclose(output[0], image[0], atol=1e-3)
+    assert torch.equal(output[1], image[1])
 
 
-@pytest.mark.parametrize("preset", ["compact", "paper"])
-@pytest.mark.parametrize("size", [(16, 16), (17, 21), (1, 6), (1, 1)])
-def test_every_size(preset: Preset, size: tuple[int, int]) -> None:
-    image = picture(*size)
-    output = module(preset)(image, torch.full_like(image, 0.01), F11, F4)
-    assert output.shape == image.shape
-    assert output.dtype == torch.float32
-    assert bool(output.isfinite().all())
-
-
-def test_each_image_of_a_batch_has_its_own_f_numbers() -> None:
-    image = picture(16, 16)
-    for preset in ("compact", "paper"):
-        made = with_map(4.0) if preset == "compact" else module("paper")
-        target = torch.tensor([4.0, 16.0])
-        output = made(image, torch.zeros_like(image), torch.tensor([8.0, 8.0]), target)
-        assert not torch.allclose(output[0], image[0], atol=1e-3)
-        assert torch.equal(output[1], image[1])
+def test_dead_zone_by_hand() -> None:
+    diameter = torch.tensor([0.0, 0.3, 0.5, 1.3, 5.0])
+    expected = [0.0, 0.0, 0.0, 1.2, np.sqrt(25 - 0.25)]  # 5, 12, 13 over ten
+    assert dead_zone(diameter, 0.5).tolist() == pytest.approx(expected, abs=1e-6)
+    assert float(dead_zone(torch.tensor(DEAD_ZONE))) == 0.0
 
 
 def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
@@ -102,14 +93,6 @@ def test_the_paper_preset_commutes_with_exposure() -> None:
         torch.testing.assert_close(result, expected * factor, rtol=1e-4, atol=1e-4 * factor)
 
 
-def test_dead_zone_by_hand() -> None:
-    diameter = torch.tensor([0.0, 0.3, 0.5, 1.3, 5.0])
-    expected = [0.0, 0.0, 0.0, 1.2, np.sqrt(25 - 0.25)]  # 5, 12, 13 over ten
-    assert dead_zone(diameter, 0.5).tolist() == pytest.approx(expected, abs=1e-6)
-    assert float(dead_zone(torch.tensor(DEAD_ZONE))) == 0.0
-    assert 0.4 <= DEAD_ZONE <= 1.0
-
-
 @pytest.mark.parametrize(("source", "target"), [(11.0, 4.0), (8.0, 5.6), (16.0, 4.0)])
 def test_added_blur_is_the_thin_lens(source: float, target: float) -> None:
     """Squared diameters add: blur at the source and what is added make the blur at the target."""
@@ -120,12 +103,8 @@ def test_added_blur_is_the_thin_lens(source: float, target: float) -> None:
     )
     added = added_blur(torch.from_numpy(at_source), source, target).numpy()
     np.testing.assert_allclose(np.hypot(at_source, added), at_target, rtol=1e-6, atol=1e-12)
-
-
-def test_added_blur_when_closing_or_staying_is_exactly_zero() -> None:
-    diameter = torch.tensor([0.0, 3.0, 12.0])
-    assert added_blur(diameter, 4.0, 4.0).tolist() == [0.0] * 3
-    assert added_blur(diameter, 4.0, 11.0).tolist() == [0.0] * 3
+    for same_or_closed in (source, 2 * source):
+        assert not added_blur(torch.from_numpy(at_source), source, same_or_closed).any()
 
 
 def test_a_picture_in_focus_is_not_touched_by_a_stray_estimate() -> None:
@@ -199,18 +178,6 @@ def test_exposure_does_not_matter(network: DefocusMap) -> None:
         factor = 2.0**exponent
         result = network(factor * image, factor * deviation)
         torch.testing.assert_close(result, expected, atol=1e-4, rtol=0)
-
-
-@pytest.mark.parametrize("level", [0.0, 0.3, 1e4])
-@pytest.mark.parametrize("noise", [0.0, 1e-4])
-def test_constant_images_give_finite_maps_and_gradients(level: float, noise: float) -> None:
-    torch.manual_seed(0)
-    net = DefocusMap(width=8)
-    image = torch.full((1, 4, 16, 16), level)
-    diameter = net.diameter(image, torch.full_like(image, noise))
-    diameter.sum().backward()
-    assert bool(diameter.isfinite().all())
-    assert all(bool(p.grad.isfinite().all()) for p in net.parameters() if p.grad is not None)
 
 
 def test_diameters_are_in_range_and_invert_the_logarithm() -> None:

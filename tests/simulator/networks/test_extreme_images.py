@@ -7,7 +7,7 @@ import torch
 
 from simulator.networks.weights import PRESETS, build_modules
 
-SIZES = ((1, 1), (17, 1), (16, 19))
+SIZES = ((1, 1), (2, 3), (17, 1), (16, 19))
 #: Black, negative, ordinary, saturated, blinding.
 LEVELS = (0.0, -0.07, 2.0**-14, 0.2, 1.0, 1e4)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -96,6 +95,11 @@ def test_every_module_runs_for_every_transition(
     calls.clear()
     compact.simulate(raw(), SOURCE, tolerance=None)
     assert calls == ["noise"]
+    for ask in (compact.prepare, lambda *a, **k: compact.plan(*a, SOURCE, **k)):
+        with pytest.raises(ValueError, match=r"`tolerance` \(=None\) .* ask `simulate`"):
+            ask(raw(), tolerance=None)
+    with pytest.raises(ValueError, match=r"`depth` \(='near'\)"):
+        compact.simulate(raw(), SOURCE, tolerance=None, depth="near")
 
 
 def test_raws_prepared_scenes_and_scenes_run_alike(compact: CameraSimulator) -> None:
@@ -132,22 +136,16 @@ def test_gain_is_part_of_the_exposure(compact: CameraSimulator) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_without_networks_the_full_run_is_exposure_and_noise(target: CameraSettings) -> None:
-    plain = CameraSimulator(device="cpu")
-    for noise, scene in itertools.product((True, False), ({}, {"image_speed": 0.4, "defocus": 2})):
-        source = raw(noise)
+@pytest.mark.parametrize("noise", [True, False])
+def test_without_networks_the_full_run_is_exposure_and_noise(
+    target: CameraSettings, noise: bool
+) -> None:
+    plain, source = CameraSimulator(device="cpu"), raw(noise)
+    for scene in ({}, {"image_speed": 0.4, "defocus": 2}):
         full = plain.simulate(source, target, seed=5, tolerance=None, **scene)
         exact = plain.simulate(source, target, seed=5, tolerance=0, **scene)
         assert torch.equal(full.data, exact.data)
         assert full.metadata == exact.metadata
-
-
-def test_what_is_prepared_is_shared(compact: CameraSimulator) -> None:
-    for ask in (compact.prepare, lambda *a, **k: compact.plan(*a, SOURCE, **k)):
-        with pytest.raises(ValueError, match=r"`tolerance` \(=None\) .* ask `simulate`"):
-            ask(raw(), tolerance=None)
-    with pytest.raises(ValueError, match=r"`depth` \(='near'\)"):
-        compact.simulate(raw(), SOURCE, tolerance=None, depth="near")
 
 
 def test_the_tolerance_of_a_prepared_scene_is_kept(compact: CameraSimulator) -> None:

@@ -17,13 +17,7 @@ from torch import nn
 
 from simulator import CameraSimulator
 from simulator.networks import weights
-from simulator.networks.weights import (
-    PRESETS,
-    build_modules,
-    list_pretrained,
-    load_modules,
-    save_modules,
-)
+from simulator.networks.weights import build_modules, list_pretrained, load_modules, save_modules
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +90,6 @@ def test_tensors_of_other_networks_are_refused(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("ending", [".json", ".safetensors"])
-def test_a_missing_file_is_named(saved: Path, ending: str) -> None:
-    beside(saved, ending).unlink()
-    with pytest.raises(ValueError, match=re.escape(f"there is no {beside(saved, ending)}")):
-        load_modules(saved)
-
-
 @pytest.mark.parametrize(
     ("card", "message"),
     [
@@ -111,19 +98,31 @@ def test_a_missing_file_is_named(saved: Path, ending: str) -> None:
         ("[]", "must hold a JSON object"),
         ('{"format": [1]}', r"model card of format 1, got \[1\]"),
         ('{"format": 1}', "must hold the hash, `sha256`"),
+        *(({"preset": p}, re.escape(f"unknown preset {p!r}")) for p in ("huge", None, ["compact"])),
     ],
 )
-def test_damaged_cards(saved: Path, card: str, message: str) -> None:
-    beside(saved, ".json").write_text(card)
+def test_damaged_cards(saved: Path, card: str | dict[str, Any], message: str) -> None:
+    path = beside(saved, ".json")
+    path.write_text(
+        card if isinstance(card, str) else json.dumps({**json.loads(path.read_text()), **card})
+    )
     with pytest.raises(ValueError, match=message):
         load_modules(saved)
 
 
-@pytest.mark.parametrize("preset", ["huge", None, ["compact"]])
-def test_an_unknown_preset_in_the_card(saved: Path, preset: Any) -> None:
-    card: dict[str, Any] = json.loads(beside(saved, ".json").read_text())
-    beside(saved, ".json").write_text(json.dumps({**card, "preset": preset}))
-    with pytest.raises(ValueError, match=re.escape(f"unknown preset {preset!r}")):
+@pytest.mark.parametrize("ending", [".json", ".safetensors"])
+def test_files_that_are_not_there_or_may_not_be_read(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    def denied(self: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "read_bytes", denied)
+        with pytest.raises(ValueError, match=r"net-0.5'\) cannot be read: .*net-0.5.safetensors"):
+            load_modules(saved)
+    beside(saved, ending).unlink()
+    with pytest.raises(ValueError, match=re.escape(f"there is no {beside(saved, ending)}")):
         load_modules(saved)
 
 
@@ -146,15 +145,6 @@ def test_a_writer_that_is_killed_leaves_no_pair_of_two_trainings(
         load_modules(saved)
 
 
-def test_weights_that_may_not_be_read(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def denied(self: Path) -> bytes:
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr(Path, "read_bytes", denied)
-    with pytest.raises(ValueError, match=r"net-0.5'\) cannot be read: .*net-0.5.safetensors"):
-        load_modules(saved)
-
-
 @pytest.fixture
 def package(saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: Any) -> Path:
     """A package that ships one set of weights, and a folder without any to be in."""
@@ -174,14 +164,13 @@ def test_shipped_weights_load_by_name(package: Path) -> None:
     simulator = CameraSimulator.from_pretrained("compact", device="cpu")
     assert simulator.noise is not None
     assert simulator.noise.preset == "compact"
-
-
-def test_an_unknown_name_proposes_the_nearest(package: Path) -> None:
     with pytest.raises(ValueError, match=r"one of \['compact'\] .* did you mean 'compact'\?"):
         load_modules("compcat")
     with pytest.raises(ValueError) as caught:
         load_modules("zzz")
     assert "did you mean" not in str(caught.value)
+    with pytest.raises(ValueError, match=r"`preset` \(='compcat'\)"):
+        build_modules("compcat")
 
 
 def test_a_baseline_is_no_simulator(tmp_path: Path) -> None:
@@ -190,12 +179,6 @@ def test_a_baseline_is_no_simulator(tmp_path: Path) -> None:
     assert (list(loaded), card["preset"]) == (["baseline"], "pc")
     with pytest.raises(ValueError, match=r"holds the baseline 'pc'"):
         CameraSimulator.from_pretrained(tmp_path / "pc", device="cpu")
-
-
-def test_an_unknown_preset_is_refused() -> None:
-    assert PRESETS == ("compact", "paper", "pc", "dl")
-    with pytest.raises(ValueError, match=r"`preset` \(='compcat'\)"):
-        build_modules("compcat")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import sys
@@ -19,13 +20,7 @@ from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from simulator.training import train
 from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.train import (
-    Clock,
-    make_accelerator,
-    train_and_save,
-    train_stage,
-    validate,
-)
+from simulator.training.train import Clock, make_accelerator, train_and_save, train_stage, validate
 from tests.simulator.training.scenes import scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
@@ -39,10 +34,7 @@ def config(preset: str = "compact", **changes: Any) -> SimulatorConfig:
 
 def scenes(config: SimulatorConfig, split: str) -> Sequence[ReferenceScene]:
     first = {"train": 0, "validation": 10}[split]
-    return [
-        scene(f"{split}-deep", seed=first),
-        scene(f"{split}-flat", seed=first + 1, depth=False),
-    ]
+    return [scene(f"{split}-deep", seed=first), scene(f"{split}-flat", seed=first + 1, depth=False)]
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +74,9 @@ def test_the_card_says_what_was_done(trained: Path) -> None:
     assert card["stages"]["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
 
 
-def test_a_second_run_trains_nothing_and_ends_the_same(trained: Path) -> None:
+def test_a_second_run_trains_nothing_and_ends_the_same(
+    trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before, card = trained.read_bytes(), card_of(trained)
     calls: list[str] = []
     again = train_and_save(
@@ -95,6 +89,25 @@ def test_a_second_run_trains_nothing_and_ends_the_same(trained: Path) -> None:
     assert again.read_bytes() == before
     assert card_of(again)["stages"] == card["stages"]
     assert not any("training" in task for task in calls)
+    monkeypatch.setitem(sys.modules, "accelerate", None)
+    with pytest.raises(ImportError, match=r"pip install 'ae-env\[train\]'"):
+        train_and_save(config(), scenes, trained.parent / "net", command="")
+
+
+def test_baselines_in_any_precision_and_their_logs(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    # One precision after another in one process.
+    for preset, precision in (("pc", "float32"), ("dl", "bfloat16"), ("pc", "float32")):
+        folder = tmp_path / f"{preset}-{precision}"
+        made = config(preset, precision=precision)
+        file = train_and_save(made, scenes, folder / preset, command="", tensorboard=True)
+        modules, card = load_modules(file)
+        assert list(modules) == list(card["stages"]) == ["baseline"]
+        assert all(p.dtype == torch.float32 for p in modules.parameters())
+    (events,) = (tmp_path / "dl-bfloat16" / "tensorboard").rglob("events.out*")
+    (entry,) = EventAccumulator(str(events.parent)).Reload().Scalars("baseline/loss")
+    assert entry.step == 2
 
 
 def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path) -> None:
@@ -114,33 +127,12 @@ def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path
         torch.equal(first[n], second[n]) for n in ("exposure.b", "noise.network.head.weight")
     )
     order = list(dict.fromkeys(task for task, _ in calls))
-    assert order == [
-        f"{stage}: {task}"
-        for stage in ("exposure", "noise", "aperture")
-        for task in ("rendering", "training")
-    ]
+    stages = itertools.product(("exposure", "noise", "aperture"), ("rendering", "training"))
+    assert order == [f"{stage}: {task}" for stage, task in stages]
     for task in order:
         shares = [share for name, share in calls if name == task]
         assert shares == sorted(shares)
         assert shares[-1] == 1.0
-
-
-@pytest.mark.parametrize("preset", ["pc", "dl"])
-def test_a_baseline(preset: str, tmp_path: Path) -> None:
-    file = train_and_save(config(preset), scenes, tmp_path / preset, command="")
-    modules, card = load_modules(file)
-    assert list(modules) == ["baseline"]
-    assert list(card["stages"]) == ["baseline"]
-
-
-def test_tensorboard_logs_each_stage(tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    train_and_save(config("pc"), scenes, tmp_path / "pc", command="", tensorboard=True)
-    (events,) = (tmp_path / "tensorboard").rglob("events.out*")
-    log = EventAccumulator(str(events.parent)).Reload()
-    (entry,) = log.Scalars("baseline/loss")
-    assert entry.step == 2
 
 
 def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
@@ -160,21 +152,6 @@ def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
     assert loss.training
     validate(loss, pairs, 16, accelerator)
     assert seen[8:] == seen[:8]
-
-
-def test_a_precision_after_another_in_one_process(tmp_path: Path) -> None:
-    for precision in ("float32", "bfloat16", "float32"):
-        path = tmp_path / precision / "pc"
-        train_and_save(config("pc", precision=precision), scenes, path, command="")
-        assert all(p.dtype == torch.float32 for p in load_modules(path)[0].parameters())
-
-
-def test_without_the_extra_it_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "accelerate", None)
-    with pytest.raises(ImportError, match=r"pip install 'ae-env\[train\]'"):
-        train_and_save(config(), scenes, tmp_path / "net", command="")
 
 
 # The loop of one stage

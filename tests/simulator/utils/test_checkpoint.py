@@ -39,8 +39,7 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path: Path) -> None:
             )
 
         def parts(self) -> dict[str, Any]:
-            own = {"module": self.module, "optimizer": self.optimizer}
-            return {**own, "schedule": self.schedule}
+            return {name: getattr(self, name) for name in ("module", "optimizer", "schedule")}
 
         def steps(self, first: int, last: int) -> list[float]:
             losses = []
@@ -63,14 +62,6 @@ def test_a_training_goes_on_as_if_it_had_not_stopped(tmp_path: Path) -> None:
     assert losses + second.steps(17, 40) == expected
 
 
-def test_nothing_to_resume(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert store(tmp_path / "none").load() is None
-    nowhere = store(None)
-    nowhere.save()
-    assert nowhere.load() is None
-    assert not caplog.records
-
-
 def test_it_saves_when_it_is_due_and_at_the_end(tmp_path: Path, monkeypatch: Any) -> None:
     path = tmp_path / "run"
     now = 100.0
@@ -88,6 +79,24 @@ def test_it_saves_when_it_is_due_and_at_the_end(tmp_path: Path, monkeypatch: Any
     with own:
         pass
     assert path.exists()
+    path.unlink()
+    with store(None) as nowhere, Checkpoint(path, "a", dict, writes=False) as silent:
+        assert nowhere.load() is silent.load() is None
+    assert not path.exists()
+
+
+def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
+    path = tmp_path / "run"
+    save_checkpoint(path, {"step": 1})
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("simulator.utils.files.os.replace", full)
+    save_checkpoint(path, {"step": 2})
+    assert "not saved" in caplog.text
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]
+    assert load_checkpoint(path) == {"step": 1}
 
 
 @pytest.mark.parametrize(
@@ -99,12 +108,6 @@ def test_what_ends_a_training_decides_whether_its_state_is_kept(
     with pytest.raises(error), store(tmp_path / "run"):
         raise error
     assert (tmp_path / "run").exists() == kept
-
-
-def test_a_process_that_does_not_write(tmp_path: Path) -> None:
-    with Checkpoint(tmp_path / "run", "a", lambda: {"step": 7}, writes=False):
-        pass
-    assert not (tmp_path / "run").exists()
 
 
 def flip_a_byte(path: Path) -> None:
@@ -152,18 +155,3 @@ def test_another_training_or_version(tmp_path: Path, monkeypatch: Any, caplog: A
     monkeypatch.setattr(checkpoint, "package_version", lambda: "77")
     assert store(path, {"seed": 0}).load() is None
     assert caplog.text.count("other settings or of another version, training restarts") == 2
-
-
-def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
-    path = tmp_path / "run"
-    save_checkpoint(path, {"step": 1})
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("simulator.utils.files.os.replace", full)
-        save_checkpoint(path, {"step": 2})
-    assert "not saved" in caplog.text
-    assert [p.name for p in tmp_path.iterdir()] == ["run"]
-    assert load_checkpoint(path) == {"step": 1}

@@ -19,14 +19,11 @@ def test_content_comes_back(tmp_path: Path, content: bytes | str) -> None:
     assert path == tmp_path / "file"
     expected = content.encode("utf-8") if isinstance(content, str) else content
     assert path.read_bytes() == expected
-
-
-def test_folders_are_made_and_files_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "a" / "b" / "file.json"
-    write_atomically(path, "old and longer")
-    write_atomically(str(path), (memoryview(b"ab" * i) for i in range(3)))
-    assert path.read_bytes() == b"ababab"
-    assert [p.name for p in path.parent.iterdir()] == ["file.json"]
+    deep = tmp_path / "a" / "b" / "file.json"  # folders are made and files replaced
+    write_atomically(deep, "old and longer")
+    write_atomically(str(deep), (memoryview(b"ab" * i) for i in range(3)))
+    assert deep.read_bytes() == b"ababab"
+    assert [p.name for p in deep.parent.iterdir()] == ["file.json"]
 
 
 def test_a_crash_leaves_the_old_content(tmp_path: Path) -> None:

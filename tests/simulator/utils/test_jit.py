@@ -35,17 +35,6 @@ def test_they_run_where_nothing_can_be_cached(
     assert "compiled again in each process" in caplog.text
 
 
-def test_only_kernels_of_the_package_are_announced(caplog: pytest.LogCaptureFixture) -> None:
-    def ours(a: int) -> int:
-        return a + 1
-
-    ours.__module__ = "simulator.example"
-    with caplog.at_level(logging.INFO, "simulator.utils.jit"):
-        assert numba.njit(ours)(1) == 2
-        assert numba.njit(add)(1, 1) == 2  # of the tests
-    assert [r.getMessage() for r in caplog.records] == ["compiling simulator.example.ours"]
-
-
 def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

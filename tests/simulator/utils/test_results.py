@@ -20,9 +20,7 @@ def test_meta_says_where_a_number_comes_from():
     assert set(meta) == {"command", "commit", "seed", "date", "machine", "versions"}
     assert meta["command"] == "ae-env bench throughput"
     assert meta["seed"] == 3
-    assert set(meta["machine"]) == {"cpu", "cores", "threads", "gpu"}
     assert meta["machine"]["threads"] == torch.get_num_threads()
-    assert meta["machine"]["cores"] >= 1
     assert meta["versions"]["torch"] == version("torch")
     age = datetime.datetime.now(datetime.UTC) - datetime.datetime.fromisoformat(meta["date"])
     assert abs(age.total_seconds()) < 60
@@ -46,21 +44,15 @@ def test_commit_is_that_of_this_checkout():
     assert result_meta("x", seed=None)["commit"] == expected
 
 
-def test_written_file_reads_back(tmp_path):
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), object(), np.float32("nan")])
+def test_files_read_back_and_bad_values_leave_them(tmp_path, bad):
     path = tmp_path / "new" / "results.json"
     rows = [{"value": np.float32(0.5), "count": np.int64(3), "tensor": torch.tensor([1.0, 2.0])}]
     assert write_results(path, rows, {"command": "x"}) == path
-    expected = {"meta": {"command": "x"}, "rows": [{"value": 0.5, "count": 3, "tensor": [1, 2]}]}
-    assert json.loads(path.read_text()) == expected
-    assert [p.name for p in path.parent.iterdir()] == ["results.json"]  # no temporary file left
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), object(), np.float32("nan")])
-def test_bad_values_leave_the_old_file(tmp_path, bad):
-    path = tmp_path / "results.json"
-    write_results(path, [{"a": 1}], {})
     before = path.read_text()
+    expected = {"meta": {"command": "x"}, "rows": [{"value": 0.5, "count": 3, "tensor": [1, 2]}]}
+    assert json.loads(before) == expected
     with pytest.raises(ValueError, match="finite JSON"):
         write_results(path, [{"a": bad}], {})
     assert path.read_text() == before
-    assert len(list(tmp_path.iterdir())) == 1
+    assert len(list(path.parent.iterdir())) == 1
