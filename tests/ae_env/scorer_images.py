@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
+from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.protocol import Captures
-from simulator import CameraSettings, get_camera
+from simulator import CameraSettings, get_camera, incident_ev100
 
 CAMERA = get_camera("nikon_z6")
+GRID = ExposureGrid.default()
 #: Height and width of pictures that filters could trip over.
 SIZES = [(1, 1), (1, 7), (2, 2), (3, 1), (5, 9), (13, 11), (36, 36)]
 
@@ -47,12 +51,37 @@ def check_image_scorer(name: str) -> None:
         assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
 
 
+def make_scene(light: np.ndarray, illuminance: float | None = 1000.0, **fields: Any) -> Scene:
+    """`light` (4, H, W) as the incident-light exposure records it."""
+    return Scene.from_array(
+        torch.from_numpy(light.astype(np.float32)),
+        reference_settings(incident_ev100(illuminance or 1000.0)),
+        CAMERA,
+        illuminance=illuminance,
+        **{"scene_id": "test", **fields},
+    )
+
+
+def random_scene(**fields: Any) -> Scene:
+    light = 0.12 * np.exp(np.random.default_rng(0).normal(0.0, 1.2, (4, 40, 40)))
+    return make_scene(light, **fields)
+
+
+def make_captures(
+    scenes: Scene | list[Scene],
+    states: list[CameraSettings],
+    speed: float = 0.0,
+    defocus: float = 0.0,
+    gain: float = 1.0,
+    row_gain: np.ndarray | None = None,
+) -> Captures:
+    """One capture of each state, all of one scene or each of its own."""
+    ones = np.ones(len(states))
+    scenes = [scenes] * len(states) if isinstance(scenes, Scene) else scenes
+    blur = {"speed": speed * ones, "defocus": defocus * ones}
+    return describe_captures(scenes, states, CAMERA, **blur, gain=gain * ones, row_gain=row_gain)
+
+
 def captures_of(light: np.ndarray, states: list[CameraSettings]) -> Captures:
     """Captures of `light` (4, H, W), which is what ISO 100, f/4, 1/64 s records."""
-    scene = Scene.from_array(
-        light.astype(np.float32), reference_settings(10.0), CAMERA, scene_id="x", illuminance=2560.0
-    )
-    zeros, count = np.zeros(len(states)), len(states)
-    return describe_captures(
-        [scene] * count, states, CAMERA, speed=zeros, defocus=zeros, gain=zeros + 1.0
-    )
+    return make_captures(make_scene(light, 2560.0), states)

@@ -12,22 +12,18 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-ID = "ae_env/AutoExposure-v0"
-ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
+from tests.ae_env.environments import assert_equal, make_env, rollout
+
 INFO_KEYS = {
     *("scene_id", "state", "iso", "exposure_time", "f_number", "ev100"),
     *("clipped_high", "clipped_low", "excess_noise", "modules", "rewards"),
 }
 
 
-def _make(**arguments: Any) -> gym.Env:
-    return gym.make(ID, **{**ARGUMENTS, **arguments})
-
-
 @pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
 @pytest.mark.parametrize("extra", [{}, {"with_oracle": True, "sensors": False}])
 def test_gymnasium_checker_has_nothing_to_say(kind: str, extra: dict[str, Any]) -> None:
-    env = _make(observation=kind, render_mode="rgb_array", **extra)
+    env = make_env(observation=kind, render_mode="rgb_array", **extra)
     check_env(env.unwrapped)  # warnings are errors
 
 
@@ -39,7 +35,7 @@ def test_sb3_checker_warns_of_exactly_the_image(kind: str, dtype: str | None) ->
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        check_sb3(_make(observation=kind).unwrapped)
+        check_sb3(make_env(observation=kind).unwrapped)
     messages = [str(w.message) for w in caught]
     if dtype is None:
         assert messages == []
@@ -49,35 +45,24 @@ def test_sb3_checker_warns_of_exactly_the_image(kind: str, dtype: str | None) ->
         assert "raw is an image but the upper and lower bounds are not in [0, 255]" in messages[1]
 
 
-@pytest.mark.parametrize(("kind", "convolves"), [("uint8", True), ("linear", False)])
-def test_sb3_default_policy_sees_the_raw_through_a_cnn(kind: str, convolves: bool) -> None:
-    from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
-
-    extractor = CombinedExtractor(_make(observation=kind).observation_space)
-    assert isinstance(extractor.extractors["raw"], NatureCNN) == convolves
-    if convolves:
-        first = extractor.extractors["raw"].cnn[0]
-        assert (first.in_channels, first.kernel_size, first.stride) == (4, (8, 8), (4, 4))
-
-
 def test_spaces_are_as_documented() -> None:
-    space = _make(resolution=40).observation_space
+    space = make_env(resolution=40).observation_space
     assert list(space) == ["raw", "sensors", "settings"]
     assert space["raw"] == gym.spaces.Box(0, 255, (4, 40, 40), np.uint8)
     assert space["settings"] == gym.spaces.Box(-1, 1, (3,), np.float32)
     assert space["sensors"] == gym.spaces.Box(-1, 1, (2,), np.float32)
-    assert "sensors" not in _make(sensors=False).observation_space.spaces
-    assert _make(observation="linear").observation_space["raw"].dtype == np.float32
-    dn = _make(observation="dn").observation_space["raw"]
+    assert "sensors" not in make_env(sensors=False).observation_space.spaces
+    assert make_env(observation="linear").observation_space["raw"].dtype == np.float32
+    dn = make_env(observation="dn").observation_space["raw"]
     assert dn.dtype == np.uint16
-    assert dn.high.max() == _make().unwrapped.camera.white_level
-    env = _make()
+    assert dn.high.max() == make_env().unwrapped.camera.white_level
+    env = make_env()
     assert env.action_space == gym.spaces.Discrete(64)
     assert env.get_wrapper_attr("action_masks")().tolist() == [True] * 64
 
 
 def test_info_has_the_same_keys_and_plain_numbers() -> None:
-    env = _make(with_oracle=True)
+    env = make_env(with_oracle=True)
     _, first = env.reset(seed=0)
     _, reward, terminated, truncated, second = env.step(5)
     assert set(first) == set(second) == INFO_KEYS | {"oracle_state", "regret"}
@@ -93,7 +78,7 @@ def test_info_has_the_same_keys_and_plain_numbers() -> None:
 
 
 def test_reset_options_choose_scene_state_and_frame() -> None:
-    env = _make(lighting={"kind": "step", "stops": -3, "at": 5})
+    env = make_env(lighting={"kind": "step", "stops": -3, "at": 5})
     scene = env.unwrapped.scenes[3]
     _, info = env.reset(seed=0, options={"scene": scene.scene_id, "state": 17})
     assert (info["scene_id"], info["state"]) == (scene.scene_id, 17)
@@ -108,29 +93,8 @@ def test_reset_options_choose_scene_state_and_frame() -> None:
     assert (first.speed, first.defocus) == (second.speed, second.defocus)
 
 
-def _rollout(seed: int, **arguments: Any) -> list[Any]:
-    env = _make(**arguments)
-    frames = [env.reset(seed=seed)]
-    frames += [env.step(int(a)) for a in np.random.default_rng(0).integers(64, size=8)]
-    frames += [env.reset()]
-    return frames
-
-
-def _assert_equal(first: Any, second: Any) -> None:
-    assert type(first) is type(second)
-    if isinstance(first, dict):
-        assert list(first) == list(second)
-        for key in first:
-            _assert_equal(first[key], second[key])
-    elif isinstance(first, tuple | list):
-        for a, b in zip(first, second, strict=True):
-            _assert_equal(a, b)
-    else:
-        np.testing.assert_array_equal(first, second)
-
-
 def test_noise_depends_on_the_frame_and_on_nothing_else() -> None:
-    env = _make()
+    env = make_env()
     first, _ = env.reset(seed=2, options={"state": 20})
     second, *_ = env.step(20)
     assert (first["raw"] != second["raw"]).any()  # the same state again, other noise
@@ -144,12 +108,12 @@ def test_global_random_state_is_left_alone() -> None:
     expected = (torch.rand(1), np.random.rand())  # noqa: NPY002
     torch.manual_seed(0)
     np.random.seed(0)  # noqa: NPY002
-    _rollout(1)
+    rollout(1)
     assert (torch.rand(1), np.random.rand()) == expected  # noqa: NPY002
 
 
 def test_returned_arrays_are_never_reused() -> None:
-    env = _make(with_oracle=True)
+    env = make_env(with_oracle=True)
     frames = [env.reset(seed=0)]
     frames += [env.step(9)[::4] for _ in range(5)]
     arrays = [array for observation, _ in frames for array in observation.values()]
@@ -162,16 +126,9 @@ def test_returned_arrays_are_never_reused() -> None:
     assert len({id(info) for _, info in frames}) == len(frames)
 
 
-def test_action_delay_counts_frames() -> None:
-    env = _make(delay=2)
-    env.reset(seed=0, options={"state": 7})
-    states = [env.step(action)[4]["state"] for action in (10, 20, 30, 40)]
-    assert states == [7, 7, 10, 20]
-
-
 def test_costs_are_subtracted_and_shown() -> None:
     costs = {"flicker": 0.5, "switch": 0.25}
-    env, free = _make(costs=costs), _make()
+    env, free = make_env(costs=costs), make_env()
     _, info = env.reset(seed=0, options={"state": 0})
     free.reset(seed=0, options={"state": 0})
     assert (info["rewards"]["flicker"], info["rewards"]["switch"]) == (0.0, 0.0)
@@ -189,7 +146,7 @@ def test_costs_are_subtracted_and_shown() -> None:
 
 
 def test_expected_reward_is_the_table_entry() -> None:
-    env = _make(reward="expected")
+    env = make_env(reward="expected")
     env.reset(seed=4)
     for state in (0, 21, 63):
         _, reward, *_ = env.step(state)
@@ -197,7 +154,7 @@ def test_expected_reward_is_the_table_entry() -> None:
 
 
 def test_oracle_and_regret_agree_with_the_expected_scores() -> None:
-    env = _make(with_oracle=True)
+    env = make_env(with_oracle=True)
     for seed in range(3):
         env.reset(seed=seed)
         _, _, _, _, info = env.step(30)
@@ -208,7 +165,7 @@ def test_oracle_and_regret_agree_with_the_expected_scores() -> None:
 
 
 def test_clipped_fractions_are_those_of_the_frame() -> None:
-    env = _make(observation="linear")
+    env = make_env(observation="linear")
     for state in (0, 63):  # the darkest but for ISO and aperture, and the brightest
         raw = env.reset(seed=0, options={"state": state})[0]["raw"]
         info = env.reset(seed=0, options={"state": state})[1]
@@ -217,13 +174,13 @@ def test_clipped_fractions_are_those_of_the_frame() -> None:
 
 
 def test_motion_and_depth_can_be_switched_off() -> None:
-    env = _make(motion="none", depth="far", noise=False)
+    env = make_env(motion="none", depth="far", noise=False)
     for seed in range(4):
         observation, info = env.reset(seed=seed)
         assert info["modules"] == "exposure"
         assert observation["sensors"][0] == -1.0
         assert info["rewards"]["sharpness"] == 1.0
-    moving = _make(motion=0.5, depth=2.0)
+    moving = make_env(motion=0.5, depth=2.0)
     longest = max(moving.unwrapped.grid.states, key=lambda s: s.exposure_time / s.f_number)
     state = moving.unwrapped.grid.states.index(longest)
     info = moving.reset(seed=0, options={"state": state})[1]
@@ -231,7 +188,7 @@ def test_motion_and_depth_can_be_switched_off() -> None:
 
 
 def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> None:
-    env = _make(resolution=36).unwrapped
+    env = make_env(resolution=36).unwrapped
     speeds, defocus = [], []
     for seed in range(400):
         env.core.begin(np.array([0]), [np.random.default_rng(seed)])
@@ -246,7 +203,7 @@ def test_a_third_of_the_episodes_stands_still_and_defocus_stays_in_range() -> No
 @pytest.mark.slow
 def test_bundled_oracle_is_spread_over_every_control() -> None:
     """No single value of a control may be the oracle's in more than 60 % of the scenes."""
-    env = gym.make(ID, scenes="bundled", split="test", resolution=64).unwrapped
+    env = make_env(scenes="bundled", split="test", resolution=64).unwrapped
     states = []
     for i in range(len(env.scenes)):
         env.core.begin(np.array([0]), [np.random.default_rng(i)], [{"scene": i}])
@@ -257,16 +214,16 @@ def test_bundled_oracle_is_spread_over_every_control() -> None:
 
 def test_cached_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blurred light is cached where memory allows; frames must not depend on it."""
-    cached = _rollout(5, depth=3.0, motion=0.5)
+    cached = rollout(5, depth=3.0, motion=0.5)
     monkeypatch.setattr("ae_env.episodes.core.LIGHT_CACHE_BYTES", 0)
-    _assert_equal(_rollout(5, depth=3.0, motion=0.5), cached)
+    assert_equal(rollout(5, depth=3.0, motion=0.5), cached)
 
 
 def test_frames_are_the_simulators_own() -> None:
     """The batched path and `CameraSimulator` give the same digital numbers for the same light."""
     from ae_env.scorers.score_table import prepare_scene
 
-    env = _make(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
+    env = make_env(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
     for state in (0, 21, 42, 63):
         observation, _ = env.reset(seed=1, options={"state": state})
         episode = env.episode()
@@ -280,21 +237,21 @@ def test_frames_are_the_simulators_own() -> None:
 
 
 @pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
-def test_same_seed_same_rollout(kind: str) -> None:
-    first = _rollout(7, observation=kind)
-    _assert_equal(_rollout(7, observation=kind), first)
-    assert (first[0][0]["raw"] != _rollout(8)[0][0]["raw"]).any()
-    unseen, _ = _make(observation=kind, sensors=False).reset(seed=7)
+def test_same_seed_samerollout(kind: str) -> None:
+    first = rollout(7, observation=kind)
+    assert_equal(rollout(7, observation=kind), first)
+    assert (first[0][0]["raw"] != rollout(8)[0][0]["raw"]).any()
+    unseen, _ = make_env(observation=kind, sensors=False).reset(seed=7)
     np.testing.assert_array_equal(unseen["raw"], first[0][0]["raw"])
 
 
 def test_a_scene_that_forbids_states() -> None:
     """Masks, random start states and the oracle keep to the allowed ones; actions need not."""
-    env = _make()
+    env = make_env()
     allowed = np.zeros(64, dtype=bool)
     allowed[[3, 20, 41]] = True
     scenes = [replace(env.unwrapped.scenes[0], allowed=allowed), env.unwrapped.scenes[1]]
-    env = _make(scenes=scenes, with_oracle=True, simulator=None)
+    env = make_env(scenes=scenes, with_oracle=True, simulator=None)
     starts = set()
     for seed in range(12):
         _, info = env.reset(seed=seed, options={"scene": 0})

@@ -10,20 +10,13 @@ from dataclasses import fields
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
 import ae_env
 from ae_env.options import EnvOptions
-
-ID = "ae_env/AutoExposure-v0"
-ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
-
-
-def _make(**arguments: Any) -> gym.Env:
-    return gym.make(ID, **{**ARGUMENTS, **arguments})
+from tests.ae_env.environments import ID, assert_equal, make_env
 
 
 class MeanSignal:
@@ -33,21 +26,8 @@ class MeanSignal:
         return images.mean(dim=(1, 2, 3))
 
 
-def _assert_equal(first: Any, second: Any) -> None:
-    assert type(first) is type(second)
-    if isinstance(first, dict):
-        assert list(first) == list(second)
-        for key in first:
-            _assert_equal(first[key], second[key])
-    elif isinstance(first, tuple | list):
-        for a, b in zip(first, second, strict=True):
-            _assert_equal(a, b)
-    else:
-        np.testing.assert_array_equal(first, second)
-
-
 def test_spec_round_trips_through_json_and_pickle() -> None:
-    env = _make(
+    env = make_env(
         observation="linear",
         costs={"switch": 0.1},
         scorer="ae_env.scorers.terms:Noise",
@@ -59,16 +39,16 @@ def test_spec_round_trips_through_json_and_pickle() -> None:
         assert spec == env.spec
         again = gym.make(spec)
         again.reset(seed=3)
-        _assert_equal(again.step(11), expected)
+        assert_equal(again.step(11), expected)
 
 
 def test_in_process_arguments_say_so_when_json_is_asked_for() -> None:
-    env = _make(scorer=MeanSignal())
+    env = make_env(scorer=MeanSignal())
     env.reset(seed=0)
     assert 0.0 <= env.step(0)[1] <= 1.0
     with pytest.raises(ValueError, match=r"`scorer`.*this process only.*package\.module"):
         env.spec.to_json()
-    env = gym.make(ID, scenes=_make().unwrapped.scenes[:2], resolution=36)
+    env = make_env(scenes=make_env().unwrapped.scenes[:2])
     with pytest.raises(ValueError, match="`scenes`"):
         env.spec.to_json()
 
@@ -107,7 +87,3 @@ def test_constructors_list_their_arguments(kind: Any) -> None:
         kind(scorrer="noise")
     with pytest.raises(TypeError, match="got an unexpected keyword argument 'frameskip'"):
         gym.make(ID, frameskip=4)  # the wording that TorchRL looks for
-
-
-def test_module_prefix_makes_the_environment_known() -> None:
-    assert gym.make(f"ae_env:{ID}", **ARGUMENTS).unwrapped.spec.id == ID

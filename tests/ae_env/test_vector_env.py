@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 from collections import deque
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,96 +11,36 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import ae_env  # noqa: F401  (registers the environment)
+from tests.ae_env.environments import (
+    assert_same,
+    check_parity,
+    make_env,
+    make_envs,
+    make_reference,
+    make_worker_env,
+)
 from tests.strategies import SEEDS
 
-ID = "ae_env/AutoExposure-v0"
-ARGUMENTS: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
-NUM_ENVS = 3
 PAIRED = {"balanced": 0.7, "banding": 0.3}
 
 
-def _native(num_envs: int = NUM_ENVS, **arguments: Any) -> gym.vector.VectorEnv:
-    return gym.make_vec(ID, num_envs=num_envs, **{**ARGUMENTS, **arguments})
+RICH = {
+    "with_oracle": True,
+    "observation": "linear",
+    "costs": {"flicker": 0.1, "switch": 0.1},
+    "lighting": "sine",
+    "delay": 1,
+}
 
 
-def _make_single(**arguments: Any) -> gym.Env:
-    torch.set_num_threads(1)  # a worker process of its own crawls with one thread per core
-    return gym.make(f"ae_env:{ID}", **{**ARGUMENTS, **arguments})
-
-
-def _reference(mode: AutoresetMode, lengths: list[int], **arguments: Any) -> SyncVectorEnv:
-    make: list[Callable[[], gym.Env]] = [
-        functools.partial(_make_single, max_episode_steps=n, **arguments) for n in lengths
-    ]
-    return SyncVectorEnv(make, autoreset_mode=mode, copy=True)
-
-
-def _assert_same(first: Any, second: Any, where: str = "") -> None:
-    """Equal values in equal shapes, whatever the order of the keys.
-
-    Scores (float64) may differ in the last digits: a pixel's exponential (float32) is rounded
-    differently in the vector unit than in the up to 15 elements left over at the end of a batch,
-    which moves exp(-mean / 0.15) of 36 x 36 pixels by up to 15 x 2**-24 / 1296 / 0.15 = 5e-9.
-    """
-    if isinstance(first, dict):
-        assert isinstance(second, dict), where
-        assert set(first) == set(second), f"{where}: {set(first) ^ set(second)}"
-        for key in first:
-            _assert_same(first[key], second[key], f"{where}.{key}")
-    elif isinstance(first, tuple):
-        for i, (a, b) in enumerate(zip(first, second, strict=True)):
-            _assert_same(a, b, f"{where}({i})")
-    elif isinstance(first, np.ndarray) and first.dtype == object:
-        assert second.dtype == object, where
-        assert first.shape == second.shape, where
-        for i, (a, b) in enumerate(zip(first, second, strict=True)):
-            _assert_same(a, b, f"{where}[{i}]")
-    elif isinstance(first, np.ndarray):
-        assert first.dtype == second.dtype, f"{where}: {first.dtype} {second.dtype}"
-        if first.dtype == np.float64:
-            np.testing.assert_allclose(first, second, rtol=1e-8, atol=1e-12, err_msg=where)
-        else:
-            np.testing.assert_array_equal(first, second, err_msg=where)
-    else:
-        assert first == second, where
-
-
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-@pytest.mark.parametrize(
-    "extra",
-    [
-        {},
-        {
-            "with_oracle": True,
-            "observation": "linear",
-            "costs": {"flicker": 0.1, "switch": 0.1},
-            "lighting": "sine",
-            "delay": 1,
-        },
-    ],
-)
-def test_parity_with_sync_vector_env(mode: AutoresetMode, extra: dict[str, Any]) -> None:
-    envs = _native(autoreset_mode=mode.name, max_episode_steps=3, **extra)
-    reference = _reference(mode, [3] * NUM_ENVS, **extra)
-    assert envs.metadata["autoreset_mode"] == mode
-    _assert_same(envs.reset(seed=11), reference.reset(seed=11), "reset")
-    rng = np.random.default_rng(0)
-    finished = np.zeros(NUM_ENVS, dtype=bool)
-    for step in range(9):
-        actions = rng.integers(64, size=NUM_ENVS)
-        if mode == AutoresetMode.DISABLED and finished.any():
-            options = {"reset_mask": finished}
-            _assert_same(
-                envs.reset(options=options), reference.reset(options=dict(options)), "again"
-            )
-        mine, theirs = envs.step(actions), reference.step(actions)
-        _assert_same(mine, theirs, f"step {step}")
-        finished = mine[3]
+@pytest.mark.parametrize("mode", [mode.name for mode in AutoresetMode])
+@pytest.mark.parametrize("extra", [{}, RICH])
+def test_parity_with_sync_vector_env(mode: str, extra: dict[str, Any]) -> None:
+    check_parity(11, 9, mode, max_episode_steps=3, **extra)
 
 
 LIGHTINGS: list[Any] = [
@@ -122,13 +60,7 @@ LIGHTINGS: list[Any] = [
 @pytest.mark.parametrize("delay", [0, 2])
 def test_parity_in_every_light_at_every_delay(lighting: Any, delay: int) -> None:
     extra = {"lighting": lighting, "delay": delay, "with_oracle": True, "scorer": PAIRED}
-    envs = _native(autoreset_mode="SAME_STEP", max_episode_steps=3, **extra)
-    reference = _reference(AutoresetMode.SAME_STEP, [3] * NUM_ENVS, **extra)
-    _assert_same(envs.reset(seed=5), reference.reset(seed=5), "reset")
-    rng = np.random.default_rng(1)
-    for step in range(4):
-        actions = rng.integers(64, size=NUM_ENVS)
-        _assert_same(envs.step(actions), reference.step(actions), f"step {step}")
+    check_parity(5, 4, max_episode_steps=3, **extra)
 
 
 @pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
@@ -136,43 +68,53 @@ def test_parity_in_every_light_at_every_delay(lighting: Any, delay: int) -> None
 def test_delayed_settings_meet_the_light_of_their_frame(lighting: Any, delay: int) -> None:
     """The light of a frame does not wait; `info` and the score are of the settings in force."""
     extra = {"lighting": lighting, "motion": "none", "depth": "far", "max_episode_steps": None}
-    delayed, direct = _native(delay=delay, **extra), _native(**extra)
+    delayed, direct = make_envs(delay=delay, **extra), make_envs(**extra)
     start = np.array([3, 20, 41])
     delayed.reset(seed=9, options={"state": start})
     direct.reset(seed=9, options={"state": start})
-    actions = np.random.default_rng(2).integers(64, size=(7, NUM_ENVS))
+    actions = np.random.default_rng(2).integers(64, size=(7, 3))
     in_force = np.concatenate([np.tile(start, (delay, 1)), actions])
     for frame in range(7):
         mine, theirs = delayed.step(actions[frame]), direct.step(in_force[frame])
         np.testing.assert_array_equal(mine[4]["state"], in_force[frame])
         times = [delayed.unwrapped.grid[s].exposure_time for s in in_force[frame]]
         np.testing.assert_array_equal(mine[4]["exposure_time"], times)
-        _assert_same(mine, theirs, f"frame {frame}")
+        assert_same(mine, theirs, f"frame {frame}")
 
 
-def test_parity_when_episodes_end_one_by_one() -> None:
-    """Episodes get out of step through masked resets; the shown frames of the others stay."""
-    envs = _native(autoreset_mode="DISABLED", max_episode_steps=2)
-    reference = _reference(AutoresetMode.DISABLED, [2] * NUM_ENVS)
-    envs.reset(seed=3)
-    reference.reset(seed=3)
-    masks = ([True, False, False], [False, True, True], [True, False, True])
-    for mask in masks:
-        _assert_same(envs.step(np.array([1, 2, 3])), reference.step(np.array([1, 2, 3])))
+def test_masked_resets_agree_with_single_ones() -> None:
+    """Episodes get out of step; the shown frames of the others stay."""
+    both = (
+        make_envs(autoreset_mode="DISABLED", max_episode_steps=2),
+        make_reference("DISABLED", max_episode_steps=2),
+    )
+    for envs in both:
+        envs.reset(seed=3)
+    for mask in ([True, False, False], [False, True, True], [True, False, True]):
+        assert_same(*(envs.step(np.array([1, 2, 3])) for envs in both))
         options = {"reset_mask": np.array(mask), "state": 5}
-        mine = envs.reset(options=dict(options))
-        theirs = reference.reset(options=dict(options))
-        _assert_same(mine, theirs, "masked reset")
-        both = np.array([True] * NUM_ENVS)
-        envs.reset(options={"reset_mask": both})
-        reference.reset(options={"reset_mask": both})
+        assert_same(*(envs.reset(options=dict(options)) for envs in both))
+        for envs in both:
+            envs.reset(options={"reset_mask": np.ones(3, bool)})
+
+
+def test_resets_that_are_needed() -> None:
+    envs = make_envs(autoreset_mode="DISABLED", max_episode_steps=1)
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step([0] * 3)
+    with pytest.raises(gym.error.ResetNeeded, match="first reset"):
+        envs.reset(options={"reset_mask": np.array([True, False, True])})
+    envs.reset(seed=0)
+    envs.step([0] * 3)
+    with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
+        envs.step([0] * 3)
 
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
 def test_staggered_episodes_agree_with_single_ones(mode: str) -> None:
     """After a masked reset the episodes end at different steps, in the autoreset modes as well."""
-    envs = _native(autoreset_mode=mode, max_episode_steps=3)
-    singles = [_make_single(max_episode_steps=3) for _ in range(NUM_ENVS)]
+    envs = make_envs(autoreset_mode=mode, max_episode_steps=3)
+    singles = [make_env(max_episode_steps=3) for _ in range(3)]
     envs.reset(seed=20)
     for i, env in enumerate(singles):
         env.reset(seed=20 + i)
@@ -181,9 +123,9 @@ def test_staggered_episodes_agree_with_single_ones(mode: str) -> None:
         env.step(1)
     envs.reset(options={"reset_mask": np.array([False, True, False])})
     singles[1].reset()
-    done = [False] * NUM_ENVS
+    done = [False] * 3
     for action in range(2, 9):
-        observation, reward, _, truncated, info = envs.step(np.full(NUM_ENVS, action))
+        observation, reward, _, truncated, info = envs.step(np.full(3, action))
         for i, env in enumerate(singles):
             if done[i]:
                 one, single_info = env.reset()
@@ -200,16 +142,8 @@ def test_staggered_episodes_agree_with_single_ones(mode: str) -> None:
             done[i] = done[i] and mode == "NEXT_STEP"
 
 
-def test_a_finished_episode_needs_a_reset_when_autoreset_is_off() -> None:
-    envs = _native(autoreset_mode="DISABLED", max_episode_steps=1)
-    envs.reset(seed=0)
-    envs.step(np.zeros(NUM_ENVS, np.int64))
-    with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
-        envs.step(np.zeros(NUM_ENVS, np.int64))
-
-
 def test_reset_options_per_environment() -> None:
-    envs = _native()
+    envs = make_envs()
     ids = [envs.unwrapped.scenes[i].scene_id for i in (0, 2, 4)]
     _, info = envs.reset(seed=0, options={"scene": ids, "state": [1, 2, 3]})
     assert info["scene_id"].tolist() == ids
@@ -226,33 +160,24 @@ def test_reset_options_per_environment() -> None:
 
 
 def test_scores_and_pictures_of_every_environment() -> None:
-    envs = _native(render_mode="rgb_array", with_oracle=True)
+    envs = make_envs(render_mode="rgb_array", with_oracle=True)
     with pytest.raises(gym.error.ResetNeeded):
         envs.render()
     _, info = envs.reset(seed=0)
     scores = envs.unwrapped.expected_scores()
-    assert scores.shape == (NUM_ENVS, 64)
-    best = scores[np.arange(NUM_ENVS), info["oracle_state"]]
+    assert scores.shape == (3, 64)
+    best = scores[np.arange(3), info["oracle_state"]]
     np.testing.assert_allclose(best, scores.max(1), atol=1e-7)
     pictures = envs.render()
-    assert len(pictures) == NUM_ENVS
+    assert len(pictures) == 3
     assert all(p.dtype == np.uint8 and p.shape[2] == 3 and p.shape[0] >= 256 for p in pictures)
-    assert _native().render() is None
-
-
-def test_no_episode_goes_on_where_one_action_is_bad() -> None:
-    envs, plain = _native(), _native()
-    for env in (envs, plain):
-        env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"`action` \(=64\) must be in \[0, 64\)"):
-        envs.step(np.array([0, 1, 64]))
-    _assert_same(envs.step(np.array([5, 6, 7])), plain.step(np.array([5, 6, 7])))
+    assert make_envs().render() is None
 
 
 @pytest.mark.parametrize("mode", [mode.name for mode in AutoresetMode])
 def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
     """Also where the caller has written to the arrays meanwhile."""
-    envs = _native(autoreset_mode=mode)
+    envs = make_envs(autoreset_mode=mode)
     shown = [envs.reset(seed=0)[0]]
     for mask in ([True, False, False], [False, True, False]):
         shown.append(envs.step(np.array([1, 2, 3]))[0])
@@ -268,11 +193,11 @@ def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
 
 @pytest.mark.slow
 def test_construction_in_spawned_processes() -> None:
-    make = functools.partial(_make_single)
+    make = make_worker_env
     envs = AsyncVectorEnv([make] * 2, context="spawn")
     try:
         observation, _ = envs.reset(seed=5)
-        native = _native(2)
+        native = make_envs(2)
         expected, _ = native.reset(seed=5)
         for action in (8, 33):
             np.testing.assert_array_equal(observation["raw"], expected["raw"])
@@ -293,7 +218,7 @@ def _resident_bytes() -> int:
 def test_memory_stays_flat() -> None:
     """Static light, and light that never repeats: neither may let a cache grow."""
     num_envs, steps = 64, 500  # 32,000 environment steps
-    envs = _native(num_envs, autoreset_mode="SAME_STEP")
+    envs = make_envs(num_envs, autoreset_mode="SAME_STEP")
     envs.reset(seed=0)
     rng = np.random.default_rng(0)
     for step in range(steps):
@@ -303,19 +228,11 @@ def test_memory_stays_flat() -> None:
     assert _resident_bytes() - before < 16 * 2**20
 
 
-def test_resets_and_steps_in_the_wrong_order() -> None:
-    envs = _native()
-    with pytest.raises(gym.error.ResetNeeded):
-        envs.step(np.zeros(3, np.int64))
-    with pytest.raises(gym.error.ResetNeeded, match="first reset"):
-        envs.reset(options={"reset_mask": np.array([True, False, True])})
-
-
 def test_masks_are_those_of_each_scene() -> None:
-    scenes = _native().unwrapped.scenes[:2]
+    scenes = make_envs().unwrapped.scenes[:2]
     allowed = np.arange(64) % 5 == 0
     scenes = [replace(scenes[0], allowed=allowed), scenes[1]]
-    envs = _native(scenes=scenes)
+    envs = make_envs(scenes=scenes)
     envs.reset(seed=0, options={"scene": [0, 1, 0]})
     wanted = [allowed, np.ones(64, bool), allowed]
     np.testing.assert_array_equal(envs.unwrapped.action_masks(), wanted)
@@ -325,7 +242,7 @@ def test_masks_are_those_of_each_scene() -> None:
 
 def _rollout(seeds: list[int], actions: np.ndarray, **arguments: Any) -> list[Any]:
     """What each of the seeds' episodes shows: raws, rewards and states, of all of its frames."""
-    envs = gym.make_vec(ID, num_envs=len(seeds), scenes="bundled:small", resolution=36, **arguments)
+    envs = make_envs(len(seeds), **arguments)
     observation, info = envs.reset(seed=seeds)
     frames = [(*observation.values(), info["state"], info["excess_noise"])]
     for action in actions:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from hypothesis import given
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env import wrappers
 from ae_env.grid import ExposureGrid
 from ae_env.wrappers import (
@@ -24,10 +22,9 @@ from ae_env.wrappers import (
     VectorControlActions,
     VectorRelativeActions,
 )
+from tests.ae_env.environments import make_env, make_envs
 from tests.strategies import SEEDS, grids
 
-ID = "ae_env/AutoExposure-v0"
-ARGUMENTS = {"scenes": "bundled:small", "resolution": 36}
 PAIRS = [
     (ControlActions, VectorControlActions),
     (RelativeActions, VectorRelativeActions),
@@ -35,12 +32,8 @@ PAIRS = [
 ]
 
 
-def _make(**arguments: object) -> gym.Env:
-    return gym.make(ID, **{**ARGUMENTS, **arguments})
-
-
 def test_control_actions_are_positions_in_the_lists() -> None:
-    env = ControlActions(_make())
+    env = ControlActions(make_env())
     assert env.action_space == gym.spaces.MultiDiscrete([4, 4, 4])
     env.reset(seed=0)
     _, _, _, _, info = env.step(np.array([2, 1, 3]))
@@ -51,7 +44,7 @@ def test_control_actions_are_positions_in_the_lists() -> None:
 
 
 def test_continuous_actions_take_the_nearest_apex_values() -> None:
-    env = ContinuousActions(_make())
+    env = ContinuousActions(make_env())
     grid = env.unwrapped.grid
     env.reset(seed=0)
     corners = {
@@ -72,8 +65,8 @@ def test_continuous_actions_take_the_nearest_apex_values() -> None:
 
 @pytest.mark.parametrize(("single", "vector"), PAIRS)
 def test_vector_twin_does_the_same(single: type, vector: type) -> None:
-    envs = vector(gym.make_vec(ID, num_envs=3, autoreset_mode="DISABLED", **ARGUMENTS))
-    alone = [single(_make()) for _ in range(3)]
+    envs = vector(make_envs(autoreset_mode="DISABLED"))
+    alone = [single(make_env()) for _ in range(3)]
     envs.reset(seed=5)
     for i, env in enumerate(alone):
         env.reset(seed=5 + i)
@@ -96,7 +89,7 @@ def test_vector_twin_does_the_same(single: type, vector: type) -> None:
 
 @pytest.mark.parametrize("single", [pair[0] for pair in PAIRS])
 def test_wrapped_spec_round_trips_through_json(single: type) -> None:
-    env = single(_make(sensors=False))
+    env = single(make_env(sensors=False))
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert again.action_space == env.action_space
     assert again.observation_space == env.observation_space
@@ -111,12 +104,12 @@ def test_wrapped_spec_round_trips_through_json(single: type) -> None:
 def test_masks_are_the_union_per_control() -> None:
     """Allowed: two states that differ in every control, whose mixtures are forbidden."""
     grid = {"isos": [100, 200], "exposure_times": [0.01, 0.02, 0.04], "f_numbers": [4, 8]}
-    base = _make(grid=grid)
+    base = make_env(grid=grid)
     inner = base.unwrapped
     allowed = np.zeros(12, bool)
     allowed[[inner.grid.index(0, 0, 1), inner.grid.index(1, 2, 0)]] = True
     scenes = [replace(inner.scenes[0], allowed=allowed)]
-    env = _make(grid=grid, scenes=scenes, simulator=None)
+    env = make_env(grid=grid, scenes=scenes, simulator=None)
     env.reset(seed=0, options={"state": inner.grid.index(1, 1, 0)})
     controls = [True, True, True, False, True, True, True]
     np.testing.assert_array_equal(ControlActions(env).action_masks(), controls)
@@ -125,7 +118,7 @@ def test_masks_are_the_union_per_control() -> None:
     np.testing.assert_array_equal(RelativeActions(env).action_masks(), steps)
     nearest = ContinuousActions(env).action(np.array([1.0, 1.0, 1.0]))  # f/8, 0.01 s, ISO 200
     assert nearest == inner.grid.index(0, 0, 1)
-    envs = gym.make_vec(ID, num_envs=2, **{**ARGUMENTS, "grid": grid, "scenes": scenes})
+    envs = make_envs(2, grid=grid, scenes=scenes)
     envs.reset(seed=0, options={"state": [inner.grid.index(1, 1, 0), 0]})
     np.testing.assert_array_equal(VectorControlActions(envs).action_masks(), [controls] * 2)
     np.testing.assert_array_equal(VectorRelativeActions(envs).action_masks()[0], steps)
@@ -136,31 +129,19 @@ def test_other_environments_are_refused(single: type, vector: type) -> None:
     with pytest.raises(ValueError, match="`env`"):
         single(gym.make("CartPole-v1"))
     with pytest.raises(ValueError, match="wrapped already"):
-        single(single(_make()))
+        single(single(make_env()))
     with pytest.raises(ValueError, match="make_vec"):
         vector(gym.make_vec("CartPole-v1", num_envs=1, vectorization_mode="sync"))
 
 
 @pytest.mark.parametrize("name", ["ControlActions", "RelativeActions", "ContinuousActions"])
 def test_odd_actions_are_refused(name: str) -> None:
-    env, envs = _make(), gym.make_vec(ID, num_envs=3, **ARGUMENTS)
+    env, envs = make_env(), make_envs()
     env.reset(seed=0)
     envs.reset(seed=0)
     single, many = getattr(wrappers, name)(env), getattr(wrappers, f"Vector{name}")(envs)
-    odd = [
-        None,
-        True,
-        "x",
-        {},
-        object(),
-        b"x",
-        1,
-        [1, 1],
-        [1, 1, math.nan],
-        [1, 1, "x"],
-        [1, 1, None],
-    ]
-    odd += [[1, 1, math.inf], [[1], [1, 1]], np.ones(3, bool), np.ones(3, complex)]
+    odd = [None, True, "x", {}, object(), b"x", 1, [1, 1], [1, 1, math.nan], [1, 1, "x"]]
+    odd += [[1, 1, None], [1, 1, math.inf], [[1], [1, 1]], np.ones(3, bool), np.ones(3, complex)]
     if name != "ContinuousActions":
         odd += [[0, 0, -1], [0, 0, 4], [0, 0, 10**30], np.ones(3)]
     for action in odd:
@@ -178,19 +159,10 @@ def test_odd_actions_are_refused(name: str) -> None:
                 assert 0 <= single.action(action) < 64
 
 
-def _spec(grid: ExposureGrid) -> dict[str, list[float]]:
-    """The grid as an environment's argument, by way of JSON."""
-    lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
-    return json.loads(json.dumps(lists))
-
-
-def _env(grid: ExposureGrid, **arguments: Any) -> gym.Env:
-    return gym.make(ID, scenes="bundled:small", resolution=36, grid=_spec(grid), **arguments)
-
-
 @given(grids(), SEEDS)
 def test_other_ways_to_act_reach_every_state(grid: ExposureGrid, seed: int) -> None:
-    env = _env(grid)
+    lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
+    env = make_env(grid=json.loads(json.dumps(lists)))
     rng = np.random.default_rng(seed)
     controls, steps, apex = ControlActions(env), RelativeActions(env), ContinuousActions(env)
     values = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.loading import SceneNetworks
@@ -25,6 +23,7 @@ from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
+from tests.ae_env.environments import assert_equal, check_parity, make_env, rollout
 from tests.ae_env.scene_files import write_hdr
 
 CAMERA = get_camera("nikon_z6")
@@ -87,7 +86,6 @@ def test_errors_name_the_value_and_the_rule(spec: object, words: str) -> None:
         load(spec)
 
 
-ID = "ae_env/AutoExposure-v0"
 #: Circle of confusion that the networks of these tests find everywhere [pixel].
 FOUND = 4.0
 #: What is left of it after the dead zone.
@@ -136,7 +134,7 @@ def flat_scene(light: float, denoised: float | None = None, **fields: Any) -> Sc
 
 
 def _make(**arguments: Any) -> gym.Env:
-    return gym.make(ID, **{"scenes": NOISY_SCENES, "resolution": 40, **arguments})
+    return make_env(**{"scenes": NOISY_SCENES, "resolution": 40, **arguments})
 
 
 def _state(env: gym.Env, iso: float, time: float, f_number: float) -> int:
@@ -145,33 +143,15 @@ def _state(env: gym.Env, iso: float, time: float, f_number: float) -> int:
     return next(i for i, s in enumerate(grid) if (s.iso, s.exposure_time, s.f_number) == wanted)
 
 
-def _rollout(
-    make: Callable[[], gym.Env], seed: int = 1, actions: Sequence[int] | None = None
-) -> list[np.ndarray]:
-    env, frames = make(), []
-    rng = np.random.default_rng(seed)
-    observation, info = env.reset(seed=seed)
-    for action in rng.integers(64, size=6) if actions is None else actions:
-        numbers = [info[k] for k in ("clipped_high", "clipped_low", "excess_noise")]
-        frames += [*observation.values(), np.array([*numbers, info["rewards"]["score"]])]
-        observation, _, _, _, info = env.step(action)
-    return frames
-
-
-def _assert_equal(first: list[np.ndarray], second: list[np.ndarray]) -> None:
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
     """The weights named here cannot be read: whoever loads them fails."""
     damaged = tmp_path / "damaged.safetensors"
     damaged.write_bytes(b"no weights")
     damaged.with_suffix(".json").write_text("{}")
     arguments = {"scenes": "bundled:small", "resolution": 36, "with_oracle": True}
-    without = _rollout(lambda: _make(**arguments, simulator=None))
-    _assert_equal(_rollout(lambda: _make(**arguments, simulator=str(damaged))), without)
-    _assert_equal(_rollout(lambda: _make(**arguments)), without)
+    without = rollout(1, **arguments, simulator=None)
+    assert_equal(rollout(1, **arguments, simulator=str(damaged)), without)
+    assert_equal(rollout(1, **arguments), without)
     with pytest.raises(ValueError, match="damaged"):
         _make(simulator=str(damaged))
 
@@ -262,29 +242,17 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
 
 def test_vector_environment_equals_single_ones(weights: str) -> None:
     arguments = {"scenes": NOISY_SCENES, "resolution": 40, "simulator": weights}
-    arguments["depth"] = "unknown"
-    envs = gym.make_vec(ID, num_envs=3, **arguments)
-    singles = [gym.make(ID, **arguments) for _ in range(3)]
-    observations, infos = envs.reset(seed=5)
-    rows = [env.reset(seed=5 + i) for i, env in enumerate(singles)]
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        for i, row in enumerate(rows):
-            for name, value in row[0].items():
-                np.testing.assert_array_equal(observations[name][i], value)
-            assert infos["modules"][i] == row[-1]["modules"]
-            assert infos["excess_noise"][i] == row[-1]["excess_noise"]
-        actions = rng.integers(64, size=3)
-        observations, _, _, _, infos = envs.step(actions)
-        rows = [env.step(a) for env, a in zip(singles, actions, strict=True)]
+    check_parity(5, 5, depth="unknown", **arguments)
 
 
 def test_spec_survives_json(weights: str) -> None:
-    env = gym.make(ID, scenes=NAMED, resolution=40, simulator=weights, depth="unknown")
+    env = _make(scenes=NAMED, simulator=weights, depth="unknown")
     text = env.unwrapped.spec.to_json()  # type: ignore[union-attr]
     assert json.loads(text)["kwargs"]["simulator"] == weights
     again = gym.make(EnvSpec.from_json(text))
-    _assert_equal(_rollout(lambda: env), _rollout(lambda: again))
+    assert_equal(*(one.reset(seed=1) for one in (env, again)))
+    for action in (3, 20, 60):
+        assert_equal(*(one.step(action) for one in (env, again)))
 
 
 def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:

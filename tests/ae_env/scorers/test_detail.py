@@ -164,13 +164,3 @@ def test_blind_sigma_of_known_noise(sigma: float) -> None:
     pictures = torch.from_numpy(noisy / 255.0).float().expand(1, 3, -1, -1)
     score = make_scorer("blind_noise").parts["blind_noise"](pictures, None).item()
     assert score == pytest.approx(1 / (1 + sigma / 10), rel=0.03)
-
-
-def test_blind_sigma_is_near_that_of_wavelets() -> None:
-    pytest.importorskip("pywt", reason="scikit-image needs PyWavelets for its estimate")
-    from skimage.restoration import estimate_sigma
-
-    rng = np.random.default_rng(4)
-    noisy = 100.0 + 0.2 * np.arange(200) + 6.0 * rng.normal(size=(180, 200))
-    found = immerkaer_sigma(torch.from_numpy(noisy[None] / 255.0)).item()
-    assert found == pytest.approx(estimate_sigma(noisy), rel=0.05)

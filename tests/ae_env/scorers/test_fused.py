@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, make_scorer
-from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.fused import FusedScores
-from ae_env.scorers.protocol import Captures
 from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.terms import Highlights, Noise, Shadows
-from simulator import get_camera
+from tests.ae_env.scorer_images import CAMERA, GRID, make_captures, make_scene
 
-CAMERA = get_camera("nikon_z6")
-GRID = ExposureGrid.default()
 TERMS = dict.fromkeys(("brightness", "highlights", "shadows", "noise", "sharpness"), 1.0)
 
 
@@ -30,27 +22,7 @@ def _scene(seed: int = 0, size: int = 40) -> Scene:
     """18 stops, some black and some negative pixels, a size that no block divides."""
     light = 2.0 ** np.random.default_rng(seed).uniform(-14, 4, (4, size, size))
     light[:, 0, :5], light[:, 1, :5] = 0.0, -0.01
-    return Scene.from_array(
-        light.astype(np.float32),
-        reference_settings(8.0),
-        CAMERA,
-        scene_id=f"test-{seed}",
-        illuminance=640.0,
-    )
-
-
-def _captures(scenes: list[Scene], rows: np.ndarray | None, gain: float = 1.0) -> Captures:
-    states = [GRID[(7 * i) % 64] for i in range(len(scenes))]
-    count = len(scenes)
-    return describe_captures(
-        scenes,
-        states,
-        CAMERA,
-        speed=np.full(count, 0.1),
-        defocus=np.ones(count),
-        gain=np.full(count, gain),
-        row_gain=rows,
-    )
+    return make_scene(light, 640.0, scene_id=f"test-{seed}")
 
 
 @pytest.mark.parametrize("size", [40, 67])
@@ -60,11 +32,12 @@ def test_scores_are_those_of_the_terms(scorer: Any, bands: bool, size: int) -> N
     made, rng = make_scorer(scorer), np.random.default_rng(1)
     one, other = _scene(0, size), _scene(1, size)
     scenes = [one] * 5 + [other] * 3 + [one]
+    states = [GRID[7 * i] for i in range(9)]
     rows = np.exp(rng.normal(0.0, 1.0, (9, size))) if bands else None
     scores = FusedScores(made)
     assert set(scores.parts) == set(made.parts)
     for gain in (2.0**-64, 2.0**-20, 0.7, 1.0, 30.0, 2.0**64):
-        captures = _captures(scenes, rows, gain)
+        captures = make_captures(scenes, states, 0.1, 1.0, gain, rows)
         wanted = made.score_parts(None, captures)
         for name, found in scores.scores(captures, scores.means(scenes, captures)).items():
             np.testing.assert_allclose(found, wanted[name], atol=1e-6, err_msg=f"{name} {gain}")
@@ -89,11 +62,7 @@ def test_constants_are_those_of_the_terms(
         monkeypatch.setattr(type(part) if on_the_class else part, constant, value)
     made = CompositeScorer(parts)
     found = ScoreTables(GRID, CAMERA, made, use_cache=False).table(_scene()).parts
-    states = list(GRID)
-    nothing = np.zeros(64)
-    captures = describe_captures(
-        [_scene()] * 64, states, CAMERA, speed=nothing, defocus=nothing, gain=nothing + 1.0
-    )
+    captures = make_captures(_scene(), list(GRID))
     for name, wanted in made.score_parts(None, captures).items():
         np.testing.assert_allclose(found[name], wanted, atol=1e-6, err_msg=name)
         assert np.abs(found[name] - before[name]).max() > 0.02
@@ -119,7 +88,7 @@ def test_another_scene_of_the_same_id_is_not_taken_for_it() -> None:
     scores = FusedScores(make_scorer("noise"))
     for seed in range(5):  # each may get the memory, and so the id(), of the one before
         scene = _scene(seed)
-        captures = _captures([scene], None, 2.0)
+        captures = make_captures([scene], [GRID[0]], 0.1, 1.0, 2.0)
         wanted = make_scorer("noise").score_parts(None, captures)["noise"]
         found = scores.scores(captures, scores.means([scene], captures))["noise"]
         np.testing.assert_allclose(found, wanted, atol=1e-6)
@@ -129,8 +98,6 @@ def test_another_scene_of_the_same_id_is_not_taken_for_it() -> None:
 @pytest.mark.parametrize("gain", [0.3, 2.0])
 def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: float) -> None:
     """What the whole table says, against another scene in its own light."""
-    from dataclasses import replace
-
     scene = _scene()
     lit = replace(scene, light=scene.light * gain, illuminance=640.0 * gain)
     tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
@@ -138,25 +105,3 @@ def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: floa
     wanted = tables.table(lit, speed=0.2, defocus=1.0)
     np.testing.assert_allclose(changed.mean, wanted.mean, atol=1e-6)
     assert changed.oracle == wanted.oracle
-
-
-def test_compiled_and_loaded_code_agree_to_the_last_bit(tmp_path: Path) -> None:
-    """The first process of a fresh installation compiles; all others load what it kept."""
-    code = (
-        "import sys, numpy as np; from ae_env.scorers.fused import fused_means as f\n"
-        "rng = np.random.default_rng(0); n = np.float32\n"
-        "light, dark = rng.random((2, 4, 1, 900)).astype(n)\n"
-        "means, ratio = np.empty((3, 3)), rng.random((3, 1))\n"
-        "f(0, 3, light, dark, rng.random((1, 900)), ratio.astype(n), ratio.astype(n), ratio,\n"
-        "  np.full((3, 4), 1e-3, n), np.full((3, 4), 1e-6, n), n(76.0), means)\n"
-        "sys.stdout.buffer.write(means.tobytes())\n"
-    )
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    outputs = [
-        subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, check=True
-        ).stdout
-        for _ in range(2)
-    ]
-    assert len(outputs[0]) == 72
-    assert outputs[0] == outputs[1]

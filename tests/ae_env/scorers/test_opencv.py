@@ -11,33 +11,18 @@ import skimage.data
 import torch
 import torch.nn.functional as functional
 
-from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
-from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.opencv import Brisque, luma_bytes, reference_pictures
-from ae_env.scorers.protocol import Captures
-from simulator import CameraSettings, get_camera, incident_ev100
+from simulator import incident_ev100
+from tests.ae_env.scorer_images import GRID, make_captures, make_scene
 
 cv2 = pytest.importorskip("cv2")
-CAMERA = get_camera("nikon_z6")
-GRID = ExposureGrid.default()
 EV = incident_ev100(1000.0)
 
 
 def _scene(light: np.ndarray, name: str = "test") -> Scene:
-    packed = torch.from_numpy(np.repeat(light[None].astype(np.float32), 4, axis=0))
-    return Scene.from_array(
-        packed, reference_settings(EV), CAMERA, scene_id=name, illuminance=1000.0
-    )
-
-
-def _captures(scenes: list[Scene], states: list[CameraSettings]) -> Captures:
-    count = len(scenes)
-    zeros = np.zeros(count)
-    return describe_captures(
-        scenes, states, CAMERA, speed=zeros, defocus=zeros, gain=np.ones(count)
-    )
+    return make_scene(np.repeat(light[None], 4, axis=0), scene_id=name)
 
 
 def _camera_man(size: int = 128) -> np.ndarray:
@@ -47,7 +32,7 @@ def _camera_man(size: int = 128) -> np.ndarray:
 def test_the_reference_is_the_right_exposure_without_noise() -> None:
     """Whatever the state, and a grey card under incident light is 18 % grey in it."""
     scene = _scene(np.full((40, 40), 0.18 * 0.6635))
-    captures = _captures([scene] * 3, [GRID[i] for i in (0, 30, 63)])
+    captures = make_captures(scene, [GRID[i] for i in (0, 30, 63)])
     pictures = reference_pictures(captures, [0, 1, 2])
     # sRGB of 18 %: 1.055 * 0.18 ** (1 / 2.4) - 0.055.
     np.testing.assert_allclose(pictures.numpy(), 0.4614, atol=2e-3)
@@ -55,7 +40,7 @@ def test_the_reference_is_the_right_exposure_without_noise() -> None:
 
 def test_a_perfect_capture_finds_all_again() -> None:
     scene = _scene(_camera_man())
-    captures = _captures([scene] * 4, [reference_settings(EV)] * 4)
+    captures = make_captures(scene, [reference_settings(EV)] * 4)
     light = captures.light.clamp(0.0, 1.0)
     generator = torch.Generator().manual_seed(0)
     noisy = (light + 0.05 * torch.randn(light.shape, generator=generator)).clamp(0.0, 1.0)
@@ -74,7 +59,7 @@ def test_a_perfect_capture_finds_all_again() -> None:
 def test_each_capture_is_compared_with_its_own_scene() -> None:
     first, second = _scene(_camera_man(), "a"), _scene(_camera_man()[::-1].copy(), "a")
     scenes = [first, second, first, second]
-    captures = _captures(scenes, [reference_settings(EV)] * 4)
+    captures = make_captures(scenes, [reference_settings(EV)] * 4)
     scores = make_scorer("matches")(captures.light.clamp(0.0, 1.0), captures)
     assert scores.tolist() == [1.0] * 4  # though the two have one name
     swapped = make_scorer("matches")(captures.light[[1, 0, 3, 2]].clamp(0.0, 1.0), captures)
@@ -85,7 +70,7 @@ def test_each_capture_is_compared_with_its_own_scene() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (2, 31), (37, 64), (65, 41)])
 def test_any_frame_is_scored(name: str, size: tuple[int, int]) -> None:
     light = np.full(size, 0.1)
-    captures = _captures([_scene(light)] * 3, [GRID[20]] * 3)
+    captures = make_captures(_scene(light), [GRID[20]] * 3)
     images = torch.zeros(3, 4, *size)
     images[1] = 1.0
     images[2] = torch.rand(4, *size)

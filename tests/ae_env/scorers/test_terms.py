@@ -11,45 +11,12 @@ import pytest
 import scipy.optimize
 import torch
 
-from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
-from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.protocol import Captures, Scorer, reads_pixels
+from ae_env.scorers.protocol import Scorer, reads_pixels
 from ae_env.scorers.score_table import ScoreTables
-from simulator import CameraSettings, NoiseLevelFunction, get_camera, incident_ev100
-
-CAMERA = get_camera("nikon_z6")
-GRID = ExposureGrid.default()
-
-
-def _scene(light: np.ndarray, illuminance: float | None = 1000.0, **fields: Any) -> Scene:
-    reference = reference_settings(incident_ev100(illuminance or 1000.0))
-    return Scene.from_array(
-        torch.from_numpy(light.astype(np.float32)),
-        reference,
-        CAMERA,
-        scene_id="test",
-        illuminance=illuminance,
-        **fields,
-    )
-
-
-def _random_scene(seed: int = 0, **fields: Any) -> Scene:
-    rng = np.random.default_rng(seed)
-    return _scene(0.12 * np.exp(rng.normal(0.0, 1.2, (4, 40, 40))), **fields)
-
-
-def _captures(scene: Scene, states: list[CameraSettings], speed: float, defocus: float) -> Captures:
-    count = len(states)
-    return describe_captures(
-        [scene] * count,
-        states,
-        CAMERA,
-        speed=np.full(count, speed),
-        defocus=np.full(count, defocus),
-        gain=np.ones(count),
-    )
+from simulator import CameraSettings, NoiseLevelFunction
+from tests.ae_env.scorer_images import CAMERA, GRID, make_captures, make_scene, random_scene
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
@@ -105,9 +72,9 @@ def _by_the_formulas(
 def test_scores_follow_the_formulas(
     illuminance: float | None, speed: float, defocus: float
 ) -> None:
-    scene = _random_scene(illuminance=illuminance)
+    scene = random_scene(illuminance=illuminance)
     states = [GRID[i] for i in (0, 13, 22, 37, 42, 63)]
-    captures = _captures(scene, states, speed, defocus)
+    captures = make_captures(scene, states, speed, defocus)
     expected = [_by_the_formulas(scene, state, speed, defocus) for state in states]
     for name in ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced"):
         scorer = make_scorer(name)
@@ -120,7 +87,7 @@ def test_scores_follow_the_formulas(
 
 @pytest.mark.parametrize("value", [1e-9, 1e4])
 def test_black_and_white_frames_score_below_a_twentieth(value: float) -> None:
-    captures = _captures(_scene(np.full((4, 40, 40), value)), list(GRID.states), 0.0, 0.0)
+    captures = make_captures(make_scene(np.full((4, 40, 40), value)), list(GRID.states))
     scores = make_scorer("balanced")(None, captures)
     parts = make_scorer("balanced").score_parts(None, captures)
     blown = -0.15 * parts["highlights"].log()
@@ -130,53 +97,38 @@ def test_black_and_white_frames_score_below_a_twentieth(value: float) -> None:
     assert scores[extreme].max() < 0.05
 
 
-def test_zero_light_and_huge_light_stay_finite() -> None:
-    light = np.zeros((4, 40, 40))
-    light[:, :20] = 1e8
-    captures = _captures(_scene(light), list(GRID.states), 100.0, 8.0)
-    for name in ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced"):
-        scores = make_scorer(name)(None, captures)
-        assert bool(torch.isfinite(scores).all())
-        assert 0 <= float(scores.min()) <= float(scores.max()) <= 1
-
-
-def _sweep(name: str, states: list[CameraSettings], **blur: float) -> np.ndarray:
-    captures = _captures(_random_scene(), states, blur.get("speed", 0.0), blur.get("defocus", 0.0))
-    return make_scorer(name)(None, captures).numpy()
-
-
 def test_scores_go_the_way_a_photographer_expects() -> None:
     longer = [CameraSettings(100, 2.0**-i, 4) for i in range(12, 0, -1)]
-    assert (np.diff(_sweep("highlights", longer)) <= 0).all()
-    assert (np.diff(_sweep("shadows", longer)) >= 0).all()
-    assert (np.diff(_sweep("noise", longer[:-2])) > 0).all()  # the last two are mostly white
-    assert (np.diff(_sweep("sharpness", longer, speed=0.2)) < 0).all()
-    brightness = _sweep("brightness", longer)
+    captures = make_captures(random_scene(), longer, speed=0.2)
+
+    def sweep(name: str) -> np.ndarray:
+        return make_scorer(name)(None, captures).numpy()
+
+    assert (np.diff(sweep("highlights")) <= 0).all()
+    assert (np.diff(sweep("shadows")) >= 0).all()
+    assert (np.diff(sweep("noise")[:-2]) > 0).all()  # the last two are mostly white
+    assert (np.diff(sweep("sharpness")) < 0).all()
+    brightness = sweep("brightness")
     best = brightness.argmax()
     assert (np.diff(brightness[: best + 1]) > 0).all()
     assert (np.diff(brightness[best:]) < 0).all()
 
 
-def test_noise_is_that_of_the_sensors_own_pixels() -> None:
-    """Box-averaging must not make ISO free: the same light scores the same at any box factor."""
-    states = list(GRID.states)
-    plain = make_scorer("noise")(None, _captures(_random_scene(), states, 0.0, 0.0))
-    boxed = make_scorer("noise")(None, _captures(_random_scene(box_factor=31), states, 0.0, 0.0))
-    assert torch.equal(plain, boxed)
+NOISY = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
 
 
-def test_noise_level_of_a_noisy_source_does_not_enter_the_score() -> None:
-    nlf = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
-    clean, noisy = _random_scene(), _random_scene(nlf=nlf)
-    first = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False).table(clean)
-    second = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False).table(noisy)
-    np.testing.assert_array_equal(first.mean, second.mean)
+@pytest.mark.parametrize("fields", [{"box_factor": 31}, {"nlf": NOISY}])
+def test_noise_is_that_of_the_cameras_own_pixels(fields: dict[str, Any]) -> None:
+    """Neither does box-averaging make ISO free, nor does the source's noise count."""
+    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
+    wanted, found = (tables.table(scene).mean for scene in (random_scene(), random_scene(**fields)))
+    np.testing.assert_array_equal(found, wanted)
 
 
 def test_values_by_hand() -> None:
     """Flat frames at white and at 2^-9 of it, and a stop, 0.1 stop of bands, b0 of blur."""
     state = GRID[0]
-    captures = _captures(_scene(np.full((4, 40, 40), 0.25)), [state] * 3, 0.0, 0.0)
+    captures = make_captures(make_scene(np.full((4, 40, 40), 0.25)), [state] * 3)
     captures = replace(captures, ratio=torch.tensor([4.0, 2.0**-7, 1.0], dtype=torch.float64))
     ev = captures.ev100
     captures = replace(captures, proper_ev=ev + torch.tensor([0.0, 1.0, -2.0]))
@@ -195,7 +147,7 @@ def test_values_by_hand() -> None:
 
 def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
     """With read noise alone SNR = x / sqrt(read); above white the signal is cut, its noise not."""
-    captures = _captures(_scene(np.full((4, 40, 40), 0.5)), [GRID[0]] * 3, 0.0, 0.0)
+    captures = make_captures(make_scene(np.full((4, 40, 40), 0.5)), [GRID[0]] * 3)
     read = (0.5 / 18) ** 2
     noises = [NoiseLevelFunction((0.0,) * 4, (r,) * 4) for r in (read, read / 16, read)]
     captures = replace(captures, nlf=noises, ratio=torch.tensor([1.0, 1.0, 8.0]).double())
@@ -210,7 +162,7 @@ def test_noise_is_a_half_at_a_signal_to_noise_ratio_of_18() -> None:
 
 def test_bands_by_hand() -> None:
     """Half of the rows at 1.2 of the light, half at 0.8; brightness is the mean over the rows."""
-    captures = _captures(_scene(np.full((4, 40, 40), 0.1)), [GRID[0]], 0.0, 0.0)
+    captures = make_captures(make_scene(np.full((4, 40, 40), 0.1)), [GRID[0]])
     rows = torch.tensor([1.2, 0.8], dtype=torch.float64).repeat_interleave(20)[None]
     captures = replace(captures, row_gain=rows, proper_ev=captures.ev100 + 1.0)
     spread = 0.5 * math.log2(1.2 / 0.8)
