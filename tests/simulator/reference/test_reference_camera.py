@@ -29,17 +29,9 @@ Z6_GREEN = {
 
 def sensor(shot: float, read: float, *, span: float = 16000.0, **options: object) -> CameraProfile:
     """A camera of round numbers: base ISO 100, the same noise in every plane."""
-    nlf = NoiseLevelFunction((shot,) * 4, (read,) * 4)
-    return CameraProfile(
-        name="round",
-        cfa=BayerPattern.RGGB,
-        black_level=(200.0,) * 4,
-        white_level=200.0 + span,
-        bit_depth=16,
-        nlf_by_iso={100.0: nlf},
-        pixel_pitch_um=5.0,
-        **options,  # type: ignore[arg-type]
-    )
+    table = {100.0: NoiseLevelFunction((shot,) * 4, (read,) * 4)}
+    values = {"nlf_by_iso": table, "pixel_pitch_um": 5.0, **options}
+    return CameraProfile("round", BayerPattern.RGGB, (200.0,) * 4, 200.0 + span, 16, **values)  # type: ignore[arg-type]
 
 
 def scene(light: torch.Tensor, depth: torch.Tensor | None = None, **options: object):
