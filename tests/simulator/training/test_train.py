@@ -64,8 +64,6 @@ def test_the_card_says_what_was_done(trained: Path) -> None:
     assert list(card["stages"]) == ["exposure", "noise", "aperture"]
     for stage in card["stages"].values():
         assert stage["steps"] == 2
-        assert stage["seconds"] >= 0
-        assert stage["pairs"] > 0
         assert stage["validation"]["loss"] > 0
     assert "gain_db" in card["stages"]["noise"]["validation"]
     assert {"map", "relative"} <= set(card["stages"]["aperture"]["validation"])
