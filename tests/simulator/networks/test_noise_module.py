@@ -49,29 +49,22 @@ def test_variance_by_hand_and_below_zero() -> None:
     assert tiny.flatten().tolist() == pytest.approx([5e-9] * 16, rel=1e-5)
 
 
-def test_the_paper_network_sees_image_and_level_and_gives_a_residual() -> None:
-    module = NoiseModule("paper")
+@pytest.mark.parametrize("preset", ["compact", "paper"])
+def test_the_networks_see_image_and_deviation(preset: Preset) -> None:
+    """The compact one that of the smoothed signal; the paper's gives a residual."""
+    module, image = NoiseModule(preset), noisy()
     module.network = Seen(0.125)
-    image = noisy()
-    assert torch.equal(module(image, SHOT, READ), image + 0.125)
-    (planes,) = module.network.given
-    assert planes.shape == (1, 8, 16, 18)
-    assert torch.equal(planes[:, :4], image)
-    signal = image.clamp(min=0)[0].double().numpy()
-    variance = np.array(NLF.read)[:, None, None] + np.array(NLF.shot)[:, None, None] * signal
-    np.testing.assert_allclose(planes[0, 4:].numpy(), np.sqrt(variance), rtol=1e-5)
-
-
-def test_the_compact_network_sees_the_deviation_of_the_smoothed_signal() -> None:
-    module = NoiseModule("compact")
-    module.network = Seen(0.5)
-    image = noisy()
-    assert bool((module(image, SHOT, READ) == 0.5).all())  # its residual is inside the network
-    seen, deviation = module.network.given
+    residual = image if preset == "paper" else torch.zeros_like(image)
+    assert torch.equal(module(image, SHOT, READ), residual + 0.125)
+    seen, deviation = torch.cat(module.network.given, dim=1).split(4, dim=1)
     assert torch.equal(seen, image)
-    signal = uniform_filter(image.double().numpy(), (1, 1, 5, 5), mode="nearest").clip(min=0)[0]
-    variance = np.array(NLF.read)[:, None, None] + np.array(NLF.shot)[:, None, None] * signal
-    np.testing.assert_allclose(deviation[0].numpy(), np.sqrt(variance), rtol=1e-4)
+    signal = image.double().numpy()
+    if preset == "compact":
+        signal = uniform_filter(signal, (1, 1, 5, 5), mode="nearest")
+    shot, read = (np.array(v)[:, None, None] for v in (NLF.shot, NLF.read))
+    expected = np.sqrt(read + shot * signal[0].clip(min=0))
+    tolerance = 1e-5 if preset == "paper" else 1e-4
+    np.testing.assert_allclose(deviation[0].numpy(), expected, rtol=tolerance)
 
 
 @pytest.mark.parametrize("exponent", [-12, -1, 5, 12])

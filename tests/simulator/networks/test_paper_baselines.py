@@ -29,19 +29,11 @@ def normal(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def concatenation() -> ParameterConcatenation:
-    torch.manual_seed(0)
-    return ParameterConcatenation(width=12).eval()
-
-
-def decoupled() -> DecoupledNet:
-    torch.manual_seed(0)
-    return DecoupledNet(width=6)
-
-
-@pytest.mark.parametrize("make", [concatenation, decoupled])
-def test_batch_of_different_parameters_equals_single_runs(make: type[nn.Module]) -> None:
-    net = make().double()
+@pytest.mark.parametrize("make", [ParameterConcatenation, DecoupledNet])
+def test_batch_of_different_parameters_equals_single_runs(
+    make: type[ParameterConcatenation | DecoupledNet],
+) -> None:
+    net = make(width=6).eval().double()
     for module in net.modules():  # running statistics that differ from a single image's
         if isinstance(module, AdaptiveNorm):
             nn.init.constant_(module.normalised, 0.5)
@@ -90,7 +82,7 @@ def test_adaptive_normalisation() -> None:
 
 
 def test_context_network_starts_as_the_identity() -> None:
-    net, image = concatenation(), normal(1, 4, 9, 7).abs()
+    net, image = ParameterConcatenation(width=12).eval(), normal(1, 4, 9, 7).abs()
     last = net.body[-1]
     assert isinstance(last, nn.Conv2d)
     nn.init.dirac_(last.weight)
@@ -126,18 +118,14 @@ def test_generated_convolution_is_each_sample_s_own(options: dict[str, int]) -> 
     result = layer(x, parameters)
     for i in range(3):
         flat = layer.generator.weight @ parameters[i] + layer.generator.bias
+        one = x[i : i + 1]
         if layer.upsample:
-            expected = F.conv_transpose2d(
-                x[i : i + 1], flat.reshape(5, 5, 4, 4), stride=2, padding=1
-            )
+            weight = flat.reshape(5, 5, 4, 4)
+            expected = F.conv_transpose2d(one, weight, stride=2, padding=1)
         else:
-            expected = F.conv2d(
-                x[i : i + 1],
-                flat.reshape(5, 5, 3, 3),
-                stride=options.get("stride", 1),
-                padding=options.get("dilation", 1),
-                dilation=options.get("dilation", 1),
-            )
+            weight = flat.reshape(5, 5, 3, 3)
+            padded = {"padding": options.get("dilation", 1), **options}
+            expected = F.conv2d(one, weight, **padded)
         torch.testing.assert_close(result[i : i + 1], expected)
 
 

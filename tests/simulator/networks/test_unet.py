@@ -155,20 +155,6 @@ def attention(width: int = 8) -> SkipAttention:
     return SkipAttention(width).double()
 
 
-def test_normalisation_is_the_paper_s_formula() -> None:
-    torch.manual_seed(0)
-    norm = ApertureNorm(3).double()
-    nn.init.normal_(norm.affine.bias)
-    x, aperture = normal(2, 3, 4, 5, dtype=torch.float64), normal(2, 2, dtype=torch.float64)
-    result = norm(x, aperture)
-    weight, bias = norm.affine.weight, norm.affine.bias
-    for i in range(2):
-        scale = weight[:3] @ aperture[i] + bias[:3]
-        shift = weight[3:] @ aperture[i] + bias[3:]
-        expected = F.instance_norm(x[i : i + 1], weight=scale, bias=shift, eps=1e-5)
-        torch.testing.assert_close(result[i : i + 1], expected)
-
-
 def test_channel_attention_needs_only_the_f_numbers() -> None:
     """The paper's branch, literally: 1 x 1 convolution (with a bias), A, average, excitation."""
     module = attention()

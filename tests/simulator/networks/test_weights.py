@@ -38,13 +38,12 @@ def beside(path: Path, suffix: str) -> Path:
 
 def rewrite(path: Path, change: Callable[[dict[str, torch.Tensor]], object]) -> None:
     """Other tensors under a card whose hash is right again."""
-    weights, card = beside(path, ".safetensors"), beside(path, ".json")
-    tensors = load_file(weights)
+    file, card = beside(path, ".safetensors"), beside(path, ".json")
+    tensors = load_file(file)
     change(tensors)
-    save_file(tensors, weights)
-    head = json.loads(card.read_text())
-    head["sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
-    card.write_text(json.dumps(head))
+    save_file(tensors, file)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    card.write_text(json.dumps({**json.loads(card.read_text()), "sha256": digest}))
 
 
 @pytest.mark.parametrize("ending", ["", ".safetensors", ".json"])

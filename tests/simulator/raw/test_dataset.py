@@ -4,6 +4,7 @@ the way the authors' preprocessing makes them."""
 from __future__ import annotations
 
 import csv
+import functools
 import io
 import logging
 import math
@@ -38,6 +39,7 @@ NIKON = ("path", "time", "iso", "aperture", "wb", "noiseprofile")
 CANON = ("path", "time", "iso", "aperture", "noiseprofile")
 
 
+@functools.cache
 def captures(camera_name: str, size: int = 16) -> list[RawImage]:
     camera = packed_camera(camera_name)
     rows = torch.linspace(0.02, 0.3, size)
@@ -81,19 +83,17 @@ def test_captures_of_the_reference_camera_come_back(
         assert sequence.captures[0].white_balance == pytest.approx((2.0, 1.0, 1.5))
 
 
-def test_captures_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
-    for write in (write_raw_sequence, write_packed_sequence):
-        folder = tmp_path / write.__name__
-        write(folder, captures("nikon_z6"))
-        sequence = read_sequence(folder)
-        next(iter(sorted(folder.glob("capture_001.*")))).unlink()
-        assert sequence.captures[0].settings == SETTINGS[0]
-        assert sequence.captures[-1].settings == SETTINGS[2]
-        assert [c.settings for c in sequence.captures[::2]] == [SETTINGS[0], SETTINGS[2]]
-        with pytest.raises(FileNotFoundError):
-            sequence.captures[1]
-        with pytest.raises(IndexError):
-            sequence.captures[3]
+@pytest.mark.parametrize("write", [write_raw_sequence, write_packed_sequence])
+def test_captures_are_read_when_they_are_asked_for(tmp_path: Path, write: Any) -> None:
+    write(tmp_path / "a", captures("nikon_z6", size=4))
+    sequence = read_sequence(tmp_path / "a")
+    next((tmp_path / "a").glob("capture_001.*")).unlink()
+    assert sequence.captures[-1].settings == SETTINGS[2]
+    assert [c.settings for c in sequence.captures[::2]] == [SETTINGS[0], SETTINGS[2]]
+    with pytest.raises(FileNotFoundError):
+        sequence.captures[1]
+    with pytest.raises(IndexError):
+        sequence.captures[3]
 
 
 # --- files as the authors' preprocessing leaves them -------------------------------------------
@@ -114,15 +114,8 @@ def author_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[Any]
 
 
 def nikon_row(path: str, **changes: Any) -> list[Any]:
-    cells = {
-        "path": path,
-        "time": 0.008,
-        "iso": 800,
-        "aperture": 5.6,
-        "wb": [1.9, 1.0, 1.4, 0.0],
-        "noiseprofile": PROFILE,
-    }
-    return [*(cells | changes).values()]
+    values = (path, 0.008, 800, 5.6, [1.9, 1.0, 1.4, 0.0], PROFILE)
+    return [*(dict(zip(NIKON, values, strict=True)) | changes).values()]
 
 
 @pytest.fixture
@@ -281,19 +274,12 @@ def test_every_folder_of_raws_is_a_sequence(tmp_path: Path) -> None:
     write_raw_sequence(tmp_path / "nikon" / "b", raws)
     write_raw_sequence(tmp_path / "nikon" / "a", raws[:2])
     (tmp_path / "nikon" / "readme.txt").write_text("words")
+    for ending in ("NEF", "jpg"):  # there twice: read once, from the DNG
+        (tmp_path / "nikon" / "b" / f"capture_000.{ending}").write_bytes(b"never read")
     found = read_dataset(tmp_path)
     assert [(s.name, len(s.captures)) for s in found] == [("nikon/a", 2), ("nikon/b", 3)]
     assert [s.name for s in read_dataset(tmp_path / "nikon" / "a")] == ["a"]
     assert_same(list(found[1].captures), raws)
-
-
-def test_a_capture_that_is_there_twice_is_read_once_from_the_dng(tmp_path: Path) -> None:
-    raws = captures("nikon_z6", size=4)
-    write_raw_sequence(tmp_path / "a", raws)
-    for stem in ("capture_000", "capture_001"):
-        (tmp_path / "a" / f"{stem}.NEF").write_bytes(b"never read")
-        (tmp_path / "a" / f"{stem}.jpg").write_bytes(b"never read")
-    assert_same(list(read_sequence(tmp_path / "a").captures), raws)
 
 
 @pytest.mark.parametrize("write", [write_raw_sequence, write_packed_sequence])

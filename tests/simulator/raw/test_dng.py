@@ -123,6 +123,20 @@ def test_writing_and_reading_invert(
         assert getattr(back.noise, name) == pytest.approx((red, green, green, blue), rel=1e-12)
 
 
+def test_noise_of_box_averages_and_beyond_the_whole_range(path: Path) -> None:
+    raw = make_raw(box_factor=4)
+    write_dng(path, raw)
+    with tifffile.TiffFile(path) as tiff:
+        stated = tiff.pages.first.tags["NoiseProfile"].value
+    assert stated[0] == pytest.approx(1.5e-4 / 16)
+    assert read_raw(path).noise.shot == pytest.approx(raw.noise.shot)
+    nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))
+    settings = CameraSettings(409_600, 4.0, 1.0)  # exposed from there
+    write_dng(path, RawImage(torch.ones(4, 8, 8), settings, get_camera("nikon_z6"), nlf))
+    back = read_raw(path)
+    assert (back.noise.shot, back.noise.read) == (nlf.shot, nlf.read)
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -161,25 +175,6 @@ def test_colour_matrix_and_camera_survive(path: Path) -> None:
     assert back.camera.colour_matrix_source == "measured"
     assert back.noise.shot[1:3] == pytest.approx(z6.nlf(800).shot[1:3])
     assert back.camera.nlf(100) == z6.nlf(100)
-
-
-def test_box_averaged_raw_states_its_own_noise(path: Path) -> None:
-    raw = make_raw(box_factor=4)
-    write_dng(path, raw)
-    with tifffile.TiffFile(path) as tiff:
-        stated = tiff.pages.first.tags["NoiseProfile"].value
-    assert stated[0] == pytest.approx(1.5e-4 / 16)
-    back = read_raw(path)
-    assert back.box_factor == 4
-    assert back.noise.shot == pytest.approx(raw.noise.shot)
-
-
-def test_noise_beyond_the_whole_range_comes_back(path: Path) -> None:
-    nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))  # ISO 409600, exposed
-    settings = CameraSettings(409_600, 4.0, 1.0)
-    write_dng(path, RawImage(torch.ones(4, 8, 8), settings, get_camera("nikon_z6"), nlf))
-    back = read_raw(path)
-    assert (back.noise.shot, back.noise.read) == (nlf.shot, nlf.read)
 
 
 # -- the file -------------------------------------------------------------------------------------

@@ -41,25 +41,6 @@ def test_packing_and_unpacking_invert(mosaic: Mosaic, odd: bool, as_float: bool)
         np.testing.assert_array_equal(packed[plane].numpy(), wanted.astype(np.float32))
 
 
-@pytest.mark.parametrize(
-    ("cfa", "tile"),
-    [
-        ("RGGB", [["R", "G1"], ["G2", "B"]]),
-        ("BGGR", [["B", "G2"], ["G1", "R"]]),
-        ("GRBG", [["G1", "R"], ["B", "G2"]]),
-        ("GBRG", [["G2", "B"], ["R", "G1"]]),
-    ],
-)
-def test_planes_and_levels_of_each_order(cfa: str, tile: list[list[str]]) -> None:
-    """Each filter gets its own number and is scaled with its own black level."""
-    numbers = {"R": 1000, "G1": 2000, "G2": 3000, "B": 4000}
-    mosaic = np.tile([[numbers[name] for name in row] for row in tile], (2, 3))
-    packed = pack_mosaic(mosaic, camera(cfa))
-    for plane, (number, black) in enumerate(zip((1000, 2000, 3000, 4000), BLACK, strict=True)):
-        expected = np.float32((number - black) / (4095 - black))
-        assert torch.all(packed[plane] == float(expected))
-
-
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32, ">u2"])
 def test_any_layout_of_a_mosaic_is_packed_alike(cfa: str, dtype: str) -> None:

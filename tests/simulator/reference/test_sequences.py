@@ -203,10 +203,9 @@ def test_the_aperture_only_opens_and_seldom_stays() -> None:
     f_numbers = (4.0, 4.0, 5.6, 5.6, 8.0, 8.0, 11.0, 11.0, 16.0, 22.0)
     settings = tuple(CameraSettings(100, 0.1 + i / 10, n) for i, n in enumerate(f_numbers))
     pairs = select_pairs([Sequence(scene(), settings)] * 3, "aperture", Z6)
-    opened = [p for p in pairs if f_numbers[p.source] > f_numbers[p.target]]
-    same = [p for p in pairs if f_numbers[p.source] == f_numbers[p.target]]
+    same = {p for p in pairs if f_numbers[p.source] == f_numbers[p.target]}
+    opened = {p for p in pairs if f_numbers[p.source] > f_numbers[p.target]}
     assert len(opened) == 3 * (10 * 9 // 2 - 4)
-    assert len(opened) + len(same) == len(pairs) == len(set(pairs))
+    assert pairs == sorted(opened | same)
     assert 0 < len(same) <= 0.1 * len(pairs)
     assert {p.sequence for p in same} == {0, 1, 2}
-    assert pairs == sorted(pairs)

@@ -60,12 +60,10 @@ def test_the_card_says_what_was_done(trained: Path) -> None:
     assert card["training"] == config().card()
     assert card["command"] == "ae-env train-simulator x.yaml"
     assert card["scenes"] == {"depth": 1, "flat": 1}
-    assert {"commit", "date", "machine", "versions", "sha256", "parameters"} <= set(card)
+    assert {"commit", "date", "machine", "versions", "sha256"} <= set(card)
     assert list(card["stages"]) == ["exposure", "noise", "aperture"]
     for stage in card["stages"].values():
         assert stage["steps"] == 2
-        assert stage["seconds"] >= 0
-        assert stage["pairs"] > 0
         assert stage["validation"]["loss"] > 0
     assert "gain_db" in card["stages"]["noise"]["validation"]
     assert {"map", "relative"} <= set(card["stages"]["aperture"]["validation"])

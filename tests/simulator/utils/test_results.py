@@ -28,19 +28,15 @@ def test_meta_says_where_a_number_comes_from():
 
 
 def test_commit_is_that_of_this_checkout():
-    root = Path(__file__).resolve().parents[3]
-    head = subprocess.run(
-        ["git", "rev-parse", "--verify", "--quiet", "HEAD"],
-        cwd=root,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if head.returncode != 0:
-        assert result_meta("x", seed=None)["commit"] is None
-        return
-    changed = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root, check=False).returncode
-    expected = head.stdout.strip() + "+changes" * changed
+    def git(*arguments):
+        folder = Path(__file__).parent
+        return subprocess.run(
+            ["git", *arguments], cwd=folder, capture_output=True, text=True, check=False
+        )
+
+    head = git("rev-parse", "--verify", "--quiet", "HEAD")
+    changed = git("diff", "--quiet", "HEAD").returncode
+    expected = None if head.returncode else head.stdout.strip() + "+changes" * changed
     assert result_meta("x", seed=None)["commit"] == expected
 
 
