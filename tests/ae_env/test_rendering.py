@@ -15,25 +15,23 @@ from ae_env import contact_sheet
 from ae_env.grid import ExposureGrid
 from ae_env.observation import decode_observation
 from ae_env.rendering import _Sheet
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator import develop, get_camera
+from tests.ae_env.environments import make_env
+from tests.ae_env.scorer_images import make_scene
 
 CAMERA = get_camera("nikon_z6")
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
 
 
 def _env(**arguments: Any) -> gym.Env:
-    arguments = {"scenes": "bundled:small", "resolution": 64, **arguments}
-    return gym.make("ae_env/AutoExposure-v0", render_mode="rgb_array", **arguments)
+    return make_env(**{"resolution": 64, "render_mode": "rgb_array", **arguments})
 
 
-def _scene(height: int = 64, width: int = 64, **fields: Any) -> Scene:
-    light = torch.rand(4, height, width, generator=torch.Generator().manual_seed(0))
-    return Scene.from_array(
-        light, reference_settings(10.0), CAMERA, scene_id="test", illuminance=2560.0, **fields
-    )
+def _scene() -> Scene:
+    return make_scene(np.random.default_rng(0).random((4, 64, 64)), 2560.0)
 
 
 @pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
@@ -59,10 +57,9 @@ def test_frame_is_the_developed_capture_enlarged(kind: str) -> None:
     assert np.abs(difference).max() <= 1
 
 
-def _layout(grid: ExposureGrid, paths: dict[str, list[int]] | None = None) -> _Sheet:
-    scores = np.linspace(0, 1, len(grid))
-    table = ScoreTable(scores, np.zeros(len(grid)), {})
-    return _Sheet(grid, table, [Image.new("RGB", (64, 64))] * len(grid), paths or {})
+def _layout(grid: ExposureGrid) -> _Sheet:
+    table = ScoreTable(np.linspace(0, 1, len(grid)), np.zeros(len(grid)), {})
+    return _Sheet(grid, table, [Image.new("RGB", (64, 64))] * len(grid), {})
 
 
 def test_time_grows_to_the_right_and_f_number_downwards_in_a_panel_per_iso() -> None:
@@ -116,7 +113,7 @@ def test_caption_and_size_of_a_frame(caplog: pytest.LogCaptureFixture) -> None:
     assert first[band].max() > 200  # the ink
     first[:] = 0  # the caller may write to it
     assert env.render().max() > 0
-    without = gym.make("ae_env/AutoExposure-v0", scenes="bundled:small").unwrapped
+    without = make_env().unwrapped
     without.reset(seed=0)
     assert without.render() is None
     assert "render_mode='rgb_array'" in caplog.text

@@ -53,17 +53,7 @@ def test_it_is_read_from_a_file(tmp_path: Path, text: str) -> None:
         ({"ev": np.zeros((2, 2))}, "must be a list of numbers"),
         ({"file": "missing.csv"}, r"`lighting\['file'\]` \(='missing.csv'\) cannot be read"),
         ({"file": 3}, "must be a path"),
-    ],
-)
-def test_bad_schedules_are_refused(spec: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make_lighting({"kind": "schedule", **spec})
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "length 0"),
+        # The text of a file.
         ("ev\n", "length 0"),
         ("0\none\n", r"row 2 \(='one'\), must be a number of stops"),
         ("0\ninf\n", "row 2"),
@@ -72,7 +62,9 @@ def test_bad_schedules_are_refused(spec: dict[str, object], message: str) -> Non
         ("0\n70\n", r"'ev'\]\[1\]` \(=70.0\)"),
     ],
 )
-def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "light.csv").write_text(text, encoding="utf-8")
+def test_bad_schedules_are_refused(tmp_path: Path, spec: object, message: str) -> None:
+    if isinstance(spec, str):
+        (tmp_path / "light.csv").write_text(spec)
+        spec = {"file": tmp_path / "light.csv"}
     with pytest.raises(ValueError, match=message):
-        make_lighting({"kind": "schedule", "file": tmp_path / "light.csv"})
+        make_lighting({"kind": "schedule", **spec})

@@ -39,6 +39,8 @@ def test_shapes(size: int, sensors: bool) -> None:
 def test_other_observations_are_refused() -> None:
     with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`.*must be a uint8 image"):
         ExposureFeatures(space(36, dtype=np.float32))
+    with pytest.raises(ValueError, match="`sensors` must be given"):
+        StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
 
 
 def planes_of(features: ExposureFeatures, frames: dict[str, np.ndarray]) -> torch.Tensor:
@@ -74,11 +76,6 @@ def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> N
     expected = nn.functional.avg_pool2d(light[None], block)[0][usable]
     error = luminance[:, usable].mean(dim=0) * 8.0 + 3.0 - expected
     assert error.abs().median() < 0.15
-
-
-def test_state_head_needs_the_sensors_it_was_made_for() -> None:
-    with pytest.raises(ValueError, match="`sensors` must be given"):
-        StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
 
 
 def test_foretold_blur_is_that_of_the_scorer() -> None:

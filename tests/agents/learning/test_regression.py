@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from agents.learning.regression import RegressionPolicy, ScoreRegressor
+from agents.learning.regression import RegressionPolicy
 from agents.policy import PolicyContext
 
 
@@ -43,11 +43,18 @@ def test_predictions_are_weighted_by_their_precision(context: PolicyContext, fra
         assert policy.act(frame).tolist() == best.argmax(axis=1).tolist()
 
 
+SURE = np.full((2, 64), -2.0)
+
+
+def best_at(state: int, score: float) -> tuple[np.ndarray, np.ndarray]:
+    """A prediction for two cameras, and its log variance."""
+    scores = np.full((2, 64), 0.1)
+    scores[:, state] = score
+    return scores, SURE
+
+
 def test_episodes_do_not_mix(context: PolicyContext, frame) -> None:
-    low, high = np.full((2, 64), 0.1), np.full((2, 64), 0.1)
-    low[:, 3], high[:, 9] = 0.9, 0.8
-    sure = np.full((2, 64), -2.0)
-    frames = [(low, sure), (high, sure), (high, sure)]
+    frames = [best_at(3, 0.9), best_at(9, 0.8), best_at(9, 0.8)]
     policy = RegressionPolicy(context, network=Stub(frames))
     policy.reset(2)
     assert policy.act(frame).tolist() == [3, 3]
@@ -58,30 +65,16 @@ def test_episodes_do_not_mix(context: PolicyContext, frame) -> None:
 
 
 def test_frames_of_other_light_are_forgotten(context: PolicyContext, photograph) -> None:
-    """The first camera's light falls by a stop, the second's stays."""
-    first, second = np.full((2, 64), 0.1), np.full((2, 64), 0.1)
-    first[:, 3], second[:, 9] = 0.9, 0.8
-    sure = np.full((2, 64), -2.0)
-    policy = RegressionPolicy(context, network=Stub([(first, sure), (second, sure)]))
+    """The first camera's light falls by a stop; the second's stays, at other settings."""
+    policy = RegressionPolicy(context, network=Stub([best_at(3, 0.9), best_at(9, 0.8)]))
     policy.reset(2)
-    states = [20, 20]
-    assert policy.act(photograph(np.ones((64, 64)), 8.0, states)).tolist() == [3, 3]
-    darker, same = (photograph(np.full((64, 64), light), 8.0, [20]) for light in (0.5, 1.0))
+    ev100 = context.grid.ev100
+    near, far = (int(np.abs(ev100 - ev).argmin()) for ev in (8.0, 9.0))  # neither clips
+    assert policy.act(photograph(np.ones((64, 64)), 8.0, [near, near])).tolist() == [3, 3]
+    darker = photograph(np.full((64, 64), 0.5), 8.0, [near])
+    same = photograph(np.ones((64, 64)), 8.0, [far])
     frames = {name: np.concatenate([darker[name], same[name]]) for name in same}
     assert policy.act(frames).tolist() == [9, 3]
-
-
-def test_other_settings_in_the_same_light_are_remembered(context, photograph) -> None:
-    known, other = np.full((1, 64), 0.1), np.full((1, 64), 0.1)
-    known[:, 3], other[:, 9] = 0.9, 0.8
-    sure = np.full((1, 64), -2.0)
-    policy = RegressionPolicy(context, network=Stub([(known, sure), (other, sure)]))
-    policy.reset(1)
-    ev100 = context.grid.ev100
-    near = [int(np.abs(ev100 - ev).argmin()) for ev in (8.0, 9.0)]  # neither clips
-    for state in near:
-        chosen = policy.act(photograph(np.ones((64, 64)), 8.0, [state]))
-        assert chosen.tolist() == [3]
 
 
 def test_masked_states_are_not_chosen(context: PolicyContext, frame) -> None:
@@ -93,13 +86,3 @@ def test_masked_states_are_not_chosen(context: PolicyContext, frame) -> None:
     policy = RegressionPolicy(context, network=Stub([(scores, np.zeros((2, 64)))]))
     policy.reset(2)
     assert policy.act(frame, masks).tolist() == [59, 17]
-
-
-def test_network_predicts_scores(context: PolicyContext, photograph) -> None:
-    network = ScoreRegressor(context.observation_space, context.grid, width=8).eval()
-    policy = RegressionPolicy(context, network=network)
-    policy.reset(3)
-    frames = photograph(np.ones((64, 64)), 8.0, [0, 31, 63])
-    actions = policy.act(frames)
-    assert actions.shape == (3,)
-    assert actions.dtype == np.int64

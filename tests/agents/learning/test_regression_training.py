@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -95,28 +94,3 @@ def test_replay_memory_is_bounded(memory: int) -> None:
         assert (batch["raw"][:4] == step).all()
         assert (batch["raw"][:, 0, 0, 0] == target[:, 0]).all()  # frames keep their own scores
     assert len(replay.memory) == max(1, memory // 4)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"frames": 0}, {"learning_rate": -1.0}, {"explore": 1.5}, {"replay": -1}, {"dropout": 1.0}],
-)
-def test_bad_hyperparameters(wrong: dict[str, float]) -> None:
-    ((name, value),) = wrong.items()
-    with pytest.raises(ValueError, match=rf"(?s){name}.*than or equal to.*input_value={value}"):
-        RegressionTraining(**wrong)
-
-
-def test_checkpoint_of_another_training(make_tiny_envs, tmp_path: Path, caplog) -> None:
-    caplog.set_level(logging.WARNING)
-    path = tmp_path / "c"
-    train_regression(make_tiny_envs(), RegressionTraining(frames=16, width=8), checkpoint=path)
-    done: list[int] = []
-    train_regression(
-        make_tiny_envs(),
-        RegressionTraining(frames=24, width=8),
-        checkpoint=path,
-        progress=lambda *a: done.append(a[0]),
-    )
-    assert done == [4, 8, 12, 16, 20, 24]
-    assert "training restarts" in caplog.text

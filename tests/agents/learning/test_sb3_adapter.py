@@ -2,54 +2,38 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.learning.sb3_adapter import SB3VectorAdapter
+from tests.ae_env.environments import assert_equal, make_env
 
 STEPS = 3  # of an episode
 
 
 def single() -> gym.Env:
-    return gym.make(
-        "ae_env/AutoExposure-v0", scenes="bundled:small", resolution=36, max_episode_steps=STEPS
-    )
-
-
-def assert_same(ours: Any, theirs: Any, where: str) -> None:
-    if isinstance(theirs, dict):
-        assert set(ours) == set(theirs), where
-        for key in theirs:
-            assert_same(ours[key], theirs[key], f"{where}/{key}")
-    elif isinstance(theirs, np.ndarray):
-        assert ours.dtype == theirs.dtype, where
-        np.testing.assert_array_equal(ours, theirs, err_msg=where)
-    else:
-        assert type(ours) is type(theirs), where
-        assert ours == theirs, where
+    return make_env(max_episode_steps=STEPS)
 
 
 def assert_same_rollout(ours: VecEnv, theirs: VecEnv, steps: int) -> None:
     rng = np.random.default_rng(1)
-    assert_same(dict(ours.reset()), dict(theirs.reset()), "reset")
-    assert_same(ours.reset_infos[1], theirs.reset_infos[1], "reset info")
+    assert_equal(dict(ours.reset()), dict(theirs.reset()), "reset")
+    assert_equal(ours.reset_infos[1], theirs.reset_infos[1], "reset info")
     for step in range(steps):
         actions = rng.integers(64, size=ours.num_envs)
         mine, other = ours.step(actions), theirs.step(actions)
-        assert_same(dict(mine[0]), dict(other[0]), f"{step}: observation")
+        assert_equal(dict(mine[0]), dict(other[0]), f"{step}: observation")
         assert mine[1].dtype == other[1].dtype == np.float32
         np.testing.assert_array_equal(mine[1], other[1])
         np.testing.assert_array_equal(mine[2], other[2])
         for i in range(ours.num_envs):
-            assert_same(mine[3][i], other[3][i], f"{step}: info {i}")
+            assert_equal(mine[3][i], other[3][i], f"{step}: info {i}")
             ended = bool(other[2][i])
             assert ("terminal_observation" in mine[3][i]) == ended
             assert mine[3][i]["TimeLimit.truncated"] == ended
-            assert_same(ours.reset_infos[i], theirs.reset_infos[i], f"{step}: reset info {i}")
+            assert_equal(ours.reset_infos[i], theirs.reset_infos[i], f"{step}: reset info {i}")
 
 
 def test_rollouts_equal_those_of_single_environments(make_tiny_envs) -> None:
