@@ -244,8 +244,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report; prints the maps as the scorers' source has them."""
     maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
     for name, knots in maps.items():
-        pairs = ", ".join(f"({x!r}, {y!r})" for x, y in knots)
-        console.print(f'"{name}": ({pairs}),', soft_wrap=True, highlight=False, markup=False)
+        columns = ", ".join(repr(column) for column in zip(*knots, strict=True))
+        console.print(f'"{name}": ({columns}),', soft_wrap=True, highlight=False, markup=False)
     rows = [row for test in tests for row in test["rows"]]
     fits = [
         {"part": "map", "name": n, "knots": knots, "in_use": KNOTS[n]} for n, knots in maps.items()
