@@ -19,9 +19,7 @@ Z6 = get_camera("nikon_z6")
 REFERENCE = CameraSettings(800, 1 / 64, 4)
 STATES = [CameraSettings(iso, time, 4) for iso in (100, 6400) for time in (1 / 500, 1 / 8)]
 STATES += [CameraSettings(400, 1 / 30, 8)]
-LIGHTS = [
-    torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(4)
-]
+LIGHTS = [torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(4)]
 
 
 def prepared(index: int) -> PreparedScene:
