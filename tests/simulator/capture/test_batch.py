@@ -29,8 +29,8 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(LIGHTS[index], REFERENCE, Z6, nlf, **moves)  # type: ignore[arg-type]
 
 
-def made(noise: Noise | None = "bank", *, keep_light: bool = True) -> CaptureBatch:
-    return CaptureBatch(prepared, 4, STATES, Z6, noise=noise, keep_light=keep_light)
+def made(noise: Noise | None = "bank", *, cache_light: bool = True) -> CaptureBatch:
+    return CaptureBatch(prepared, 4, STATES, Z6, noise=noise, cache_light=cache_light)
 
 
 def photographed(
@@ -54,9 +54,9 @@ def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "
 
 
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
-@pytest.mark.parametrize("keep_light", [True, False])
-def test_frames_are_those_of_each_scene_alone(noise: Noise | None, keep_light: bool) -> None:
-    batch, rng = made(noise, keep_light=keep_light), np.random.default_rng(0)
+@pytest.mark.parametrize("cache_light", [True, False])
+def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: bool) -> None:
+    batch, rng = made(noise, cache_light=cache_light), np.random.default_rng(0)
     keys = noise_keys(np.arange(4), np.arange(4) + 5)
     for _ in range(8):
         states, gains = rng.integers(len(STATES), size=4), rng.choice([0.25, 1.0, 3.0], 4)
@@ -112,7 +112,7 @@ def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -
         calls.append(index)
         return prepared(index)
 
-    batch = CaptureBatch(counted, 4, STATES, Z6, noise="bank", keep_light=True)
+    batch = CaptureBatch(counted, 4, STATES, Z6, noise="bank", cache_light=True)
     first, _ = photographed(batch, [1, 1, 1, 1])
     again, _ = photographed(batch, [1, 1, 1, 1])
     photographed(batch, [4, 4, 4, 4])
