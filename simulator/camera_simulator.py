@@ -30,11 +30,11 @@ from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.tiles import in_tiles, varying
 
-#: What is known of a scene's depth: it is far or in focus throughout, or not known.
+#: Depth of a scene: it is far or in focus throughout, or it is not known.
 Depth = Literal["far", "unknown"]
-#: What can be simulated from.
+#: Sources of a simulation.
 Source = RawImage | PreparedScene | HasPrepared
-#: What the compact networks see around a pixel [pixel]; tiles overlap by it.
+#: Reach of the compact networks around a pixel [pixel]; tiles overlap by it.
 _NOISE_HALO, _MAP_HALO = 36, 56
 #: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
 _DISC_REACH = 16
@@ -91,8 +91,8 @@ class CameraSimulator:
             is taken as far.
         device: ``"auto"`` (CUDA where there is one), or any torch device.
         precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32.
-        cache: Where `prepare` keeps what the networks find out about a source, for the next time
-            that it comes: ``"memory"`` (the last 256 MiB), ``"disk"`` (also in the cache folder,
+        cache: Where `prepare` stores the networks' results about a source, for the next time that
+            it comes: ``"memory"`` (the last 256 MiB), ``"disk"`` (also in the cache folder,
             for later runs), or None: nowhere.
 
     >>> import torch

@@ -31,7 +31,7 @@ from simulator.optics.disc_bank import DIAMETERS
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18
-#: Memory that the blurred light of all episodes together may take [byte]; larger is not kept.
+#: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
 LIGHT_CACHE_BYTES = 256 * 2**20
 _RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
@@ -42,13 +42,13 @@ _NOISES: dict[bool | str, Noise | None] = {
     "bank": "bank",
     "exact": "exact",
 }
-#: What `CaptureBatch.record` calls each kind of observation.
+#: Name of each kind of observation in `CaptureBatch.record`.
 _OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
 
 
 @dataclass
 class Frames:
-    """What n episodes show after a reset or a step.
+    """Observations, info and rewards of n episodes after a reset or a step.
 
     Args:
         observation: Arrays by name, n long; new ones every time.
@@ -110,7 +110,7 @@ class EpisodeCore:
             states,
             self.camera,
             noise=_NOISES[options.noise],
-            keep_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
+            cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
         )
 
     def _cached_frames(self) -> int:
@@ -169,7 +169,7 @@ class EpisodeCore:
         self._set_light_index(env_indices)
 
     def _forget(self, env_indices: np.ndarray) -> None:
-        """Lets go of what was worked out for the scenes that are shown in `env_indices`."""
+        """Drops what was worked out for the scenes that `env_indices` show."""
         own = len(self.scenes) + env_indices
         self._captures.forget(own)
         self._part_scores.forget(own)
@@ -302,7 +302,7 @@ class EpisodeCore:
         return columns
 
     def _prepared(self, light_index: int) -> PreparedScene:
-        """What the camera sees under a `Episodes.light_index`, in the scene's own light."""
+        """The scene of a `Episodes.light_index` as the camera sees it, in its own light."""
         env_index = light_index - len(self.scenes)
         if env_index < 0:
             return self._prepared_at_rest(light_index)

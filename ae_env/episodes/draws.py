@@ -1,4 +1,4 @@
-"""What an episode begins with: scene, start state, motion, defocus, seeds."""
+"""Draws of new episodes: scene, start state, motion, defocus, seeds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STATIC_SHARE = 1.0 / 3.0
 SPEED_SIGMA = 1.3
 #: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
-#: What a reset may choose, and what its errors call it; frames are counted up to `MAX_FRAME`.
+#: Names that a reset may choose, and their names in errors; frames count up to `MAX_FRAME`.
 OPTIONS = ("scene", "state", "frame")
 _OPTION = tuple(f"options[{name!r}]" for name in OPTIONS)
 MAX_FRAME = 2**31 - 1
@@ -33,7 +33,7 @@ class Draws:
 
     Args:
         options: The environment's arguments.
-        scenes: What episodes choose from; of sequences, the first frames.
+        scenes: Scenes that episodes choose from; of sequences, the first frames.
         num_states: Number of exposure states.
     """
 
@@ -57,7 +57,7 @@ class Draws:
     ) -> dict[str, np.ndarray]:
         """K episodes as columns, each of its own generator.
 
-        What is drawn does not depend on what is chosen, which only replaces it.
+        The draws do not depend on what is chosen, which only replaces them.
 
         Args:
             rngs: K generators; each gives the same count of numbers for every episode.
@@ -133,7 +133,7 @@ def check_options(options: Any, *more: str) -> dict[str, Any]:
     """The options of a reset as a dictionary of its own.
 
     Args:
-        options: What `reset` was given: None or a mapping.
+        options: The options of `reset`: None or a mapping.
         more: Names that are allowed beside those of `OPTIONS`.
 
     Raises:

@@ -18,7 +18,7 @@ class FrameLight:
     Args:
         lighting: How it changes.
         episodes: In which frame each episode is.
-        scenes: What they show.
+        scenes: Scenes of the episodes.
         camera: The body, whose shutter rolls.
         resolution: Rows of a frame.
     """

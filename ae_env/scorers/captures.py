@@ -1,4 +1,4 @@
-"""`Captures`, what scorers are told: of any captures, and of every state of a scene."""
+"""Descriptions of captures for scorers: of any captures, and of every state of a scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from simulator.camera import CameraProfile
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.cache import LruCache
 
-#: What the captures of a state take in memory, about [byte].
+#: Memory that the captures of a state take, about [byte].
 _STATE_BYTES = 1000
 
 
@@ -65,7 +65,7 @@ def describe_captures(
 
 @dataclass(frozen=True)
 class _AtRest:
-    """Captures of a scene at rest in its own light, and what blur is worked out from."""
+    """Captures of a scene at rest in its own light, and the numbers that blur depends on."""
 
     scene: weakref.ref[Scene]
     captures: Captures
@@ -74,11 +74,11 @@ class _AtRest:
 
 
 class SceneCaptures:
-    """Describes captures of a scene, and keeps what depends neither on blur nor on its light.
+    """Describes captures of a scene, and caches what depends neither on blur nor on its light.
 
     Args:
         camera: The body.
-        max_bytes: What it may keep.
+        max_bytes: Memory of its cache.
         copies: Whether scorers get a copy of the light.
     """
 
@@ -96,11 +96,11 @@ class SceneCaptures:
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> Captures:
-        """Captures of `states`, which a grid's order begins and ends (S long).
+        """Captures of consecutive states of a grid.
 
         Args:
             scene: The scene.
-            states: Some that follow each other in a grid.
+            states: S states that follow each other in the grid.
             speed: Image speed [frame heights per second].
             defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
             gain: Light relative to the scene's own, one or (S,).

@@ -32,13 +32,13 @@ from simulator.utils.cache import DiskCache, LruCache, cache_key
 
 #: Bumped when the way that scores are computed changes.
 TABLE_VERSION = 4
-#: What the scores that are kept in memory take at most: some 10,000 scenes at 64 states [byte].
+#: Memory for cached scores [byte]: some 10,000 scenes at 64 states.
 MEMORY_BYTES = 2**25
 #: States evaluated at once: more only spends time in memory paging. Where only the blur matters,
 #: which seldom looks at pixels, as many as this number of samples allows.
 _CHUNK = 16
 _BLUR_SAMPLES = 2**22
-#: What an entry takes in memory beside its numbers, about [byte].
+#: Memory that an entry takes besides its numbers, about [byte].
 _ENTRY_BYTES = 1000
 #: Scores closer than this are equal: rounding moves them by 1e-8, noise seeds by 1e-5.
 TIE = 1e-7
@@ -79,7 +79,7 @@ def prepare_scene(
     defocus: float = 0.0,
     gain: float = 1.0,
 ) -> PreparedScene:
-    """What `camera` sees of `scene` in an episode.
+    """`scene` as `camera` sees it in an episode.
 
     Args:
         scene: The scene.
@@ -106,7 +106,7 @@ class ScoreTables:
     Args:
         grid: The states.
         camera: The body that takes the captures.
-        scorer: What rates them.
+        scorer: The scorer that rates them.
         noise_seeds: Captures per state that the parts without a closed form are averaged over.
         noise: Whether the captures that are scored are noisy.
         tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.
@@ -198,7 +198,7 @@ class ScoreTables:
         return parts | self._parts(scene, ("blur",), speed, defocus, **light)
 
     def _of_steady_light(self, scene: Scene, gain: float) -> _LightParts:
-        """What is the same for any blur, kept in memory; of the scene's own light, on disk too."""
+        """The parts that do not depend on blur, cached in memory; of the own light, on disk too."""
         known = self._light_parts.get((id(scene), gain))
         if known is not None and known.scene() is scene:  # an id may be given out again
             return known
@@ -215,7 +215,7 @@ class ScoreTables:
         if stored is not None and self._is_whole(stored, names):
             parts = {name: stored[f"score:{name}"].numpy() for name in names}
             return _LightParts(weakref.ref(scene), stored["means"].numpy(), parts)
-        found = self._of_light(scene, keep=False)  # its means are kept, its pixels not needed again
+        found = self._of_light(scene, keep=False)  # the means are cached, not the pixels
         if key is not None:
             scores = {f"score:{name}": torch.from_numpy(v) for name, v in found.parts.items()}
             self._disk.put("score_tables", key, {"means": torch.from_numpy(found.means), **scores})
@@ -237,7 +237,7 @@ class ScoreTables:
         row_gain: np.ndarray | None = None,
         keep: bool = True,
     ) -> _LightParts:
-        """What the scene and its light decide; `keep` is that of `FusedScores.means`."""
+        """The parts that depend on the scene and its light; `keep` as in `FusedScores.means`."""
         states, means = self.grid.states, np.empty((0, 3))
         light: Any = {"gain": gain, "row_gain": row_gain}
         if self.fused.reads_pixels:
@@ -333,7 +333,7 @@ class ScoreTables:
 
 @dataclass(frozen=True)
 class _LightParts:
-    """What a scene's light decides; the scene itself is not kept for it.
+    """The parts of a score that a scene's light decides; they keep no scene alive.
 
     Args:
         scene: The scene.

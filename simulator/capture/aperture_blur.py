@@ -143,4 +143,4 @@ class NetworkApertureBlur:
         return result
 
     def remaining_variance(self, f_number: float) -> None:
-        """The recorded noise is gone: there is nothing to account for."""
+        """None: the recorded noise is gone, there is nothing to account for."""

@@ -1,8 +1,8 @@
 """Many scenes side by side, photographed in batches: what the environment runs on.
 
-A capture here is cheap because nothing is worked out twice. All that a frame depends on but for its
-noise is planned when a state is first asked for, and kept as a row of columns; light that was
-blurred is kept as long as the scene is shown; a batch of frames is then one call of
+A capture here is cheap because nothing is worked out twice. All that a frame depends on, except for
+its noise, is planned when a state is first used, and cached as a row of columns. Blurred light is
+cached as long as its scene is shown. A batch of frames is then one call of
 `simulator.capture.sensor.record`.
 """
 
@@ -29,7 +29,7 @@ from simulator.utils.threads import in_shares
 
 @dataclass(frozen=True)
 class FrameStatistics:
-    """What is known of a batch of frames besides their pixels, (B,) each.
+    """Statistics of a batch of frames, (B,) each.
 
     Args:
         clipped_low: Share of the samples that are clipped low: at most 2**-10 of white.
@@ -37,7 +37,7 @@ class FrameStatistics:
         excess_variance: Mean over the pixels of the noise variance beyond the target's, relative
             to it; in flickering light, that of the frame's mean light.
         modules: Names of the steps that ran, joined by ``"+"``.
-        keys: Of the noise, uint64.
+        keys: Keys of the noise, uint64.
     """
 
     clipped_low: np.ndarray
@@ -58,13 +58,14 @@ class CaptureBatch:
     an index, call `forget` first. A pickled copy works everything out again.
 
     Args:
-        prepared: Gives the scene of an index, in its own light; called when it is first needed.
+        prepared: Function that returns the scene of an index, in its own light; called when the
+            scene is first photographed.
         num_scenes: Number of scenes, n.
         states: The settings of the S states.
         camera: The body.
         noise: How the noise is made; None for no noise.
-        keep_light: Whether the defocused light of every f-number is kept until a scene is
-            forgotten; else only that of the latest.
+        cache_light: Whether the defocused light of every f-number is cached until a scene is
+            forgotten; else only that of the latest f-number.
     """
 
     def __init__(
@@ -75,10 +76,10 @@ class CaptureBatch:
         camera: CameraProfile,
         *,
         noise: Noise | None,
-        keep_light: bool,
+        cache_light: bool,
     ) -> None:
         self._prepared, self.num_scenes, self.states = prepared, num_scenes, states
-        self.camera, self.noise, self._keep_light = camera, noise, keep_light
+        self.camera, self.noise, self._cache_light = camera, noise, cache_light
         self._forget_all()
 
     def _forget_all(self) -> None:
@@ -98,7 +99,7 @@ class CaptureBatch:
         self._forget_all()
 
     def forget(self, indices: np.ndarray) -> None:
-        """Lets go of all that is known of the scenes `indices`; their memory is used again."""
+        """Drops all that is cached for the scenes `indices`; their memory is used again."""
         count = len(self.states)
         for index in indices.tolist():
             self._rows.forget(slice(index * count, (index + 1) * count))
@@ -196,7 +197,7 @@ class CaptureBatch:
     def _light(self, index: int) -> _SceneLight:
         light = self._lights.get(index)
         if light is None:
-            light = _SceneLight(self._prepared(index), self._free, self._keep_light)
+            light = _SceneLight(self._prepared(index), self._free, self._cache_light)
             self._lights[index] = light
         return light
 
@@ -229,12 +230,12 @@ class CaptureBatch:
         return blur
 
     def _balance(self, index: int, row: int) -> None:
-        """The excess variance where only the pixels tell it."""
+        """Computes the excess variance where it depends on the pixels."""
         columns = self._rows
         if np.isnan(columns.excess_variance[row]):
             balance = noise_balance(columns.light[row], columns.exposure[row])
             columns.excess_variance[row] = balance.relative_excess_variance
-        if not self._keep_light:  # an aperture blur caches the light of each f-number
+        if not self._cache_light:  # an aperture blur caches the light of each f-number
             self._light(index).prepared = self._prepared(index)
 
 
@@ -247,7 +248,7 @@ def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, in
 
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
-    """See `FrameStatistics`; NaN where the pixels must tell."""
+    """See `FrameStatistics`; NaN where it depends on the pixels."""
     if exposure.source.is_zero:
         return 0.0
     source, target = exposure.source_noise, exposure.target
@@ -265,15 +266,15 @@ def _modules(exposure: Exposure, noise: bool) -> str:
 
 
 class _Rows:
-    """Captures that were planned: all that a frame depends on but for its noise, as columns.
+    """Planned captures: all that a frame depends on except for its noise, as columns.
 
     A row takes some 40 bytes from the start, the rest of its memory when it is used.
 
     Attributes:
         gain: Light that the row was planned for; NaN where it was not planned.
         table: (5, 4) float32 each, of `exposure_table`.
-        excess_variance: As in `FrameStatistics`; NaN where it takes the blurred light to tell, and
-            that is not made.
+        excess_variance: As in `FrameStatistics`; NaN where it depends on blurred light that is not
+            made yet.
         modules: Names of the steps, joined by ``"+"``.
         light: (4, H, W) that is exposed; where it is blurred, until its scene blurs another.
         remaining_variance: `Exposure.remaining_variance` of that light; None for all.
@@ -296,18 +297,18 @@ class _Rows:
 class _SceneLight:
     """The blurred light of one scene, in memory that is used again.
 
-    Other than `simulator.capture.blurred_light.BlurredLight`, which serves sweeps, it only says
-    what must be blurred, so that many scenes are blurred side by side. The latest light is kept,
-    because an agent that has settled repeats it.
+    Unlike `simulator.capture.blurred_light.BlurredLight`, which serves sweeps, it only says what
+    must be blurred, so that many scenes are blurred side by side. The latest light is cached, because an
+    agent that has settled repeats its state.
 
     Args:
         prepared: The scene in its own light.
-        free: Images that may be written to, and to give back to.
-        keep: Whether the defocused light of every f-number is kept.
+        free: Images that may be written to; they are put back here.
+        cache: Whether the defocused light of every f-number is cached.
     """
 
-    def __init__(self, prepared: PreparedScene, free: list[torch.Tensor], keep: bool) -> None:
-        self.prepared, self._free, self._keep = prepared, free, keep
+    def __init__(self, prepared: PreparedScene, free: list[torch.Tensor], cache: bool) -> None:
+        self.prepared, self._free, self._cache = prepared, free, cache
         self._defocused: dict[tuple[Any, ...], torch.Tensor] = {}  # by aperture
         self._blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
         self._streak: torch.Tensor | None = None
@@ -326,7 +327,7 @@ class _SceneLight:
         if light is None:
             light = source = self.prepared.source_light(exposure).contiguous()
             if exposure.defocus_px:
-                if not self._keep:
+                if not self._cache:
                     self._drop_defocused()
                 light = defocused = self._defocused[exposure.lens_blur] = self._take(light)
         if exposure.motion_px:
@@ -344,7 +345,7 @@ class _SceneLight:
         return self._free.pop() if self._free else torch.empty(like.shape)
 
     def give_back(self) -> None:
-        """Gives all memory back; the light is not to be used afterwards."""
+        """Puts all memory back; the light must not be used afterwards."""
         self._drop_defocused()
         if self._streak is not None:
             self._free.append(self._streak)

@@ -23,8 +23,8 @@ CACHE_BYTES = 512 * 2**20
 class Denoised:
     """Light with its noise removed by a noise module.
 
-    A network is the most expensive step there is, and many transitions do without: nothing runs
-    before `light` is read, and then once.
+    A network is the most expensive step there is, and many transitions need none: it runs when
+    `light` is first read, and only then.
 
     Args:
         light: (4, H, W) float32, or a function that works it out.
@@ -132,7 +132,7 @@ class BlurredLight:
     def is_of(
         self, light: torch.Tensor, denoised: Denoised | None, aperture_blur: ApertureBlur | None
     ) -> bool:
-        """Whether it was made for these very objects."""
+        """Whether it was made for exactly these objects."""
         return (
             self.light is light
             and self.denoised is denoised

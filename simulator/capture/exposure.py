@@ -1,4 +1,4 @@
-"""What one capture does to the light of a scene, and the limits that its numbers stay within."""
+"""Exposure of one capture, and the limits that its numbers stay within."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Step(NamedTuple):
     """A step that a transition may leave out; `simulator.capture.plan.decide` makes it.
 
     Args:
-        name: What it is called in `SimulationPlan.modules`.
+        name: Its name in `SimulationPlan.modules`.
         runs: Whether it runs.
         reason: Why it does, or does not; ``{extent}`` and ``{error}`` stand for the numbers.
         error: Error of leaving it out, in units of the target's noise.
@@ -46,7 +46,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Exposure:
-    """What happens to the light of a scene during one capture.
+    """Exposure of one capture: ratio, noise and blur, from a scene's light to the sensor.
 
     Args:
         ratio: Exposure ratio from the prepared scene's reference to the capture.
@@ -83,12 +83,12 @@ class Exposure:
 
     @property
     def lens_blur(self) -> tuple[bool, float | None, float]:
-        """What the light behind the lens depends on, before motion and exposure."""
+        """Key of the light behind the lens, before motion and exposure."""
         return self.denoised, self.opened_to, self.defocus_px
 
     @property
     def blur(self) -> tuple[bool, float | None, float, float]:
-        """What the light on the sensor depends on, besides the exposure ratio."""
+        """Key of the light on the sensor, before exposure."""
         return self.denoised, self.opened_to, self.defocus_px, self.motion_px
 
 

@@ -41,7 +41,7 @@ _UNIT_BLOCKS = 256
 _WORTH_A_THREAD = 4 * 64 * 64 * 4
 _FAST = {"nnan", "nsz", "contract"}
 _ZERO, _HALF, _ONE, _CODES = np.float32(0), np.float32(0.5), np.float32(1), np.float32(255)
-#: What a sample that is clipped high counts as: more than all blocks of a unit can be clipped low.
+#: Bit from which samples clipped high are counted: no unit has as many that are clipped low.
 _HIGH_BITS = 16
 _NEITHER, _LOW, _HIGH = np.int32(0), np.int32(1), np.int32(1 << _HIGH_BITS)
 #: How the noise is made: not at all, from the bank, or drawn.
@@ -176,7 +176,7 @@ def _record(  # type: ignore[no-untyped-def]
     last,
     samples,
     light,
-    remaining,
+    remaining_variance,
     exposure,
     keys,
     drawn,
@@ -202,8 +202,8 @@ def _record(  # type: ignore[no-untyped-def]
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
         frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[call-arg]
-        shares = samples if remaining[frame] else 0
-        share = numba.carray(as_pointer(remaining[frame]), (shares,))  # type: ignore[call-arg]
+        shares = samples if remaining_variance[frame] else 0
+        share = numba.carray(as_pointer(remaining_variance[frame]), (shares,))  # type: ignore[call-arg]
         clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start = block * BLOCK

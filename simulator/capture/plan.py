@@ -33,7 +33,7 @@ WORTH_DENOISING = 0.006
 #: with these, `SimulationPlan.predicted_difference` bounds 98 % of 261 measured distances between
 #: the full run and plans without noise reduction, and is two to three times the median one.
 BIAS, GAMMA = 0.35, 0.015
-#: What float32 loses in a transition, as a share of the light.
+#: Rounding error of float32 in a transition, as a share of the light.
 ROUNDING = 2.0**-20
 #: Arithmetic operations per sample of the steps whose cost does not depend on anything.
 _OPERATIONS = {
@@ -65,7 +65,7 @@ def check_tolerance(tolerance: float) -> float:
 
 
 class Situation(NamedTuple):
-    """All that decides which steps a transition takes.
+    """The numbers that decide which steps a transition takes.
 
     Args:
         ratio: Exposure ratio from the source to the target.
@@ -76,7 +76,8 @@ class Situation(NamedTuple):
         noise: Whether a capture is wanted; else the light without noise, in which noise of the
             source cannot count as part of the target's.
         statistics: Of the light as it was recorded.
-        denoised: Gives the statistics of the noise-reduced light; None without a noise module.
+        denoised: Function that returns the statistics of the noise-reduced light; None without a
+            noise module.
         defocus_px: Diameter of the defocus disc [pixel].
         motion_px: Length of the streak of motion [pixel].
         aperture_px: Largest diameter of the blur that the opening aperture adds [pixel], inf where
@@ -237,7 +238,7 @@ class PlannedStep:
     """One step of a transition.
 
     Args:
-        name: What it is called in `SimulationPlan.modules`.
+        name: Its name in `SimulationPlan.modules`.
         runs: Whether it runs.
         reason: Why it does, or does not.
         error: Error of leaving it out, in units of the target's noise; 0 if it runs.
@@ -253,7 +254,7 @@ class PlannedStep:
 
 @dataclass(frozen=True)
 class SimulationPlan:
-    """What a change of settings takes, and what it will cost in error and in work.
+    """Steps of a change of settings, with their cost in error and in work.
 
     Predicted errors are distances between the distributions of a pixel, root mean square over the
     pixels: ``sqrt(mean((dm^2 + ds^2) / s^2))`` where the mean moves by dm, the standard deviation
@@ -263,7 +264,7 @@ class SimulationPlan:
         settings: Settings to simulate.
         exposure_ratio: How much brighter than the source the result is.
         steps: Every step in order, with the reason why it runs or not.
-        tolerance: What `predicted_error` was allowed to be.
+        tolerance: Bound that `predicted_error` was planned for.
         excess_noise: Variance that the source brings beyond the target's, relative to the target's,
             mean over the pixels. 0 means that the noise is exact.
         clipped_source: Share of the pixels that are saturated in the source: what they would show
@@ -358,8 +359,8 @@ def make_plan(
 
     Args:
         settings: Settings to simulate.
-        exposure: What was decided for them.
-        given: What it was decided on.
+        exposure: The exposure that was decided for them.
+        given: The numbers that it was decided on.
         balance: The source's noise against the target's.
         light: (4, H, W) as it was recorded.
         clipped_source: See `SimulationPlan`.

@@ -137,7 +137,7 @@ class PreparedScene:
     def exposure(
         self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
     ) -> Exposure:
-        """What happens to this light in a capture at `settings`, less what `tolerance` leaves out.
+        """Exposure of a capture at `settings`, without the steps that `tolerance` leaves out.
 
         Tens of microseconds: the statistics of the light are worked out once.
 
@@ -181,11 +181,12 @@ class PreparedScene:
     def _disc(self, f_number: float) -> float:
         """Diameter of the defocus disc at `f_number` [pixel]."""
         diameter = self.defocus * 4.0 / f_number
-        if diameter > MAX_DISC_PX and diameter > max(self.light.shape[-2:]):
+        most = max(*self.light.shape[-2:], MAX_DISC_PX)
+        if diameter > most:
             raise ValueError(
                 f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel "
-                f"at f/{f_number:.3g}: it must not be wider than the frame ({max(self.light.shape)} "
-                f"pixel) and {MAX_DISC_PX:g} pixel"
+                f"at f/{f_number:.3g}: it must be at most {most:g} pixel wide, as wide as the frame "
+                f"or {MAX_DISC_PX:g} pixel"
             )
         return diameter
 
@@ -301,7 +302,7 @@ class PreparedScene:
         """A sweep: one capture per state, (S, 4, H, W) float32.
 
         States that share their blur follow each other, so that none is computed twice; the order
-        of `states` is kept in the result.
+        of `states` stays in the result.
 
         Args:
             states: Settings to simulate.

@@ -35,7 +35,7 @@ _BALANCED = 2**15
 
 @dataclass(frozen=True)
 class Transitions:
-    """All that B frames depend on but for their noise.
+    """All that B frames depend on, except for their noise.
 
     Args:
         light: (4, H, W) each, contiguous float32: blurred already, at the exposure of its
@@ -84,7 +84,7 @@ class Transitions:
         return Transitions(lights, self.table, shares)
 
     def shares(self) -> list[torch.Tensor | None]:
-        """`remaining_variance`, one of each frame in any case."""
+        """`remaining_variance` as a list, one entry for each frame."""
         known = self.remaining_variance
         return [None] * len(self.light) if known is None else list(known)
 
@@ -232,7 +232,7 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
 
     Args:
         light: (4, H, W) at the exposure of the prepared scene.
-        exposure: What happens to it; neither its ratio nor its noise are in `light` yet.
+        exposure: Its exposure; neither its ratio nor its noise are in `light` yet.
     """
     source, target = exposure.source_noise, exposure.target
     if source.is_zero:

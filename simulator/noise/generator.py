@@ -56,7 +56,7 @@ def noise_generator(seed: int, *key: int | float) -> torch.Generator:
 
     Args:
         seed: Integer >= 0.
-        key: What the noise shall differ by: the step of a training, the settings of a capture.
+        key: Numbers that the noise differs by: the step of a training, the settings of a capture.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0")
@@ -98,8 +98,8 @@ def noise_keys(seeds: np.ndarray | int, *numbers: np.ndarray | float) -> np.ndar
 
     Args:
         seeds: (B,) or a single integer, >= 0.
-        numbers: What the noise of the frames shall differ by, each (B,) or a single number:
-            the step of an episode, the settings of a capture.
+        numbers: Numbers that the noise of the frames differs by, each (B,) or a single one: the
+            frame of an episode, the settings of a capture.
 
     Returns:
         (B,) uint64, each a function of its seed and its numbers and of nothing else.
@@ -191,9 +191,9 @@ def bank_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
 # -- exact draws: each block of a frame from its number and the frame's key --------------------
 #
 # Philox4x32-10 (Salmon, Moraes, Dror and Shaw 2011) turns a counter and a key into four random
-# words, the transform of Box and Muller (1958) two words into two independent normals. Any block can
-# be drawn alone, on any thread, and the compiler draws many counters at once: three times as fast as
-# torch's generator. The normals reach to 6.7 standard deviations.
+# words; the transform of Box and Muller (1958) turns two words into two independent normals. Any
+# block can be drawn alone, on any thread, and the compiler draws many counters at once: three times
+# as fast as torch's generator. The normals reach to 6.7 standard deviations.
 
 #: Counters of a block: each gives four words, and those four normals.
 _COUNTERS = BLOCK // 4
@@ -210,7 +210,7 @@ _SQRT_HALF_BITS = np.int32(np.float32(math.sqrt(0.5)).view(np.int32))
 def _coefficients(
     function: Callable[[Any], Any], low: float, high: float, degree: int
 ) -> tuple[np.float32, ...]:
-    """Of the polynomial, lowest power first, that meets `function` at the Chebyshev nodes."""
+    """Coefficients, lowest power first, of the polynomial through the Chebyshev nodes."""
     fit = np.polynomial.Chebyshev.interpolate(function, degree, domain=[low, high])
     return tuple(np.float32(c) for c in fit.convert(kind=np.polynomial.Polynomial).coef)
 
@@ -251,7 +251,7 @@ def _polynomial(x, coefficients):  # type: ignore[no-untyped-def]
 
 @_jit()
 def _logarithm(x):  # type: ignore[no-untyped-def]
-    """Of a float32 in (0, 1]: a power of two, and a polynomial from sqrt(1/2) to sqrt(2)."""
+    """Logarithm of a float32 in (0, 1]: a power of two, and a polynomial around 1."""
     bits = np.float32(x).view(np.int32)
     power = np.int32(np.int32(bits - _SQRT_HALF_BITS) >> np.int32(23))
     t = np.int32(bits - np.int32(power << np.int32(23))).view(np.float32) - _ONE

@@ -164,7 +164,9 @@ def test_full_well() -> None:
         ({"white_level": math.nan}, "`white_level`"),
         ({"black_level": math.nan}, "`white_level`"),
         ({"bit_depth": 0}, "`bit_depth`"),
-        ({"bit_depth": 24}, "`bit_depth`"),
+        ({"bit_depth": 17}, "`bit_depth`"),
+        ({"bit_depth": 10.5}, "`bit_depth`"),
+        ({"white_level": 1022.5}, "must be a whole number"),
     ],
 )
 def test_bad_profiles_are_refused(fields: dict[str, object], message: str) -> None:

@@ -316,10 +316,10 @@ def test_a_large_sweep_streams_one_frame_at_a_time() -> None:
         (lambda s, raw: s.simulate(raw, BASE, image_speed=-1.0), "`image_speed`"),
         (lambda s, raw: s.simulate(raw, BASE, image_speed=math.nan), "`image_speed`"),
         (lambda s, raw: s.simulate(raw, BASE, defocus=math.inf), "`defocus`"),
-        (lambda s, raw: s.prepare(raw, defocus=513.0), "`defocus` .* not be wider than the frame"),
+        (lambda s, raw: s.prepare(raw, defocus=513.0), "`defocus` .* at most 512 pixel wide"),
         (
             lambda s, raw: s.simulate(raw, CameraSettings(100, 1, 1), defocus=200.0),
-            "`defocus` .* a disc of 800 pixel at f/1: .*frame",
+            "`defocus` .* a disc of 800 pixel at f/1: .* as wide as the frame",
         ),
         (lambda s, raw: s.prepare(raw, image_speed=1001.0), r"`image_speed` .* in \[0, 1000\]"),
         (lambda s, raw: PreparedScene(raw.data[:3], BASE, Z6, ZERO), "`light`"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 
@@ -83,6 +84,27 @@ def test_recorded_shutter_speeds_snap_to_the_exact_stop(nominal: float, exact: f
         exact, rel=1e-12
     )
     assert snap_exposure_time(nominal) == pytest.approx(exact, rel=1e-12)
+
+
+# The shutter speeds engraved on cameras, retyped: consecutive third stops, 3 s beside 3.2 s.
+ENGRAVED = """8000 6400 5000 4000 3200 2500 2000 1600 1250 1000 800 640 500 400 320 250 200 160 125
+100 80 60 50 40 30 25 20 15 13 10 8 6 5 4"""
+LONG = "0.3 0.4 0.5 0.6 0.8 1 1.3 1.6 2 2.5 3.2 4 5 6 8 10 13 15 20 25 30"
+SPEEDS = [1 / int(n) for n in ENGRAVED.split()] + [float(n) for n in LONG.split()]
+
+
+def test_engraved_speeds_are_consecutive_third_stops() -> None:
+    thirds = [3 * math.log2(snap_exposure_time(speed)) for speed in SPEEDS]
+    np.testing.assert_allclose(thirds, np.arange(-39, 16), atol=1e-9)
+    assert snap_exposure_time(3.0) == snap_exposure_time(3.2)
+
+
+@pytest.mark.parametrize("speed", [*SPEEDS, 3.0])
+def test_speeds_snap_within_3_percent(speed: float) -> None:
+    for edge in (1.03, 0.97):
+        inside, outside = (speed * (1 + (edge - 1) * share) for share in (0.9999, 1.0001))
+        assert snap_exposure_time(inside) == snap_exposure_time(speed)
+        assert snap_exposure_time(outside) == outside
 
 
 @pytest.mark.parametrize("exposure_time", [1 / 90, 1 / 45, 1 / 55, 0.0002 / 3, 45.0, 120.0])

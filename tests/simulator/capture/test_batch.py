@@ -19,9 +19,7 @@ Z6 = get_camera("nikon_z6")
 REFERENCE = CameraSettings(800, 1 / 64, 4)
 STATES = [CameraSettings(iso, time, 4) for iso in (100, 6400) for time in (1 / 500, 1 / 8)]
 STATES += [CameraSettings(400, 1 / 30, 8)]
-LIGHTS = [
-    torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(4)
-]
+LIGHTS = [torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(i)) * 2.0 for i in range(4)]
 
 
 def prepared(index: int) -> PreparedScene:
@@ -31,8 +29,8 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(LIGHTS[index], REFERENCE, Z6, nlf, **moves)  # type: ignore[arg-type]
 
 
-def made(noise: Noise | None = "bank", *, keep_light: bool = True) -> CaptureBatch:
-    return CaptureBatch(prepared, 4, STATES, Z6, noise=noise, keep_light=keep_light)
+def made(noise: Noise | None = "bank", *, cache_light: bool = True) -> CaptureBatch:
+    return CaptureBatch(prepared, 4, STATES, Z6, noise=noise, cache_light=cache_light)
 
 
 def photographed(
@@ -56,9 +54,9 @@ def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "
 
 
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
-@pytest.mark.parametrize("keep_light", [True, False])
-def test_frames_are_those_of_each_scene_alone(noise: Noise | None, keep_light: bool) -> None:
-    batch, rng = made(noise, keep_light=keep_light), np.random.default_rng(0)
+@pytest.mark.parametrize("cache_light", [True, False])
+def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: bool) -> None:
+    batch, rng = made(noise, cache_light=cache_light), np.random.default_rng(0)
     keys = noise_keys(np.arange(4), np.arange(4) + 5)
     for _ in range(8):
         states, gains = rng.integers(len(STATES), size=4), rng.choice([0.25, 1.0, 3.0], 4)
@@ -114,7 +112,7 @@ def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -
         calls.append(index)
         return prepared(index)
 
-    batch = CaptureBatch(counted, 4, STATES, Z6, noise="bank", keep_light=True)
+    batch = CaptureBatch(counted, 4, STATES, Z6, noise="bank", cache_light=True)
     first, _ = photographed(batch, [1, 1, 1, 1])
     again, _ = photographed(batch, [1, 1, 1, 1])
     photographed(batch, [4, 4, 4, 4])

@@ -150,6 +150,13 @@ def test_operations_add_up() -> None:
     assert large.plan(target).operations == 4 * small.plan(target).operations
 
 
+def test_operations_by_hand() -> None:
+    """Per sample: 2 + 1 + 4 + 2 (1 + 2^2) + 6 + 14 + 6, for a disc of 2.5 pixel."""
+    everything = prepared(tolerance=0.0, image_speed=0.2, defocus=2.5)
+    plan = everything.plan(CameraSettings(6400, 1 / 64, 4))
+    assert [step.operations / (4 * 16 * 20) for step in plan.steps] == [2, 1, 4, 10, 6, 14, 6]
+
+
 # Deciding on numbers alone
 
 

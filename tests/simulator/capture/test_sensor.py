@@ -279,6 +279,17 @@ def test_white_is_exactly_one_and_black_exactly_the_pedestal() -> None:
     assert recorded[:, 0].tolist() == [[float(expected)] * 2 + [1.0, 1.0]] * 4
 
 
+def test_limits_of_light_and_signal() -> None:
+    zero = NoiseLevelFunction.zero()
+    light = torch.tensor([3e6, -3e6, 3e9, -3e9]).expand(4, 1, 4).contiguous()
+    assert sensor_light(light, Exposure(1.0, zero, zero))[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
+    blurred = sensor_light(light, Exposure(1e-6, zero, zero, motion_px=1e-3))
+    expected = [3.0, -3.0, 1e3, -1e3]  # white at every exposure
+    np.testing.assert_allclose(blurred[0, 0].numpy(), expected, rtol=1e-4, atol=1e-3)
+    prepared = PreparedScene(light, CameraSettings(100, 1, 4), Z6, zero, gain=1e39)
+    assert prepared.exposure(CameraSettings(100, 1, 4)).ratio == 2.0**107
+
+
 def test_motion_blur_comes_before_the_clip() -> None:
     """A lamp ten times above white, smeared over five pixels, is still at white along the streak:
     10 / 5 = 2. Clipped first it would come out at 0.2."""

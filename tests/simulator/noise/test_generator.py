@@ -324,6 +324,7 @@ def test_different_keys_give_independent_draws(
 
 def test_numpy_integers_are_seeds() -> None:
     assert noise_generator(np.int64(5)).initial_seed() == noise_generator(5).initial_seed()
+    assert all(noise_generator(seed).initial_seed() < 2**63 for seed in range(8))
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, "1", None, True])

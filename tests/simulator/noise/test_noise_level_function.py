@@ -54,7 +54,17 @@ def test_noise_level_function_arithmetic() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [(1e-5,) * 3, (-1e-9,) * 4, (math.nan,) * 4, (math.inf,) * 4, 1, "abcd", None],
+    [
+        (1e-5,) * 3,
+        (-1e-9,) * 4,
+        (math.nan,) * 4,
+        (math.inf,) * 4,
+        1,
+        "abcd",
+        None,
+        (1e-5,) * 5,
+        (1e-5, 1e-5, -1e-5, 1e-5),
+    ],
 )
 @pytest.mark.parametrize("name", ["shot", "read"])
 def test_bad_noise_level_function(name: str, value: object) -> None:
