@@ -1,4 +1,4 @@
-"""Radiance maps that the tests of scenes write."""
+"""Radiance maps that the tests of scenes write, and scenes loaded small."""
 
 from __future__ import annotations
 
@@ -6,6 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from ae_env.scenes import Scene, load_scenes
+from simulator import get_camera
+
+
+def load(spec: object, split: str = "all", resolution: int | None = 16) -> list[Scene]:
+    camera = get_camera("nikon_z6")
+    return load_scenes(spec, split, camera=camera, resolution=resolution)  # type: ignore[arg-type]
 
 
 def write_hdr(path: Path, seed: int = 0, height: int = 20, width: int = 24) -> None:

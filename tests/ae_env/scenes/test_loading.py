@@ -24,7 +24,7 @@ from simulator import CameraSettings, get_camera
 from simulator.networks.aperture_module import DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 from tests.ae_env.environments import assert_equal, check_parity, make_env, rollout
-from tests.ae_env.scene_files import write_hdr
+from tests.ae_env.scene_files import load, write_hdr
 
 CAMERA = get_camera("nikon_z6")
 
@@ -36,10 +36,6 @@ def my_scenes(split: str, camera: object) -> list[Scene]:
 
 
 MINE = my_scenes("all", None)
-
-
-def load(spec: object, split: str = "all", resolution: int | None = 16) -> list[Scene]:
-    return load_scenes(spec, split, camera=CAMERA, resolution=resolution)  # type: ignore[arg-type]
 
 
 def test_scenes_from_lists_and_attributes() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -146,21 +147,21 @@ def test_invalid_fields_are_named(fields: dict[str, object], words: str) -> None
     assert words in str(error.value)
 
 
-def test_invalid_arrays_and_sizes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"`resolution` \(=5\)"):
-        array_scene(torch.ones(4, 8, 4)).resized(5)
-    with pytest.raises(ValueError, match=r"`resolution` \(=0\)"):
-        array_scene(torch.ones(4, 8, 4)).resized(0)
-    with pytest.raises(ValueError, match="`crop`"):
-        array_scene(torch.ones(4, 8, 4)).resized(2, crop="centre")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="`rgb`"):
-        radiance_scene(np.full((3, 2, 2), np.nan))
-    with pytest.raises(ValueError, match="uint8"):
-        radiance_scene(np.zeros((3, 2, 2), np.uint8))
-    with pytest.raises(ValueError, match="no exposure brings its mean"):
-        radiance_scene(np.zeros((3, 2, 2), np.float32))
-    with pytest.raises(ValueError, match="`illuminant`"):
-        radiance_scene(np.ones((3, 2, 2)), illuminance=1.0, illuminant=(1.0, 0.0, 1.0))
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: array_scene(torch.ones(4, 8, 4)).resized(5), r"`resolution` \(=5\)"),
+        (lambda: array_scene(torch.ones(4, 8, 4)).resized(0), r"`resolution` \(=0\)"),
+        (lambda: array_scene(torch.ones(4, 8, 4)).resized(2, crop="centre"), "`crop`"),
+        (lambda: radiance_scene(np.full((3, 2, 2), np.nan)), "`rgb`"),
+        (lambda: radiance_scene(np.zeros((3, 2, 2), np.uint8)), "uint8"),
+        (lambda: radiance_scene(np.zeros((3, 2, 2))), "no exposure brings its mean"),
+        (lambda: radiance_scene(np.ones((3, 2, 2)), illuminant=(1.0, 0.0, 1.0)), "`illuminant`"),
+    ],
+)
+def test_invalid_arrays_and_sizes_are_named(make: Callable[[], Scene], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
 def test_content_is_that_of_the_tensors() -> None:

@@ -9,16 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.split import Shot, group_shots, split_groups
-from simulator.camera import get_camera
-from tests.ae_env.scene_files import write_hdr
-
-CAMERA = get_camera("nikon_z6")
-
-
-def load(spec: object, split: str = "all", resolution: int | None = 16) -> list[Scene]:
-    return load_scenes(spec, split, camera=CAMERA, resolution=resolution)  # type: ignore[arg-type]
+from tests.ae_env.scene_files import load, write_hdr
 
 
 def test_large_folder_is_split_by_group(tmp_path: Path) -> None:
@@ -45,12 +37,14 @@ def test_groups_file_names_the_groups(tmp_path: Path) -> None:
         write_hdr(tmp_path / f"{name}.hdr")
     (tmp_path / "groups.csv").write_text("file,group\na.hdr,first\nb.hdr,first\n")
     assert [s.group for s in load(tmp_path)] == ["first", "first", "c"]
-    for text, words in (
-        ("name,group\na.hdr,x\n", "columns"),
-        ("file,group\nz.hdr,x\n", "line 2"),
-        ("file,group\na.hdr,\n", "line 2"),
+    for content, words in (
+        (b"name,group\na.hdr,x\n", "columns"),
+        (b"file,group\nz.hdr,x\n", "line 2"),
+        (b"file,group\na.hdr,\n", "line 2"),
+        (b"\xff\xfe\0", r"groups\.csv' must be a CSV file in UTF-8"),
+        (b'file,group\n"' + b"x" * 200_000, r"groups\.csv' must be a CSV file in UTF-8"),
     ):
-        (tmp_path / "groups.csv").write_text(text)
+        (tmp_path / "groups.csv").write_bytes(content)
         with pytest.raises(ValueError, match=words):
             load(tmp_path)
 
@@ -93,14 +87,6 @@ def test_grouping_of_two_shots(first: Shot, second: Shot, same: bool) -> None:
 def test_shots_are_grouped_in_the_order_of_their_times() -> None:
     shots = [shot(1000, 0), shot(0, 1), shot(1010, 2), shot(20, 3)]
     assert group_shots(["a", "b", "c", "d"], shots) == ["a", "b", "a", "b"]
-
-
-@pytest.mark.parametrize("content", [b"\xff\xfe\0", b'file,group\n"' + b"x" * 200_000])
-def test_groups_that_are_no_table(tmp_path: Path, content: bytes) -> None:
-    write_hdr(tmp_path / "a.hdr")
-    (tmp_path / "groups.csv").write_bytes(content)
-    with pytest.raises(ValueError, match=r"groups\.csv' must be a CSV file in UTF-8"):
-        load(tmp_path)
 
 
 @pytest.mark.real_data

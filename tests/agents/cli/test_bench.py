@@ -41,7 +41,3 @@ def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, m
     assert code == 2
     assert "the benchmarks are not part of the installed package" in error
     assert "pip install -e ." in error
-
-
-def test_the_checkout_is_the_packages_own():
-    assert Path(bench.__file__).resolve() == (bench.CHECKOUT / "agents" / "cli" / "bench.py")

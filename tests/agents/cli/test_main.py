@@ -63,6 +63,15 @@ def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "empty.dng"), "a file, but it is a folder"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
+        (("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none.safetensors"), "no none.json"),
+        (
+            ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none", "--depth", "unknown"),
+            "`depth` (='unknown') needs an aperture",
+        ),
+        (
+            ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none", "--depth", "near"),
+            "`depth` (='near') must be one of",
+        ),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", "--policy", "randm"), "did you mean 'random'?"),
         (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),

@@ -109,19 +109,3 @@ def test_networks_run_once_for_a_raw(
     assert Path("first.dng").read_bytes() == Path("second.dng").read_bytes()
     first, second = (Path(f, "contact_sheet.png").read_bytes() for f in ("first", "second"))
     assert first == second
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (("--weights", "none.safetensors"), "there is no none.json"),
-        (("--weights", "none", "--depth", "unknown"), "`depth` (='unknown') needs an aperture"),
-        (("--depth", "near", "--weights", "none"), "`depth` (='near') must be one of"),
-    ],
-)
-def test_errors_of_simulate(ae_env, noisy: Path, options, message: str, tmp_path: Path) -> None:
-    code, _, error = simulated(ae_env, noisy, *options)
-    assert code == 2
-    assert message in error
-    assert error.count("\n") == 1
-    assert not (tmp_path / "out.dng").exists()
