@@ -132,7 +132,7 @@ class EpisodeCore:
             "dn": (0.0, self.camera.white_level, np.uint16),
         }[self.options.observation]
         spaces: dict[str, gym.Space[Any]] = {
-            "raw": gym.spaces.Box(low, high, shape, dtype),  # type: ignore[arg-type]
+            "raw": gym.spaces.Box(low, high, shape, dtype),
             "settings": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
         }
         if self.options.sensors:

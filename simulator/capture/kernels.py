@@ -201,9 +201,12 @@ def _record(  # type: ignore[no-untyped-def]
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
-        frame_light = numba.carray(as_pointer(light[frame]), (4 * samples,))  # type: ignore[call-arg]
+        frame_light = numba.carray(  # type: ignore[attr-defined]
+            as_pointer(light[frame]),
+            (4 * samples,),  # type: ignore[call-arg]
+        )
         shares = samples if remaining_variance[frame] else 0
-        share = numba.carray(as_pointer(remaining_variance[frame]), (shares,))  # type: ignore[call-arg]
+        share = numba.carray(as_pointer(remaining_variance[frame]), (shares,))
         clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
             start = block * BLOCK

@@ -184,14 +184,14 @@ def _blur_some(  # type: ignore[no-untyped-def]
     """Images `first` to `last`; an address of 0 leaves the blur that would be written there out."""
     shape = (planes * height, width)
     for i in range(first, last):
-        rows = numba.carray(as_pointer(light[i]), shape)  # type: ignore[call-arg]
+        rows = numba.carray(as_pointer(light[i]), shape)  # type: ignore[attr-defined, call-arg]
         if defocused[i]:
-            out = numba.carray(as_pointer(defocused[i]), shape)  # type: ignore[call-arg]
+            out = numba.carray(as_pointer(defocused[i]), shape)
             weights, reach = _quadrant(radius[i])
             _disc(0, len(rows), height, rows, weights, reach, limit, out)
             rows = out
         if moved[i]:
-            out = numba.carray(as_pointer(moved[i]), shape)  # type: ignore[call-arg]
+            out = numba.carray(as_pointer(moved[i]), shape)
             _moved(0, len(rows), rows, whole[i], end[i], limit, out)
 
 

@@ -10,13 +10,12 @@ from simulator.networks.aperture_module import (
     LOG_OFFSET,
     ApertureModule,
     DefocusMap,
-    added_blur,
     dead_zone,
     to_diameter,
 )
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
-from simulator.optics.disc_bank import DiscBank
+from simulator.optics.disc_bank import DiscBank, added_blur
 from simulator.training.data import Batch
 
 #: Weight of the loss on the logarithm of the circle of confusion beside that on the picture.
