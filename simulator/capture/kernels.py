@@ -201,10 +201,8 @@ def _record(  # type: ignore[no-untyped-def]
         bound = min(_LIMIT / ratio, _LARGEST)
         darkest = black - np.float32(PEDESTAL) * span
         scale = _CODES / np.sqrt(span * np.float32(1.0 + PEDESTAL))
-        frame_light = numba.carray(  # type: ignore[attr-defined]
-            as_pointer(light[frame]),
-            (4 * samples,),  # type: ignore[call-arg]
-        )
+        pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
+        frame_light = numba.carray(pointer, (4 * samples,))
         shares = samples if remaining_variance[frame] else 0
         share = numba.carray(as_pointer(remaining_variance[frame]), (shares,))
         clipped[:] = 0

@@ -231,10 +231,8 @@ def _blend(first, last, diameter, knots, images, samples, out):  # type: ignore[
                 target = out[plane, y, start:end]
                 offset = (plane * height + y) * width + start
                 for x in range(size):
-                    one = numba.carray(  # type: ignore[attr-defined]
-                        as_pointer(images[index[x]]),
-                        (samples,),  # type: ignore[call-arg]
-                    )
+                    pointer = as_pointer(images[index[x]])  # type: ignore[call-arg, var-annotated]
+                    one = numba.carray(pointer, (samples,))
                     other = numba.carray(as_pointer(images[index[x] + 1]), (samples,))
                     least = (_ONE - share[x]) * one[np.uint64(offset + x)]
                     target[x] = least + share[x] * other[np.uint64(offset + x)]
