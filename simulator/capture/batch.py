@@ -298,8 +298,8 @@ class _SceneLight:
     """The blurred light of one scene, in memory that is used again.
 
     Unlike `simulator.capture.blurred_light.BlurredLight`, which serves sweeps, it only says what
-    must be blurred, so that many scenes are blurred side by side. The latest light is cached, because an
-    agent that has settled repeats its state.
+    must be blurred, so that many scenes are blurred side by side. The latest light is cached,
+    because an agent that has settled repeats its state.
 
     Args:
         prepared: The scene in its own light.
