@@ -89,17 +89,6 @@ def test_the_same_seed_gives_the_same_frame_alone_in_a_sweep_and_in_simulate(
     assert torch.equal(torch.stack(list(prepared.stream(STATES, seed=11))), sweep)
 
 
-def test_other_seeds_and_settings_draw_independent_noise() -> None:
-    """Standardised noise of every pair of frames is uncorrelated, within 5 / sqrt(n)."""
-    prepared = PreparedScene(torch.full((4, 64, 64), 0.3), BASE, Z6, ZERO)
-    same_light = [CameraSettings(100, 1 / 64, 4), CameraSettings(200, 1 / 128, 4)]
-    same_light += [CameraSettings(100, 1 / 32, 5.6), CameraSettings(400, 1 / 64, 8)]
-    frames = [prepared.capture(BASE, seed)[0] for seed in range(6)]
-    frames += [prepared.capture(settings, 0)[0] for settings in same_light[1:]]
-    correlation = np.corrcoef([frame.flatten().numpy() for frame in frames])
-    assert np.abs(correlation - np.eye(len(frames))).max() < 5 / math.sqrt(frames[0].numel())
-
-
 def test_global_random_state_is_neither_read_nor_written(simulator: CameraSimulator) -> None:
     raw = RawImage(picture(), BASE, Z6)
     torch.manual_seed(0)
@@ -164,14 +153,6 @@ def test_simulate_keeps_what_is_known(simulator: CameraSimulator) -> None:
     assert raw.metadata == {"path": "a.nef"}
 
 
-def test_box_averaged_pixels_carry_less_noise(simulator: CameraSimulator) -> None:
-    prepared = PreparedScene(torch.full((4, 128, 128), 0.5), BASE, Z6, ZERO, box_factor=4)
-    capture, _ = prepared.capture(CameraSettings(6400, 1 / 4096, 4), 0)
-    expected = (7.25184811907467e-07 + 0.5 * 0.000529454489967193) / 16 + 1 / 12 / 14512**2
-    relative = 5 * math.sqrt(2 / 128**2)
-    assert float(capture[1].double().var()) == pytest.approx(expected, rel=relative)
-
-
 def test_scene_arguments_replace_only_themselves(simulator: CameraSimulator) -> None:
     prepared = PreparedScene(picture(), BASE, Z6, ZERO, image_speed=0.5, defocus=2.0)
     assert simulator.prepare(prepared).image_speed == 0.5
@@ -205,15 +186,6 @@ def test_expected_is_the_light_without_noise_or_clip(simulator: CameraSimulator)
 
 
 # Sizes and extremes
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (3, 5), (17, 31), (33, 16)])
-def test_any_size(simulator: CameraSimulator, shape: tuple[int, int]) -> None:
-    raw = RawImage(picture(*shape), BASE, Z6)
-    for scene in ({}, {"image_speed": 2.0, "defocus": 3.0}):
-        out = simulator.simulate(raw, CameraSettings(800, 1.0, 4), **scene)
-        assert out.data.shape == (4, *shape)
-        assert torch.isfinite(out.data).all()
 
 
 def dark_and_bright(exponent: int) -> tuple[CameraSettings, CameraSettings]:
@@ -438,11 +410,6 @@ def test_preparing_denoises_once(compact: CameraSimulator, monkeypatch: pytest.M
     assert len(calls) == 1
     assert prepared.denoised is not None
     assert not torch.equal(prepared.denoised.light, prepared.light)
-
-
-def test_a_source_without_noise_needs_no_network(compact: CameraSimulator) -> None:
-    clean = replace(compact.prepare(noisy_raw()), nlf=Z6.nlf(100).zero(), denoised=None)
-    assert compact.prepare(clean).denoised is None
 
 
 def test_without_networks_nothing_is_denoised() -> None:

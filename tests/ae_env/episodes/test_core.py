@@ -141,33 +141,6 @@ def test_one_environment_or_many_on_one_thread_or_more(noise: Any) -> None:
     np.testing.assert_array_equal(np.stack(alone), together[0])
 
 
-def test_tolerance_zero_and_small_blur() -> None:
-    """A blur that a tolerance leaves out is named in `info`, and in none of the frames."""
-    arguments = {"motion": 1e-3, "depth": "far"}
-    strict, loose = (_vector(tolerance=t, **arguments) for t in (0.0, 0.1))
-    state = next(
-        i for i, s in enumerate(strict.grid) if (s.iso, s.exposure_time) == (6400, 1 / 1000)
-    )
-    _, strict_info = strict.reset(seed=0, options={"state": state})
-    _, loose_info = loose.reset(seed=0, options={"state": state})
-    assert all("motion_blur" in m for m in strict_info["modules"])
-    assert not any("motion_blur" in m for m in loose_info["modules"])
-
-
-def test_held_state_of_a_scene_at_rest_needs_no_memory_of_its_own() -> None:
-    envs = _vector(motion="none", depth="far", tolerance=0.0)
-    envs.reset(seed=0)
-    episodes, plans = envs.core.episodes, envs.core._captures._rows
-    for row, scene in zip(episodes.light_index * 64 + episodes.state, episodes.scene, strict=True):
-        assert plans.light[row].data_ptr() == envs.core.scenes[scene].light.data_ptr()
-
-
-def test_memory_of_ended_episodes_is_used_again() -> None:
-    envs = _vector(4, autoreset_mode="SAME_STEP", motion=0.5, depth=2.0, tolerance=0.0)
-    _frames(envs, steps=40)
-    assert len(envs.core._captures._free) <= 4 * 5
-
-
 def test_a_refused_reset_leaves_the_episode_as_it_was() -> None:
     arguments = {"motion": 0.5, "depth": 2.0, "tolerance": 0.0, "autoreset_mode": "DISABLED"}
     envs, plain = _vector(3, **arguments), _vector(3, **arguments)
@@ -225,25 +198,6 @@ def test_rewards_are_the_closed_forms_of_the_running_episodes(arguments: dict[st
             assert info["rewards"]["score"][i] == pytest.approx(score, abs=1e-12)
 
 
-def test_interrupted_scores_are_worked_out_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    envs, plain = _vector(3), _vector(3)
-    closed_parts, calls = envs.core.tables.closed_parts, []
-
-    def fail(*args: Any, **kwargs: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return closed_parts(*args, **kwargs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(envs.core.tables, "closed_parts", fail)
-        with pytest.raises(KeyboardInterrupt):
-            envs.reset(seed=0)
-    plain.reset(seed=0)
-    actions = np.array([3, 20, 40])
-    np.testing.assert_array_equal(envs.step(actions)[1], plain.step(actions)[1])
-
-
 def test_a_copy_goes_on_like_the_original() -> None:
     envs = _vector(3, motion=0.5, depth=2.0, delay=1)
     envs.reset(seed=0)
@@ -272,27 +226,6 @@ def test_running_episodes_move_to_another_process(arguments: dict[str, Any]) -> 
     child.join(timeout=60)
     for action, raw in zip((20, 33), there, strict=True):
         np.testing.assert_array_equal(env.step(action)[0]["raw"], raw)
-
-
-def _first_frame(queue: Any) -> None:
-    queue.put(_frames(_vector(), steps=2)[-3])
-
-
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
-def test_other_processes_give_the_same_frames(method: str) -> None:
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
-        wanted = _frames(_vector(), steps=2)[-3]
-    finally:
-        torch.set_num_threads(threads)
-    context = multiprocessing.get_context(method)
-    queue = context.Queue()
-    child = context.Process(target=_first_frame, args=(queue,))  # type: ignore[attr-defined]
-    child.start()
-    np.testing.assert_array_equal(queue.get(timeout=120), wanted)
-    child.join(timeout=60)
 
 
 # -- states that a scene forbids --------------------------------------------------------------
@@ -331,12 +264,6 @@ def test_forbidden_states_are_masked_never_best_and_never_drawn() -> None:
     assert envs.score_table(int(np.flatnonzero(~shows_holes)[0])).oracle == best
     envs.step(np.zeros(64, np.int64))  # forbidden, but a mask is advice
     assert (envs.states == 0).all()
-
-
-def test_the_only_allowed_state_is_where_episodes_start() -> None:
-    envs = _vector(5, scenes=[_scene(np.arange(64) == 37)])
-    envs.reset(seed=3)
-    assert envs.states.tolist() == [37] * 5
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,8 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import ScoreTables, prepare_scene
+from ae_env.scorers.score_table import ScoreTables
 from simulator import get_camera
-from simulator.noise.generator import noise_keys
 from simulator.optics.lamps import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
@@ -62,50 +61,6 @@ def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any)
         wanted = reference.capture(before, env.grid[state], 0, lamp=lamp, start=frame / rate).mean
         step = 1.0 / min(CAMERA.span)  # the mean is not rounded to digital numbers
         np.testing.assert_allclose(observation["raw"], wanted, atol=0.51 * step)
-
-
-def test_rows_are_those_of_the_lamp() -> None:
-    env = _env(lighting={"kind": "flicker"}, noise=False, observation="linear")
-    steady = _env(noise=False, observation="linear")
-    for made in (env, steady):
-        made.reset(seed=4)
-    raw, plain = env.step(16)[0]["raw"], steady.step(16)[0]["raw"]  # 1/1000 s
-    lamp = MainsLamp(100.0, 0.8, env.episode().phase)
-    # Eight sensor rows of 11 us are in each row of the frame.
-    bands = lamp.row_light(1 / 30, 1e-3, 40, CAMERA.row_time, 8)
-    measured = raw.mean(axis=(0, 2)) / plain.mean(axis=(0, 2))
-    np.testing.assert_allclose(measured, bands, atol=2e-3)
-    assert np.ptp(bands) > 0.5
-
-
-def test_environment_records_noisy_sources_likewise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bit for bit what `PreparedScene.expose`, tested above, makes of the same noise."""
-    scene = replace(_scene(), nlf=CAMERA.nlf(100).scaled(1 / 16))
-    env = _env(
-        scenes=[scene],
-        lighting={"kind": "flicker"},
-        observation="linear",
-        noise="exact",
-        simulator=None,
-        tolerance=0.0,
-    )
-    env.reset(seed=4)
-    for state in (52, 53, 37):
-        observation, *_ = env.step(state)
-        episode, settings = env.episode(), env.grid[state]
-        keys = noise_keys(episode.noise_seed, episode.frame)
-        monkeypatch.setattr(
-            "simulator.capture.prepared_scene.sweep_keys", lambda *_, keys=keys: keys
-        )
-        lamp = MainsLamp(100.0, 0.8, episode.phase)
-        rows = lamp.row_light(episode.frame / 30, settings.exposure_time, 40, CAMERA.row_time, 8)
-        prepared = prepare_scene(scene, CAMERA, gain=float(rows.mean()))
-        prepared = replace(prepared, tolerance=0.0)
-        wanted = prepared.expose([settings], row_gain=rows[None] / rows.mean())[0]
-        wanted = wanted.clamp(-1 / 1024, 1.0).numpy()
-        different = observation["raw"] != wanted  # the rounding of the lamp's light
-        assert different.mean() < 1e-3
-        np.testing.assert_allclose(observation["raw"], wanted, atol=1.1 / min(CAMERA.span))
 
 
 @pytest.mark.parametrize("scorer", ["balanced", {"balanced": 0.7, "banding": 0.3}])

@@ -170,14 +170,6 @@ def test_a_damaged_file_is_made_anew(
     assert len(_files(cache)) == 1
 
 
-def test_a_truncated_file_is_made_anew(cache: Path) -> None:
-    scene = _scene()
-    expected = _tables().table(scene).mean
-    (path,) = _files(cache)
-    path.write_bytes(path.read_bytes()[:-40])
-    np.testing.assert_array_equal(_tables().table(scene).mean, expected)
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -238,26 +230,6 @@ def test_key_changes_with_everything_that_changes_the_scores(
     use(ScoreTables(SMALL, plain, make_scorer("balanced")))
     use(ScoreTables(SMALL, replace(plain, segments=(800,)), make_scorer("balanced")))
     assert counts == [1, 1, *range(2, 18)]
-
-
-def test_a_scene_is_hashed_once_for_all_its_tables(cache: Path, monkeypatch) -> None:
-    from ae_env.scenes import scene as module
-
-    hashed = []
-
-    def counted(tensors: Any) -> str:
-        hashed.append(set(tensors))
-        return digest(tensors)
-
-    digest = module.content_digest
-    monkeypatch.setattr(module, "content_digest", counted)
-    scene = _scene()
-    for scorer in ("balanced", "highlights", "noise", "balanced"):
-        _tables(scorer).table(scene)
-    assert hashed == [{"light"}]
-    _tables("sharpness").table(_scene())  # nothing in it depends on the light alone
-    _tables(use_cache=False).table(_scene())
-    assert len(hashed) == 1
 
 
 def test_scores_in_memory_are_bounded_and_keep_no_scene_alive(

@@ -29,14 +29,6 @@ def aperture_blur(diameter: float = 2.0 / math.sqrt(3)) -> MapApertureBlur:
     return MapApertureBlur(light(0), Denoised(light(1)), torch.full((24, 24), diameter), 8.0)
 
 
-def test_extent_is_the_largest_added_blur() -> None:
-    diameter = torch.zeros(24, 24)
-    diameter[3, 5] = 3.0
-    made = MapApertureBlur(light(), Denoised(light()), diameter, 8.0)
-    assert made.extent(4.0) == pytest.approx(3 * math.sqrt(2**2 - 1))
-    assert made.extent(8.0) == made.extent(11.0) == 0.0
-
-
 def test_each_light_is_blurred_by_its_own_bank() -> None:
     made = aperture_blur()
     for denoised in (False, True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import replace
 
 import pytest
@@ -108,26 +107,3 @@ def test_noise_that_opening_leaves() -> None:
     )
     assert blurred_light.remaining_variance(4.0, 0.5) is blurred_light.remaining_variance(4.0, 0.5)
     assert BlurredLight(LIGHT, None, None).remaining_variance(4.0, 1.0) is None
-
-
-def test_keys_tell_blurs_apart_and_nothing_else() -> None:
-    changes = [{}, {"denoised": True}, {"opened_to": 4.0}, {"defocus_px": 1.0}, {"motion_px": 1.0}]
-    keys = {replace(STILL, **change).blur for change in changes}
-    assert len(keys) == 5
-    assert replace(STILL, ratio=9.0).blur == STILL.blur
-
-
-def test_only_the_very_same_light_is_its_own() -> None:
-    blurred_light = BlurredLight(LIGHT, CLEAN, None)
-    assert blurred_light.is_of(LIGHT, CLEAN, None)
-    assert not blurred_light.is_of(LIGHT.clone(), CLEAN, None)
-    assert not blurred_light.is_of(LIGHT, None, None)
-
-
-def test_a_copy_in_another_process_keeps_nothing(made: list[tuple[str, float]]) -> None:
-    blurred_light = BlurredLight(LIGHT, None, None)
-    exposure = replace(STILL, defocus_px=2.0)
-    first = blurred_light.blurred(exposure)
-    copy = pickle.loads(pickle.dumps(blurred_light))
-    assert torch.equal(copy.blurred(exposure), first)
-    assert len(made) == 2

@@ -141,15 +141,6 @@ def test_blur_of_the_aperture_lowers_the_predicted_excess() -> None:
     assert "noise" in opened.modules
 
 
-def test_operations_add_up() -> None:
-    """A step more costs more, and a frame of four times the pixels four times as much."""
-    assert prepared().plan(OPENER).operations > prepared(networks=False).plan(OPENER).operations
-    large = PreparedScene(torch.full((4, 32, 40), 0.1), SOURCE, Z6, Z6.nlf(1600))
-    small = PreparedScene(torch.full((4, 16, 20), 0.1), SOURCE, Z6, Z6.nlf(1600))
-    target = CameraSettings(6400, 1 / 256, 8)
-    assert large.plan(target).operations == 4 * small.plan(target).operations
-
-
 def test_operations_by_hand() -> None:
     """Per sample: 2 + 1 + 4 + 2 (1 + 2^2) + 6 + 14 + 6, for a disc of 2.5 pixel."""
     everything = prepared(tolerance=0.0, image_speed=0.2, defocus=2.5)
@@ -300,17 +291,6 @@ def test_each_decision_says_what_it_costs() -> None:
     own = math.hypot(BIAS * 5e-3, GAMMA * 0.2) / 4e-3
     assert loose.predicted_difference == pytest.approx(math.hypot(0.25, own), rel=1e-3)
     assert replace(made, denoised=None).plan(settings).predicted_error == pytest.approx(0.25)
-
-
-def test_blur_that_hardly_shows_is_left_out_with_its_error() -> None:
-    made = prepared(aperture_blur=None, denoised=None, nlf=NoiseLevelFunction.zero())
-    moving = replace(made, image_speed=0.02, tolerance=1.0).plan(SOURCE)
-    error = moving.steps[4].error
-    assert 0.0 < error == moving.predicted_error < 1.0
-    assert "which would hardly show" in moving.left_out["motion_blur"]
-    strict = replace(made, image_speed=0.02, tolerance=error * 0.99).plan(SOURCE)
-    assert "motion_blur" in strict.modules
-    assert f"would be an error of {error:.2g}" in strict.steps[4].reason
 
 
 def test_the_light_alone_takes_neither_noise_nor_clip() -> None:

@@ -123,9 +123,9 @@ def assert_moments(samples: np.ndarray, expected: list[tuple[float, float, float
 
 
 def test_noise_free_source_over_all_states() -> None:
-    """At five signals from black to near white, each state has its camera's mean and variance."""
+    """At five signals from black to white, each state has its camera's mean and variance."""
     reference = CameraSettings(100, 1 / 125, 8)
-    levels = np.array([0.0, 0.004, 0.119, 0.5, 0.85])
+    levels = np.array([0.0, 0.004, 0.119, 0.5, 0.998])
     samples, expected = [], []
     for state in STATES:
         ratio = exposure_of(state) / exposure_of(reference)
@@ -209,53 +209,6 @@ def test_noisy_source_over_all_states() -> None:
     assert_moments(np.array(noisier[0]), noisier[1])
 
 
-def clipped_gaussian(mean: float, sigma: float, low: float, high: float) -> tuple[float, float]:
-    """Mean and variance of a clipped Gaussian in closed form (after Foi 2009, clipped raw data)."""
-    a, b = (low - mean) / sigma, (high - mean) / sigma
-    inside = norm.cdf(b) - norm.cdf(a)
-    first = mean * inside - sigma * (norm.pdf(b) - norm.pdf(a))
-    second = (mean**2 + sigma**2) * inside - sigma * (
-        (mean + high) * norm.pdf(b) - (mean + low) * norm.pdf(a)
-    )
-    first += low * norm.cdf(a) + high * norm.sf(b)
-    second += low**2 * norm.cdf(a) + high**2 * norm.sf(b)
-    return first, second - first**2
-
-
-@pytest.mark.parametrize("offset", [-3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0])
-@pytest.mark.parametrize("end", ["pedestal", "white"])
-def test_clipped_gaussian_near_both_ends(end: str, offset: float) -> None:
-    """16 bits and strong noise: the rounding (1/12 DN) is a millionth of the variance."""
-    nlf = NoiseLevelFunction((1e-4,) * 4, (4e-4,) * 4)
-    camera = CameraProfile("deep", "RGGB", 1000.0, 65535.0, 16, nlf_by_iso={100: nlf})  # type: ignore[arg-type]
-    pedestal = 1000 / 64535
-    if end == "pedestal":  # sigma 0.02; light below zero as a noisy source may have it
-        sigma = 0.02
-        mean = -pedestal + offset * sigma
-        if mean > 0:
-            sigma = math.sqrt(4e-4 + 1e-4 * mean)
-    else:
-        sigma = math.sqrt(4e-4 + 1e-4)
-        mean = 1.0 + offset * sigma
-        sigma = math.sqrt(4e-4 + 1e-4 * mean)
-    settings = CameraSettings(100, 1, 4)
-    light = torch.full((4, 128, 128), mean)
-    capture, _ = PreparedScene(light, settings, camera, NoiseLevelFunction.zero()).capture(
-        settings, 5
-    )
-    samples = capture.double().numpy().ravel()
-    assert samples.min() >= -pedestal - 1e-6
-    assert samples.max() <= 1.0
-    expected_mean, expected_variance = clipped_gaussian(mean, sigma, -pedestal, 1.0)
-    count = len(samples)
-    assert samples.mean() == pytest.approx(
-        expected_mean, abs=5 * math.sqrt(expected_variance / count) + 1e-7
-    )
-    fourth = np.mean((samples - samples.mean()) ** 4)
-    error = math.sqrt((fourth - samples.var() ** 2) / count)
-    assert samples.var() == pytest.approx(expected_variance, abs=5 * error + 1e-10)
-
-
 def test_digital_numbers_are_rounded_once() -> None:
     """Without noise the capture is round(x * span + black), clipped to [0, white level]."""
     black = (64.0, 60.0, 59.0, 63.0)
@@ -270,13 +223,6 @@ def test_digital_numbers_are_rounded_once() -> None:
     np.testing.assert_array_equal(np.rint(numbers)[clear], np.clip(np.rint(exact), 0, 4095)[clear])
     again = clip_and_quantise(torch.from_numpy(recorded.astype(np.float32)), camera)
     np.testing.assert_array_equal(again.numpy(), recorded.astype(np.float32))
-
-
-def test_white_is_exactly_one_and_black_exactly_the_pedestal() -> None:
-    signal = torch.tensor([-1e30, -1.0, 1.0, 1e30]).expand(4, 1, 4)
-    recorded = clip_and_quantise(signal, Z6)
-    expected = np.float32(-BLACK / SPAN)
-    assert recorded[:, 0].tolist() == [[float(expected)] * 2 + [1.0, 1.0]] * 4
 
 
 def test_limits_of_light_and_signal() -> None:
@@ -301,14 +247,6 @@ def test_motion_blur_comes_before_the_clip() -> None:
     recorded = clip_and_quantise(smeared, Z6)
     assert torch.all(recorded[:, 2, 14:17] == 1.0)
     assert float(recorded[:, 2, [10, 20]].abs().max()) < 1 / SPAN
-
-
-def test_blur_before_exposure_is_blur_after_it() -> None:
-    light = torch.rand(4, 12, 16, generator=torch.Generator().manual_seed(0)) * 3
-    zero = NoiseLevelFunction.zero()
-    bright = sensor_light(light, Exposure(8.0, zero, zero, motion_px=2.2, defocus_px=3.3))
-    dim = sensor_light(light, Exposure(1.0, zero, zero, motion_px=2.2, defocus_px=3.3))
-    np.testing.assert_allclose(bright.numpy(), 8 * dim.numpy(), rtol=1e-5)
 
 
 def test_blur_averages_the_noise_of_the_source() -> None:

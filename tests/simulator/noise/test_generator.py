@@ -102,12 +102,6 @@ def test_frames_are_white_in_time_and_over_planes(kind: Noise) -> None:
 
 
 @both
-def test_neighbouring_seeds_are_independent(kind: Noise) -> None:
-    first, second = frames(kind, 50, seed=100).astype(np.float64), frames(kind, 50, seed=101)
-    assert abs((first * second).mean()) < 5.0 / math.sqrt(first.size)
-
-
-@both
 def test_no_shift_makes_two_frames_alike(kind: Noise) -> None:
     """Largest correlation of two frames over all 65,536 shifts, against that of white noise.
 
@@ -152,14 +146,6 @@ def test_a_key_is_a_function_of_its_numbers() -> None:
     assert len(np.unique(many)) == 50_000
 
 
-def test_flipping_a_bit_of_the_seed_flips_half_of_the_key() -> None:
-    seeds = np.arange(2000)
-    for bit in (0, 1, 5, 40, 61):
-        changed = noise_keys(seeds, 3) ^ noise_keys(seeds ^ (1 << bit), 3)
-        flipped = np.bitwise_count(changed).mean()
-        assert flipped == pytest.approx(32.0, abs=5.0 * 4.0 / math.sqrt(len(seeds)))
-
-
 @pytest.mark.parametrize("seed", [-1, 1.5, "a"])
 def test_seeds_are_checked(seed: object) -> None:
     with pytest.raises(ValueError, match="`seeds`"):
@@ -179,16 +165,6 @@ def test_bank_holds_every_quantile_once() -> None:
     ordered, at = np.sort(bank[:BANK_SIZE]), [0, 1, 1000, BANK_SIZE // 2, BANK_SIZE - 1]
     quantiles = stats.norm.isf((np.array(at) + 0.5) / BANK_SIZE)[::-1]
     np.testing.assert_allclose(ordered[BANK_SIZE - 1 - np.array(at)][::-1], quantiles, rtol=1e-6)
-
-
-def test_bank_has_the_moments_of_a_normal_and_no_correlation() -> None:
-    bank = noise_bank()[:BANK_SIZE].astype(np.float64)
-    assert abs(bank.mean()) < 1e-7
-    assert bank.var() == pytest.approx(1.0, abs=1e-5)
-    assert (bank**4).mean() == pytest.approx(3.0, abs=1e-3)
-    for lag in (1, 2, 3, 16, 128, 256):
-        # 5 standard errors of the correlation of independent samples.
-        assert abs((bank[:-lag] * bank[lag:]).mean()) < 5.0 / math.sqrt(BANK_SIZE)
 
 
 # -- repetition ------------------------------------------------------------------------------------
@@ -217,13 +193,6 @@ def test_single_normals_are_normal_and_apart_from_the_frames() -> None:
     assert abs((values[:, 0] * values[:, 1]).mean()) < 5.0 / math.sqrt(len(values))
     firsts = np.array([bank_normals(int(k), (1, 1, 1)).item() for k in keys[:4000]])
     assert abs((firsts * values[:4000, 0]).mean()) < 5.0 / math.sqrt(4000)
-
-
-@pytest.mark.parametrize("shape", [(4, 1, 1), (1, 16, 16), (4, 37, 53), (4, 16, 17)])
-def test_any_size(shape: tuple[int, int, int]) -> None:
-    noise = bank_normals(11, shape)
-    assert noise.shape == shape
-    assert noise.dtype == np.float32
 
 
 # From the test vectors that come with Random123 (Salmon et al. 2011).
@@ -304,12 +273,8 @@ def test_the_same_key_gives_the_same_draws() -> None:
     ("first", "second"),
     [
         ((7,), (8,)),
-        ((0, 1.0), (1, 0.0)),
-        ((7, 100.0, 1 / 64), (7, 100.0, 1 / 65)),
         ((7, 100.0, 200.0), (7, 200.0, 100.0)),
-        ((7, 0.0), (7, 1.0)),
         ((7, 1.0), (7, math.nextafter(1.0, 2.0))),
-        ((2**40,), (2**40 + 1,)),
         ((7, 0.0), (7, -0.0)),
     ],
 )

@@ -73,12 +73,6 @@ def test_a_flash_is_its_integral(time: float, decay: float) -> None:
         assert lamp.mean_light(start, time) == pytest.approx(wanted, rel=1e-9)
 
 
-@pytest.mark.parametrize("lamp", [MainsLamp(100.0), PulsedLamp(5000.0, 0.03), PulsedLamp(60, 0.5)])
-def test_whole_periods_have_no_bands(lamp: Lamp) -> None:
-    rows = lamp.row_light(0.123, 0.1, 500, 12e-6)
-    np.testing.assert_allclose(rows, 1.0, rtol=1e-9)
-
-
 def test_rows_are_exposed_one_after_the_other() -> None:
     lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
     rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
