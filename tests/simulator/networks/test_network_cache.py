@@ -134,7 +134,7 @@ def test_other_weights_are_seen(change: str) -> None:
     else:
         next(iter(module.parameters())).data.mul_(1.01)
     after = _denoised(simulator, raw)
-    assert torch.equal(after, simulator.denoise(simulator._prepared(raw)))
+    assert torch.equal(after, simulator.denoise(simulator.prepare(raw)))
     assert not torch.equal(after, before)
 
 
