@@ -79,8 +79,10 @@ def _draw(results: dict[str, list[Row]]) -> Figure:
         axis.set(title=group, xlabel=GROUPS[group][1], ylabel=rows[0]["error"])
         if min(xs) > 0 and max(xs) > 50 * min(xs):
             axis.set_xscale("log")
-        if max(ys) > 50 * min([y for y in ys if y > 0], default=1.0):
-            axis.set_yscale("symlog", linthresh=min(y for y in ys if y > 0))
+        largest = max(ys + [row["limit"] or 0.0 for row in rows])
+        if largest > 50 * (sorted(ys)[len(ys) // 2] or largest * 1e-4):
+            axis.set_yscale("symlog", linthresh=1e-4 * largest)
+        axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
         if len(rows) <= 12:
             axis.legend(fontsize=5.5)
