@@ -37,8 +37,10 @@ def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
             if file.is_file():
                 return file
         own = Path(name).expanduser()
-        if own.suffix in (".yaml", ".yml") and own.is_file():
-            return own
+        if own.suffix in (".yaml", ".yml"):
+            if own.is_file():
+                return own
+            raise ValueError(f"`preset` (={str(name)!r}): there is no such file")
     known = list_presets(kind)
     hint = did_you_mean(name, known)
     raise ValueError(f"`preset` (={name!r}) must be one of {known} or a .yaml file{hint}")

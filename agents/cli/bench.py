@@ -22,7 +22,10 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 def bench(
     name: Annotated[str, typer.Argument(help=", ".join(BENCHMARKS))],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("docs/results"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the results; by default the checkout's docs/results."),
+    ] = None,
     seed: Seed = 0,
     quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
     against: Annotated[
@@ -43,8 +46,9 @@ def bench(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
             "run this in a clone of the repository, installed with `pip install -e .`"
         )
+    out = CHECKOUT / "docs" / "results" if out is None else out
     make_folder(out)
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
-    options = {} if against is None else {"against": against}
+    options: dict[str, Path] = {} if against is None else {"against": against}
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)

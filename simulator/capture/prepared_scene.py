@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Protocol, cast
 
 import numpy as np
@@ -97,6 +98,10 @@ class PreparedScene:
             statistics = cached.statistics if cached is not None and same_light else None
             lights = BlurredLight(self.light, self.denoised, self.aperture_blur, statistics)
             object.__setattr__(self, "blurred_light", lights)
+        for name in ("image_speed", "defocus", "gain"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Real):
+                raise ValueError(f"`{name}` (={value!r}) must be a number")
         if not 0.0 <= self.image_speed <= MAX_IMAGE_SPEED:
             raise ValueError(
                 f"`image_speed` (={self.image_speed!r}) must be in [0, {MAX_IMAGE_SPEED:g}] frame "

@@ -692,3 +692,21 @@ def test_two_hops_have_the_noise_of_one(
         assert raw.metadata["excess_noise"] < 1e-6
         assert raw.noise.shot == pytest.approx(wanted.shot, rel=1e-6)
         assert raw.noise.read == pytest.approx(wanted.read, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("scene", "rule"),
+    [
+        ({"defocus": 1e9}, r"`defocus` \(=1000000000.0 .*at most 512 pixel wide"),
+        ({"defocus": float("nan")}, r"`defocus` \(=nan\) must be finite and >= 0"),
+        ({"defocus": [1]}, r"`defocus` \(=\[1\]\) must be a number"),
+        ({"image_speed": 1000.1}, r"`image_speed` \(=1000.1\) must be in \[0, 1000\]"),
+        ({"image_speed": -0.1}, r"`image_speed` \(=-0.1\) must be in \[0, 1000\]"),
+        ({"image_speed": "fast"}, r"`image_speed` \(='fast'\) must be a number"),
+    ],
+)
+def test_blur_beyond_the_frame_is_refused(scene: dict, rule: str) -> None:
+    """Before any blur is made: a disc of 1e9 pixels would ask for all of the memory."""
+    raw = RawImage(torch.rand(4, 16, 24), BASE, camera=Z6)
+    with pytest.raises(ValueError, match=rule):
+        CameraSimulator().prepare(raw, **scene)

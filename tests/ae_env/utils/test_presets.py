@@ -64,6 +64,8 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"`preset` \(=.*\) must be one of .*'snow'"):
             ae_env.load_preset(name)  # type: ignore[arg-type]
     own = tmp_path / "own.yaml"
+    with pytest.raises(ValueError, match=r"`preset` \(='.*own.yaml'\): there is no such file"):
+        ae_env.load_preset(own)
     own.write_text("lighting: sine\nmax_episode_steps: 4\n")
     assert ae_env.load_preset(own) == ae_env.load_preset(str(own))
     assert ae_env.load_preset(str(own)) == {"lighting": "sine", "max_episode_steps": 4}
