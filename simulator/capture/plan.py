@@ -152,11 +152,9 @@ def _curvature(given: Situation, denoised: bool) -> tuple[float, float]:
 def _decide_noise_reduction(given: Situation) -> Step:
     if given.source.is_zero:
         return _CLEAN_SOURCE
-    name = "noise_reduction"
-    error_of = given.statistics.excess_error if given.noise else given.statistics.relative_noise
-    error = error_of(given.ratio, given.source, given.target)
-    if given.denoised is None:
-        return Step(name, False, "the simulator has no noise module", error)
+    if given.denoised is None:  # its error need not be known to decide: `make_plan` works it out
+        return _NO_NOISE_MODULE
+    name, error = "noise_reduction", _noise_error(given)
     # Blur averages noise, too. That is not counted on: it may be left out itself.
     if given.opens_denoised and given.aperture_px:
         reason = "the aperture module works on the noise-reduced light only"
@@ -174,6 +172,12 @@ def _decide_noise_reduction(given: Situation) -> Step:
     else:
         reason = "the source is noisier than the target"
     return Step(name, True, reason + _WITHOUT, error)
+
+
+def _noise_error(given: Situation) -> float:
+    """Error of leaving the source's noise in, in units of the target's."""
+    error_of = given.statistics.excess_error if given.noise else given.statistics.relative_noise
+    return error_of(given.ratio, given.source, given.target)
 
 
 def _worth_denoising(given: Situation) -> bool:
@@ -203,6 +207,7 @@ def _no_defocus(given: Situation) -> Step:
 
 #: Steps that would do nothing.
 _CLEAN_SOURCE = Step("noise_reduction", False, "the source carries no noise")
+_NO_NOISE_MODULE = Step("noise_reduction", False, "the simulator has no noise module")
 _NO_APERTURE_MODULE = Step("aperture", False, "no defocus was estimated: `depth` is not 'unknown'")
 _CLOSES = Step(
     "aperture", False, "the aperture does not open; what is blurred in the source stays so"
@@ -366,7 +371,10 @@ def make_plan(
         clipped_source: See `SimulationPlan`.
     """
     samples = light.numel()
-    optional = tuple(_planned(step, samples) for step in exposure.steps)
+    noise_reduction, *blurs = exposure.steps
+    if noise_reduction is _NO_NOISE_MODULE:
+        noise_reduction = noise_reduction._replace(error=_noise_error(given))
+    optional = tuple(_planned(step, samples) for step in (noise_reduction, *blurs))
     wanted, reason = given.noise, "only the light is asked for"
     noise = Step("noise", wanted and balance.lacks_noise, "" if wanted else reason)
     if wanted and not balance.lacks_noise:
