@@ -170,9 +170,11 @@ class EpisodeCore:
 
     def _forget(self, env_indices: np.ndarray) -> None:
         """Drops what was worked out for the scenes that `env_indices` show."""
-        own = len(self.scenes) + env_indices
-        self._captures.forget(own)
-        self._part_scores.forget(own)
+        lights = self.episodes.light_index[env_indices]
+        own = lights[lights >= len(self.scenes)]  # the others are those of scenes at rest, and stay
+        if len(own):
+            self._captures.forget(own)
+            self._part_scores.forget(own)
         for env_index in env_indices.tolist():
             self._tables[env_index] = None
 

@@ -27,7 +27,7 @@ from simulator.settings import CameraSettings
 from simulator.utils.threads import in_shares
 
 
-@dataclass(frozen=True)
+@dataclass
 class FrameStatistics:
     """Statistics of a batch of frames, (B,) each.
 

@@ -98,6 +98,6 @@ def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
     The rows: exposure ratio; then the rows of `simulator.noise.top_up.top_up_table`.
     """
     table = np.empty((len(exposures), 5, 4), np.float32)
-    table[:, 0] = np.array([e.ratio for e in exposures]).reshape(-1, 1)
+    table[:, 0] = np.array([exposure.ratio for exposure in exposures])[:, None]
     table[:, 1:] = top_up_table([e.source_noise for e in exposures], [e.target for e in exposures])
     return table

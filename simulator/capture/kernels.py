@@ -272,7 +272,7 @@ def record_frames(
     Returns:
         (B, 2) int64: samples of each frame that are clipped low, and high; 0 without `count`.
     """
-    frames, samples = len(light), light[0].shape[-2] * light[0].shape[-1]
+    frames, samples = len(light), light[0].numel() // 4
     blocks = -(-samples // BLOCK)
     pieces = -(-blocks // _UNIT_BLOCKS)
     units = frames * 4 * pieces

@@ -335,10 +335,11 @@ class PreparedScene:
         for some in parts:
             chosen = exposures[some]
             lights = [self.blurred_light.blurred(exposure) for exposure in chosen]
+            transitions = Transitions.of(lights, chosen)
             record(
-                Transitions.of(lights, chosen),
+                transitions,
                 self.camera,
-                keys=keys[some],
+                keys=keys[some] if transitions.lacks_noise else None,
                 noise=noise,
                 row_gain=None if row_gain is None else row_gain[some],
                 signals=frames[some],

@@ -19,6 +19,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import LIGHT_LIMIT, SIGNAL_LIMIT, Exposure, exposure_table
+from simulator.capture.kernels import record_frames
 from simulator.noise.generator import Noise, frame_normals
 from simulator.noise.noise_level_function import VARIANCE_LIMIT
 from simulator.noise.top_up import missing_variance, top_up_table
@@ -33,7 +34,7 @@ _BALANCED = 2**15
 # -- a batch of frames ------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass
 class Transitions:
     """All that B frames depend on, except for their noise.
 
@@ -90,7 +91,7 @@ class Transitions:
 
     @property
     def lacks_noise(self) -> bool:
-        """Whether any signal could have less noise than its target; where not, none is drawn."""
+        """Whether any signal could have less noise than its target; else none need be drawn."""
         if (self.table[:, 1:3] > 0.0).any():
             return True
         return any(share is not None for share in self.shares())
@@ -130,11 +131,7 @@ def record(
         return np.zeros((0, 2), np.int64)
     if row_gain is not None:
         transitions = transitions.in_bands(row_gain)
-    if keys is not None and not transitions.lacks_noise:
-        keys = None
-    if transitions.light[0].device.type == "cpu":
-        from simulator.capture.kernels import record_frames  # numba: only where there is a capture
-
+    if transitions.light[0].is_cpu:
         return record_frames(
             transitions.light,
             transitions.table,

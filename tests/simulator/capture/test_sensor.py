@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ import torch
 from scipy.stats import norm
 
 from simulator.camera import CameraProfile, get_camera
-from simulator.capture import kernels
 from simulator.capture.exposure import Exposure
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import (
@@ -365,20 +363,21 @@ def test_a_source_without_noise_lacks_all_of_it() -> None:
 
 
 @pytest.mark.parametrize("source", [100, 6400])
-def test_noise_is_made_only_where_the_source_lacks_some(
+def test_noise_is_drawn_only_where_the_source_lacks_some(
     source: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = []
-    original = kernels.record_frames
-
-    def watched(*args: Any, keys: Any, **options: Any) -> Any:
-        made.append(keys)
-        return original(*args, keys=keys, **options)
-
-    monkeypatch.setattr(kernels, "record_frames", watched)
     light, share = torch.full((4, 8, 8), 0.2), torch.full((8, 8), 0.5)
-    exposure = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
-    recorded(light, exposure, 3)
-    recorded(light, Exposure(1.0, Z6.nlf(source), Z6.nlf(12800)), 3)
-    recorded(light, replace(exposure, remaining_variance=share), 3)
-    assert [keys is None for keys in made] == [True, False, False]
+    enough = Exposure(1.0, Z6.nlf(source), Z6.nlf(100))
+    blurred = replace(enough, remaining_variance=share)
+    short = Exposure(1.0, Z6.nlf(source), Z6.nlf(12800))
+    for exposures, lacks in (([enough], False), ([blurred], True), ([enough, short], True)):
+        assert Transitions.of([light] * len(exposures), exposures).lacks_noise is lacks
+    made = []
+    monkeypatch.setattr(
+        "simulator.capture.prepared_scene.record", lambda *_, keys, **__: made.append(keys)
+    )
+    settings = CameraSettings(source, 1 / 64, 4)
+    prepared = PreparedScene(light, settings, Z6, Z6.nlf(source))
+    prepared.expose([settings])
+    prepared.expose([settings, CameraSettings(12800, 1 / 256, 4)])
+    assert [keys is None for keys in made] == [True, False]
