@@ -293,10 +293,7 @@ def _first(observation: Observation) -> Observation:
 
 def single_info(columns: dict[str, Any], row: int) -> dict[str, Any]:
     """Row `row` of the info columns as the plain numbers that one environment returns."""
-    info: dict[str, Any] = {}
-    for name, values in columns.items():
-        if isinstance(values, dict):
-            info[name] = single_info(values, row)
-        else:
-            info[name] = values.item(row)
-    return info
+    return {
+        name: single_info(values, row) if isinstance(values, dict) else values.item(row)
+        for name, values in columns.items()
+    }

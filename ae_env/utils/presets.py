@@ -31,6 +31,7 @@ def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
     Raises:
         ValueError: If there is neither; the message proposes the nearest name.
     """
+    option = "env" if kind == "env" else "preset"  # as the command line calls it
     if isinstance(name, str | PathLike):
         for folder in _FOLDERS:
             file = folder / kind / f"{name}.yaml"
@@ -40,10 +41,12 @@ def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
         if own.suffix in (".yaml", ".yml"):
             if own.is_file():
                 return own
-            raise ValueError(f"`preset` (={str(name)!r}): there is no such file")
+            raise ValueError(f"`{option}` (={str(name)!r}): there is no such file")
     known = list_presets(kind)
     hint = did_you_mean(name, known)
-    raise ValueError(f"`preset` (={name!r}) must be one of {known} or a .yaml file{hint}")
+    raise ValueError(
+        f"`{option}` (={name!r}) must be one of {', '.join(known)} or a .yaml file{hint}"
+    )
 
 
 def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
@@ -62,9 +65,7 @@ def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
     file = find_preset(name)
     from simulator.utils.config_file import read_yaml
 
-    content = read_yaml(file, name="preset")
+    content = read_yaml(file, name="env")
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise ValueError(
-            f"`preset` (={str(file)!r}) must map arguments of the environment to values"
-        )
+        raise ValueError(f"`env` (={str(file)!r}) must map arguments of the environment to values")
     return content

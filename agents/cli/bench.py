@@ -14,7 +14,7 @@ from agents.cli.console import Seed, make_folder
 
 BENCHMARKS = (
     *("agents", "brackets", "colour_checker", "convergence", "defects", "scorers", "simulator"),
-    *("stability", "throughput", "work-precision"),
+    *("stability", "throughput", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -36,6 +36,7 @@ def bench(
 
     Example: `ae-env bench throughput --quick --out /tmp/results`
     """
+    name = name.replace("-", "_")
     check_word("name", name, BENCHMARKS)
     if against is not None and (name != "throughput" or not against.is_dir()):
         raise ValueError(
@@ -49,6 +50,6 @@ def bench(
     out = CHECKOUT / "docs" / "results" if out is None else out
     make_folder(out)
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
-    stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
+    stem = {"simulator": "fidelity"}.get(name, name)
     options: dict[str, Path] = {} if against is None else {"against": against}
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)

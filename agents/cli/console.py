@@ -26,7 +26,7 @@ Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
 
 @contextmanager
 def progress_bars() -> Iterator[Any]:
-    """Progress bars with time left; yields a function that opens one."""
+    """Progress bars with time left, in a log a line each; yields a function that opens one."""
     from rich.progress import (
         BarColumn,
         Progress,
@@ -43,11 +43,13 @@ def progress_bars() -> Iterator[Any]:
         TimeRemainingColumn(),
         TextColumn("[dim]{task.fields[note]}"),
     )
-    with Progress(*columns, console=console) as display:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as display:
 
         @contextmanager
         def bar(title: str) -> Iterator[Any]:
             task = display.add_task(title, total=None, note="")
+            if not console.is_terminal:
+                print_line(f"{title} ...")
 
             def move(done: int, total: int, note: str = "") -> None:
                 display.update(task, completed=done, total=total, note=note)

@@ -32,9 +32,10 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(bench, cache),
+    cache,
 ):
     app.command()(command)
+app.command(no_args_is_help=True)(bench)
 
 #: Commands that go on where they were stopped.
 _RESUMING = ("quickstart", "train", "train-simulator", "evaluate", "bench")
@@ -67,7 +68,7 @@ def main() -> None:
     except SystemExit as stop:
         if stop.code in (_INTERRUPTED, _TERMINATED):  # the first is what Typer makes of Ctrl-C
             resumes = any(name in sys.argv[1:] for name in _RESUMING)
-            more = "; the same command goes on where it was" if resumes else ""
+            more = "; run the same command again to continue" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
         raise
 

@@ -120,9 +120,10 @@ class CaptureBatch:
         stale = self._rows.gain[rows] != gains
         if stale.any():
             self._plan(indices[stale], rows[stale], gains[stale])
-        missing = self._rows.blurs[rows] & (self._blurred_row[indices] != rows)
-        if missing.any():
-            self._blur(indices[missing], rows[missing])
+        if self._rows.any_blurs:
+            missing = self._rows.blurs[rows] & (self._blurred_row[indices] != rows)
+            if missing.any():
+                self._blur(indices[missing], rows[missing])
 
     def record(
         self,
@@ -152,7 +153,7 @@ class CaptureBatch:
         rows, columns = indices * len(self.states) + states, self._rows
         keys = noise_keys(seeds, frames)
         light, remaining = columns.light[rows], None
-        if columns.blurs[rows].any():  # else all of the source's variance remains
+        if columns.any_blurs:  # else all of the source's variance remains
             remaining = columns.remaining_variance[rows]
         counts = record(
             Transitions(light, columns.table[rows], remaining),
@@ -184,6 +185,7 @@ class CaptureBatch:
             exposure = prepared.exposure(self.states[row % len(self.states)], gain=gain)
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
             columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
+            columns.any_blurs |= bool(blurs)
             if not blurs:
                 columns.light[row] = prepared.source_light(exposure).contiguous()
             excess = _excess_variance(prepared.statistics, exposure) if noisy else 0.0
@@ -279,12 +281,14 @@ class _Rows:
         light: (4, H, W) that is exposed; where it is blurred, until its scene blurs another.
         remaining_variance: `Exposure.remaining_variance` of that light; None for all.
         blurs: Whether the light must be blurred; else it is the scene's own.
+        any_blurs: Whether that was ever so in any row.
         exposure: `Exposure` of light that must be blurred; else None.
     """
 
     def __init__(self, count: int) -> None:
         self.gain, self.excess_variance = np.full(count, np.nan), np.zeros(count)
         self.table, self.blurs = np.zeros((count, 5, 4), np.float32), np.zeros(count, bool)
+        self.any_blurs = False
         objects = np.empty((4, count), object)
         self.modules, self.light, self.remaining_variance, self.exposure = objects
 

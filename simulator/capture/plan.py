@@ -208,7 +208,9 @@ def _no_defocus(given: Situation) -> Step:
 #: Steps that would do nothing.
 _CLEAN_SOURCE = Step("noise_reduction", False, "the source carries no noise")
 _NO_NOISE_MODULE = Step("noise_reduction", False, "the simulator has no noise module")
-_NO_APERTURE_MODULE = Step("aperture", False, "no defocus was estimated: `depth` is not 'unknown'")
+_NO_APERTURE_MODULE = Step(
+    "aperture", False, "the scene is taken as in focus: `depth` is not 'unknown'"
+)
 _CLOSES = Step(
     "aperture", False, "the aperture does not open; what is blurred in the source stays so"
 )

@@ -47,7 +47,7 @@ class HasPrepared(Protocol):
         """Its light."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PreparedScene:
     """Light of a scene at reference settings, ready to be exposed at any others.
 
@@ -86,7 +86,7 @@ class PreparedScene:
     denoised: Denoised | None = None
     aperture_blur: ApertureBlur | None = None
     tolerance: float = DEFAULT_TOLERANCE
-    blurred_light: BlurredLight = field(default=cast(BlurredLight, None), repr=False)
+    blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
@@ -125,6 +125,10 @@ class PreparedScene:
                 f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
                 f"{tuple(self.light.shape)}"
             )
+
+    def __repr__(self) -> str:
+        _, height, width = self.light.shape
+        return f"PreparedScene({height} x {width} packed, {self.reference}, {self.camera.name})"
 
     @property
     def statistics(self) -> LightStatistics:

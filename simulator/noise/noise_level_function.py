@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ class NoiseLevelFunction:
 
     def scaled(self, factor: float) -> NoiseLevelFunction:
         """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
-        return self._with((v * factor for v in self.shot), (v * factor for v in self.read))
+        return self._with([v * factor for v in self.shot], [v * factor for v in self.read])
 
     def at_least(self, other: NoiseLevelFunction) -> NoiseLevelFunction:
         """The larger shot and the larger read noise of both, plane by plane."""
@@ -63,20 +63,20 @@ class NoiseLevelFunction:
         No variance exceeds `VARIANCE_LIMIT`.
         """
         return self._with(
-            (min(v * ratio, VARIANCE_LIMIT) for v in self.shot),
-            (min(v * ratio * ratio, VARIANCE_LIMIT) for v in self.read),
+            [min(v * ratio, VARIANCE_LIMIT) for v in self.shot],
+            [min(v * ratio * ratio, VARIANCE_LIMIT) for v in self.read],
         )
 
     def _with(self, shot: Any, read: Any) -> NoiseLevelFunction:
-        return replace(self, shot=tuple(shot), read=tuple(read))
+        return NoiseLevelFunction(shot, read, self.extrapolated, self.source)
 
 
-def _four_variances(name: str, given: object) -> tuple[float, ...]:
+def _four_variances(name: str, given: Any) -> tuple[float, ...]:
     try:
-        values = tuple(float(v) for v in given)  # type: ignore[attr-defined]
+        values = tuple(map(float, given))
     except (TypeError, ValueError):  # a single number, a word
         values = ()
-    if len(values) != 4 or not all(0.0 <= v < math.inf for v in values):
+    if len(values) != 4 or not all(map(math.isfinite, values)) or min(values) < 0.0:
         raise ValueError(
             f"`{name}` (={given!r}) must be 4 finite values >= 0, one for each of R, G1, G2, B"
         )

@@ -105,7 +105,7 @@ def _box(current, following, length, out):  # type: ignore[no-untyped-def]
 
 
 @_jit()
-def _streak(first, last, rows, radius, edge, full, limit, out):  # type: ignore[no-untyped-def]
+def _streak(first, last, rows, radius, share, full, limit, out):  # type: ignore[no-untyped-def]
     width = rows.shape[1]
     pitch = width + 2 * radius
     many = max(1, _GROUP // pitch)
@@ -120,7 +120,8 @@ def _streak(first, last, rows, radius, edge, full, limit, out):  # type: ignore[
             row = np.uint64(y + i)  # unsigned: no check whether it counts from the end
             for x in range(width):
                 ends = padded[i, x] + padded[i, np.uint64(x + 2 * radius)]
-                out[row, x] = box[i, x] * full + ends * edge
+                # One product to a sum: of two, the compiler would choose which one it fuses.
+                out[row, x] = (box[i, x] + ends * share) * full
 
 
 @_jit()
@@ -174,7 +175,7 @@ def _moved(first, last, rows, n, end, limit, out):  # type: ignore[no-untyped-de
     if n + 1 >= rows.shape[1]:
         _whole_rows(first, last, rows, n + 1, end * full, full, limit, out)
     else:
-        _streak(first, last, rows, n + 1, np.float32(end * full), np.float32(full), limit, out)
+        _streak(first, last, rows, n + 1, np.float32(end), np.float32(full), limit, out)
 
 
 @_jit()

@@ -199,7 +199,9 @@ def check_packed(name: str, data: object, *, ndim: int = 3) -> torch.Tensor:
         )
     shape = "(4, H, W)" if ndim == 3 else "(B, 4, H, W)"
     if data.ndim != ndim or data.shape[-3] != 4 or min(data.shape) < 1:
-        raise ValueError(f"`{name}` (shape {tuple(data.shape)}) must be {shape}: R, G1, G2, B")
+        raise ValueError(
+            f"`{name}` (shape {tuple(data.shape)}) must be {shape}, not empty: R, G1, G2, B"
+        )
     if not data.dtype.is_floating_point:
         raise ValueError(
             f"`{name}` (dtype {data.dtype}) must be floating point with white at 1.0; digital "

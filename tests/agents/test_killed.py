@@ -188,7 +188,7 @@ def test_a_stopped_command(number: int, status: int, context: Any, tmp_path: Pat
     os.kill(process.pid, number)
     process.join(60)
     assert process.exitcode == status
-    assert "stopped; the same command goes on where it was" in (tmp_path / "words").read_text()
+    assert "stopped; run the same command again to continue" in (tmp_path / "words").read_text()
     left = {path.name for path in tmp_path.iterdir()} - {"mine.yaml", "words"}
     assert left == {"agent.checkpoint"}
     stored = load_checkpoint(tmp_path / "agent.checkpoint")

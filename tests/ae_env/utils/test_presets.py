@@ -58,13 +58,13 @@ def test_scenes_of_one_kind(name: str, kind: str) -> None:
 
 
 def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"`preset` .*did you mean 'tunnel'"):
+    with pytest.raises(ValueError, match=r"`env` .*did you mean 'tunnel'"):
         ae_env.load_preset("tunel")
     for name in (None, 3, ["snow"], b"snow", ""):
-        with pytest.raises(ValueError, match=r"`preset` \(=.*\) must be one of .*'snow'"):
+        with pytest.raises(ValueError, match=r"`env` \(=.*\) must be one of .*snow"):
             ae_env.load_preset(name)  # type: ignore[arg-type]
     own = tmp_path / "own.yaml"
-    with pytest.raises(ValueError, match=r"`preset` \(='.*own.yaml'\): there is no such file"):
+    with pytest.raises(ValueError, match=r"`env` \(='.*own.yaml'\): there is no such file"):
         ae_env.load_preset(own)
     own.write_text("lighting: sine\nmax_episode_steps: 4\n")
     assert ae_env.load_preset(own) == ae_env.load_preset(str(own))
@@ -78,7 +78,7 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
     bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
     bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 30))
     own.write_text(bomb)  # 10^30 entries with the aliases written out
-    with pytest.raises(ValueError, match=r"`preset` \(='.*own\.yaml'\)"):
+    with pytest.raises(ValueError, match=r"`env` \(='.*own\.yaml'\)"):
         ae_env.load_preset(str(own))
     assert find_preset("snow").read_text().startswith("#")
 

@@ -43,7 +43,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     arguments = ("train-simulator", "tiny.yaml", "--device", "cpu")
     code, _, error = ae_env(*arguments)
     assert code == 130
-    assert error == "\nstopped; the same command goes on where it was\n"
+    assert error == "\nstopped; run the same command again to continue\n"
     before = len(steps)
     code, text, error = ae_env(*arguments)
     assert (code, error) == (0, "")
