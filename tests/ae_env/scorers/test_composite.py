@@ -12,17 +12,11 @@ import pytest
 import torch
 
 from ae_env import AutoExposureEnv, AutoExposureVectorEnv
-from ae_env.scorers import (
-    Balanced,
-    CompositeScorer,
-    make_scorer,
-)
+from ae_env.scorers import Balanced, CompositeScorer, make_scorer
 from ae_env.scorers.protocol import Captures
 from ae_env.utils.checks import UserCodeError
+from tests.ae_env.environments import SMALL
 from tests.ae_env.scorer_images import GRID, make_captures, random_scene
-
-SMALL: dict[str, Any] = {"scenes": "bundled:small", "resolution": 36}
-
 
 #: The fields and the properties worked out from them that a scorer could write to.
 TENSORS = [f.name for f in dataclasses.fields(Captures) if "Tensor" in str(f.type)]
@@ -119,22 +113,21 @@ def test_what_a_scorer_does_to_its_images_is_its_own_affair(observation: str) ->
         images.numpy()[:] = 0.0  # past torch's own counting
         return images.new_zeros(len(images))
 
+    def step(scorer: Any) -> Any:
+        envs = AutoExposureVectorEnv(3, scorer=scorer, observation=observation, **SMALL)
+        envs.reset(seed=0)
+        return envs.step(np.array([3, 20, 40]))
+
     for domain in ("raw", "srgb"):
         frames = []
         for first in (None, blacken):
             parts = {"first": Own(first, domain), "mean": Own(_mean, domain)}
             scorer = CompositeScorer(parts)
-            envs = AutoExposureVectorEnv(
-                num_envs=3, scorer=scorer, observation=observation, **SMALL
-            )
-            envs.reset(seed=0)
-            frames.append(envs.step(np.array([3, 20, 40])))
+            frames.append(step(scorer))
         (plain, _, _, _, info), (black, _, _, _, black_info) = frames
         np.testing.assert_array_equal(plain["raw"], black["raw"])
         np.testing.assert_array_equal(info["rewards"]["mean"], black_info["rewards"]["mean"])
-    envs = AutoExposureVectorEnv(num_envs=3, scorer=Own(blacken), observation=observation, **SMALL)
-    envs.reset(seed=0)
-    np.testing.assert_array_equal(envs.step(np.array([3, 20, 40]))[0]["raw"], plain["raw"])
+    np.testing.assert_array_equal(step(Own(blacken))[0]["raw"], plain["raw"])
 
 
 @pytest.mark.parametrize("name", TENSORS)
@@ -166,14 +159,12 @@ def test_misspelt_attributes_are_refused() -> None:
 @pytest.mark.parametrize("kind", [np.array, torch.tensor])
 def test_balanced_stays_in_its_range_where_shares_are_rounded_up(kind: Any) -> None:
     highlights = np.exp(-1.0 / 0.15) * (1.0 - np.array([0.0, 1e-16, 1e-15, 1e-12, 1e-9]))
-    scores = {"highlights": highlights}
-    scores |= {name: np.ones(5) for name in ("brightness", "shadows", "noise", "sharpness")}
-    blown = -0.15 * np.log(highlights)
-    assert (blown > 1.0).any()  # else this shows nothing
+    assert (-0.15 * np.log(highlights) > 1.0).any()  # else this shows nothing
+    scores = dict.fromkeys(("brightness", "shadows", "noise", "sharpness"), np.ones(5))
+    scores["highlights"] = highlights
     totals = Balanced().combine({name: kind(values) for name, values in scores.items()})
     assert 0.0 <= float(totals.min()) <= float(totals.max()) <= 1.0
-    best = Balanced().combine(dict.fromkeys(scores, kind(np.ones(3))))
-    assert best.tolist() == [1.0] * 3
+    assert Balanced().combine(dict.fromkeys(scores, kind(np.ones(3)))).tolist() == [1.0] * 3
 
 
 @pytest.mark.parametrize("total", [math.nan, math.inf, -0.1, 1.1])

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import scipy.ndimage
 import skimage.data
 import torch
-from skimage.measure import blur_effect as skimage_blur_effect
 
 from ae_env.scenes import Scene
 from ae_env.scorers import defects as defect_signs
@@ -18,27 +15,18 @@ from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, Defects, mapped, sever
 from ae_env.scorers.luma import srgb_decode
 from benchmarks import defects as benchmark
 from simulator.raw.develop import srgb_encode
-from tests.ae_env.scorer_images import CAMERA, check_image_scorer, random_pictures
+from tests.ae_env.scorer_images import CAMERA, random_pictures
 
 MEASURES = [f"analytic_{defect}" for defect in DEFECTS]
-
-
-@pytest.mark.parametrize("name", MEASURES)
-def test_any_picture_has_a_score(name: str) -> None:
-    check_image_scorer(name)
-
-
-def _photograph(**fields: Any) -> Scene:
-    picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
-    scene = Scene.from_radiance(srgb_decode(picture), CAMERA, scene_id="astronaut", **fields)
-    return scene.resized(128)
 
 
 @pytest.fixture(scope="module")
 def rendered() -> dict[str, torch.Tensor]:
     """Pictures (L, 3, H, W) of a photograph with each defect at its severities."""
+    picture = torch.from_numpy(skimage.data.astronaut()).permute(2, 0, 1) / 255.0
+    scene = Scene.from_radiance(srgb_decode(picture), CAMERA, scene_id="astronaut").resized(128)
     generator = torch.Generator().manual_seed(3)
-    return {name: benchmark.render(_photograph(), name, generator) for name in DEFECTS}
+    return {name: benchmark.render(scene, name, generator) for name in DEFECTS}
 
 
 @pytest.mark.parametrize("defect", DEFECTS)
@@ -76,11 +64,6 @@ def test_colourfulness_is_hasler_and_suesstrunks() -> None:
         spread, mean = np.hypot(rg.std(), yb.std()), np.hypot(rg.mean(), yb.mean())
         expected.append(spread + 0.3 * mean)
     np.testing.assert_allclose(defect_signs.colourfulness(pictures), expected, rtol=1e-5)
-    # A red and a green half: rg is 255 and -255, yb 127.5.
-    halves = torch.zeros(1, 3, 4, 6)
-    halves[:, 0, :, :3] = 1.0
-    halves[:, 1, :, 3:] = 1.0
-    assert defect_signs.colourfulness(halves).item() == pytest.approx(255.0 + 0.3 * 127.5)
 
 
 def test_veil_is_the_airlight_over_the_mean() -> None:
@@ -105,9 +88,6 @@ def test_blur_effect_is_cretes() -> None:
     images = torch.from_numpy(np.stack(pictures)).float()[:, None].expand(-1, 3, -1, -1)
     found = defect_signs.blur_effect(images)
     np.testing.assert_allclose(found, expected, atol=1e-4)
-    # scikit-image differentiates with Sobel's filter: alike, not equal.
-    other = [skimage_blur_effect(picture, h_size=9) for picture in pictures]
-    np.testing.assert_allclose(found, other, atol=0.12)
     assert defect_signs.blur_effect(torch.full((1, 3, 8, 8), 0.5)).item() == 1.0
 
 
@@ -132,5 +112,5 @@ def test_the_defect_score_is_one_less_the_worst_and_the_mean() -> None:
     scores = {name: np.full((2, 3), v) for name, v in zip(MEASURES, values, strict=True)}
     expected = 0.75 * 0.2 + 0.25 * sum(values) / 6
     np.testing.assert_allclose(scorer.combine(scores), np.full((2, 3), expected))
-    tensors = {name: torch.tensor([v]) for name, v in zip(MEASURES, values, strict=True)}
-    assert scorer.combine(tensors).item() == pytest.approx(expected)
+    tensors = {name: torch.from_numpy(score) for name, score in scores.items()}
+    torch.testing.assert_close(scorer.combine(tensors), torch.full((2, 3), expected).double())

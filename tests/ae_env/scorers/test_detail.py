@@ -19,12 +19,7 @@ from ae_env.scorers.detail import (
     zhang_gradient,
 )
 from simulator import CameraSettings
-from tests.ae_env.scorer_images import CAMERA, captures_of, check_image_scorer, random_pictures
-
-
-@pytest.mark.parametrize("name", ["shim", "zhang", "shin", "blind_noise"])
-def test_any_picture_has_a_score(name: str) -> None:
-    check_image_scorer(name)
+from tests.ae_env.scorer_images import CAMERA, captures_of, random_pictures
 
 
 def _levels(count: int = 3, height: int = 40, width: int = 60) -> np.ndarray:
@@ -35,6 +30,9 @@ def _levels(count: int = 3, height: int = 40, width: int = 60) -> np.ndarray:
 def _sobel(picture: np.ndarray) -> np.ndarray:
     x, y = (scipy.ndimage.sobel(picture, axis=axis, mode="nearest") for axis in (1, 0))
     return np.hypot(x, y)
+
+
+KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])  # Immerkaer's
 
 
 def _shim_pixels(picture: np.ndarray) -> np.ndarray:
@@ -82,8 +80,8 @@ def test_zhang_is_the_weighted_mean_of_sorted_squared_gradients() -> None:
         expected.append(np.dot(weights, ordered) / sum(weights))
     got = zhang_gradient(torch.from_numpy(levels / 255.0))
     np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
-    scores = make_scorer("zhang").parts["zhang"](torch.from_numpy(levels[:, None] / 255.0).float()
-                                                 .expand(-1, 3, -1, -1), None)  # fmt: skip
+    pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
+    scores = make_scorer("zhang").parts["zhang"](pictures, None)
     np.testing.assert_allclose(scores, np.array(expected) / (np.array(expected) + 256), rtol=1e-4)
 
 
@@ -102,8 +100,7 @@ def _shin(picture: np.ndarray) -> float:
     squared = _sobel(picture) ** 2
     flat = squared <= np.sort(squared.ravel())[round(0.1 * picture.size) - 1]
     used = flat & (picture >= 15) & (picture <= 235)
-    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
-    response = np.abs(scipy.ndimage.convolve(picture, kernel, mode="nearest"))
+    response = np.abs(scipy.ndimage.convolve(picture, KERNEL, mode="nearest"))
     noise = math.sqrt(math.pi / 2) / (6 * used.sum()) * response[used].sum()
     return 0.4 * gradient + 0.6 * entropy - 0.4 * noise
 
@@ -120,25 +117,16 @@ def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
     np.testing.assert_allclose(scores, mapped, atol=1e-2)  # a level may round the other way
 
 
-KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])
-
-
 def test_snr_is_the_mean_of_decibels() -> None:
     light = 0.1 * np.exp(np.random.default_rng(0).normal(0.0, 2.0, (4, 6, 5)))
-    states = [
-        CameraSettings(iso=100, exposure_time=1 / 64, f_number=4),
-        CameraSettings(iso=6400, exposure_time=1 / 64, f_number=4),
-        CameraSettings(iso=400, exposure_time=1 / 4000, f_number=4),
-    ]
+    states = [CameraSettings(*s) for s in ((100, 1 / 64, 4), (6400, 1 / 64, 4), (400, 1 / 4000, 4))]
     expected = []
     for state in states:
-        nlf, total = CAMERA.nlf(state.iso), 0.0
-        for plane in range(4):
-            for value in light[plane].ravel():
-                x = value * (state.exposure_time * 64) * (state.iso / 100)
-                power = min(x, 1.0) ** 2 / (nlf.shot[plane] * x + nlf.read[plane])
-                total += min(max(10 * math.log10(power), 0.0), 50.0)
-        expected.append(total / light.size / 50.0)
+        nlf = CAMERA.nlf(state.iso)
+        shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
+        x = light * (state.exposure_time * 64) * (state.iso / 100)
+        decibels = 10 * np.log10(np.minimum(x, 1.0) ** 2 / (shot * x + read))
+        expected.append(decibels.clip(0.0, 50.0).mean() / 50.0)
     scores = make_scorer("snr")(None, captures_of(light, states))
     np.testing.assert_allclose(scores.numpy(), expected, rtol=1e-5)
     assert make_scorer("snr").closed_form
@@ -153,14 +141,12 @@ def test_blind_sigma_is_immerkaers() -> None:
     np.testing.assert_allclose(immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("sigma", [2.0, 5.0, 12.0])
-def test_blind_sigma_of_known_noise(sigma: float) -> None:
+def test_blind_sigma_of_known_noise() -> None:
     rows, columns = np.mgrid[0:200, 0:220]
     slope = 60.0 + 0.3 * rows + 0.2 * columns  # straight slopes leave nothing
-    noisy = slope + sigma * np.random.default_rng(2).normal(size=slope.shape)
-    found = immerkaer_sigma(torch.from_numpy(noisy[None] / 255.0)).item()
-    assert found == pytest.approx(sigma, rel=0.02)
-    assert immerkaer_sigma(torch.from_numpy(slope[None] / 255.0)).item() < 1e-9
+    noisy = slope + 5.0 * np.random.default_rng(2).normal(size=slope.shape)
+    found = immerkaer_sigma(torch.from_numpy(np.stack([noisy, slope]) / 255.0)).tolist()
+    assert found == pytest.approx([5.0, 0.0], rel=0.02, abs=1e-9)
     pictures = torch.from_numpy(noisy / 255.0).float().expand(1, 3, -1, -1)
     score = make_scorer("blind_noise").parts["blind_noise"](pictures, None).item()
-    assert score == pytest.approx(1 / (1 + sigma / 10), rel=0.03)
+    assert score == pytest.approx(1 / (1 + 5.0 / 10), rel=0.03)

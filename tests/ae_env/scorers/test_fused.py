@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,17 +88,6 @@ def test_static_and_changing_light_are_scored_by_the_same_kernel(
         np.testing.assert_allclose(found.mean, 0.8 * other.mean + 0.2 * other.parts["noise"])
 
 
-def test_another_scene_of_the_same_id_is_not_taken_for_it() -> None:
-    scores = FusedScores(make_scorer("noise"))
-    for seed in range(5):  # each may get the memory, and so the id(), of the one before
-        scene = _scene(seed)
-        captures = make_captures([scene], [GRID[0]], 0.1, 1.0, 2.0)
-        wanted = make_scorer("noise").score_parts(None, captures)["noise"]
-        found = scores.scores(captures, scores.means([scene], captures))["noise"]
-        np.testing.assert_allclose(found, wanted, atol=1e-6)
-        del scene, captures
-
-
 @pytest.mark.parametrize("gain", [0.3, 2.0])
 def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: float) -> None:
     """What the whole table says, against another scene in its own light."""
@@ -105,3 +98,31 @@ def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: floa
     wanted = tables.table(lit, speed=0.2, defocus=1.0)
     np.testing.assert_allclose(changed.mean, wanted.mean, atol=1e-6)
     assert changed.oracle == wanted.oracle
+
+
+def test_compiled_and_loaded_kernels_agree_to_the_last_bit(tmp_path: Path) -> None:
+    """The first process of a fresh installation compiles; all others load what it cached."""
+    code = (
+        "import sys, numpy as np; from ae_env.scorers.fused import fused_means\n"
+        "rng = np.random.default_rng(0); n = np.float32\n"
+        "light, dark = rng.random((2, 4, 1, 900)).astype(n)\n"
+        "means, ratio = np.empty((3, 3)), rng.random((3, 1))\n"
+        "fixed = rng.random((1, 900)), ratio.astype(n), ratio.astype(n), ratio\n"
+        "noise = np.full((3, 4), 1e-3, n), np.full((3, 4), 1e-6, n), n(76.0)\n"
+        "fused_means(0, 3, light, dark, *fixed, *noise, means)\n"
+        "print(*fused_means.stats.cache_hits.values(), means.tobytes().hex())\n"
+    )
+    outputs = []
+    for _ in range(2):
+        outputs.append(
+            subprocess.run(
+                [sys.executable, "-c", code],
+                env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+                capture_output=True,
+                check=True,
+                text=True,
+            ).stdout.split()
+        )
+    (compiled,), (hits, loaded) = outputs
+    assert (hits, len(loaded)) == ("1", 2 * 72)
+    assert loaded == compiled

@@ -25,11 +25,13 @@ from ae_env.scorers import (
     register_scorer,
     registry,
 )
+from ae_env.scorers.defects import DEFECTS
 from ae_env.scorers.protocol import Captures
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
 from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
 from simulator import NoiseLevelFunction, get_camera
+from tests.ae_env.scorer_images import random_pictures
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 ID = "ae_env/AutoExposure-v0"
@@ -73,30 +75,24 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("packages")
-def test_a_real_entry_point_works_beside_broken_ones() -> None:
-    assert {"their_level", "broken", "gone", "ends", "balanced"} <= set(list_scorers())
+def test_a_real_entry_point_works_and_is_listed_beside_broken_ones() -> None:
     images = torch.full((2, 4, 5, 5), 0.25)
     scorer = make_scorer({"their_level": 1.0})
     assert scorer.parts["their_level"](images, None).tolist() == [0.25, 0.25]  # type: ignore[arg-type]
-    for name, cause in (("broken", "no licence"), ("gone", "not_there"), ("ends", "SystemExit: 3")):
-        with pytest.raises(ValueError, match=rf"`scorer` \(='{name}'\) cannot be loaded.*{cause}"):
-            make_scorer(name)
-    assert make_scorer("noise").closed_form
-    sys.modules.pop("their_scores", None)
-
-
-@pytest.mark.usefixtures("packages")
-def test_the_list_tells_of_each_scorer() -> None:
     rows = {row.name: row for row in describe_scorers()}
     assert list(rows) == list_scorers()
     level = ScorerRow("their_level", "raw", "image", "", "Level of the *frame*.", "their_scores")
     assert rows["their_level"] == level
-    assert rows["broken"].error == "OSError: no licence"
-    assert rows["gone"].error == "ModuleNotFoundError: No module named 'not_there'"
-    assert rows["ends"].error == "SystemExit: 3"
-    assert rows["balanced"].depends_on == "blur"
+    for name, error in (
+        ("broken", "OSError: no licence"),
+        ("gone", "ModuleNotFoundError: No module named 'not_there'"),
+        ("ends", "SystemExit: 3"),
+    ):
+        assert rows[name].error == error
+        with pytest.raises(ValueError, match=rf"`scorer` \(='{name}'\) cannot be loaded.*{error}"):
+            make_scorer(name)
     assert (rows["balanced"].domain, rows["defects"].domain) == ("raw", "srgb")
-    assert rows["noise"].depends_on == "light"
+    assert (rows["balanced"].depends_on, rows["noise"].depends_on) == ("blur", "light")
     assert rows["nima_technical"].needs == "weights: AE_ENV_NIMA_TECHNICAL"
     assert rows["keypoints"].needs == "extra cv"
     for row in rows.values():
@@ -139,8 +135,8 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 class FakeMetric:
-    def __init__(self, **fields: Any) -> None:
-        self.__dict__.update(fields)
+    def __init__(self, mode: str, lower: bool | None, score_range: str | None) -> None:
+        self.metric_mode, self.lower_better, self.score_range = mode, lower, score_range
 
     def __call__(self, images: torch.Tensor) -> torch.Tensor:
         assert images.shape[1] == 3
@@ -151,11 +147,11 @@ class FakeMetric:
 def pyiqa(monkeypatch: pytest.MonkeyPatch) -> None:
     """A module with pyiqa's interface: a factory of metrics that state their range."""
     metrics = {
-        "musiq": FakeMetric(metric_mode="NR", lower_better=False, score_range="~0, ~100"),
-        "niqe": FakeMetric(metric_mode="NR", lower_better=True, score_range="-50.0, 150"),
-        "lpips": FakeMetric(metric_mode="FR", lower_better=True, score_range="0, 1"),
-        "open": FakeMetric(metric_mode="NR", lower_better=True, score_range="0, inf"),
-        "old": FakeMetric(metric_mode="NR"),
+        "musiq": FakeMetric("NR", False, "~0, ~100"),
+        "niqe": FakeMetric("NR", True, "-50.0, 150"),
+        "lpips": FakeMetric("FR", True, "0, 1"),
+        "open": FakeMetric("NR", True, "0, inf"),
+        "old": FakeMetric("NR", None, None),
     }
     module = types.ModuleType("pyiqa")
 
@@ -189,13 +185,8 @@ def test_metrics_of_pyiqa_are_mapped_to_their_range(monkeypatch: pytest.MonkeyPa
         make_scorer("pyiqa:musiq")
 
 
-@pytest.fixture
-def clean_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "_REGISTRY", dict(registry._REGISTRY))
-
-
-@pytest.mark.usefixtures("clean_registry")
-def test_registered_scorers_work_by_name() -> None:
     register_scorer("mean_signal")(Constant)
     register_scorer("mean_signal")(Constant)  # a notebook cell run twice
     assert "mean_signal" in list_scorers()
@@ -268,6 +259,29 @@ def test_scorers_inside_of_others_enter_the_key(
 
 
 # -- properties that hold for every scorer ---------------------------------------------------------
+
+IMAGE_SCORERS = ["mid_grey", "clipping", "well_exposedness", "entropy", "shim", "zhang", "shin"]
+IMAGE_SCORERS += ["blind_noise", *(f"analytic_{defect}" for defect in DEFECTS)]
+
+
+@pytest.mark.parametrize("name", IMAGE_SCORERS)
+def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
+    scorer = make_scorer(name).parts[name]
+    channels = 3 if scorer.domain == "srgb" else 4
+    pictures = random_pictures()[:, :channels].contiguous()
+    before = pictures.clone()
+    scores = scorer(pictures, None)
+    assert torch.equal(pictures, before)
+    assert (scores.shape, scores.dtype) == ((5,), torch.float64)
+    assert torch.equal(scores, scorer(pictures, None))
+    alone = torch.cat([scorer(picture[None], None) for picture in pictures])
+    torch.testing.assert_close(alone, scores, rtol=0.0, atol=1e-6)
+    for height, width in ((1, 1), (1, 7), (2, 2), (3, 1), (5, 9), (13, 11), (36, 36)):
+        extremes = torch.zeros(3, channels, height, width)
+        extremes[1] = 1.0
+        extremes[2] = random_pictures(1, height, width)[:, :channels]
+        values = scorer(extremes, None)
+        assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
 
 
 @given(

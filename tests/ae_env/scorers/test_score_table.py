@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import logging
 import weakref
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -45,7 +44,8 @@ def _scene(seed: int = 0, **fields: Any) -> Scene:
 
 
 def _tables(scorer: Any = "balanced", **options: Any) -> ScoreTables:
-    return ScoreTables(options.pop("grid", SMALL), CAMERA, make_scorer(scorer), **options)
+    given = {"grid": SMALL, "camera": CAMERA, "scorer": make_scorer(scorer), **options}
+    return ScoreTables(**given)
 
 
 class FirstPixel:
@@ -62,14 +62,6 @@ class MeanSignal:
 
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         return images.mean(dim=(1, 2, 3))
-
-
-def test_closed_form_has_no_error() -> None:
-    table = _tables().table(_scene(), speed=0.2, defocus=1.0)
-    np.testing.assert_array_equal(table.standard_error, 0.0)
-    assert table.mean.shape == (8,)
-    assert table.mean.dtype == np.float64
-    assert set(table.parts) == {"brightness", "highlights", "shadows", "noise", "sharpness"}
 
 
 def test_average_over_noise_is_the_noise_free_signal() -> None:
@@ -97,26 +89,27 @@ def test_standard_error_is_that_of_the_sensor_noise() -> None:
         assert error == pytest.approx(sigma / np.sqrt(seeds), rel=0.13)
 
 
-def test_common_noise_makes_one_seed_repeatable_and_its_error_unknown() -> None:
-    first = _tables(MeanSignal(), noise_seeds=1).table(_scene())
-    second = _tables(MeanSignal(), noise_seeds=1).table(_scene())
-    np.testing.assert_array_equal(first.mean, second.mean)
-    assert np.isnan(first.standard_error).all()
-
-
 def test_mixed_scorer_averages_only_what_is_noisy() -> None:
-    scorer = CompositeScorer({"mean": MeanSignal(), "noise": make_scorer("noise").parts["noise"]})
+    noise = make_scorer("noise").parts["noise"]
+    scorer = CompositeScorer({"mean": MeanSignal(), "noise": noise})
     table = _tables(scorer, noise_seeds=4).table(_scene())
+    closed = _tables("noise").table(_scene())
     assert (table.standard_error > 0).all()
-    np.testing.assert_array_equal(
-        table.parts["noise"], _tables("noise").table(_scene()).parts["noise"]
-    )
+    assert (closed.standard_error == 0).all()
+    np.testing.assert_array_equal(table.parts["noise"], closed.parts["noise"])
     np.testing.assert_allclose(table.mean, 0.5 * (table.parts["mean"] + table.parts["noise"]))
+    first, second = (_tables(MeanSignal(), noise_seeds=1).table(_scene()) for _ in range(2))
+    np.testing.assert_array_equal(first.mean, second.mean)
+    assert np.isnan(first.standard_error).all()  # unknown from one seed
+    with pytest.raises(ValueError, match="`noise_seeds`"):
+        _tables(noise_seeds=0)
 
 
 def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
     table = _tables().table(_scene())
     assert table.mean[table.oracle] == table.mean.max()
+    assert (table.mean.shape, table.mean.dtype) == ((8,), np.float64)
+    assert set(table.parts) == {"brightness", "highlights", "shadows", "noise", "sharpness"}
     # Under `brightness` alone all states of one EV are alike: ISO 100 at 1/25 s equals ISO 400
     # at 1/100 s and ISO 1600 at 1/400 s; times that are no powers of two round differently.
     grid = ExposureGrid((100, 400, 1600), (1 / 400, 1 / 100, 1 / 25), (4, 8))
@@ -125,15 +118,6 @@ def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
         best = _tables("brightness", grid=grid, use_cache=False).table(scene)
         alike = np.flatnonzero(best.mean > best.mean.max() - 1e-7)
         assert best.oracle == alike[0]
-
-
-def test_more_light_is_like_a_longer_exposure() -> None:
-    """Twice the light at 1/500 s is that of 1/250 s, to a score that sees only light."""
-    scene = _scene()
-    grid = ExposureGrid((100,), (1 / 500, 1 / 250), (4,))
-    plain = _tables(grid=grid).table(scene)
-    brighter = _tables(grid=grid).table(scene, gain=2.0)
-    assert brighter.mean[0] == pytest.approx(plain.mean[1], rel=1e-6)
 
 
 def _files(cache: Path) -> list[Path]:
@@ -155,21 +139,6 @@ def test_second_time_comes_from_the_cache(cache: Path, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(first.mean, second.mean)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"not a table"])
-def test_a_damaged_file_is_made_anew(
-    cache: Path, content: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    scene = _scene()
-    expected = _tables().table(scene).mean
-    (path,) = _files(cache)
-    path.write_bytes(content)
-    with caplog.at_level(logging.WARNING):
-        np.testing.assert_array_equal(_tables().table(scene).mean, expected)
-    assert "made again" in caplog.text
-    np.testing.assert_array_equal(_tables().table(scene).mean, expected)
-    assert len(_files(cache)) == 1
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -177,26 +146,34 @@ def test_a_damaged_file_is_made_anew(
         lambda means: means.reshape(-1),
         lambda means: means * float("nan"),
         lambda means: torch.where(means == means.max(), float("inf"), means),
+        b"",
+        b"not a table",
     ],
 )
-def test_a_table_of_a_wrong_shape_or_without_numbers_is_made_again(
-    cache: Path, change: Callable[[torch.Tensor], torch.Tensor]
+def test_a_damaged_table_is_made_again(
+    cache: Path, change: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The file is whole, and its digest is that of its content: only the content cannot be."""
+    """Bytes that are no file of a table, or a whole file whose content cannot be."""
     expected, disk = _tables().table(_scene()).mean, DiskCache(cache)
-    key = _files(cache)[0].stem
-    stored = disk.get("score_tables", key)
+    (file,) = _files(cache)
+    stored = disk.get("score_tables", file.stem)
     assert stored is not None
-    disk.put("score_tables", key, stored | {"means": change(stored["means"])})
+    if isinstance(change, bytes):
+        file.write_bytes(change)
+    else:
+        disk.put("score_tables", file.stem, stored | {"means": change(stored["means"])})
     np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
-    mended = disk.get("score_tables", key)
+    assert ("made again" in caplog.text) == isinstance(change, bytes)
+    mended = disk.get("score_tables", file.stem)
     assert mended is not None
     assert torch.equal(mended["means"], stored["means"])
 
 
-def test_key_changes_with_everything_that_changes_the_scores(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_key_changes_with_everything_that_changes_the_scores(cache: Path) -> None:
+    class Strict(Highlights):
+        version = 1
+        scale = 0.05
+
     scene = _scene()
     counts = []
 
@@ -207,18 +184,18 @@ def test_key_changes_with_everything_that_changes_the_scores(
     use(_tables())
     use(_tables())  # nothing changed
     use(_tables(grid=ExposureGrid((100,), (1 / 500,), (4,))))
-    use(ScoreTables(SMALL, get_camera("canon_70d"), make_scorer("balanced")))
+    use(_tables(camera=get_camera("canon_70d")))
     scaled = CAMERA.with_nlf(100, CAMERA.nlf(100).scaled(2.0))
-    use(ScoreTables(SMALL, scaled, make_scorer("balanced")))  # the same name, other noise
+    use(_tables(camera=scaled))  # the same name, other noise
     use(_tables({"highlights": 1.0, "noise": 1.0}))
     use(_tables(), replace(scene, light=scene.light * 1.5))
     use(_tables(), replace(scene, reference=reference_settings(9.0)))
     use(_tables(), replace(scene, illuminance=None))
-    other = make_scorer("highlights")
-    use(ScoreTables(SMALL, CAMERA, other))
-    strict = Highlights()
-    strict.scale = 0.05
-    use(ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": strict})))
+    use(_tables("highlights"))
+    own = Highlights()
+    own.scale = 0.1
+    for strict in (own, Strict()):  # a constant of the object, and of the class
+        use(_tables(CompositeScorer({"highlights": strict})))
     use(_tables(), replace(scene, white_balance=(2.0, 1.0, 1.5)))
     use(_tables(), replace(scene, scene_id="another"))
     noisy = replace(scene, nlf=CAMERA.nlf(100))
@@ -227,9 +204,9 @@ def test_key_changes_with_everything_that_changes_the_scores(
     use(_tables(), replace(scene, defocus_map=torch.full((40, 40), 2.0)))
     calibrated = {100: CAMERA.nlf(100), 6400: CAMERA.nlf(6400)}
     plain = replace(CAMERA, nlf_by_iso=calibrated, segments=())
-    use(ScoreTables(SMALL, plain, make_scorer("balanced")))
-    use(ScoreTables(SMALL, replace(plain, segments=(800,)), make_scorer("balanced")))
-    assert counts == [1, 1, *range(2, 18)]
+    use(_tables(camera=plain))
+    use(_tables(camera=replace(plain, segments=(800,))))
+    assert counts == [1, 1, *range(2, 19)]
 
 
 def test_scores_in_memory_are_bounded_and_keep_no_scene_alive(
@@ -275,35 +252,8 @@ def test_a_folder_that_cannot_be_written_is_not_needed(
     assert "could not be cached" in caplog.text
 
 
-def test_class_constants_enter_the_key(cache: Path) -> None:
-    """A subclass that only changes a constant is another scorer."""
-
-    class Strict(Highlights):
-        version = 1
-        scale = 0.05
-
-    scene = _scene()
-    mild = ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": Highlights()})).table(scene)
-    strict = ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": Strict()})).table(scene)
-    assert (strict.mean < mild.mean).any()
-    assert len(_files(cache)) == 2
-
-
-def test_scorers_with_state_that_cannot_be_keyed_are_not_cached(cache: Path) -> None:
-    scorer = Highlights()
-    scorer.network = torch.nn.Linear(2, 2)  # type: ignore[attr-defined]
-    table = ScoreTables(SMALL, CAMERA, CompositeScorer({"highlights": scorer})).table(_scene())
-    assert np.isfinite(table.mean).all()
-    assert _files(cache) == []
-
-
-def test_noise_seeds_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="`noise_seeds`"):
-        _tables(noise_seeds=0)
-
-
-def test_a_scorer_of_ones_own_is_not_kept_on_disk_unless_it_has_a_version() -> None:
-    """What a scorer closes over cannot be hashed: a changed constant must not find old scores."""
+def test_scorers_that_cannot_be_keyed_are_not_cached(cache: Path) -> None:
+    """A network is no constant; and what a function closes over cannot be hashed."""
 
     def constant(value: float) -> Any:
         def score(images: Any, captures: Any) -> torch.Tensor:
@@ -312,10 +262,13 @@ def test_a_scorer_of_ones_own_is_not_kept_on_disk_unless_it_has_a_version() -> N
         score.domain, score.depends_on = "raw", "light"  # type: ignore[attr-defined]
         return score
 
-    scene, grid, camera = _scene(), ExposureGrid((100,), (1 / 100,), (4,)), get_camera("nikon_z6")
+    scorer = Highlights()
+    scorer.network = torch.nn.Linear(2, 2)  # type: ignore[attr-defined]
+    table = _tables(CompositeScorer({"highlights": scorer})).table(_scene())
+    assert np.isfinite(table.mean).all()
     for value in (0.2, 0.9):
-        table = ScoreTables(grid, camera, make_scorer(constant(value))).table(scene)
-        assert table.mean == pytest.approx(value)
+        np.testing.assert_allclose(_tables(constant(value)).table(_scene()).mean, value, rtol=1e-6)
+    assert _files(cache) == []
 
 
 def test_bands_count_whatever_form_the_gain_has() -> None:
@@ -345,14 +298,12 @@ def test_without_noise_the_expected_score_is_that_of_the_noise_free_capture() ->
         return images.std(dim=(1, 2, 3)).clamp(0.0, 1.0)
 
     spread.domain = "raw"  # type: ignore[attr-defined]
-    flat = torch.full((4, 36, 36), 0.2)
-    scene = replace(_scene(), light=flat, saturated=None)
-    grid, camera = ExposureGrid((6400,), (1 / 1000,), (4,)), get_camera("nikon_z6")
-    clean = ScoreTables(grid, camera, make_scorer(spread), noise=False).table(scene)
-    noisy = ScoreTables(grid, camera, make_scorer(spread)).table(scene)
+    scene = replace(_scene(), light=torch.full((4, 36, 36), 0.2), saturated=None)
+    grid = ExposureGrid((6400,), (1 / 1000,), (4,))
+    clean = _tables(spread, grid=grid, noise=False).table(scene)
     assert clean.mean == pytest.approx(0.0, abs=1e-4)
     assert clean.standard_error == pytest.approx(0.0)
-    assert noisy.mean > 1e-3
+    assert _tables(spread, grid=grid).table(scene).mean > 1e-3
 
 
 def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
