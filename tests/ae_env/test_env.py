@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from tests.ae_env.environments import assert_equal, make_env, rollout
 
@@ -20,29 +20,26 @@ INFO_KEYS = {
 }
 
 
-@pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
-@pytest.mark.parametrize("extra", [{}, {"with_oracle": True, "sensors": False}])
-def test_gymnasium_checker_has_nothing_to_say(kind: str, extra: dict[str, Any]) -> None:
-    env = make_env(observation=kind, render_mode="rgb_array", **extra)
-    check_env(env.unwrapped)  # warnings are errors
+@pytest.mark.parametrize(
+    "arguments",
+    [{}, {"observation": "linear", "with_oracle": True}, {"observation": "dn", "sensors": False}],
+)
+def test_gymnasium_checker_has_nothing_to_say(arguments: dict[str, Any]) -> None:
+    check_env(make_env(render_mode="rgb_array", **arguments).unwrapped)  # warnings are errors
 
 
 @pytest.mark.parametrize(
     ("kind", "dtype"), [("uint8", None), ("linear", "float32"), ("dn", "uint16")]
 )
 def test_sb3_checker_warns_of_exactly_the_image(kind: str, dtype: str | None) -> None:
-    from stable_baselines3.common.env_checker import check_env as check_sb3
-
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_sb3(make_env(observation=kind).unwrapped)
     messages = [str(w.message) for w in caught]
-    if dtype is None:
-        assert messages == []
-    else:
-        assert len(messages) == 2
-        assert f"raw is an image but its `dtype` is ({dtype})" in messages[0]
-        assert "raw is an image but the upper and lower bounds are not in [0, 255]" in messages[1]
+    expected = [f"raw is an image but its `dtype` is ({dtype})"]
+    expected += ["raw is an image but the upper and lower bounds are not in [0, 255]"]
+    assert len(messages) == 2 * (dtype is not None)
+    assert all(part in message for part, message in zip(expected, messages, strict=False))
 
 
 def test_spaces_are_as_documented() -> None:
@@ -103,13 +100,13 @@ def test_noise_depends_on_the_frame_and_on_nothing_else() -> None:
 
 
 def test_global_random_state_is_left_alone() -> None:
-    torch.manual_seed(0)
-    np.random.seed(0)  # noqa: NPY002
-    expected = (torch.rand(1), np.random.rand())  # noqa: NPY002
-    torch.manual_seed(0)
-    np.random.seed(0)  # noqa: NPY002
-    rollout(1)
-    assert (torch.rand(1), np.random.rand()) == expected  # noqa: NPY002
+    drawn = []
+    for work in (lambda: None, lambda: rollout(1)):
+        torch.manual_seed(0)
+        np.random.seed(0)  # noqa: NPY002
+        work()
+        drawn.append((float(torch.rand(1)), np.random.rand()))  # noqa: NPY002
+    assert drawn[0] == drawn[1]
 
 
 def test_returned_arrays_are_never_reused() -> None:
@@ -143,14 +140,6 @@ def test_costs_are_subtracted_and_shown() -> None:
         assert reward == pytest.approx(expected, abs=1e-6)
         assert info["rewards"]["score"] == pytest.approx(score)
         before = mean
-
-
-def test_expected_reward_is_the_table_entry() -> None:
-    env = make_env(reward="expected")
-    env.reset(seed=4)
-    for state in (0, 21, 63):
-        _, reward, *_ = env.step(state)
-        assert reward == env.unwrapped.expected_scores()[state]
 
 
 def test_oracle_and_regret_agree_with_the_expected_scores() -> None:
@@ -219,23 +208,6 @@ def test_cached_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert_equal(rollout(5, depth=3.0, motion=0.5), cached)
 
 
-def test_frames_are_the_simulators_own() -> None:
-    """The batched path and `CameraSimulator` give the same digital numbers for the same light."""
-    from ae_env.scorers.score_table import prepare_scene
-
-    env = make_env(observation="dn", noise=False, depth=2.0, motion=0.3).unwrapped
-    for state in (0, 21, 42, 63):
-        observation, _ = env.reset(seed=1, options={"state": state})
-        episode = env.episode()
-        scene = env.scenes[episode.scene]
-        prepared = prepare_scene(scene, env.camera, speed=episode.speed, defocus=episode.defocus)
-        light = prepared.expected(env.grid[state]).numpy().astype(np.float64)
-        span, black = env.camera.span[0], env.camera.black_level[0]
-        numbers = np.clip(np.rint(light * span + black), 0, env.camera.white_level)
-        assert np.abs(observation["raw"] - numbers).max() <= 1  # float32 against float64
-        assert (observation["raw"] != numbers).mean() < 1e-3
-
-
 @pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
 def test_same_seed_samerollout(kind: str) -> None:
     first = rollout(7, observation=kind)
@@ -243,22 +215,3 @@ def test_same_seed_samerollout(kind: str) -> None:
     assert (first[0][0]["raw"] != rollout(8)[0][0]["raw"]).any()
     unseen, _ = make_env(observation=kind, sensors=False).reset(seed=7)
     np.testing.assert_array_equal(unseen["raw"], first[0][0]["raw"])
-
-
-def test_a_scene_that_forbids_states() -> None:
-    """Masks, random start states and the oracle keep to the allowed ones; actions need not."""
-    env = make_env()
-    allowed = np.zeros(64, dtype=bool)
-    allowed[[3, 20, 41]] = True
-    scenes = [replace(env.unwrapped.scenes[0], allowed=allowed), env.unwrapped.scenes[1]]
-    env = make_env(scenes=scenes, with_oracle=True, simulator=None)
-    starts = set()
-    for seed in range(12):
-        _, info = env.reset(seed=seed, options={"scene": 0})
-        np.testing.assert_array_equal(env.unwrapped.action_masks(), allowed)
-        starts.add(info["state"])
-        assert info["oracle_state"] in (3, 20, 41)
-    assert starts <= {3, 20, 41}
-    assert env.step(0)[4]["state"] == 0
-    env.reset(seed=0, options={"scene": 1})
-    assert env.unwrapped.action_masks().all()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +17,13 @@ from hypothesis import strategies as st
 from tests.ae_env.environments import (
     assert_same,
     check_parity,
-    make_env,
     make_envs,
-    make_reference,
     make_worker_env,
 )
 from tests.strategies import SEEDS
 
-PAIRED = {"balanced": 0.7, "banding": 0.3}
-
-
-RICH = {
-    "with_oracle": True,
-    "observation": "linear",
-    "costs": {"flicker": 0.1, "switch": 0.1},
-    "lighting": "sine",
-    "delay": 1,
-}
+RICH = {"with_oracle": True, "observation": "linear", "lighting": "sine", "delay": 1}
+RICH["costs"] = {"flicker": 0.1, "switch": 0.1}
 
 
 @pytest.mark.parametrize("mode", [mode.name for mode in AutoresetMode])
@@ -57,45 +46,27 @@ LIGHTINGS: list[Any] = [
 
 
 @pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
-@pytest.mark.parametrize("delay", [0, 2])
-def test_parity_in_every_light_at_every_delay(lighting: Any, delay: int) -> None:
-    extra = {"lighting": lighting, "delay": delay, "with_oracle": True, "scorer": PAIRED}
-    check_parity(5, 4, max_episode_steps=3, **extra)
+def test_parity_in_every_light(lighting: Any) -> None:
+    extra = {"lighting": lighting, "with_oracle": True, "scorer": {"balanced": 0.7, "banding": 0.3}}
+    check_parity(5, 4, max_episode_steps=3, delay=2, **extra)
 
 
 @pytest.mark.parametrize("lighting", LIGHTINGS, ids=str)
-@pytest.mark.parametrize("delay", [1, 4])
-def test_delayed_settings_meet_the_light_of_their_frame(lighting: Any, delay: int) -> None:
+def test_delayed_settings_meet_the_light_of_their_frame(lighting: Any) -> None:
     """The light of a frame does not wait; `info` and the score are of the settings in force."""
     extra = {"lighting": lighting, "motion": "none", "depth": "far", "max_episode_steps": None}
-    delayed, direct = make_envs(delay=delay, **extra), make_envs(**extra)
+    delayed, direct = make_envs(delay=3, **extra), make_envs(**extra)
     start = np.array([3, 20, 41])
-    delayed.reset(seed=9, options={"state": start})
-    direct.reset(seed=9, options={"state": start})
-    actions = np.random.default_rng(2).integers(64, size=(7, 3))
-    in_force = np.concatenate([np.tile(start, (delay, 1)), actions])
-    for frame in range(7):
+    for envs in (delayed, direct):
+        envs.reset(seed=9, options={"state": start})
+    actions = np.random.default_rng(2).integers(64, size=(5, 3))
+    in_force = np.concatenate([np.tile(start, (3, 1)), actions])
+    for frame in range(5):
         mine, theirs = delayed.step(actions[frame]), direct.step(in_force[frame])
         np.testing.assert_array_equal(mine[4]["state"], in_force[frame])
         times = [delayed.unwrapped.grid[s].exposure_time for s in in_force[frame]]
         np.testing.assert_array_equal(mine[4]["exposure_time"], times)
         assert_same(mine, theirs, f"frame {frame}")
-
-
-def test_masked_resets_agree_with_single_ones() -> None:
-    """Episodes get out of step; the shown frames of the others stay."""
-    both = (
-        make_envs(autoreset_mode="DISABLED", max_episode_steps=2),
-        make_reference("DISABLED", max_episode_steps=2),
-    )
-    for envs in both:
-        envs.reset(seed=3)
-    for mask in ([True, False, False], [False, True, True], [True, False, True]):
-        assert_same(*(envs.step(np.array([1, 2, 3])) for envs in both))
-        options = {"reset_mask": np.array(mask), "state": 5}
-        assert_same(*(envs.reset(options=dict(options)) for envs in both))
-        for envs in both:
-            envs.reset(options={"reset_mask": np.ones(3, bool)})
 
 
 def test_resets_that_are_needed() -> None:
@@ -108,38 +79,6 @@ def test_resets_that_are_needed() -> None:
     envs.step([0] * 3)
     with pytest.raises(gym.error.ResetNeeded, match="reset_mask"):
         envs.step([0] * 3)
-
-
-@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
-def test_staggered_episodes_agree_with_single_ones(mode: str) -> None:
-    """After a masked reset the episodes end at different steps, in the autoreset modes as well."""
-    envs = make_envs(autoreset_mode=mode, max_episode_steps=3)
-    singles = [make_env(max_episode_steps=3) for _ in range(3)]
-    envs.reset(seed=20)
-    for i, env in enumerate(singles):
-        env.reset(seed=20 + i)
-    envs.step(np.array([1, 1, 1]))
-    for env in singles:
-        env.step(1)
-    envs.reset(options={"reset_mask": np.array([False, True, False])})
-    singles[1].reset()
-    done = [False] * 3
-    for action in range(2, 9):
-        observation, reward, _, truncated, info = envs.step(np.full(3, action))
-        for i, env in enumerate(singles):
-            if done[i]:
-                one, single_info = env.reset()
-                expected, score, done[i] = one, 0.0, False
-            else:
-                expected, score, _, done[i], single_info = env.step(action)
-                if mode == "SAME_STEP" and done[i]:
-                    np.testing.assert_array_equal(info["final_obs"][i]["raw"], expected["raw"])
-                    expected, single_info = env.reset()
-            np.testing.assert_array_equal(observation["raw"][i], expected["raw"])
-            assert info["scene_id"][i] == single_info["scene_id"]
-            assert reward[i] == score
-            assert truncated[i] == done[i]
-            done[i] = done[i] and mode == "NEXT_STEP"
 
 
 def test_reset_options_per_environment() -> None:
@@ -193,8 +132,7 @@ def test_a_masked_reset_shows_the_others_as_they_were(mode: str) -> None:
 
 @pytest.mark.slow
 def test_construction_in_spawned_processes() -> None:
-    make = make_worker_env
-    envs = AsyncVectorEnv([make] * 2, context="spawn")
+    envs = AsyncVectorEnv([make_worker_env] * 2, context="spawn")
     try:
         observation, _ = envs.reset(seed=5)
         native = make_envs(2)
@@ -209,15 +147,13 @@ def test_construction_in_spawned_processes() -> None:
 
 
 def _resident_bytes() -> int:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * 4096
+    return 4096 * int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
 def test_memory_stays_flat() -> None:
-    """Static light, and light that never repeats: neither may let a cache grow."""
-    num_envs, steps = 64, 500  # 32,000 environment steps
+    num_envs, steps = 64, 200  # 12,800 environment steps
     envs = make_envs(num_envs, autoreset_mode="SAME_STEP")
     envs.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -225,19 +161,7 @@ def test_memory_stays_flat() -> None:
         envs.step(rng.integers(64, size=num_envs))
         if step == steps // 4:
             before = _resident_bytes()
-    assert _resident_bytes() - before < 16 * 2**20
-
-
-def test_masks_are_those_of_each_scene() -> None:
-    scenes = make_envs().unwrapped.scenes[:2]
-    allowed = np.arange(64) % 5 == 0
-    scenes = [replace(scenes[0], allowed=allowed), scenes[1]]
-    envs = make_envs(scenes=scenes)
-    envs.reset(seed=0, options={"scene": [0, 1, 0]})
-    wanted = [allowed, np.ones(64, bool), allowed]
-    np.testing.assert_array_equal(envs.unwrapped.action_masks(), wanted)
-    envs.reset(options={"scene": 1})
-    assert envs.unwrapped.action_masks().all()
+    assert _resident_bytes() - before < 6 * 2**20
 
 
 def _rollout(seeds: list[int], actions: np.ndarray, **arguments: Any) -> list[Any]:

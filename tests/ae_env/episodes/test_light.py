@@ -25,16 +25,10 @@ CAMERA = get_camera("nikon_z6")
 LED = {"kind": "flicker", "frequency": 250.0, "duty": 0.3, "frame_rate": 24.0}
 
 
-def _scene(box_factor: int = 4) -> Scene:
+def _scene() -> Scene:
     light = 0.05 + 0.3 * np.random.default_rng(0).random((4, 40, 40), np.float32)
-    return Scene.from_array(
-        torch.from_numpy(light),
-        reference_settings(8.0),
-        CAMERA,
-        scene_id="grey",
-        illuminance=640.0,
-        box_factor=box_factor,
-    )
+    given: Any = {"scene_id": "grey", "illuminance": 640.0, "box_factor": 4}
+    return Scene.from_array(torch.from_numpy(light), reference_settings(8.0), CAMERA, **given)
 
 
 def _env(**arguments: Any) -> Any:
@@ -73,15 +67,9 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> Non
     for state in (0, 9, 18, 30, 63):
         settings = env.grid[state]
         rows = lamp.row_light(1 / 24, settings.exposure_time, 40, CAMERA.row_time, 8)
-        captures = describe_captures(
-            [scene],
-            [settings],
-            CAMERA,
-            speed=np.array([0.05]),
-            defocus=np.array([0.5]),
-            gain=np.array([rows.mean()]),
-            row_gain=rows[None] / rows.mean(),
-        )
+        blur = {"speed": np.array([0.05]), "defocus": np.array([0.5])}
+        gains = {"gain": np.array([rows.mean()]), "row_gain": rows[None] / rows.mean()}
+        captures = describe_captures([scene], [settings], CAMERA, **blur, **gains)
         wanted = float(make_scorer(scorer)(None, captures))
         assert q[state] == pytest.approx(wanted, abs=1e-6)
     assert reward == pytest.approx(q[18], abs=1e-9)

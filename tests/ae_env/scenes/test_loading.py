@@ -15,7 +15,7 @@ import pytest
 import torch
 from gymnasium.envs.registration import EnvSpec
 
-from ae_env.options import EnvOptions
+from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.loading import SceneNetworks
 from ae_env.scorers import make_scorer
@@ -49,12 +49,13 @@ def test_scenes_from_lists_and_attributes() -> None:
 def test_small_folder_is_zero_shot(tmp_path: Path) -> None:
     for i in (10, 2, 1):
         write_hdr(tmp_path / f"map{i}.hdr", i)
-    scenes = load(tmp_path, "test")
-    assert [s.scene_id for s in scenes] == ["map1", "map2", "map10"]
-    assert [s.group for s in scenes] == ["map1", "map2", "map10"]
-    assert [s.scene_id for s in load(str(tmp_path), "all")] == ["map1", "map2", "map10"]
-    assert [s.scene_id for s in load(str(tmp_path / "map1*.hdr"))] == ["map1", "map10"]
-    assert [s.scene_id for s in load(tmp_path / "map2.hdr")] == ["map2"]
+    for spec, split, names in (
+        (tmp_path, "test", ["map1", "map2", "map10"]),
+        (str(tmp_path), "all", ["map1", "map2", "map10"]),
+        (str(tmp_path / "map1*.hdr"), "all", ["map1", "map10"]),
+        (tmp_path / "map2.hdr", "all", ["map2"]),
+    ):
+        assert [(s.scene_id, s.group) for s in load(spec, split)] == [(n, n) for n in names]
     with pytest.raises(ValueError, match=r"at least 15 source groups.*has at most 3.*split='test'"):
         load(tmp_path, "train")
 
@@ -103,13 +104,13 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path.with_suffix(".safetensors"))
 
 
-def noisy_scenes(resolution: int = 40, count: int = 2) -> list[Scene]:
-    """Photographs at ISO 6400, twice as many pixels a side as wanted."""
+def noisy_scenes() -> list[Scene]:
+    """Photographs at ISO 6400, of 80 x 80 pixels."""
     rng = np.random.default_rng(0)
     nlf = CAMERA.nlf(NOISY.iso)
     scenes = []
-    for i in range(count):
-        light = 0.1 + 0.3 * rng.random((4, 2 * resolution, 2 * resolution))
+    for i in range(2):
+        light = 0.1 + 0.3 * rng.random((4, 80, 80))
         light += rng.normal(size=light.shape) * np.sqrt(nlf.read[0] + nlf.shot[0] * light)
         data = torch.from_numpy(light.astype(np.float32))
         scenes.append(Scene.from_array(data, NOISY, CAMERA, scene_id=f"noisy-{i}", nlf=nlf))
@@ -120,23 +121,19 @@ NOISY_SCENES = noisy_scenes()
 NAMED = f"{__name__}:NOISY_SCENES"
 
 
-def flat_scene(light: float, denoised: float | None = None, **fields: Any) -> Scene:
-    given = {"nlf": CAMERA.nlf(NOISY.iso)} if denoised is not None else {}
+def flat_scene(light: float, denoised: float | None = None) -> Scene:
+    given: dict[str, Any] = {"scene_id": "flat", "illuminance": 640.0}
     if denoised is not None:
-        fields["denoised"] = torch.full((4, 40, 40), denoised)
-    return Scene.from_array(
-        torch.full((4, 40, 40), light), NOISY, CAMERA, scene_id="flat", **given, **fields
-    )
+        given |= {"nlf": CAMERA.nlf(NOISY.iso), "denoised": torch.full((4, 40, 40), denoised)}
+    return Scene.from_array(torch.full((4, 40, 40), light), NOISY, CAMERA, **given)
 
 
 def _make(**arguments: Any) -> gym.Env:
     return make_env(**{"scenes": NOISY_SCENES, "resolution": 40, **arguments})
 
 
-def _state(env: gym.Env, iso: float, time: float, f_number: float) -> int:
-    grid: Any = env.unwrapped.grid  # type: ignore[attr-defined]
-    wanted = (iso, time, f_number)
-    return next(i for i, s in enumerate(grid) if (s.iso, s.exposure_time, s.f_number) == wanted)
+def _state(iso: float, time: float, f_number: float) -> int:
+    return ExposureGrid.default().states.index(CameraSettings(iso, time, f_number))
 
 
 def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> None:
@@ -155,7 +152,7 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
 def test_states_cleaner_than_the_source_are_denoised(weights: str) -> None:
     for simulator, denoised in ((weights, True), (None, False)):
         env = _make(simulator=simulator, motion="none", depth="far")
-        state = _state(env, 100, 1 / 15, 8)
+        state = _state(100, 1 / 15, 8)
         _, info = env.reset(seed=0, options={"state": state})
         assert ("noise_reduction" in info["modules"].split("+")) == denoised
         # 68 times the light at a 64th of the ISO: nearly all noise is the source's.
@@ -169,7 +166,7 @@ def test_capture_of_denoised_light_has_the_cameras_noise(weights: str) -> None:
     sigma = (scene.nlf.read[0] + scene.nlf.shot[0] * 0.2) ** 0.5
     scene = replace(scene, light=scene.light + sigma * noise)
     env = _make(scenes=[scene], simulator=weights, motion="none", depth="far", observation="linear")
-    observation, info = env.reset(seed=0, options={"state": _state(env, 100, 1 / 125, 4)})
+    observation, info = env.reset(seed=0, options={"state": _state(100, 1 / 125, 4)})
     assert "noise_reduction" in info["modules"]
     signal = 0.2 * (1024 / 125) * (100 / 6400) * 4  # f/4 for f/8
     nlf = CAMERA.nlf(100)
@@ -182,9 +179,9 @@ def test_closed_forms_are_those_of_the_denoised_light(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    noisy = flat_scene(0.2, denoised=0.1, illuminance=640.0)
-    tables = ScoreTables(EnvOptions().make_grid(), CAMERA, make_scorer("balanced"))
-    without, found = tables.table(flat_scene(0.1, illuminance=640.0)), tables.table(noisy)
+    noisy = flat_scene(0.2, denoised=0.1)
+    tables = ScoreTables(ExposureGrid.default(), CAMERA, make_scorer("balanced"))
+    without, found = tables.table(flat_scene(0.1)), tables.table(noisy)
     np.testing.assert_array_equal(found.mean, without.mean)
     raw = tables.table(replace(noisy, denoised=None))
     assert np.abs(raw.mean - found.mean).max() > 0.01
@@ -194,46 +191,37 @@ def test_closed_forms_are_those_of_the_denoised_light(
     assert len(files) == 4  # one each: none is taken for another
 
 
-def point_scene(size: int = 80, f_number: float = 8.0) -> Scene:
-    """A point of light, without noise, taken at `f_number`."""
+def point_scene(size: int = 80) -> Scene:
+    """A point of light, without noise, taken at f/8."""
     light = torch.zeros(4, size, size)
     light[:, size // 2 : size // 2 + 2, size // 2 : size // 2 + 2] = 0.9
-    reference = CameraSettings(100, 1 / 125, f_number)
+    reference = CameraSettings(100, 1 / 125, 8)
     return Scene.from_array(light, reference, CAMERA, scene_id="point", illuminance=640.0)
 
 
 def _spread(raw: np.ndarray) -> float:
     """Variance along the columns of the light in (H, W) [pixel^2]."""
     weights, columns = raw.sum(axis=0), np.arange(raw.shape[1])
-    mean = (weights * columns).sum() / weights.sum()
-    return float((weights * (columns - mean) ** 2).sum() / weights.sum())
+    mean = np.average(columns, weights=weights)
+    return float(np.average((columns - mean) ** 2, weights=weights))
 
 
 def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
     """Found at 80 x 80 pixels, halved at 40 x 40; a disc's variance is its squared diameter / 16"""
-    env = _make(
-        scenes=[point_scene()],
-        simulator=weights,
-        depth="unknown",
-        motion="none",
-        noise=False,
-        observation="linear",
-    )
-    spread, modules, raw = {}, {}, {}
-    for f_number in (4, 5.6, 8, 11):
-        state = _state(env, 100, 1 / 125, f_number)
-        observation, info = env.reset(seed=0, options={"state": state})
-        raw[f_number] = observation["raw"][0].astype(np.float64)
-        spread[f_number], modules[f_number] = _spread(raw[f_number]), info["modules"]
-    working = DIAMETER / 2.0
-    for f_number, growth in ((4, 4.0 - 1.0), (5.6, 2.0 - 1.0)):
-        assert spread[f_number] == pytest.approx(working**2 * growth / 16.0, rel=0.03)
-        assert modules[f_number] == "exposure+aperture"
-    for f_number in (8, 11):  # closing leaves the blur: not a digital number differs
-        sharp = np.zeros((40, 40))
-        sharp[20, 20] = 0.9 * 8.0 ** (2 * (f_number < 8)) / (1 if f_number == 8 else 2)
-        np.testing.assert_allclose(raw[f_number], sharp, atol=1 / CAMERA.span[0])
-        assert modules[f_number] == "exposure"
+    arguments = {"scenes": [point_scene()], "simulator": weights, "depth": "unknown"}
+    env = _make(**arguments, motion="none", noise=False, observation="linear")
+    for f_number, growth in ((4, 4.0 - 1.0), (5.6, 2.0 - 1.0), (8, 0.0), (11, 0.0)):
+        options = {"state": _state(100, 1 / 125, f_number)}
+        observation, info = env.reset(seed=0, options=options)
+        raw = observation["raw"][0].astype(np.float64)
+        assert info["modules"] == ("exposure+aperture" if growth else "exposure")
+        if growth:
+            wanted = (DIAMETER / 2.0) ** 2 * growth / 16.0
+            assert _spread(raw) == pytest.approx(wanted, rel=0.03)
+        else:  # closing leaves the blur: not a digital number differs
+            sharp = np.zeros((40, 40))
+            sharp[20, 20] = 0.9 * (1.0 if f_number == 8 else 0.5)
+            np.testing.assert_allclose(raw, sharp, atol=1 / CAMERA.span[0])
 
 
 def test_vector_environment_equals_single_ones(weights: str) -> None:
@@ -281,29 +269,28 @@ def test_maps_are_kept_and_made_again_where_damaged(
     weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    scene = NOISY_SCENES[0]
-    first = SceneNetworks(weights).resized(scene, 40)
-    assert first.defocus_map is not None
-    with caplog.at_level(logging.INFO, logger="ae_env"):
-        second = SceneNetworks(weights).resized(scene, 40)
-    assert not caplog.records
-    assert torch.equal(second.defocus_map, first.defocus_map)  # type: ignore[arg-type]
-    (file,) = (tmp_path / "defocus_maps").iterdir()
-    file.write_bytes(b"damaged")
-    with caplog.at_level(logging.WARNING, logger="ae_env"):
-        third = SceneNetworks(weights).resized(scene, 40)
-    assert "damaged" in caplog.text
-    assert torch.equal(third.defocus_map, first.defocus_map)  # type: ignore[arg-type]
-    SceneNetworks(weights).resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
+    caplog.set_level(logging.INFO, logger="ae_env")
+    scene, networks = NOISY_SCENES[0], lambda: SceneNetworks(weights)
+    first = networks().resized(scene, 40).defocus_map
+    assert first is not None
+    caplog.clear()
+    for content, message in ((None, ""), (b"damaged", "damaged")):
+        (file,) = (tmp_path / "defocus_maps").iterdir()
+        if content:
+            file.write_bytes(content)
+        again = networks().resized(scene, 40).defocus_map
+        assert again is not None
+        assert torch.equal(again, first)
+        assert message in caplog.text
+        assert bool(caplog.records) == bool(content)
+    networks().resized(replace(scene, nlf=scene.nlf.scaled(0.5)), 40)
     assert len(list((tmp_path / "defocus_maps").iterdir())) == 2
 
 
 def test_every_source_of_scenes_is_seen_at_its_finest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cv2 = pytest.importorskip("cv2")
-    image = np.random.default_rng(0).uniform(0.1, 4.0, (96, 100, 3)).astype(np.float32)
-    (tmp_path / "map.hdr").write_bytes(cv2.imencode(".hdr", image)[1].tobytes())
+    write_hdr(tmp_path / "map.hdr", height=96, width=100)
     bundled = [point_scene(256)]
     monkeypatch.setattr(
         "ae_env.scenes.loading.bundled_scenes",

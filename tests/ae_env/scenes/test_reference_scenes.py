@@ -53,11 +53,9 @@ def test_scenes_are_reproducible_and_more_of_them_keep_the_first(
 ) -> None:
     fewer = reference_scenes("test", CAMERA, number=5, size=48)[:5]
     for scene, again in zip(scenes["test"], fewer, strict=False):
-        assert scene.scene_id == again.scene_id
-        assert torch.equal(scene.light, again.light)
-        assert (scene.depth is None) == (again.depth is None)
-        assert scene.depth is None or torch.equal(scene.depth, again.depth)
-        assert scene.lens == again.lens
+        assert (scene.scene_id, scene.lens) == (again.scene_id, again.lens)
+        for field in ("light", "depth"):
+            torch.testing.assert_close(getattr(again, field), getattr(scene, field), rtol=0, atol=0)
     other = reference_scenes("test", CAMERA, number=1, size=48, seed=1)[0]
     assert other.group != fewer[0].group
     assert not torch.equal(other.light, fewer[0].light)
@@ -161,16 +159,10 @@ def test_real_maps_and_cones(data_dir: Path) -> None:
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
 
 
-def picture(kind: str = "indoor", size: int = 64) -> ReferenceScene:
-    generator = torch.Generator().manual_seed(1)
-    return ReferenceScene(
-        scene_id="a",
-        group="the-group",
-        kind=kind,
-        light=torch.rand(4, size, size, generator=generator),
-        reference=CameraSettings(100, 1 / 64, 4),
-        illuminance=100.0,
-    )
+def picture(size: int = 64) -> ReferenceScene:
+    light = torch.rand(4, size, size, generator=torch.Generator().manual_seed(1))
+    reference = CameraSettings(100, 1 / 64, 4)
+    return ReferenceScene("a", "the-group", "indoor", light, reference, illuminance=100.0)
 
 
 def test_light_and_group_stay_and_depth_is_new() -> None:
@@ -184,12 +176,8 @@ def test_light_and_group_stay_and_depth_is_new() -> None:
     assert not torch.equal(first.depth, second.depth)  # type: ignore[arg-type]
 
 
-def test_blur_is_what_the_thin_lens_says() -> None:
-    """|1/s - 1/z| f^2 / N / (1 - f / s) over the packed pixel, at most 7 px at f/11."""
+def test_blur_of_draped_pictures_is_in_range() -> None:
     for scene in draped_scenes([picture(size=128)], CAMERA, copies=6):
-        assert scene.depth is not None
-        f, s = scene.lens.focal_length, scene.lens.focus_distance
-        depth = scene.depth.double().numpy()
-        blur = np.abs(1 / s - 1 / depth) * f**2 / 11 / (1 - f / s) / (2 * 5.94e-6)
-        assert blur.max() <= 7.0 + 1e-3
-        assert blur.min() < 0.35  # something is in focus
+        diameter = blur(scene)
+        assert diameter.max() <= 7.0 + 1e-3
+        assert diameter.min() < 0.35  # something is in focus
