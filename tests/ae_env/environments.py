@@ -1,7 +1,5 @@
 """Small environments, one and many, and the comparison of what they show."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

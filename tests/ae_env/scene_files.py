@@ -1,7 +1,5 @@
 """Radiance maps that the tests of scenes write, and scenes loaded small."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pictures and captures that the tests of the scorers share."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -60,3 +58,19 @@ def make_captures(
 def captures_of(light: np.ndarray, states: list[CameraSettings]) -> Captures:
     """Captures of `light` (4, H, W), which is what ISO 100, f/4, 1/64 s records."""
     return make_captures(make_scene(light, 2560.0), states)
+
+
+def mean_signal(images: torch.Tensor, captures: Captures) -> torch.Tensor:
+    return images.mean(dim=(1, 2, 3))
+
+
+class Own:
+    """A scorer that is a function of its images and captures."""
+
+    def __init__(
+        self, function: Any = mean_signal, domain: str = "raw", depends_on: str = "image"
+    ) -> None:
+        self.function, self.domain, self.depends_on = function, domain, depends_on
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> Any:
+        return self.function(images, captures)

@@ -1,7 +1,5 @@
 """The environment contract: spaces, info, seeding, rewards, and the checkers of its consumers."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

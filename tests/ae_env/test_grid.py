@@ -1,7 +1,5 @@
 """The exposure grid: order of the states, exposure values, errors."""
 
-from __future__ import annotations
-
 import json
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """Registration with Gymnasium, specs, and the public names."""
 
-from __future__ import annotations
-
 import inspect
 import pickle
 import subprocess
@@ -11,19 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-import torch
 from gymnasium.envs.registration import EnvSpec
 
 import ae_env
 from ae_env.options import EnvOptions
 from tests.ae_env.environments import ID, assert_equal, make_env
-
-
-class MeanSignal:
-    domain = "raw"
-
-    def __call__(self, images: torch.Tensor, captures: Any) -> torch.Tensor:
-        return images.mean(dim=(1, 2, 3))
+from tests.ae_env.scorer_images import Own
 
 
 def test_spec_round_trips_through_json_and_pickle() -> None:
@@ -43,7 +34,7 @@ def test_spec_round_trips_through_json_and_pickle() -> None:
 
 
 def test_in_process_arguments_say_so_when_json_is_asked_for() -> None:
-    env = make_env(scorer=MeanSignal())
+    env = make_env(scorer=Own())
     env.reset(seed=0)
     assert 0.0 <= env.step(0)[1] <= 1.0
     with pytest.raises(ValueError, match=r"`scorer`.*this process only.*package\.module"):

@@ -1,7 +1,5 @@
 """Pictures: the rendered frame, and the layout of the contact sheet."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """The native vector environment against SyncVectorEnv of single ones, and in other processes."""
 
-from __future__ import annotations
-
 from collections import deque
 from pathlib import Path
 from typing import Any

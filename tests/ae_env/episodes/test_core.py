@@ -1,7 +1,5 @@
 """Running episodes: frames of the simulator, rewards, masks, and copies that go on alike."""
 
-from __future__ import annotations
-
 import copy
 import multiprocessing
 import pickle
@@ -23,6 +21,7 @@ from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from simulator import get_camera
 from simulator.capture.sensor import exposed_light
 from simulator.noise.generator import frame_normals, noise_keys
+from tests.ae_env.scorer_images import Own
 
 ID = "ae_env/AutoExposure-v0"
 CAMERA = get_camera("nikon_z6")
@@ -105,14 +104,11 @@ def test_observations_are_codes_of_the_same_digital_numbers() -> None:
 def test_scorers_that_look_at_images_see_the_frames_that_are_observed() -> None:
     seen: list[torch.Tensor] = []
 
-    class Watching:
-        domain = "raw"
+    def watch(images: torch.Tensor, captures: Any) -> torch.Tensor:
+        seen.append(images.clone())
+        return torch.full((len(images),), 0.5)
 
-        def __call__(self, images: torch.Tensor, captures: Any) -> torch.Tensor:
-            seen.append(images.clone())
-            return torch.full((len(images),), 0.5)
-
-    watched = _frames(_vector(scorer=Watching()))
+    watched = _frames(_vector(scorer=Own(watch)))
     _assert_equal(watched, _frames(_vector()))
     codes = torch.from_numpy(watched[0])
     assert float(seen[0].min()) >= 0.0
@@ -168,8 +164,7 @@ def test_batches_in_changing_light_are_worked_out_in_chunks(
         sizes.append(len(captures))
         return captures.light.mean(dim=(1, 2, 3)).clamp(0.0, 1.0)
 
-    light.domain, light.depends_on = "raw", "light"  # type: ignore[attr-defined]
-    _vector(lighting="sine", scorer=light).reset(seed=0)
+    _vector(lighting="sine", scorer=Own(light, depends_on="light")).reset(seed=0)
     assert sizes == [2, 2, 1]
 
 

@@ -1,7 +1,5 @@
 """The light of frames: bands of flicker in captures, scores and tables."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +17,7 @@ from ae_env.scorers.score_table import ScoreTables
 from simulator import get_camera
 from simulator.optics.lamps import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from tests.ae_env.scorer_images import Own
 
 ID = "ae_env/AutoExposure-v0"
 CAMERA = get_camera("nikon_z6")
@@ -76,17 +75,10 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> Non
     assert info["regret"] == pytest.approx(q.max() - q[18], abs=1e-6)
 
 
-class MeanSignal:
-    domain = "raw"
-
-    def __call__(self, images: torch.Tensor, captures: Any) -> torch.Tensor:
-        return images.mean(dim=(1, 2, 3), dtype=torch.float64)
-
-
 @pytest.mark.parametrize("noise", [True, False])
 def test_scores_of_images_are_those_of_banded_ones(noise: bool) -> None:
     grid = ExposureGrid((100,), (1 / 60, 1 / 15), (5.6, 8))
-    tables = ScoreTables(grid, CAMERA, make_scorer(MeanSignal()), noise=noise)
+    tables = ScoreTables(grid, CAMERA, make_scorer(Own()), noise=noise)
     flat = replace(_scene(), light=torch.full((4, 40, 40), 0.4))
     gain, rows = np.array([0.5, 0.5, 1.5, 1.5]), np.ones((4, 40))
     rows[:, :20], rows[:, 20:] = 1.8, 0.2

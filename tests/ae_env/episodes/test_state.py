@@ -1,7 +1,5 @@
 """The columns of running episodes."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 import numpy as np

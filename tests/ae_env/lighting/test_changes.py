@@ -1,7 +1,5 @@
 """Light that changes by a rule, and lightings by name."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import fields

@@ -1,13 +1,11 @@
 """Flickering light, against sums over finely divided exposures."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 
-from ae_env.lighting import FlickerLighting, RollingShutter, make_lighting
+from ae_env.lighting import RollingShutter, make_lighting
 
 SHUTTER = RollingShutter(rows=40, row_time=2e-5, sensor_rows=8)
 
@@ -48,15 +46,6 @@ def test_rows_are_integrated_over_their_own_exposures(spec, light, time: float) 
     assert lighting.gain(7, time, 0.3) == pytest.approx(_sampled(light, 7 / 24, time), abs=2e-4)
 
 
-@pytest.mark.parametrize("spec", [{}, {"duty": 0.2}, {"duty": 0.2, "depth": 0.6}, {"depth": 1.0}])
-def test_light_over_all_phases_is_the_scenes_own(spec: dict[str, float]) -> None:
-    lighting = make_lighting({"kind": "flicker", **spec})
-    phases = np.arange(200) / 200
-    for time in (1 / 1000, 1 / 125, 1 / 15):
-        gains = [lighting.rows(5, time, phase, SHUTTER)[0] for phase in phases]
-        assert np.mean(gains) == pytest.approx(1.0, abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("frequency", "times"), [(100, (1 / 100, 1 / 50, 1 / 25, 1 / 2)), (120, (1 / 120, 1 / 60))]
 )
@@ -67,15 +56,6 @@ def test_whole_periods_have_no_bands(frequency: float, times, duty: float | None
         for frame, phase in ((0, 0.0), (3, 0.37), (100_000, 0.9)):
             assert lighting.rows(frame, time, phase, SHUTTER) == (1.0, None)
     assert lighting.rows(0, 1 / 90, 0.0, SHUTTER)[1] is not None
-
-
-def test_frames_are_at_their_place_in_the_period() -> None:
-    """At 30 frames per second, 100 Hz is back after three frames, and a third of a period later
-    in each."""
-    lighting = FlickerLighting()
-    gains = [lighting.gain(frame, 1e-6, 0.0) for frame in range(4)]
-    wanted = [1.0 + 0.8 * math.cos(2.0 * math.pi * frame / 3.0) for frame in range(4)]
-    assert gains == pytest.approx(wanted, abs=1e-3)
 
 
 @pytest.mark.parametrize(

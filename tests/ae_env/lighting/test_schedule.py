@@ -1,7 +1,5 @@
 """Light that follows a list or a file."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A user's files: folders of raws and maps with bad files in them, and recorded sequences."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

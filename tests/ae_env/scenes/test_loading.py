@@ -1,8 +1,5 @@
 """load_scenes by name, list and attribute; and the environment with trained networks."""
 
-from __future__ import annotations
-
-import json
 import logging
 import math
 from dataclasses import replace
@@ -13,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.registration import EnvSpec
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
@@ -227,16 +223,6 @@ def test_opening_grows_the_scenes_own_defocus(weights: str) -> None:
 def test_vector_environment_equals_single_ones(weights: str) -> None:
     arguments = {"scenes": NOISY_SCENES, "resolution": 40, "simulator": weights}
     check_parity(5, 5, depth="unknown", **arguments)
-
-
-def test_spec_survives_json(weights: str) -> None:
-    env = _make(scenes=NAMED, simulator=weights, depth="unknown")
-    text = env.unwrapped.spec.to_json()  # type: ignore[union-attr]
-    assert json.loads(text)["kwargs"]["simulator"] == weights
-    again = gym.make(EnvSpec.from_json(text))
-    assert_equal(*(one.reset(seed=1) for one in (env, again)))
-    for action in (3, 20, 60):
-        assert_equal(*(one.step(action) for one in (env, again)))
 
 
 def test_map_of_a_crop_is_that_of_the_whole_frame(tmp_path: Path) -> None:

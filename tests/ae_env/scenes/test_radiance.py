@@ -1,7 +1,5 @@
 """Radiance maps: reading, cleaning, perspective views, lying files."""
 
-from __future__ import annotations
-
 import logging
 import struct
 from pathlib import Path

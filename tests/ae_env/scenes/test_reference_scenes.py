@@ -1,7 +1,5 @@
 """Scenes of the reference camera: splits, light, depth of real photographs, draped pictures."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scene: normalisation, colours, resizing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Source groups of raws, and the split by group."""
 
-from __future__ import annotations
-
 import logging
 from datetime import datetime, timedelta
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Signs of photographic defects, their maps to severities, and the defect score."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.ndimage

@@ -1,7 +1,5 @@
 """Gradient metrics of exposure papers and noise estimates, against SciPy, loops and wavelets."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

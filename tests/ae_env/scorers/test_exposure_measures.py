@@ -1,7 +1,5 @@
 """Brightness, clipping and histogram scorers, against hand arithmetic and other libraries."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

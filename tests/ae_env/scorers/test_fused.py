@@ -1,7 +1,5 @@
 """Closed forms by a fused kernel, against the scorers that are written in torch."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """NIMA against Keras: one network with the same random weights, from files that Keras wrote."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import textwrap

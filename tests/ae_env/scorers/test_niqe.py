@@ -1,7 +1,5 @@
 """The statistics of NIQE against SciPy's distributions, loops in NumPy, and themselves."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

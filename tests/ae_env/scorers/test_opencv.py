@@ -1,7 +1,5 @@
 """Keypoints and matches by hand, BRISQUE against OpenCV's own class with a model trained here."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

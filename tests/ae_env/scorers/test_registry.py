@@ -1,7 +1,5 @@
 """Scorers by name, from files, from other packages and from pyiqa, and the list of them all."""
 
-from __future__ import annotations
-
 import pickle
 import sys
 import types
@@ -120,18 +118,18 @@ def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.Monkey
     folder.mkdir()
     (folder / "my_scorer.py").write_text(MINE)
     monkeypatch.chdir(tmp_path)
-    by_relative = make_scorer("mine too/my_scorer.py:Level")
+    relative = make_scorer("mine too/my_scorer.py:Level")
     monkeypatch.chdir(folder)
-    assert list(by_relative.parts) == ["Level"]
     mixed = make_scorer({f"{folder}/my_scorer.py:Level": 3.0, "noise": 1.0})
     assert mixed.weights == {"Level": 0.75, "noise": 0.25}
-    assert type(mixed.parts["Level"]) is type(make_scorer("my_scorer.py:Level").parts["Level"])
-    with pytest.raises(ValueError, match=r"`scorer` \(='my_scorer.py:Levle'\).*did you mean 'Lev"):
-        make_scorer("my_scorer.py:Levle")
-    with pytest.raises(ValueError, match=r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"):
-        make_scorer({"no.py:Level": 1.0})
-    with pytest.raises(ValueError, match=r"must be callable"):
-        make_scorer("my_scorer.py:torch")
+    assert type(mixed.parts["Level"]) is type(relative.parts["Level"])
+    for spec, message in (
+        ("my_scorer.py:Levle", r"`scorer` \(='my_scorer.py:Levle'\).*did you mean 'Lev"),
+        ({"no.py:Level": 1.0}, r"`scorer` \(='no.py:Level'\): there is no file 'no.py'"),
+        ("my_scorer.py:torch", "must be callable"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_scorer(spec)
 
 
 class FakeMetric:
@@ -204,9 +202,7 @@ def test_registered_scorers_work_by_name(monkeypatch: pytest.MonkeyPatch) -> Non
         ("no_such_module:Thing", "cannot be loaded: "),
         ("ae_env.scorers.terms:Nothing", "cannot be loaded: "),
         ("math:pi", "must be callable"),
-        ({}, "weights"),
-        ({"noise": 0.0}, "must all be > 0"),
-        ({"noise": float("nan")}, "must all be > 0"),
+        ({}, "must map one name or more"),
         (lambda images, captures: None, "must be 'raw' or 'srgb'"),
         (3, "name, a mapping of weights or a callable"),
     ],

@@ -1,9 +1,6 @@
 """Score tables: expectations over noise, their standard errors, the oracle, the cache."""
 
-from __future__ import annotations
-
 import gc
-import logging
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -20,27 +17,29 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.fused import FusedScores
 from ae_env.scorers.protocol import Captures
-from ae_env.scorers.score_table import ScoreTables, prepare_scene
+from ae_env.scorers.score_table import ScoreTables
 from ae_env.scorers.terms import Highlights
 from simulator import get_camera
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.utils.cache import DiskCache
+from tests.ae_env.environments import SMALL as ENV
+from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
-CAMERA = get_camera("nikon_z6")
 SMALL = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
 
 
-def _scene(seed: int = 0, **fields: Any) -> Scene:
-    rng = np.random.default_rng(seed)
-    light = 0.12 * np.exp(rng.normal(0.0, 1.0, (4, 40, 40)))
-    return Scene.from_array(
-        torch.from_numpy(light.astype(np.float32)),
-        reference_settings(8.0),
-        CAMERA,
-        scene_id="test",
-        illuminance=640.0,
-        **fields,
-    )
+def _scene(seed: int = 0) -> Scene:
+    light = 0.12 * np.exp(np.random.default_rng(seed).normal(0.0, 1.0, (4, 40, 40)))
+    return make_scene(light, 640.0)
+
+
+def _flat(value: float) -> Scene:
+    return make_scene(np.full((4, 40, 40), value), 640.0)
+
+
+def _light(scene: Scene, grid: ExposureGrid) -> np.ndarray:
+    """What the states record of light that `scene.reference` records as 1."""
+    return 2.0 ** (np.array([s.log2_exposure for s in grid]) - scene.reference.log2_exposure)
 
 
 def _tables(scorer: Any = "balanced", **options: Any) -> ScoreTables:
@@ -48,57 +47,34 @@ def _tables(scorer: Any = "balanced", **options: Any) -> ScoreTables:
     return ScoreTables(**given)
 
 
-class FirstPixel:
-    """Reads one pixel in the middle of the range: its noise is that of the sensor."""
-
-    domain = "raw"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        return images[:, 1, 0, 0]
-
-
-class MeanSignal:
-    domain = "raw"
-
-    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        return images.mean(dim=(1, 2, 3))
-
-
 def test_average_over_noise_is_the_noise_free_signal() -> None:
     """Mid-range flat light: noise is symmetric there, so a mean of pixels must come out exact."""
-    scene = replace(_scene(), light=torch.full((4, 40, 40), 0.2))
-    grid = ExposureGrid((100, 200), (1 / 500,), (4, 5.6))
-    table = _tables(MeanSignal(), grid=grid, noise_seeds=64).table(scene)
-    prepared = prepare_scene(scene, CAMERA)
-    for state, mean, error in zip(grid, table.mean, table.standard_error, strict=True):
-        light = 0.2 * 2.0 ** (state.log2_exposure - scene.reference.log2_exposure)
-        assert float(prepared.expected(state).mean()) == pytest.approx(light, rel=1e-6)
-        assert abs(mean - light) < 5 * error + 1 / 15_520  # quantised to digital numbers
+    scene, grid = _flat(0.2), ExposureGrid((100, 200), (1 / 500,), (4, 5.6))
+    table = _tables(Own(), grid=grid, noise_seeds=64).table(scene)
+    light = 0.2 * _light(scene, grid)
+    assert (np.abs(table.mean - light) < 5 * table.standard_error + 1 / 15_520).all()  # 1 DN
 
 
 def test_standard_error_is_that_of_the_sensor_noise() -> None:
-    scene = replace(_scene(), light=torch.full((4, 40, 40), 0.3))
-    grid = ExposureGrid((100,), (1 / 1000, 1 / 250), (4,))
-    seeds = 400
-    table = _tables(FirstPixel(), grid=grid, noise_seeds=seeds).table(scene)
+    scene, grid = _flat(0.3), ExposureGrid((100,), (1 / 1000, 1 / 250), (4,))
+    first_pixel = Own(lambda images, _: images[:, 1, 0, 0])
+    table = _tables(first_pixel, grid=grid, noise_seeds=400).table(scene)
     nlf = CAMERA.nlf(100)
-    for state, error in zip(grid, table.standard_error, strict=True):
-        light = 0.3 * 2.0 ** (state.log2_exposure - scene.reference.log2_exposure)
-        sigma = np.sqrt(nlf.read[1] + nlf.shot[1] * light)
-        # The spread of 400 normals is known to 1 / sqrt(2 * 399) = 3.5 %; quantisation adds a bit.
-        assert error == pytest.approx(sigma / np.sqrt(seeds), rel=0.13)
+    sigma = np.sqrt(nlf.read[1] + nlf.shot[1] * 0.3 * _light(scene, grid))
+    # The spread of 400 normals is known to 1 / sqrt(2 * 399) = 3.5 %; quantisation adds a bit.
+    np.testing.assert_allclose(table.standard_error, sigma / np.sqrt(400), rtol=0.13)
 
 
 def test_mixed_scorer_averages_only_what_is_noisy() -> None:
     noise = make_scorer("noise").parts["noise"]
-    scorer = CompositeScorer({"mean": MeanSignal(), "noise": noise})
+    scorer = CompositeScorer({"mean": Own(), "noise": noise})
     table = _tables(scorer, noise_seeds=4).table(_scene())
     closed = _tables("noise").table(_scene())
     assert (table.standard_error > 0).all()
     assert (closed.standard_error == 0).all()
     np.testing.assert_array_equal(table.parts["noise"], closed.parts["noise"])
     np.testing.assert_allclose(table.mean, 0.5 * (table.parts["mean"] + table.parts["noise"]))
-    first, second = (_tables(MeanSignal(), noise_seeds=1).table(_scene()) for _ in range(2))
+    first, second = (_tables(Own(), noise_seeds=1).table(_scene()) for _ in range(2))
     np.testing.assert_array_equal(first.mean, second.mean)
     assert np.isnan(first.standard_error).all()  # unknown from one seed
     with pytest.raises(ValueError, match="`noise_seeds`"):
@@ -121,7 +97,7 @@ def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
 
 
 def _files(cache: Path) -> list[Path]:
-    return sorted((cache / "score_tables").glob("*"))
+    return list((cache / "score_tables").glob("*"))
 
 
 @pytest.fixture
@@ -174,39 +150,34 @@ def test_key_changes_with_everything_that_changes_the_scores(cache: Path) -> Non
         version = 1
         scale = 0.05
 
-    scene = _scene()
-    counts = []
-
-    def use(tables: ScoreTables, scene: Scene = scene) -> None:
-        tables.table(scene)
-        counts.append(len(_files(cache)))
-
-    use(_tables())
-    use(_tables())  # nothing changed
-    use(_tables(grid=ExposureGrid((100,), (1 / 500,), (4,))))
-    use(_tables(camera=get_camera("canon_70d")))
-    scaled = CAMERA.with_nlf(100, CAMERA.nlf(100).scaled(2.0))
-    use(_tables(camera=scaled))  # the same name, other noise
-    use(_tables({"highlights": 1.0, "noise": 1.0}))
-    use(_tables(), replace(scene, light=scene.light * 1.5))
-    use(_tables(), replace(scene, reference=reference_settings(9.0)))
-    use(_tables(), replace(scene, illuminance=None))
-    use(_tables("highlights"))
-    own = Highlights()
-    own.scale = 0.1
-    for strict in (own, Strict()):  # a constant of the object, and of the class
-        use(_tables(CompositeScorer({"highlights": strict})))
-    use(_tables(), replace(scene, white_balance=(2.0, 1.0, 1.5)))
-    use(_tables(), replace(scene, scene_id="another"))
+    own, scene = Highlights(), _scene()
+    own.scale = 0.1  # a constant of the object, where that of `Strict` is of the class
     noisy = replace(scene, nlf=CAMERA.nlf(100))
-    use(_tables(), replace(noisy, denoised=scene.light * 0.9))
-    use(_tables(), replace(noisy, denoised=scene.light * 0.8))  # by other weights
-    use(_tables(), replace(scene, defocus_map=torch.full((40, 40), 2.0)))
     calibrated = {100: CAMERA.nlf(100), 6400: CAMERA.nlf(6400)}
     plain = replace(CAMERA, nlf_by_iso=calibrated, segments=())
-    use(_tables(camera=plain))
-    use(_tables(camera=replace(plain, segments=(800,))))
-    assert counts == [1, 1, *range(2, 19)]
+    tables = [
+        _tables(),
+        _tables(grid=ExposureGrid((100,), (1 / 500,), (4,))),
+        _tables(camera=get_camera("canon_70d")),
+        _tables(camera=CAMERA.with_nlf(100, CAMERA.nlf(100).scaled(2.0))),
+        _tables(camera=plain),
+        _tables(camera=replace(plain, segments=(800,))),
+        _tables({"highlights": 1.0, "noise": 1.0}),
+        *(_tables(CompositeScorer({"highlights": s})) for s in (Highlights(), own, Strict())),
+    ]
+    uses = [(each, scene) for each in [*tables, tables[0]]]  # the first one again
+    uses += [(tables[0], replace(scene, **fields)) for fields in (
+        {"light": scene.light * 1.5},
+        {"reference": reference_settings(9.0)},
+        {"illuminance": None},
+        {"white_balance": (2.0, 1.0, 1.5)},
+        {"scene_id": "another"},
+        {"defocus_map": torch.full((40, 40), 2.0)},
+    )]  # fmt: skip
+    uses += [(tables[0], replace(noisy, denoised=scene.light * x)) for x in (0.9, 0.8)]
+    for each, shown in uses:
+        each.table(shown)
+    assert len(_files(cache)) == len(uses) - 1
 
 
 def test_scores_in_memory_are_bounded_and_keep_no_scene_alive(
@@ -214,30 +185,25 @@ def test_scores_in_memory_are_bounded_and_keep_no_scene_alive(
 ) -> None:
     made = []
 
-    class Own(Highlights):
+    class Counted(Highlights):
         def __call__(self, images: Any, captures: Captures) -> torch.Tensor:
             made.append(len(captures))
             return super().__call__(images, captures)
 
     each = 8 * len(SMALL) + 1000  # one part, and what an entry takes itself
     monkeypatch.setattr("ae_env.scorers.score_table.MEMORY_BYTES", 3 * each)
-    tables, scene = _tables(Own(), use_cache=False), _scene()
-    for gain in (3.0, 2.0, 4.0, 3.0, 8.0):  # 8 takes the place of 2
-        tables.table(scene, gain=gain)
+    tables, scene = _tables(Counted(), use_cache=False), _scene()
+    for gain, count in zip((3, 2, 4, 3, 8, 3, 4, 8, 2), (1, 2, 3, 3, 4, 4, 4, 4, 5), strict=True):
+        tables.table(scene, gain=float(gain))  # 8 takes the place of 2
+        assert len(made) == count
         assert tables._light_parts.nbytes <= 3 * each
-    assert len(made) == 4
-    for gain in (3.0, 4.0, 8.0):
-        tables.table(scene, gain=gain)
-    assert len(made) == 4
-    tables.table(scene, gain=2.0)
-    assert len(made) == 5
 
     gone = weakref.ref(scene)
     del scene
     gc.collect()
     assert gone() is None
     for seed in range(4):  # new scenes may get the old one's id, but never its scores
-        expected = _tables(Own(), use_cache=False).table(_scene(seed)).mean
+        expected = _tables(Counted(), use_cache=False).table(_scene(seed)).mean
         np.testing.assert_array_equal(tables.table(_scene(seed)).mean, expected)
 
 
@@ -247,63 +213,50 @@ def test_a_folder_that_cannot_be_written_is_not_needed(
     expected = _tables(use_cache=False).table(_scene()).mean
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "file"))
-    with caplog.at_level(logging.WARNING):
-        np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
+    np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
     assert "could not be cached" in caplog.text
 
 
 def test_scorers_that_cannot_be_keyed_are_not_cached(cache: Path) -> None:
     """A network is no constant; and what a function closes over cannot be hashed."""
-
-    def constant(value: float) -> Any:
-        def score(images: Any, captures: Any) -> torch.Tensor:
-            return torch.full((len(captures),), value)
-
-        score.domain, score.depends_on = "raw", "light"  # type: ignore[attr-defined]
-        return score
-
     scorer = Highlights()
     scorer.network = torch.nn.Linear(2, 2)  # type: ignore[attr-defined]
     table = _tables(CompositeScorer({"highlights": scorer})).table(_scene())
     assert np.isfinite(table.mean).all()
-    for value in (0.2, 0.9):
-        np.testing.assert_allclose(_tables(constant(value)).table(_scene()).mean, value, rtol=1e-6)
+    for value in (0.25, 0.75):
+
+        def constant(images: Any, captures: Captures, value: float = value) -> torch.Tensor:
+            return torch.full((len(captures),), value)
+
+        constant.domain, constant.depends_on = "raw", "light"  # type: ignore[attr-defined]
+        assert _tables(constant).table(_scene()).mean.tolist() == [value] * 8
     assert _files(cache) == []
 
 
 def test_bands_count_whatever_form_the_gain_has() -> None:
-    scene = replace(_scene(), light=torch.full((4, 40, 40), 0.05), saturated=None)
-    rows = np.full((8, 40), 1.9)
+    scene, rows = _flat(0.05), np.full((8, 40), 1.9)
     rows[:, 20:] = 0.1
     # Half of the rows each: the standard deviation is half the distance, 2.124 stops.
     banding = 1.0 / (1.0 + (np.log2(1.9 / 0.1) / 2.0 / 0.1) ** 2)
     for gain in (1.0, 0.5, np.ones(8)):
         table = _tables("banding").table(scene, gain=gain, row_gain=rows)
         np.testing.assert_allclose(table.mean, banding, rtol=1e-6)
-
-    def top(images: torch.Tensor, captures: Captures) -> torch.Tensor:
-        return images[:, :, :20].mean(dim=(1, 2, 3))
-
-    top.domain = "raw"  # type: ignore[attr-defined]
+    top = Own(lambda images, _: images[:, :, :20].mean(dim=(1, 2, 3)))
     grid = ExposureGrid((100,), (1 / 500, 1 / 250), (4,))
     for noise in (False, True):
-        tables = _tables(top, grid=grid, noise=noise, use_cache=False)
-        found = tables.table(scene, row_gain=rows[:2]).mean
-        stops = [s.log2_exposure - scene.reference.log2_exposure for s in grid]
-        np.testing.assert_allclose(found, 0.05 * 1.9 * 2.0 ** np.array(stops), atol=1e-3)
+        found = _tables(top, grid=grid, noise=noise).table(scene, row_gain=rows[:2]).mean
+        np.testing.assert_allclose(found, 0.05 * 1.9 * _light(scene, grid), atol=1e-3)
 
 
 def test_without_noise_the_expected_score_is_that_of_the_noise_free_capture() -> None:
-    def spread(images: torch.Tensor, captures: Any) -> torch.Tensor:
-        return images.std(dim=(1, 2, 3)).clamp(0.0, 1.0)
-
-    spread.domain = "raw"  # type: ignore[attr-defined]
-    scene = replace(_scene(), light=torch.full((4, 36, 36), 0.2), saturated=None)
-    grid = ExposureGrid((6400,), (1 / 1000,), (4,))
-    clean = _tables(spread, grid=grid, noise=False).table(scene)
+    spread, grid = (
+        Own(lambda images, _: images.std(dim=(1, 2, 3))),
+        ExposureGrid((6400,), (1e-3,), (4,)),
+    )
+    clean, noisy = (_tables(spread, grid=grid, noise=n).table(_flat(0.2)) for n in (False, True))
     assert clean.mean == pytest.approx(0.0, abs=1e-4)
     assert clean.standard_error == pytest.approx(0.0)
-    assert _tables(spread, grid=grid).table(scene).mean > 1e-3
+    assert noisy.mean > 1e-3
 
 
 def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
@@ -317,11 +270,9 @@ def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
         return expose(prepared, *args, **kwargs)
 
     monkeypatch.setattr(PreparedScene, "expose", exposed)
-    _tables(MeanSignal(), tolerance=0.025).table(_scene(), speed=0.2)
+    _tables(Own(), tolerance=0.025).table(_scene(), speed=0.2)
     assert seen == {0.025}
     with pytest.raises(ValueError, match="`tolerance`"):
         _tables(tolerance=-1.0)
-    options = EnvOptions(
-        scenes="bundled:small", resolution=36, scorer=MeanSignal(), tolerance=0.375
-    )
-    assert EpisodeCore(options, 1).tables.tolerance == 0.375
+    core = EpisodeCore(EnvOptions(**ENV, scorer=Own(), tolerance=0.375), 1)
+    assert core.tables.tolerance == 0.375

@@ -1,7 +1,5 @@
 """The terms with a closed form against the published formulas and hand-checked values."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Classes from files of the user's own."""
 
-from __future__ import annotations
-
 import sys
 import textwrap
 from pathlib import Path
