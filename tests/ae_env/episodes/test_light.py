@@ -3,36 +3,31 @@
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import ScoreTables
-from simulator import get_camera
 from simulator.optics.lamps import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from tests.ae_env.scorer_images import Own
+from tests.ae_env.environments import make_env, make_envs
+from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
-ID = "ae_env/AutoExposure-v0"
-CAMERA = get_camera("nikon_z6")
 LED = {"kind": "flicker", "frequency": 250.0, "duty": 0.3, "frame_rate": 24.0}
 
 
 def _scene() -> Scene:
     light = 0.05 + 0.3 * np.random.default_rng(0).random((4, 40, 40), np.float32)
-    given: Any = {"scene_id": "grey", "illuminance": 640.0, "box_factor": 4}
-    return Scene.from_array(torch.from_numpy(light), reference_settings(8.0), CAMERA, **given)
+    return make_scene(light, 640.0, scene_id="grey", box_factor=4)
 
 
 def _env(**arguments: Any) -> Any:
     given = {"scenes": [_scene()], "resolution": 40, "motion": "none", "depth": "far"}
-    return gym.make(ID, **{**given, **arguments}).unwrapped
+    return make_env(**{**given, **arguments}).unwrapped
 
 
 @pytest.mark.parametrize(
@@ -93,10 +88,7 @@ def test_steady_rows_among_banded_ones_are_as_in_steady_light() -> None:
     """1/50 s beside 1/1000 s, in one batch."""
     grid = {"isos": [100, 400], "exposure_times": [0.001, 0.02], "f_numbers": [4, 8]}
     arguments = {"scenes": [_scene()], "resolution": 40, "grid": grid}
-    envs, plain = (
-        gym.make_vec(ID, num_envs=2, lighting=lighting, **arguments)
-        for lighting in ("flicker", "static")
-    )
+    envs, plain = (make_envs(2, lighting=light, **arguments) for light in ("flicker", "static"))
     for made in (envs, plain):
         made.reset(seed=3)
     first, second = envs.step(np.array([0, 2])), plain.step(np.array([0, 2]))

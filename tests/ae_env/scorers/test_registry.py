@@ -13,9 +13,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import (
     CompositeScorer,
     list_scorers,
@@ -28,12 +27,11 @@ from ae_env.scorers.protocol import Captures
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
 from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
-from simulator import NoiseLevelFunction, get_camera
-from tests.ae_env.scorer_images import random_pictures
+from simulator import NoiseLevelFunction
+from tests.ae_env.environments import make_env
+from tests.ae_env.scorer_images import CAMERA, make_scene, random_pictures
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
-ID = "ae_env/AutoExposure-v0"
-SMALL = {"scenes": "bundled:small", "split": "test", "resolution": 36}
 MINE = '''
 import torch
 
@@ -104,7 +102,7 @@ def test_a_real_entry_point_works_and_is_listed_beside_broken_ones() -> None:
 def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> None:
     """As docs/scorers.md says of a scorer from a file, whose class no other process knows."""
     (tmp_path / "my_scorer.py").write_text(MINE)
-    env = gym.make(ID, scorer=f"{tmp_path}/my_scorer.py:Level", **SMALL)
+    env = make_env(scorer=f"{tmp_path}/my_scorer.py:Level")
     content = pickle.dumps(env.spec)
     for name in [name for name in sys.modules if name.startswith("ae_env_user_")]:
         del sys.modules[name]
@@ -215,7 +213,6 @@ def test_bad_scorers_are_refused(spec: Any, message: str) -> None:
 # -- fingerprints, which tell the cached scores of scorers apart ----------------------------------
 
 
-CAMERA = get_camera("nikon_z6")
 GRID = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
 
 
@@ -240,9 +237,7 @@ def test_scorers_inside_of_others_enter_the_key(
         return CompositeScorer({"in": inner, "noise": Noise()})
 
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    scene = Scene.from_array(
-        torch.full((4, 40, 40), 0.2), reference_settings(8.0), CAMERA, scene_id="flat"
-    )
+    scene = make_scene(np.full((4, 40, 40), 0.2))
     noise = ScoreTables(GRID, CAMERA, make_scorer("noise")).table(scene).mean
     for value in (0.2, 0.8):
         for version in (None, 1):  # neither finds the scores of the other value
@@ -287,7 +282,7 @@ def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
     st.sampled_from([None, 1e-3, 640.0, 1e6]),
     st.booleans(),
     st.sampled_from([0.0, 1e-3, 1.0, 100.0]),
-    st.sampled_from([0.0, 1.0, 500.0]),
+    st.sampled_from([0.0, 1.0, 25.0]),
     st.sampled_from([1.0, 2.0**-20, 2.0**20]),
 )
 def test_scores_are_shares_and_the_oracle_has_the_highest(
