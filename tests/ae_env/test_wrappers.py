@@ -12,23 +12,13 @@ from hypothesis import given
 
 from ae_env import wrappers
 from ae_env.grid import ExposureGrid
-from ae_env.wrappers import (
-    ContinuousActions,
-    ControlActions,
-    RelativeActions,
-    VectorContinuousActions,
-    VectorControlActions,
-    VectorRelativeActions,
-)
+from ae_env.wrappers import ContinuousActions, ControlActions, RelativeActions
 from simulator import CameraSettings
 from tests.ae_env.environments import assert_equal, make_env, make_envs
 from tests.strategies import SEEDS, grids
 
-PAIRS = [
-    (ControlActions, VectorControlActions),
-    (RelativeActions, VectorRelativeActions),
-    (ContinuousActions, VectorContinuousActions),
-]
+SINGLE = [ControlActions, RelativeActions, ContinuousActions]
+PAIRS = [(single, getattr(wrappers, f"Vector{single.__name__}")) for single in SINGLE]
 
 
 def test_continuous_actions_take_the_nearest_apex_values() -> None:
@@ -53,10 +43,8 @@ def test_vector_twin_does_the_same(single: type, vector: type) -> None:
     for i, env in enumerate(alone):
         env.reset(seed=5 + i)
         assert env.action_space == envs.single_action_space
-    envs.action_space.seed(1)
     for _ in range(4):
         actions = envs.action_space.sample()
-        assert envs.action_space.contains(actions)
         assert actions.shape == (3, 3)
         if hasattr(envs, "action_masks"):
             expected = np.stack([env.action_masks() for env in alone])
@@ -64,12 +52,11 @@ def test_vector_twin_does_the_same(single: type, vector: type) -> None:
         observation, reward, _, _, info = envs.step(actions)
         for i, env in enumerate(alone):
             one, score, _, _, single_info = env.step(actions[i])
-            assert single_info["state"] == info["state"][i]
-            assert score == reward[i]
+            assert (single_info["state"], score) == (info["state"][i], reward[i])
             np.testing.assert_array_equal(one["raw"], observation["raw"][i])
 
 
-@pytest.mark.parametrize("single", [pair[0] for pair in PAIRS])
+@pytest.mark.parametrize("single", SINGLE)
 def test_wrapped_spec_round_trips_through_json(single: type) -> None:
     env = single(make_env(sensors=False))
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
@@ -99,8 +86,10 @@ def test_masks_are_the_union_per_control() -> None:
     assert nearest == inner.grid.index(0, 0, 1)
     envs = make_envs(2, grid=grid, scenes=scenes)
     envs.reset(seed=0, options={"state": [inner.grid.index(1, 1, 0), 0]})
-    np.testing.assert_array_equal(VectorControlActions(envs).action_masks(), [controls] * 2)
-    np.testing.assert_array_equal(VectorRelativeActions(envs).action_masks()[0], steps)
+    np.testing.assert_array_equal(
+        wrappers.VectorControlActions(envs).action_masks(), [controls] * 2
+    )
+    np.testing.assert_array_equal(wrappers.VectorRelativeActions(envs).action_masks()[0], steps)
 
 
 @pytest.mark.parametrize(("single", "vector"), PAIRS)
@@ -113,19 +102,18 @@ def test_other_environments_are_refused(single: type, vector: type) -> None:
         vector(gym.make_vec("CartPole-v1", num_envs=1, vectorization_mode="sync"))
 
 
-@pytest.mark.parametrize("name", ["ControlActions", "RelativeActions", "ContinuousActions"])
-def test_odd_actions_are_refused(name: str) -> None:
-    env, envs = make_env(), make_envs()
-    env.reset(seed=0)
-    envs.reset(seed=0)
-    single, many = getattr(wrappers, name)(env), getattr(wrappers, f"Vector{name}")(envs)
+@pytest.mark.parametrize(("single", "vector"), PAIRS)
+def test_odd_actions_are_refused(single: type, vector: type) -> None:
+    one, many = single(make_env()), vector(make_envs())
+    one.reset(seed=0)
+    many.reset(seed=0)
     odd = [None, True, "x", {}, object(), b"x", 1, [1, 1], [1, 1, math.nan], [1, 1, "x"]]
     odd += [[1, 1, None], [1, 1, math.inf], [[1], [1, 1]], np.ones(3, bool), np.ones(3, complex)]
-    if name != "ContinuousActions":
+    if single is not ContinuousActions:
         odd += [[0, 0, -1], [0, 0, 4], [0, 0, 10**30], np.ones(3)]
     for action in odd:
         with pytest.raises(ValueError, match="`action`"):
-            single.action(action)
+            one.action(action)
         rows = [[1, 1, 1], [1, 1, 1], action]
         with pytest.raises(ValueError, match="`action`"):
             many.actions(rows if not isinstance(action, np.ndarray) else np.stack([action] * 3))
@@ -136,20 +124,18 @@ def test_other_ways_to_act_reach_every_state(grid: ExposureGrid, seed: int) -> N
     lists = {n: getattr(grid, n) for n in ("isos", "exposure_times", "f_numbers")}
     env = make_env(grid=json.loads(json.dumps(lists)))
     rng = np.random.default_rng(seed)
-    controls, steps, apex = ControlActions(env), RelativeActions(env), ContinuousActions(env)
+    controls, steps, apex = (wrapper(env) for wrapper in SINGLE)
     values = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid])
     low, span = values.min(axis=0), np.ptp(values, axis=0)
     for state in rng.permutation(len(grid))[:16].tolist():
         position = grid.controls(state)
         assert controls.action(position) == state
         unit = np.where(span > 0, 2 * (values[state] - low) / np.where(span > 0, span, 1) - 1, 0)
-        found = values[apex.action(unit)]
-        np.testing.assert_allclose(found, values[state], atol=1e-4)
+        np.testing.assert_allclose(values[apex.action(unit)], values[state], atol=1e-4)
         env.reset(seed=seed, options={"state": state})
-        move = rng.integers(-1, 2, 3)
-        moved = grid.controls(int(steps.action(move + 1)))
-        np.testing.assert_array_equal(moved, np.clip(position + move, 0, np.array(grid.shape) - 1))
-        assert steps.action(np.ones(3, int)) == state
+        for move in (rng.integers(-1, 2, 3), np.zeros(3, int)):
+            moved = np.clip(position + move, 0, np.array(grid.shape) - 1)
+            np.testing.assert_array_equal(grid.controls(int(steps.action(move + 1))), moved)
     wanted = rng.uniform(-1, 1, 3)
     distance = np.square(low + (wanted + 1) / 2 * span - values).sum(axis=1)
     assert distance[apex.action(wanted)] <= distance.min() + 1e-8

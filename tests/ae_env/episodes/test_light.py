@@ -1,21 +1,17 @@
 """The light of frames: bands of flicker in captures, scores and tables."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
-from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import ScoreTables
 from simulator.optics.lamps import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from tests.ae_env.environments import make_env, make_envs
-from tests.ae_env.scorer_images import CAMERA, Own, make_scene
+from tests.ae_env.scorer_images import CAMERA, make_scene
 
 LED = {"kind": "flicker", "frequency": 250.0, "duty": 0.3, "frame_rate": 24.0}
 
@@ -68,20 +64,6 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> Non
         assert q[state] == pytest.approx(wanted, abs=1e-6)
     assert reward == pytest.approx(q[18], abs=1e-9)
     assert info["regret"] == pytest.approx(q.max() - q[18], abs=1e-6)
-
-
-@pytest.mark.parametrize("noise", [True, False])
-def test_scores_of_images_are_those_of_banded_ones(noise: bool) -> None:
-    grid = ExposureGrid((100,), (1 / 60, 1 / 15), (5.6, 8))
-    tables = ScoreTables(grid, CAMERA, make_scorer(Own()), noise=noise)
-    flat = replace(_scene(), light=torch.full((4, 40, 40), 0.4))
-    gain, rows = np.array([0.5, 0.5, 1.5, 1.5]), np.ones((4, 40))
-    rows[:, :20], rows[:, 20:] = 1.8, 0.2
-    plain = tables.table(flat).mean
-    banded = tables.table(flat, gain=gain, row_gain=rows).mean
-    # The bright half is white where 1.8 times the gain takes it there.
-    wanted = [(min(1.8 * g * p, 1.0) + 0.2 * g * p) / 2 for g, p in zip(gain, plain, strict=True)]
-    np.testing.assert_allclose(banded, wanted, rtol=5e-3)
 
 
 def test_steady_rows_among_banded_ones_are_as_in_steady_light() -> None:

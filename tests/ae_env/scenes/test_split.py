@@ -56,11 +56,8 @@ def test_split_of_groups_is_stable_and_needs_fifteen() -> None:
 
 
 def shot(seconds: float | None, look: int, camera: str = "A") -> Shot:
-    histogram = np.zeros(4)
-    histogram[look] = 1.0
-    start = datetime(2024, 1, 1)
-    time = None if seconds is None else start + timedelta(seconds=seconds)
-    return Shot(camera, time, histogram)
+    time = None if seconds is None else datetime(2024, 1, 1) + timedelta(seconds=seconds)
+    return Shot(camera, time, np.eye(4)[look])
 
 
 @pytest.mark.parametrize(

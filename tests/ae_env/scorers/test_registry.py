@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -29,7 +28,7 @@ from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
 from simulator import NoiseLevelFunction
 from tests.ae_env.environments import make_env
-from tests.ae_env.scorer_images import CAMERA, make_scene, random_pictures
+from tests.ae_env.scorer_images import CAMERA, random_pictures
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
 MINE = '''
@@ -213,9 +212,6 @@ def test_bad_scorers_are_refused(spec: Any, message: str) -> None:
 # -- fingerprints, which tell the cached scores of scorers apart ----------------------------------
 
 
-GRID = ExposureGrid((100, 1600), (1 / 500, 1 / 30), (4, 8))
-
-
 class Constant:
     domain, depends_on = "raw", "light"
 
@@ -228,25 +224,16 @@ class Constant:
         return torch.full((len(captures),), self.value)
 
 
-def test_scorers_inside_of_others_enter_the_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def nested(value: float, version: int | None = None, deeper: bool = False) -> CompositeScorer:
+def test_scorers_inside_of_others_enter_the_key() -> None:
+    def nested(value: float, version: int | None = None, deeper: bool = False) -> str | None:
         inner = CompositeScorer({"p": Constant(value, version)})
         inner = CompositeScorer({"in": inner}) if deeper else inner
-        return CompositeScorer({"in": inner, "noise": Noise()})
+        return scorer_fingerprint(CompositeScorer({"in": inner, "noise": Noise()}))
 
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    scene = make_scene(np.full((4, 40, 40), 0.2))
-    noise = ScoreTables(GRID, CAMERA, make_scorer("noise")).table(scene).mean
-    for value in (0.2, 0.8):
-        for version in (None, 1):  # neither finds the scores of the other value
-            table = ScoreTables(GRID, CAMERA, nested(value, version)).table(scene)
-            np.testing.assert_allclose(table.mean, (value + noise) / 2, atol=1e-6)
-    assert scorer_fingerprint(nested(0.2)) is scorer_fingerprint(nested(0.2, deeper=True)) is None
+    assert nested(0.2) is nested(0.2, deeper=True) is None  # its text may change unnoticed
     kinds = [(0.2, 1), (0.8, 1), (0.2, 2), (0.2, 1, True)]
-    assert len({scorer_fingerprint(nested(*kind)) for kind in kinds}) == 4
-    assert scorer_fingerprint(nested(0.2, 1)) == scorer_fingerprint(nested(0.2, 1))
+    assert len({nested(*kind) for kind in kinds}) == 4
+    assert nested(0.2, 1) == nested(0.2, 1)
 
 
 # -- properties that hold for every scorer ---------------------------------------------------------

@@ -262,17 +262,14 @@ def test_without_noise_the_expected_score_is_that_of_the_noise_free_capture() ->
 def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    seen = set()
-    expose = PreparedScene.expose
+    seen, expose = set(), PreparedScene.expose
 
     def exposed(prepared: PreparedScene, *args: Any, **kwargs: Any) -> torch.Tensor:
         seen.add(prepared.tolerance)
         return expose(prepared, *args, **kwargs)
 
     monkeypatch.setattr(PreparedScene, "expose", exposed)
-    _tables(Own(), tolerance=0.025).table(_scene(), speed=0.2)
-    assert seen == {0.025}
+    EpisodeCore(EnvOptions(**ENV, scorer=Own(), tolerance=0.375), 1).tables.table(_scene())
+    assert seen == {0.375}
     with pytest.raises(ValueError, match="`tolerance`"):
         _tables(tolerance=-1.0)
-    core = EpisodeCore(EnvOptions(**ENV, scorer=Own(), tolerance=0.375), 1)
-    assert core.tables.tolerance == 0.375

@@ -51,26 +51,6 @@ def test_a_file_is_run_once_until_it_changes(
     assert load_from_file(str(file), "Mine", ARGUMENT).number == 2
 
 
-def test_a_file_means_what_it_means_alone(tmp_path: Path) -> None:
-    """Neither this package's imports nor its postponed annotations reach into it."""
-    file = _write(
-        tmp_path / "mine.py",
-        """
-        from dataclasses import dataclass
-
-        @dataclass
-        class Mine:
-            number: int = 0
-
-        def own(x: int): ...
-        """,
-    )
-    mine = load_from_file(str(file), "Mine", ARGUMENT)
-    assert mine(3).number == 3
-    assert load_from_file(str(file), "own", ARGUMENT).__annotations__ == {"x": int}
-    assert not hasattr(sys.modules[mine.__module__], "Path")
-
-
 def test_helpers_beside_a_file_are_found_and_not_mixed_up(tmp_path: Path) -> None:
     """From any folder, a package too; two folders may have helpers of the same names."""
     before, path = set(sys.modules), list(sys.path)
