@@ -35,26 +35,19 @@ def rollout(seed: int, **arguments: Any) -> list[Any]:
 
 def assert_equal(first: Any, second: Any, where: str = "", **tolerance: float) -> None:
     """Equal values in equal shapes, whatever the order of the keys."""
+    assert type(first) is type(second), where
     if isinstance(first, dict):
-        assert isinstance(second, dict), where
         assert set(first) == set(second), f"{where}: {set(first) ^ set(second)}"
         for key in first:
             assert_equal(first[key], second[key], f"{where}.{key}", **tolerance)
-    elif isinstance(first, tuple | list) or (
-        isinstance(first, np.ndarray) and first.dtype == object
-    ):
-        assert type(first) is type(second), where
+    elif isinstance(first, tuple | list) or getattr(first, "dtype", None) == np.dtype("O"):
         assert len(first) == len(second), where
         for i, (a, b) in enumerate(zip(first, second, strict=True)):
             assert_equal(a, b, f"{where}[{i}]", **tolerance)
     elif isinstance(first, np.ndarray):
-        assert first.dtype == second.dtype, f"{where}: {first.dtype} {second.dtype}"
-        if first.dtype == np.float64 and tolerance:
-            np.testing.assert_allclose(first, second, err_msg=where, **tolerance)
-        else:
-            np.testing.assert_array_equal(first, second, err_msg=where, strict=True)
+        limits = tolerance if first.dtype == np.float64 else {"rtol": 0.0}
+        np.testing.assert_allclose(first, second, err_msg=where, strict=True, **limits)
     else:
-        assert type(first) is type(second), where
         assert first == second, where
 
 

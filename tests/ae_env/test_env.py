@@ -41,17 +41,17 @@ def test_sb3_checker_warns_of_exactly_the_image(kind: str, dtype: str | None) ->
 
 
 def test_spaces_are_as_documented() -> None:
-    space = make_env(resolution=40).observation_space
-    assert list(space) == ["raw", "sensors", "settings"]
-    assert space["raw"] == gym.spaces.Box(0, 255, (4, 40, 40), np.uint8)
-    assert space["settings"] == gym.spaces.Box(-1, 1, (3,), np.float32)
-    assert space["sensors"] == gym.spaces.Box(-1, 1, (2,), np.float32)
+    box = gym.spaces.Box
+    env = make_env(resolution=40)
+    assert dict(env.observation_space) == {
+        "raw": box(0, 255, (4, 40, 40), np.uint8),
+        "sensors": box(-1, 1, (2,), np.float32),
+        "settings": box(-1, 1, (3,), np.float32),
+    }
     assert "sensors" not in make_env(sensors=False).observation_space.spaces
-    assert make_env(observation="linear").observation_space["raw"].dtype == np.float32
-    dn = make_env(observation="dn").observation_space["raw"]
-    assert dn.dtype == np.uint16
-    assert dn.high.max() == make_env().unwrapped.camera.white_level
-    env = make_env()
+    linear, dn = (make_env(observation=kind).observation_space["raw"] for kind in ("linear", "dn"))
+    assert (linear.dtype, dn.dtype) == (np.float32, np.uint16)
+    assert dn.high.max() == env.unwrapped.camera.white_level
     assert env.action_space == gym.spaces.Discrete(64)
     assert env.get_wrapper_attr("action_masks")().tolist() == [True] * 64
 
@@ -207,7 +207,7 @@ def test_cached_light_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kind", ["uint8", "linear", "dn"])
-def test_same_seed_samerollout(kind: str) -> None:
+def test_same_seed_same_rollout(kind: str) -> None:
     first = rollout(7, observation=kind)
     assert_equal(rollout(7, observation=kind), first)
     assert (first[0][0]["raw"] != rollout(8)[0][0]["raw"]).any()

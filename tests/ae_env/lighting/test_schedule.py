@@ -25,12 +25,7 @@ def test_each_frame_has_its_stops_and_the_last_holds(ev: object) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "0\n-1\n2\n",
-        "\ufeff 0 \n\n-1\n2",
-        "ev\n0\n-1\n2\n",
-        "frame,ev,note\n0,0,a\n1,-1,b\n2,2,c\n",
-    ],
+    ["0\n-1\n2\n", "\ufeff 0 \n\n-1\n2", "ev\n0\n-1\n2\n", "frame,ev,note\n0,0,a\n1,-1,b\n2,2,c\n"],
 )
 def test_it_is_read_from_a_file(tmp_path: Path, text: str) -> None:
     (tmp_path / "light.csv").write_text(text, encoding="utf-8")

@@ -30,7 +30,6 @@ def scenes() -> dict[str, list[ReferenceScene]]:
 
 def blur(scene: ReferenceScene, pitch: float = 11.88e-6) -> np.ndarray:
     """Circle of confusion at f/11 [packed pixels] by the thin-lens formula."""
-    assert scene.depth is not None
     f, s, z = scene.lens.focal_length, scene.lens.focus_distance, scene.depth.double().numpy()
     return f * f / (11.0 * (s - f)) * np.abs(z - s) / z / pitch
 
@@ -72,7 +71,6 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
         assert scene.light.dtype == torch.float32
         assert bool((scene.light >= 0).all())
         assert (scene.depth is not None) == (scene.kind == "depth")
-        assert scene.illuminance is not None
         assert 1.0 <= scene.illuminance <= 20_000.0
         # The incident-light exposure, E = 2.5 * 2**EV100, with ISO 12232's 120 for white.
         exposure = 2.0**scene.reference.log2_exposure
@@ -114,7 +112,6 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
     assert front.group == middle.group == "motorcycle"
     assert front.light.shape == (4, 250, 370)
-    assert front.depth is not None
     assert torch.equal(front.depth, middle.depth)
     depth = 0.193001 * 994.978 / (np.where(np.isfinite(disparity), disparity, np.nan) + 31.086)
     four = depth[:500, :740].reshape(250, 2, 370, 2).transpose(0, 2, 1, 3).reshape(250, 370, 4)
@@ -141,7 +138,6 @@ def test_real_cones(data_dir: Path) -> None:
     assert [s.scene_id for s in cones] == ["cones-front", "cones-middle"]
     for scene in cones:
         assert scene.light.shape == (4, 187, 225)
-        assert scene.depth is not None
         assert scene.depth.shape == (187, 225)
         assert bool(torch.isfinite(scene.depth).all())
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
@@ -159,7 +155,6 @@ def test_light_and_group_stay_and_depth_is_new() -> None:
     for copy in (first, second):
         assert torch.equal(copy.light, sharpened(scene).light)
         assert (copy.group, copy.kind) == ("the-group", DRAPED)
-        assert copy.depth is not None
     assert first.scene_id != second.scene_id
     assert not torch.equal(first.depth, second.depth)  # type: ignore[arg-type]
 

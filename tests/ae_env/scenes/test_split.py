@@ -92,10 +92,8 @@ def test_real_raws_are_three_subjects(data_dir: Path, caplog: pytest.LogCaptureF
         assert len({groups[m] for m in members}) == 1
     assert "3 source groups" in caplog.text
     for scene in scenes:
-        assert scene.light.shape == (4, 64, 64)
-        assert scene.box_factor == 13
-        assert not scene.noise_free
-        assert scene.illuminance is None
+        assert (scene.light.shape, scene.box_factor) == ((4, 64, 64), 13)
+        assert (scene.noise_free, scene.illuminance) == (False, None)
         assert scene.camera.model.endswith("S40")
     with pytest.raises(ValueError, match="at most 8"):
         load(data_dir / "canon_crw_cc0", "train")

@@ -110,17 +110,8 @@ def test_compiled_and_loaded_kernels_agree_to_the_last_bit(tmp_path: Path) -> No
         "fused_means(0, 3, light, dark, *fixed, *noise, means)\n"
         "print(*fused_means.stats.cache_hits.values(), means.tobytes().hex())\n"
     )
-    outputs = []
-    for _ in range(2):
-        outputs.append(
-            subprocess.run(
-                [sys.executable, "-c", code],
-                env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-                capture_output=True,
-                check=True,
-                text=True,
-            ).stdout.split()
-        )
+    command, given = [sys.executable, "-c", code], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    outputs = [subprocess.check_output(command, env=given, text=True).split() for _ in range(2)]
     (compiled,), (hits, loaded) = outputs
     assert (hits, len(loaded)) == ("1", 2 * 72)
     assert loaded == compiled

@@ -40,17 +40,13 @@ KERAS = """
         values = []
         for w in layer.weights:
             shape, name = tuple(w.shape), w.name
-            if name == "moving_variance":
-                values.append(rng.uniform(0.5, 2.0, shape))
-            elif name == "gamma":
-                values.append(rng.uniform(0.8, 1.6, shape))
-            elif name in ("beta", "moving_mean"):
-                values.append(rng.normal(0.2, 0.3, shape))
-            elif name == "bias":
-                values.append(rng.normal(0.0, 0.1, shape))
+            if name in ("moving_variance", "gamma"):
+                values.append(rng.uniform(0.7, 1.6, shape))
+            elif name in ("beta", "moving_mean", "bias"):
+                values.append(rng.normal(0.1, 0.3, shape))
             else:  # He's scale, or the signal dies in the depth
                 fan = np.prod(shape[:2]) if "dw" in layer.name else np.prod(shape[:-1])
-                gain = 12.0 if layer.name == "dense_1" else 2.0
+                gain = 24.0 if layer.name == "dense_1" else 2.0
                 values.append(rng.normal(0.0, np.sqrt(gain / fan), shape))
         layer.set_weights(values)
     assert model.count_params() == 3_239_114

@@ -1,12 +1,10 @@
 """Scorers by name, from files, from other packages and from pyiqa, and the list of them all."""
 
-import pickle
 import sys
 import types
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import torch
 from hypothesis import given
@@ -14,20 +12,13 @@ from hypothesis import strategies as st
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
-from ae_env.scorers import (
-    CompositeScorer,
-    list_scorers,
-    make_scorer,
-    register_scorer,
-    registry,
-)
+from ae_env.scorers import CompositeScorer, list_scorers, make_scorer, register_scorer, registry
 from ae_env.scorers.defects import DEFECTS
 from ae_env.scorers.protocol import Captures
 from ae_env.scorers.registry import ScorerRow, describe_scorers, scorer_fingerprint
 from ae_env.scorers.score_table import TIE, ScoreTables
 from ae_env.scorers.terms import Noise
 from simulator import NoiseLevelFunction
-from tests.ae_env.environments import make_env
 from tests.ae_env.scorer_images import CAMERA, random_pictures
 from tests.strategies import LIGHT, USUAL_SETTINGS, grids, lights
 
@@ -96,18 +87,6 @@ def test_a_real_entry_point_works_and_is_listed_beside_broken_ones() -> None:
             assert row.domain in ("raw", "srgb")
             assert row.summary.endswith(".")
     sys.modules.pop("their_scores", None)
-
-
-def test_the_spec_of_an_environment_goes_to_other_processes(tmp_path: Path) -> None:
-    """As docs/scorers.md says of a scorer from a file, whose class no other process knows."""
-    (tmp_path / "my_scorer.py").write_text(MINE)
-    env = make_env(scorer=f"{tmp_path}/my_scorer.py:Level")
-    content = pickle.dumps(env.spec)
-    for name in [name for name in sys.modules if name.startswith("ae_env_user_")]:
-        del sys.modules[name]
-    other = gym.make(pickle.loads(content))
-    rewards = [(e.reset(seed=0), e.step(5))[1][1] for e in (env, other)]
-    assert rewards[0] == rewards[1] > 0.0
 
 
 def test_a_file_works_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,16 +13,15 @@ import ae_env
 from ae_env.options import EnvOptions
 from ae_env.scenes.loading import BUNDLED, BUNDLED_PARTS
 from ae_env.utils.presets import find_preset
+from tests.ae_env.environments import ID, SMALL
 
-ID = "ae_env/AutoExposure-v0"
 PRESETS = ae_env.list_presets()
 
 
 def _load(name: str) -> dict[str, Any]:
-    """A preset with few scenes, to be made quickly."""
     arguments = ae_env.load_preset(name)
     assert arguments["scenes"] in {*BUNDLED, *BUNDLED_PARTS}
-    return {**arguments, "scenes": "bundled:small", "resolution": 36}
+    return {**arguments, **SMALL}
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -41,7 +40,7 @@ def test_presets_run_on_small_scenes(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "kind"), [("snow", "snow"), ("concert", "spot_light")])
 def test_scenes_of_one_kind(name: str, kind: str) -> None:
-    scenes = EnvOptions(**{**ae_env.load_preset(name), "split": "test"}).load_scenes()
+    scenes = EnvOptions(scenes=ae_env.load_preset(name)["scenes"], split="test").load_scenes()
     assert len(scenes) >= 10
     assert {scene.kind for scene in scenes} == {kind}
 

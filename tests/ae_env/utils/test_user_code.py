@@ -22,7 +22,6 @@ def _write(file: Path, text: str) -> Path:
         ("mine.py:Mine", ("mine.py", "Mine")),
         ("/a/b.py/mine.py:Mine", ("/a/b.py/mine.py", "Mine")),
         ("C:\\a b\\mine.py:Mine", ("C:\\a b\\mine.py", "Mine")),
-        ("mine.py", ("mine.py", "")),
         ("mine.py:", ("mine.py", "")),
         ("my.pyramid:Mine", None),
         ("noise", None),
