@@ -54,9 +54,8 @@ def assert_equal(first: Any, second: Any, where: str = "", **tolerance: float) -
 def assert_same(first: Any, second: Any, where: str = "") -> None:
     """As `assert_equal`, but for the last digits of scores (float64).
 
-    A pixel's exponential (float32) is rounded differently in the vector unit than in the up to 15
-    elements left over at the end of a batch, which moves exp(-mean / 0.15) of 36 x 36 pixels by up
-    to 15 x 2**-24 / 1296 / 0.15 = 5e-9.
+    The exponentials of the last pixels of a batch are rounded differently: up to 15 of them move
+    exp(-mean / 0.15) of 36 x 36 pixels by up to 15 x 2**-24 / 1296 / 0.15 = 5e-9.
     """
     assert_equal(first, second, where, rtol=1e-8, atol=1e-12)
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 from hypothesis import given
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.grid import ExposureGrid
 from tests.strategies import SEEDS, grids
 

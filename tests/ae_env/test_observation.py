@@ -8,7 +8,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.observation import (
     PEDESTAL,
     SENSOR_RANGES,

@@ -175,9 +175,6 @@ def test_running_episodes_move_to_another_process() -> None:
         np.testing.assert_array_equal(env.step(action)[0]["raw"], raw)
 
 
-# -- states that a scene forbids --------------------------------------------------------------
-
-
 def _scene(allowed: Any, scene_id: str = "holes") -> Scene:
     return make_scene(np.full((4, 40, 40), 0.12), 640.0, scene_id=scene_id, allowed=allowed)
 
@@ -218,9 +215,6 @@ def test_forbidden_states_are_masked_never_best_and_never_drawn() -> None:
 def test_masks_that_cannot_be(allowed: np.ndarray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make_envs(1, scenes=[_scene(allowed)])
-
-
-# -- scores -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lighting", ["static", "sine", "flicker"])

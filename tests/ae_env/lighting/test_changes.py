@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.lighting import KINDS, MAX_STOPS, Lighting, StepLighting, make_lighting
 from tests.strategies import log_uniform
 

@@ -103,9 +103,6 @@ def test_options_reach_the_scenes(tmp_path: Path) -> None:
     assert only.ev100 == pytest.approx(8.0, abs=0.05)
 
 
-# -- sequences: raws in name order are the frames of an episode ------------------------------------
-
-
 #: Signal, ISO and exposure time of each frame; the light is that of signal / (ISO time), the same
 #: in the first and the second, twice that in the third.
 FRAMES = ((0.1, 100, 1 / 64), (0.2, 200, 1 / 64), (0.2, 100, 1 / 64))

@@ -97,6 +97,9 @@ def test_radiance_maps_by_name(tmp_path: Path, caplog: pytest.LogCaptureFixture)
         assert view.light[1].mean().item() == pytest.approx(0.12, rel=0.01)  # flat in 90 degrees
         assert f"{view.illuminance:g} lux assumed" in view.source
         assert view.reference.log2_exposure == pytest.approx(-np.log2(view.illuminance / 2.5))
+    write_exr(tmp_path / "maps" / "StillLife.exr", np.ones((256, 300)))  # no panorama
+    found = reference_scenes("validation", CAMERA, number=0, size=64, radiance=tmp_path)
+    assert "StillLife" in {s.scene_id for s in found}
     train = reference_scenes("train", CAMERA, number=0, size=64, radiance=tmp_path)
     assert all(s.kind == "photograph" for s in train)
     with pytest.raises(FileNotFoundError, match="`radiance`"):

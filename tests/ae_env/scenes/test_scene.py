@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.color import rgb2xyz
 
-import ae_env  # noqa: F401  (registers the environment)
 from ae_env.scenes import Scene
 from ae_env.scenes.colour import camera_from_srgb, temperature_tint
 from simulator import CameraSettings, NoiseLevelFunction, get_camera

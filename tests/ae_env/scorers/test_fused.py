@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,18 +83,6 @@ def test_static_and_changing_light_are_scored_by_the_same_kernel(
         other = alone.table(_scene(), speed=0.1, gain=gain)
         np.testing.assert_array_equal(found.parts["balanced"], other.mean)
         np.testing.assert_allclose(found.mean, 0.8 * other.mean + 0.2 * other.parts["noise"])
-
-
-@pytest.mark.parametrize("gain", [0.3, 2.0])
-def test_tables_of_changed_light_are_those_of_a_scene_with_that_light(gain: float) -> None:
-    """What the whole table says, against another scene in its own light."""
-    scene = _scene()
-    lit = replace(scene, light=scene.light * gain, illuminance=640.0 * gain)
-    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
-    changed = tables.table(scene, speed=0.2, defocus=1.0, gain=gain)
-    wanted = tables.table(lit, speed=0.2, defocus=1.0)
-    np.testing.assert_allclose(changed.mean, wanted.mean, atol=1e-6)
-    assert changed.oracle == wanted.oracle
 
 
 def test_compiled_and_loaded_kernels_agree_to_the_last_bit(tmp_path: Path) -> None:

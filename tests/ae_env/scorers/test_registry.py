@@ -188,9 +188,6 @@ def test_bad_scorers_are_refused(spec: Any, message: str) -> None:
         make_scorer(spec)
 
 
-# -- fingerprints, which tell the cached scores of scorers apart ----------------------------------
-
-
 class Constant:
     domain, depends_on = "raw", "light"
 
@@ -214,8 +211,6 @@ def test_scorers_inside_of_others_enter_the_key() -> None:
     assert len({nested(*kind) for kind in kinds}) == 4
     assert nested(0.2, 1) == nested(0.2, 1)
 
-
-# -- properties that hold for every scorer ---------------------------------------------------------
 
 IMAGE_SCORERS = ["mid_grey", "clipping", "well_exposedness", "entropy", "shim", "zhang", "shin"]
 IMAGE_SCORERS += ["blind_noise", *(f"analytic_{defect}" for defect in DEFECTS)]

@@ -241,8 +241,9 @@ def test_bands_count_whatever_form_the_gain_has() -> None:
         np.testing.assert_allclose(table.mean, banding, rtol=1e-6)
     top = Own(lambda images, _: images[:, :, :20].mean(dim=(1, 2, 3)))
     grid = ExposureGrid((100,), (1 / 500, 1 / 250), (4,))
-    for noise in (False, True):
-        found = _tables(top, grid=grid, noise=noise).table(scene, row_gain=rows[:2]).mean
+    for noise, gain in ((False, 1.0), (True, np.ones(2))):
+        tables = _tables(top, grid=grid, noise=noise)
+        found = tables.table(scene, gain=gain, row_gain=rows[:2]).mean
         np.testing.assert_allclose(found, 0.05 * 1.9 * _light(scene, grid), atol=1e-3)
 
 

@@ -12,7 +12,6 @@ from gymnasium.utils.env_checker import check_env
 import ae_env
 from ae_env.options import EnvOptions
 from ae_env.scenes.loading import BUNDLED, BUNDLED_PARTS
-from ae_env.utils.presets import find_preset
 from tests.ae_env.environments import ID, SMALL
 
 PRESETS = ae_env.list_presets()
@@ -63,7 +62,6 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
         own.write_text(text)
         with pytest.raises(ValueError, match=rf"`preset` \(='.*own\.yaml'\).*{message}"):
             ae_env.load_preset(str(own))
-    assert find_preset("snow").read_text().startswith("#")
 
 
 def test_every_package_and_the_presets_are_installed() -> None:

@@ -1,7 +1,6 @@
 """Classes from files of the user's own."""
 
 import sys
-import textwrap
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ ARGUMENT = "`thing` (='mine.py:Mine')"
 
 
 def _write(file: Path, text: str) -> Path:
-    file.write_text(textwrap.dedent(text))
+    file.write_text(text)
     return file
 
 
