@@ -54,13 +54,13 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"`env` \(='.*own.yaml'\): there is no such file"):
         ae_env.load_preset(own)
     own.write_text("lighting: sine\nmax_episode_steps: 4\n")
-    assert ae_env.load_preset(own) == ae_env.load_preset(str(own))
-    assert ae_env.load_preset(str(own)) == {"lighting": "sine", "max_episode_steps": 4}
+    expected = {"lighting": "sine", "max_episode_steps": 4}
+    assert ae_env.load_preset(own) == ae_env.load_preset(str(own)) == expected
     bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"  # 10^30 entries with the aliases written out
     bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 30))
     for text, message in (("- 1\n", "must map arguments"), ("a: [", "not YAML"), (bomb, "")):
         own.write_text(text)
-        with pytest.raises(ValueError, match=rf"`preset` \(='.*own\.yaml'\).*{message}"):
+        with pytest.raises(ValueError, match=rf"`env` \(='.*own\.yaml'\).*{message}"):
             ae_env.load_preset(str(own))
 
 
