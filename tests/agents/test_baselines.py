@@ -51,27 +51,17 @@ SETTINGS = (
 )
 
 
-@pytest.fixture
-def folder(tmp_path):
-    camera = get_camera("nikon_z6")
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_recording_is_replayed_on_its_own_raws(tmp_path, delay):
+    """Every frame of the sequence is shot at the settings that its raw was recorded at."""
     for i, settings in enumerate(SETTINGS):
-        raw = RawImage(torch.full((4, 16, 16), 0.1), CameraSettings(*settings), camera=camera)
+        light = torch.full((4, 40, 40), 0.1)
+        raw = RawImage(light, CameraSettings(*settings), get_camera("nikon_z6"))
         write_dng(tmp_path / f"frame_{i:02d}.dng", raw)
     (tmp_path / "notes.txt").write_text("not a raw")
-    return tmp_path
-
-
-@pytest.mark.parametrize("delay", [0, 1])
-def test_a_recording_is_replayed_on_its_own_raws(folder, delay):
-    """Every frame of the sequence is shot at the settings that its raw was recorded at."""
-    options = {"scenes": {"sequence": str(folder)}, "split": "test", "resolution": 36}
-    for i, settings in enumerate(SETTINGS):  # large enough for an environment
-        raw = RawImage(
-            torch.full((4, 40, 40), 0.1), CameraSettings(*settings), camera=get_camera("nikon_z6")
-        )
-        write_dng(folder / f"frame_{i:02d}.dng", raw)
+    options = {"scenes": {"sequence": str(tmp_path)}, "split": "test", "resolution": 36}
     envs = make_envs({**options, "delay": delay, "depth": "far"}, num_envs=1, frames=4)
-    policy = make_policy(f"recorded:{folder}", PolicyContext.from_envs(envs))
+    policy = make_policy(f"recorded:{tmp_path}", PolicyContext.from_envs(envs))
     policy.reset(1)
     observations, _ = envs.reset(seed=0, options={"state": 0})
     for frame in range(1, 4):

@@ -14,35 +14,25 @@ def _data(groups=60, seeds=1, seed=0):
     return gains, span
 
 
-def test_interval_over_groups_agrees_with_scipy():
-    gains, span = _data()
-    expected = scipy.stats.bootstrap(
-        (gains[0], span),
-        lambda g, s, axis=-1: g.sum(axis) / s.sum(axis),
-        paired=True,
-        n_resamples=20_000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
-    found = score_interval(gains, span, resamples=20_000)
-    assert found.value == pytest.approx(gains.sum() / span.sum())
-    assert found.pair == pytest.approx([expected.low, expected.high], abs=2e-3)
+def test_intervals_agree_with_scipy_and_differences_are_paired():
+    def expected(tolerance, statistic, *samples):
+        options = {"paired": True, "n_resamples": 20_000, "method": "percentile"}
+        rng = np.random.default_rng(1)
+        found = scipy.stats.bootstrap(samples, statistic, **options, rng=rng).confidence_interval
+        return pytest.approx([found.low, found.high], abs=tolerance)
 
-
-def test_paired_difference_agrees_with_scipy_and_is_narrower_than_unpaired():
     first, span = _data()
     second = first * 0.95
-    expected = scipy.stats.bootstrap(
-        (first[0], second[0], span),
-        lambda a, b, s, axis=-1: (a.sum(axis) - b.sum(axis)) / s.sum(axis),
-        paired=True,
-        n_resamples=20_000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
+    alone = score_interval(first, span, resamples=20_000)
+    assert alone.value == pytest.approx(first.sum() / span.sum())
+    mean = expected(2e-3, lambda g, s, axis=-1: g.sum(axis) / s.sum(axis), first[0], span)
+    assert alone.pair == mean
     found = difference_interval(first, second, span, resamples=20_000)
-    assert found.pair == pytest.approx([expected.low, expected.high], abs=5e-4)
-    alone = score_interval(first, span)
+    assert found.pair == expected(
+        5e-4,
+        lambda a, b, s, axis=-1: (a.sum(axis) - b.sum(axis)) / s.sum(axis),
+        *(first[0], second[0], span),
+    )
     assert found.high - found.low < 0.2 * (alone.high - alone.low)
 
 

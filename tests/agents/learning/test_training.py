@@ -107,17 +107,12 @@ def test_trained_once(agent: str, tmp_path: Path) -> None:
     config, out = tiny(agent), tmp_path / "runs" / f"{agent}-0.1"
     assert not is_trained(config, out)
     calls: list[int] = []
-    with torch.random.fork_rng():
-        train_agent(config, out, progress=lambda done, total, values: calls.append(done))
+    train_agent(config, out, progress=lambda done, total, values: calls.append(done))
     assert calls[-1] == {"regression": 24, "ppo": 32}[agent]
     names = {path.name for path in out.parent.iterdir()}
     assert names == {f"{agent}-0.1.json", f"{agent}-0.1.safetensors"}  # no checkpoint is left
     assert is_trained(config, out)
-    stamp = (out.parent / f"{agent}-0.1.safetensors").stat().st_mtime_ns
-    again: list[int] = []
-    train_agent(config, out, progress=lambda done, total, values: again.append(done))
-    assert again == []
-    assert (out.parent / f"{agent}-0.1.safetensors").stat().st_mtime_ns == stamp
+    train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
     # Another training, or a damaged file, is not taken for this one.
     assert not is_trained(config.with_seed(1), out)
     assert not is_trained(tiny(agent, width=9), out)
@@ -125,40 +120,31 @@ def test_trained_once(agent: str, tmp_path: Path) -> None:
     assert not is_trained(config, out)
 
 
-def test_a_failed_save_keeps_the_training(tmp_path: Path, monkeypatch) -> None:
+def test_a_failed_save_keeps_the_training_and_its_log(tmp_path: Path, monkeypatch) -> None:
+    pytest.importorskip("tensorboard")
+
     def full(*args: Any) -> None:
         raise OSError("no space left on device")
 
-    config, out = tiny(), tmp_path / "agent"
+    config, out = tiny().with_seed(1), tmp_path / "agent"
     with monkeypatch.context() as patch:
         patch.setattr("agents.learning.training.save_agent", full)
         with pytest.raises(OSError, match="no space"):
-            train_agent(config, out)
-    calls: list[int] = []
-    train_agent(config, out, progress=lambda *a: calls.append(a[0]))
-    assert calls == []  # all the frames had been seen
-    assert is_trained(config, out)
-
-
-def test_tensorboard(tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    train_agent(tiny().with_seed(1), tmp_path / "a", tensorboard=tmp_path / "log")
-    assert json.loads((tmp_path / "a.json").read_text())["training"]["training"]["seed"] == 1
+            train_agent(config, out, tensorboard=tmp_path / "log")
     (events,) = (tmp_path / "log").glob("events*")
     assert events.stat().st_size > 200
+    train_agent(config, out, progress=lambda *_: pytest.fail("all the frames had been seen"))
+    assert is_trained(config, out)
+    assert json.loads((tmp_path / "agent.json").read_text())["training"]["training"]["seed"] == 1
 
 
 # Several at once
 
 
-def jobs(folder: Path, frames: int) -> list[TrainingJob]:
-    trainings = {"regression": {"frames": frames}, "ppo": {"total_timesteps": frames}}
-    return [TrainingJob(n, tiny(n, **own), folder / n) for n, own in trainings.items()]
-
-
-@pytest.mark.slow
+@pytest.mark.usefixtures("quick_spawn")
 def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
-    todo = jobs(tmp_path, frames=240)
+    trainings = {"regression": {"frames": 240}, "ppo": {"total_timesteps": 240}}
+    todo = [TrainingJob(n, tiny(n, **own), tmp_path / n) for n, own in trainings.items()]
     running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
 
     def stop(*_: object) -> None:
@@ -188,7 +174,7 @@ def _share(job: int) -> None:
         raise ValueError("job 2 has failed")
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("quick_spawn")
 def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training, "core_count", lambda: 6)
     seen: list[tuple[object, ...]] = []
@@ -203,6 +189,8 @@ def _never_end(job: int) -> None:
 
 
 def _wait_for_ever(pipe: Connection) -> None:
+    forkserver = multiprocessing.get_context("forkserver")
+    multiprocessing.get_context = {"spawn": forkserver}.__getitem__  # type: ignore[assignment]
     run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
 
 
@@ -213,12 +201,10 @@ def _runs(pid: int) -> bool:
         return False
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="needs /proc")
-def test_workers_do_not_outlive_a_killed_parent() -> None:
-    context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    parent = context.Process(target=_wait_for_ever, args=(there,))
+def test_workers_do_not_outlive_a_killed_parent(forkserver: Any) -> None:
+    here, there = forkserver.Pipe()
+    parent = forkserver.Process(target=_wait_for_ever, args=(there,))
     parent.start()
     workers = [here.recv(), here.recv()]
     assert all(_runs(pid) for pid in workers)
@@ -227,4 +213,4 @@ def test_workers_do_not_outlive_a_killed_parent() -> None:
     end = time.monotonic() + 30
     while any(_runs(pid) for pid in workers):
         assert time.monotonic() < end, "they work on for nobody"
-        time.sleep(0.1)
+        time.sleep(0.05)
