@@ -1,7 +1,5 @@
 """Fixtures shared by all tests."""
 
-from __future__ import annotations
-
 import logging
 import multiprocessing
 import multiprocessing.forkserver

@@ -1,7 +1,5 @@
 """Strategies of property tests: settings, camera bodies, grids and images of any shape."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

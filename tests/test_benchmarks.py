@@ -1,7 +1,6 @@
 """The harness of the benchmarks: tables, rounding, runs that continue where they were stopped."""
 
-from __future__ import annotations
-
+import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -80,8 +79,6 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_every_benchmark_of_the_command_can_be_imported() -> None:
-    import importlib
-
     for name in BENCHMARKS:
         stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
         assert callable(importlib.import_module(f"benchmarks.{stem}").run)

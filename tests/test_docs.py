@@ -1,7 +1,5 @@
 """README and docs: links lead somewhere, code runs as printed, commands parse."""
 
-from __future__ import annotations
-
 import os
 import pkgutil
 import re

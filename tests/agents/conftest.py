@@ -1,7 +1,5 @@
 """A camera, a grid and synthetic frames for the policies' tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

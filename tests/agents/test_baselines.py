@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -41,8 +39,6 @@ def test_oracle_reads_info_and_nothing_else(context):
     with pytest.raises(ValueError, match="with_oracle=True"):
         policy.act({})
 
-
-# -- recorded settings ----------------------------------------------------------------------------
 
 SETTINGS = (
     (100, 1 / 1000, 4.0),

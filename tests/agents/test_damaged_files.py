@@ -1,7 +1,5 @@
 """Damaged maps and configurations: each is read, or refused with a ValueError."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Trainings that are killed go on from their last checkpoint."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

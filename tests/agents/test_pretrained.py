@@ -1,7 +1,5 @@
 """The agents that come with the package."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import pytest

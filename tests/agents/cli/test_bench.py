@@ -1,7 +1,5 @@
 """`ae-env bench` runs the benchmarks of its own checkout, and no others."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`ae-env cache`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

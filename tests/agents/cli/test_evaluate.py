@@ -1,7 +1,5 @@
 """`ae-env evaluate`: how its options become a plan, presets, and benchmarks."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -36,9 +34,8 @@ def preset(tmp_path: Path) -> str:
 
 def test_plain_options_mean_one_condition():
     plan = _plan(None, None, ["random"], {"lighting": "sine", "delay": 2, "episodes": 3, "seed": 5})
-    assert {n: (c.lighting, c.delay) for n, c in plan.all_conditions.items()} == {
-        "sine": ("sine", 2)
-    }
+    ((name, condition),) = plan.all_conditions.items()
+    assert (name, condition.lighting, condition.delay) == ("sine", "sine", 2)
     assert (plan.starts, plan.frames, plan.seeds) == (("random",), 8, (5, 6, 7))
     assert plan.environment == {"scenes": "bundled", "resolution": 64}
 
@@ -80,8 +77,7 @@ def test_mistakes_are_one_line(ae_env, tmp_path, arguments, message):
     (tmp_path / "mine.yaml").write_text(BASE)
     (tmp_path / "broken.yaml").write_text(BASE.replace("dark", "drak"))
     code, _, error = ae_env("evaluate", *arguments)
-    assert code == 2
-    assert len(error.strip().splitlines()) == 1, error
+    assert (code, error.strip().count("\n")) == (2, 0), error
     assert message in error
     assert not (tmp_path / "evaluation").exists()
 
@@ -103,9 +99,6 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
         lines = list(csv.DictReader(stream))
     assert len(lines) == len(content["rows"])
     assert {"regret_given_ev", "regret_delayed", "converged", "ms_alone"} <= set(lines[0])
-    late = [r for r in lines if (r["policy"], r["condition"]) == ("oracle", "static/delay1")]
-    assert float(late[0]["regret_delayed"]) == pytest.approx(0.0, abs=1e-9)
-    assert float(late[0]["regret"]) > 0.01
     text = (folder / "report.md").read_text()
     for title in ("Ranking", "Conditions", "Score against time", "Clipping", "Under other scorers"):
         assert f"## {title}" in text

@@ -1,7 +1,5 @@
 """The command line as a whole: its commands, its help, its errors and exit statuses."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path
@@ -12,7 +10,18 @@ from typer.testing import CliRunner
 
 from agents.cli import main as cli
 
-COMMANDS = sorted(c.callback.__name__.replace("_", "-") for c in cli.app.registered_commands)
+COMMANDS = [
+    "bench",
+    "cache",
+    "convert-nima",
+    "evaluate",
+    "quickstart",
+    "scorers",
+    "simulate",
+    "sweep",
+    "train",
+]
+COMMANDS.append("train-simulator")
 UNMADE = """\
 from agents import Policy
 class Unmade(Policy):
@@ -21,11 +30,15 @@ class Unmade(Policy):
     def act(self, observations, action_masks=None): ...
 """
 SIMULATE = ("--iso", "800", "--shutter", "1/60", "--aperture", "4")
-
-
-def test_every_command_is_there() -> None:
-    names = "bench cache convert-nima evaluate quickstart scorers simulate sweep train"
-    assert [*names.split(), "train-simulator"] == COMMANDS
+PLAIN = ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none")
+FILES = {
+    "text.dng": "not a raw\n",
+    "bad.py": "def (:\n",
+    "own.py": UNMADE,
+    "script.py": "import sys\nsys.exit(0)\n",
+    "wrong.yaml": "agent: regression\ntraining: {frame: 3}\n",
+    "agent.yaml": "agent: ppo\n",
+}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -43,7 +56,7 @@ def test_help_has_an_example_and_out(command: str) -> None:
 def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
     code, out, _ = ae_env("--help")
     assert code == 0
-    assert all(command in out for command in COMMANDS)
+    assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", out, re.MULTILINE)) == sorted(COMMANDS)
     monkeypatch.setattr("sys.argv", ["agents.cli", "--help"])
     with pytest.raises(SystemExit):
         runpy.run_module("agents.cli", run_name="__main__")
@@ -64,14 +77,8 @@ def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", f"{'x' * 300}.dng"), "File name too long"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--device", "tpu"), "`device` (='tpu') must be auto"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none.safetensors"), "no none.json"),
-        (
-            ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none", "--depth", "unknown"),
-            "`depth` (='unknown') needs an aperture",
-        ),
-        (
-            ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none", "--depth", "near"),
-            "`depth` (='near') must be one of",
-        ),
+        ((*PLAIN, "--depth", "unknown"), "`depth` (='unknown') needs an aperture"),
+        ((*PLAIN, "--depth", "near"), "`depth` (='near') must be one of"),
         (("sweep", "IMG_1.dng", "--out", "text.dng"), "text.dng is a file"),
         (("evaluate", "--policy", "randm"), "did you mean 'random'?"),
         (("evaluate", "--policy", "bad.py:Mine"), "(bad.py, line 1)"),
@@ -91,17 +98,9 @@ def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else "",
 )
-def test_errors_are_one_line(ae_env, dng: Path, arguments, message, monkeypatch) -> None:
+def test_errors_are_one_line(ae_env, dng: Path, arguments, message) -> None:
     folder = dng.parent
-    files = {
-        "text.dng": "not a raw\n",
-        "bad.py": "def (:\n",
-        "own.py": UNMADE,
-        "script.py": "import sys\nsys.exit(0)\n",
-        "wrong.yaml": "agent: regression\ntraining: {frame: 3}\n",
-        "agent.yaml": "agent: ppo\n",
-    }
-    for name, text in files.items():
+    for name, text in FILES.items():
         (folder / name).write_text(text)
     Image.new("RGB", (8, 8)).save(folder / "picture.png")
     (folder / "empty.dng").mkdir()
@@ -110,10 +109,9 @@ def test_errors_are_one_line(ae_env, dng: Path, arguments, message, monkeypatch)
     before = {path.name for path in folder.iterdir()}
     code, _, error = ae_env(*arguments)
     assert code == 2
-    lines = error.strip().splitlines()
-    assert len(lines) == 1, error
-    assert lines[0].startswith("error ")
-    assert message in lines[0]
+    assert error.strip().count("\n") == 0
+    assert error.startswith("error ")
+    assert message in error
     left = {path.name for path in folder.iterdir()} - before
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
@@ -159,8 +157,7 @@ def test_failures_while_running(ae_env, dng, monkeypatch, raised, status, messag
 
     monkeypatch.setattr("simulator.write_dng", fail)
     code, _, error = ae_env("simulate", dng, *SIMULATE, "--weights", "none")
-    assert code == status
-    assert error.count("\n") == 1
+    assert (code, error.count("\n")) == (status, 1)
     assert message in error
 
 

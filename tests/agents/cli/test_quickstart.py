@@ -1,7 +1,5 @@
 """The main job on few frames: every file is there, and nothing is done twice."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -86,7 +84,7 @@ def test_bundled_scenes_then_raws_of_ones_own(raw: RawImage, tmp_path: Path, mon
     assert content["meta"]["zero_shot"] is True
     assert content["meta"]["trained_on"] == "bundled:small"
     rows = [row for row in content["rows"] if row["condition"] == "all"]
-    assert {(row["num_groups"], row["ci95"]) for row in rows} == {(3, None)}  # too few groups
+    assert {(row["num_groups"], row["ci95"]) for row in rows} == {(1, None)}  # they look alike
     assert "Every source group" in (out / "report.md").read_text()
 
 

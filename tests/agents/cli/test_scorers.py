@@ -1,7 +1,5 @@
 """`ae-env scorers` and `ae-env convert-nima`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py
@@ -27,7 +25,7 @@ def keras_file(tmp_path: Path) -> Path:
     return tmp_path / "weights.hdf5"
 
 
-def test_all_scorers_are_listed(ae_env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_scorers_are_listed(ae_env) -> None:
     code, out, _ = ae_env("scorers")
     assert code == 0
     for name in list_scorers():

@@ -1,7 +1,5 @@
 """`ae-env train`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

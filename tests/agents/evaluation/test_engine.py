@@ -1,7 +1,5 @@
 """`evaluate`: every policy on the same episodes, whatever the batch or the forbidden states."""
 
-from __future__ import annotations
-
 import dataclasses
 from contextlib import closing
 
@@ -65,9 +63,6 @@ def test_the_batch_size_changes_nothing_and_a_plan_is_the_same(small, result, tm
             np.testing.assert_array_equal(*(getattr(track, name) for track in tracks))
 
 
-# -- policies that do what they must not ----------------------------------------------------------
-
-
 class Bad(Policy):
     answer: object = None
 
@@ -106,9 +101,6 @@ def test_arguments_are_checked(small):
         evaluate({}, OPTIONS)
 
 
-# -- states that a scene forbids ------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def holes() -> dict:
     """Scenes that allow a third of the states each, another third every time."""
@@ -145,9 +137,6 @@ def test_a_forbidden_choice_is_refused(small, holes):
     policy.answer = np.zeros(6, int)
     with pytest.raises(ValueError, match="policy 'mine': state 0 is masked in this scene"):
         evaluate({"mine": policy}, holes, frames=1)
-
-
-# -- delays, fits, sequences ----------------------------------------------------------------------
 
 
 def test_delay_scores_the_frame_that_was_exposed(small):

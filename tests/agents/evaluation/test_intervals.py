@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.stats
@@ -56,8 +54,6 @@ def test_below_fifteen_groups_there_is_no_interval():
     assert "no interval" in str(found)
     assert score_interval(*_data(MIN_GROUPS)).pair is not None
 
-
-# -- ranking --------------------------------------------------------------------------------------
 
 SPAN = np.ones(60)
 

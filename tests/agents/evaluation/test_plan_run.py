@@ -1,7 +1,5 @@
 """A plan's parts: measured once, measured again where they are missing, the same in any process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

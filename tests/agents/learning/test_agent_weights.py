@@ -1,7 +1,5 @@
 """Agents on disk: safetensors and JSON, and clear words when they do not fit."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -29,9 +27,8 @@ from simulator.utils.files import sibling
 
 
 def make_network(context: PolicyContext) -> ScoreRegressor:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return ScoreRegressor(context.observation_space, context.grid, width=8)
+    torch.manual_seed(0)
+    return ScoreRegressor(context.observation_space, context.grid, width=8)
 
 
 @pytest.fixture
@@ -43,21 +40,14 @@ def agent(context: PolicyContext, tmp_path: Path) -> Path:
 
 
 def test_round_trip(agent: Path, context: PolicyContext) -> None:
-    assert sorted(p.name for p in agent.parent.iterdir()) == [
-        "regression-0.5.json",
-        "regression-0.5.safetensors",
-    ]
+    files = {path.name for path in agent.parent.iterdir()}
+    assert files == {"regression-0.5.json", "regression-0.5.safetensors"}
     tensors, card = load_agent(agent, "regression")
-    on_disk = load_file(sibling(agent, ".safetensors"))
-    assert set(tensors) == set(on_disk)
-    assert all(torch.equal(tensors[name], on_disk[name]) for name in on_disk)
-    assert card["width"] == 8
-    assert card["training"] == {"agent": "regression"}
-    assert card["context"] == describe_context(context)
-    network = make_network(context)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.zero_()
+    expected = {"width": 8, "training": {"agent": "regression"}}
+    assert card | expected | {"context": describe_context(context)} == card
+    network, on_disk = make_network(context), load_file(sibling(agent, ".safetensors"))
+    for parameter in network.parameters():
+        parameter.data.zero_()
     load_into(network, tensors, agent)
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
 
@@ -125,8 +115,7 @@ def test_wrong_types_in_the_card(
 def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> None:
     before = sibling(agent, ".safetensors").read_bytes()
     network = make_network(context)
-    with torch.no_grad():
-        next(network.parameters()).fill_(float("nan"))
+    next(network.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="must be finite: their training has failed"):
         save_agent(agent, "regression", network, describe_agent(8, context, {}))
     assert sibling(agent, ".safetensors").read_bytes() == before
@@ -179,12 +168,8 @@ def test_a_finer_grid_gives_known_states_their_values(name: str, context: Policy
         tuple(sorted({*coarse.exposure_times, 1 / 30})),
         coarse.f_numbers[:3],
     )
-    generator = torch.Generator().manual_seed(4)
-    frame = {
-        "raw": torch.rand(2, 4, 64, 64, generator=generator),
-        "settings": torch.rand(2, 3, generator=generator) * 2 - 1,
-        "sensors": torch.rand(2, 2, generator=generator) * 2 - 1,
-    }
+    raw, settings, sensors = torch.rand(2, 4, 64, 64), torch.rand(2, 3), torch.rand(2, 2)
+    frame = {"raw": raw, "settings": settings * 2 - 1, "sensors": sensors * 2 - 1}
     values = []
     for grid in (coarse, finer):
         network = make_policy(name, replace(context, grid=grid)).network

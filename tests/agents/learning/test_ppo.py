@@ -1,7 +1,5 @@
 """The PPO agent: a CNN, deterministic, resumable, the same after saving."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,9 @@ def test_progress_and_determinism(make_tiny_envs) -> None:
 
     def train(seed: int) -> dict[str, torch.Tensor]:
         training = TRAINING.model_copy(update={"seed": seed, "total_timesteps": 32})
-        return train_ppo(make_tiny_envs(), training, progress=lambda *a: seen.append(a)).state_dict()
+        return train_ppo(
+            make_tiny_envs(), training, progress=lambda *a: seen.append(a)
+        ).state_dict()
 
     first, again, other = train(3), train(3), train(4)
     assert [(done, total) for done, total, _ in seen] == [(n, 32) for n in range(4, 33, 4)] * 3

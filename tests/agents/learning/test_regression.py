@@ -1,7 +1,5 @@
 """The regression agent: how it adds up its predictions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

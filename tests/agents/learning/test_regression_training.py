@@ -1,7 +1,5 @@
 """Training of the regression agent: it learns, is reproducible, and goes on after Ctrl-C."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

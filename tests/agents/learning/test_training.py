@@ -1,7 +1,5 @@
 """From YAML to an agent: what is accepted, what is refused and how, and that nothing is redone."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -136,9 +134,6 @@ def test_a_failed_save_keeps_the_training_and_its_log(tmp_path: Path, monkeypatc
     train_agent(config, out, progress=lambda *_: pytest.fail("all the frames had been seen"))
     assert is_trained(config, out)
     assert json.loads((tmp_path / "agent.json").read_text())["training"]["training"]["seed"] == 1
-
-
-# Several at once
 
 
 @pytest.mark.usefixtures("quick_spawn")

@@ -1,7 +1,5 @@
 """A meter and a program in the loop: with synthetic frames, and with the environment."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 
@@ -22,9 +20,6 @@ STILL = {"motion": "none", "depth": "far"}
 EVERY = 3
 GREY = np.ones((64, 64))
 RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
-
-
-# -- what is remembered of earlier frames ---------------------------------------------------------
 
 
 def _reading(ev, saturated=0.0, black=False):
@@ -71,9 +66,6 @@ def test_another_light_is_noticed_at_once(context, photograph):
         _kept(reference, photograph(RAMP, 9.0, grid.nearest(9.0)))
         later = photograph(RAMP, 9.0 + change, grid.nearest(11.0))
         assert abs(_kept(reference, later) - grid.ev100[grid.nearest(11.0)]) < 0.05
-
-
-# -- on frames of a grey card ---------------------------------------------------------------------
 
 
 def _run(policy, photograph, scene_ev, *, frames=5, start=0, masks=None, **blur):
@@ -161,9 +153,6 @@ def test_a_policy_that_was_not_reset_says_so(context, photograph):
         policy = make_policy(name, context)
         with pytest.raises(ValueError, match=r"are of 2: call reset\(num_envs\) first"):
             policy.act(frame)
-
-
-# -- with the environment -------------------------------------------------------------------------
 
 
 @functools.cache
