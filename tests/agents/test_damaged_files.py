@@ -15,26 +15,13 @@ INPUTS = 120
 
 
 def damaged(content: bytes, rng: np.random.Generator) -> bytes:
-    """`content` after one to four accidents: cut off, bits flipped, pieces lost or overwritten.
-
-    Most of them near the beginning, where the structure of a file is.
-    """
+    """Cut off, or with up to four pieces lost or overwritten, most of them near the beginning."""
     data = bytearray(content)
     for _ in range(rng.integers(1, 5)):
-        reach = max(1, len(data) if rng.random() < 0.3 else min(len(data), 1024))
-        at, size = int(rng.integers(reach)), int(rng.integers(1, 65))
-        accident = int(rng.integers(5))
-        if accident == 0:
-            del data[at:]
-        elif accident == 1 and data:
-            data[at] ^= 1 << int(rng.integers(8))
-        elif accident == 2:
-            del data[at : at + size]
-        elif accident == 3:
-            data[at:at] = rng.bytes(size)
-        else:
-            data[at : at + size] = bytes([int(rng.choice([0, 0x7F, 0xFF]))]) * size
-    return bytes(data)
+        at = int(rng.integers(1 + len(data) if rng.random() < 0.3 else 1024))
+        lost, new = rng.integers(65, size=2) // rng.choice([1, 64])  # a piece, or a byte
+        data[at : at + lost] = rng.bytes(new)
+    return bytes(data if rng.random() < 0.8 else data[: rng.integers(1 + len(data))])
 
 
 def radiance_maps(folder: Path) -> Iterator[Path]:

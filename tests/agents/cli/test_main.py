@@ -22,19 +22,24 @@ COMMANDS = [
     "train",
 ]
 COMMANDS.append("train-simulator")
-UNMADE = """\
+#: Policies that fail when they are made, when it is their turn, and before.
+OWN = """\
 from agents import Policy
-class Unmade(Policy):
+class Raises(Policy):
+    def act(self, observations, action_masks=None):
+        raise KeyError("lost")
+class Counts(Raises):
+    captures_per_decision = "two"
+class Unmade(Raises):
     def __init__(self, context):
         raise KeyError("x")
-    def act(self, observations, action_masks=None): ...
 """
 SIMULATE = ("--iso", "800", "--shutter", "1/60", "--aperture", "4")
 PLAIN = ("simulate", "IMG_1.dng", *SIMULATE, "--weights", "none")
 FILES = {
     "text.dng": "not a raw\n",
     "bad.py": "def (:\n",
-    "own.py": UNMADE,
+    "own.py": OWN,
     "script.py": "import sys\nsys.exit(0)\n",
     "wrong.yaml": "agent: regression\ntraining: {frame: 3}\n",
     "agent.yaml": "agent: ppo\n",
@@ -47,10 +52,8 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert result.exit_code == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", result.output)
     assert re.search(rf"Example: \W?ae-env {command} ", text)
-    if command not in ("cache", "scorers"):
-        assert "--out" in text
-    if command not in ("cache", "scorers", "convert-nima"):
-        assert "--seed" in text
+    assert ("--out" in text) == (command not in ("cache", "scorers"))
+    assert ("--seed" in text) == (command not in ("cache", "scorers", "convert-nima"))
 
 
 def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
@@ -116,17 +119,6 @@ def test_errors_are_one_line(ae_env, dng: Path, arguments, message) -> None:
     assert left <= {"quickstart", "runs", "evaluation", "sweep"}  # at most an empty folder
 
 
-#: A policy that loads, and fails when it is its turn; and one that fails before.
-OWN = """\
-from agents import Policy
-class Raises(Policy):
-    def act(self, observations, action_masks=None):
-        raise KeyError("lost")
-class Counts(Raises):
-    captures_per_decision = "two"
-"""
-
-
 @pytest.mark.parametrize(
     ("name", "status", "message"),
     [
@@ -136,8 +128,8 @@ class Counts(Raises):
 )
 def test_policies_that_fail(ae_env, tmp_path: Path, name: str, status: int, message: str) -> None:
     (tmp_path / "own.py").write_text(OWN)
-    arguments = ("--scenes", "bundled:small", "--resolution", 36, "--frames", 1, "--episodes", 1)
-    code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *arguments)
+    small = ["--scenes", "bundled:small", "--resolution", "36", "--frames", "1", "--episodes", "1"]
+    code, _, error = ae_env("evaluate", "--policy", f"own.py:{name}", *small)
     assert (code, error.count("\n")) == (status, 1)
     assert message in error
     assert "own.py:" in error

@@ -138,7 +138,7 @@ def test_delayed_oracle_acts_on_what_it_saw_earlier():
         found = metrics.delayed_oracle_score(scores, np.ones((1, 3), bool), np.array([2]), delay)
         np.testing.assert_array_equal(found, [expected])
     masked = metrics.delayed_oracle_score(scores, np.arange(3) > 0, np.array([2]), 1)
-    np.testing.assert_array_equal(masked, [[0, 0, 0, 1]])
+    np.testing.assert_array_equal(masked, [[0, 1, 0, 1]])  # states 2, 1, 1, 2
 
 
 def test_normalised_score_at_its_ends_and_weighting():

@@ -95,13 +95,6 @@ def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
     # 6 updates of 2 epochs of 2 batches: Adam goes on counting, so its moments were restored.
     steps = {float(state["step"]) for state in optimizer.state_dict()["state"].values()}
     assert steps == {24.0}
-    again = train_ppo(
-        make_tiny_envs(), TRAINING, checkpoint=path, progress=lambda *_: pytest.fail("trains")
-    ).state_dict()
-    assert all(torch.equal(again[k], v) for k, v in network.state_dict().items())
-    assert any(not torch.equal(half["policy"][k], v) for k, v in again.items())
-
-
-def test_batches_must_divide_the_rollout(make_tiny_envs) -> None:
-    with pytest.raises(ValueError, match=r"`batch_size` \(=256\) must divide .*16 \* 4 = 64"):
-        train_ppo(make_tiny_envs(), PPOTraining())
+    end, weights = torch.load(path, weights_only=True)["state"], network.state_dict()
+    assert all(torch.equal(end["policy"][k], v) for k, v in weights.items())
+    assert any(not torch.equal(half["policy"][k], v) for k, v in weights.items())

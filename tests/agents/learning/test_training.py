@@ -51,8 +51,7 @@ def test_shipped_configs(path: Path) -> None:
     kind = {"regression": RegressionTraining, "ppo": PPOTraining}[config.agent]
     hyperparameters = config.hyperparameters()
     assert isinstance(hyperparameters, kind)
-    for name, value in text["training"].items():
-        assert getattr(hyperparameters, name) == value
+    assert text["training"].items() <= hyperparameters.model_dump().items()
     assert config.environment["split"] == "train"
     assert config.with_seed(7).hyperparameters().seed == 7
     assert json.loads(json.dumps(config.card())) == config.card()
@@ -70,13 +69,10 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: ppo\ntraining: {batch_size: 1}", r"training.batch_size \(=1\): .*equal to 2"),
         ("agent: ppo\ntraining: {learning_rate: .nan}", r"training.learning_rate \(=nan\)"),
         ("agent: ppo\ntraining: {batch_size: 100}", r"`batch_size` \(=100\) must divide"),
-        *(
-            (f"agent: regression\ntraining: {{{name}: {value}}}", rf"training.{name} \(={value}\)")
-            for name, value in (
-                *(("learning_rate", -1.0), ("explore", 1.5), ("replay", -1), ("dropout", 1.0)),
-                ("frames", 0),
-            )
-        ),
+        ("agent: regression\ntraining: {learning_rate: -1.0}", r"training.learning_rate \(=-1.0\)"),
+        ("agent: regression\ntraining: {explore: 1.5}", r"training.explore \(=1.5\)"),
+        ("agent: regression\ntraining: {replay: -1}", r"training.replay \(=-1\)"),
+        ("agent: regression\ntraining: {dropout: 1.0}", r"training.dropout \(=1.0\)"),
         ("agent: regression\ntraining: {frames: 1.5}", r"training.frames \(=1.5\)"),
         ("agent: ppo\nenvironment: {resolutoin: 64}", r"`resolutoin`.*mean `resolution`"),
         ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be an integer in"),
@@ -87,10 +83,8 @@ def test_shipped_configs(path: Path) -> None:
 def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(text)
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=rf"^.*mine\.yaml.*{message}.*\Z"):  # one line
         load_config(path)
-    assert "mine.yaml" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_bad_values_from_python() -> None:
@@ -159,8 +153,6 @@ def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
     assert is_trained(todo[0].config, todo[0].out)
     assert seen[0] > 4  # it went on
     assert seen == list(range(seen[0], 241, 4))
-    # Nothing is left to do, and no process is started.
-    train_in_parallel(todo[:1], progress=lambda *_: pytest.fail("trained again"))
 
 
 def _share(job: int) -> None:

@@ -1,6 +1,7 @@
 """A meter and a program in the loop: with synthetic frames, and with the environment."""
 
 import functools
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,8 @@ from agents.policy import MANUAL_PROGRAMS, METERS, PolicyContext, make_policy
 
 CONTROLLERS = (*METERS, "rpi_agc")
 SMALL = {"scenes": "bundled:small", "split": "all", "resolution": 36}
-STILL = {"motion": "none", "depth": "far"}
-#: Scenes of every kind: each third of the small ones.
-EVERY = 3
+#: Scenes of the loops: each third of the small ones, so some of every kind.
+COUNT = 14
 GREY = np.ones((64, 64))
 RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
 
@@ -156,35 +156,26 @@ def test_a_policy_that_was_not_reset_says_so(context, photograph):
 
 
 @functools.cache
-def _loop(
-    name: str, frames: int, start: int | None = None, **options: Any
-) -> tuple[Any, np.ndarray, np.ndarray]:
-    """The grid, the states (E, T) and the EV of the light at the start (E,)."""
-    options = {
-        **SMALL,
-        **STILL,
-        **{k: dict(v) if k == "lighting" else v for k, v in options.items()},
-    }
-    envs = make_envs(options, num_envs=1, frames=1)
-    count = len(envs.unwrapped.scenes)  # type: ignore[attr-defined]
-    envs.close()
-    scenes = list(range(0, count, EVERY))
-    envs = make_envs(options, num_envs=len(scenes), frames=frames)
-    try:
+def _loop(name: str, frames: int, start: int | None = None, step: float | None = None) -> Any:
+    """EVs of the grid's ends, of the states (E, T), and of the light at the start (E,)."""
+    lighting = {"kind": "step", "stops": step, "at": 12}  # seen two frames later
+    options = {**SMALL, "motion": "none", "depth": "far"}
+    if step is not None:
+        options |= {"lighting": lighting, "delay": 2}
+    with closing(make_envs(options, num_envs=COUNT, frames=frames)) as envs:
         base: Any = envs.unwrapped
+        scenes = range(0, len(base.scenes), 3)
         policy = make_policy(name, PolicyContext.from_envs(envs))
-        policy.reset(len(scenes), seed=0)
-        observations, _ = envs.reset(
-            seed=0, options={"scene": scenes, **({} if start is None else {"state": start})}
-        )
+        policy.reset(COUNT, seed=0)
+        where = {"scene": list(scenes)} | ({} if start is None else {"state": start})
+        observations, _ = envs.reset(seed=0, options=where)
         states = []
         for _ in range(frames):
             states.append(policy.act(observations, base.action_masks()))
             observations, *_ = envs.step(states[-1])
         light = np.array([base.scenes[i].ev100 for i in scenes])
-        return base.grid, np.stack(states, axis=1), light
-    finally:
-        envs.close()
+        ev100 = base.grid.ev100
+        return ev100.min(), ev100.max(), ev100[np.stack(states, axis=1)], light
 
 
 @pytest.mark.parametrize(
@@ -193,8 +184,7 @@ def _loop(
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_comes_to_rest_in_steady_light(name, program, start):
     """From a start of the environment's, from the darkest state (3) and from the brightest (60)."""
-    grid, states, light = _loop(f"{name}:{program}", 24, start)
-    ev = grid.ev100[states]
+    _, _, ev, light = _loop(f"{name}:{program}", 24, start)
     # Shim's and Zhang's meters may still be on their way in the dark, but they do not turn back.
     moves = np.sign(np.diff(ev[:, -10:], axis=1).round(1))
     assert (np.abs(moves).sum(axis=1) == np.abs(moves.sum(axis=1))).all()
@@ -207,21 +197,18 @@ def test_comes_to_rest_in_steady_light(name, program, start):
 @pytest.mark.parametrize("stops", [-4.0, 4.0])
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_comes_to_rest_after_a_step_with_delay(name, stops):
-    lighting = (("kind", "step"), ("stops", stops), ("at", 12))
-    grid, states, _ = _loop(f"{name}:P", 60, delay=2, lighting=lighting)
-    last = grid.ev100[states[:, -8:]]
-    assert (last.max(axis=1) - last.min(axis=1)).max() < 0.1
-    before, after = grid.ev100[states[:, 11]], grid.ev100[states[:, -1]]
-    end = 5.6 if name == "rpi_agc" else grid.ev100.min() + 0.6  # of its ladder
-    inside = (after > end) & (after < grid.ev100.max() - 0.6)
+    low, high, ev, _ = _loop(f"{name}:P", 60, step=stops)
+    assert np.ptp(ev[:, -8:], axis=1).max() < 0.1
+    before, after = ev[:, 11], ev[:, -1]
+    end = 5.6 if name == "rpi_agc" else low + 0.6  # of its ladder
+    inside = (after > end) & (after < high - 0.6)
     assert np.median((after - before)[inside]) == pytest.approx(stops, abs=1.5)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_compensation_shifts_the_exposure_by_its_ev(name):
-    grid, plain, _ = _loop(f"{name}:P", 24)
-    _, darker, _ = _loop(f"{name}:P?compensation=-2", 24)
-    first, second = grid.ev100[plain[:, -1]], grid.ev100[darker[:, -1]]
-    inside = (second < grid.ev100.max() - 0.6) & (first > grid.ev100.min() + 0.6)
+    low, high, plain, _ = _loop(f"{name}:P", 24)
+    first, second = plain[:, -1], _loop(f"{name}:P?compensation=-2", 24)[2][:, -1]
+    inside = (second < high - 0.6) & (first > low + 0.6)
     assert inside.sum() >= 4
     assert np.median((second - first)[inside]) == pytest.approx(2.0, abs=0.3)
