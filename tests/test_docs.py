@@ -18,7 +18,6 @@ import typer
 import yaml
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.registry import describe_scorers
 from agents.cli.main import app
 from agents.learning.training import AgentConfig
 
@@ -160,13 +159,7 @@ def test_the_scorer_is_used_as_printed(capsys: pytest.CaptureFixture) -> None:
     use = _blocks(SCORER_PAGE, "python")[1]
     assert "resolution=64" in use
     exec(use.replace("resolution=64", 'resolution=36, scenes="bundled:snow"'), {})
-    printed = capsys.readouterr().out
-    assert "CentreContrast" in printed
-    assert "noise" in printed
-
-
-@pytest.mark.usefixtures("my_scorer")
-def test_the_scorer_in_the_yaml_of_a_training() -> None:
+    assert re.search("CentreContrast.*noise", capsys.readouterr().out, re.DOTALL)
     (text,) = _blocks(SCORER_PAGE, "yaml")
     config = AgentConfig.model_validate(yaml.safe_load(text))
     assert config.environment["scorer"] == {"my_scorer.py:CentreContrast": 0.5, "noise": 0.5}
@@ -183,22 +176,10 @@ def test_the_scorer_on_the_command_line(ae_env, my_scorer: Path) -> None:
     assert (my_scorer / "out" / "results.json").is_file()
 
 
-def test_the_scorer_in_a_package(my_scorer: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its metadata as pip would write it from the page's pyproject.toml."""
+def test_the_scorer_in_a_package(my_scorer: Path) -> None:
     project = tomllib.loads(_blocks(SCORER_PAGE, "toml")[0])
     (module,) = project["tool"]["setuptools"]["py-modules"]
-    name, version = project["project"]["name"], project["project"]["version"]
-    info = my_scorer / f"{name.replace('-', '_')}-{version}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    groups = project["project"]["entry-points"]
-    lines = [f"[{g}]\n" + "\n".join(f"{k} = {v}" for k, v in groups[g].items()) for g in groups]
-    (info / "entry_points.txt").write_text("\n".join(lines))
-    monkeypatch.syspath_prepend(my_scorer)
-    row = next(row for row in describe_scorers() if row.name == "centre_contrast")
-    assert (row.package, row.domain, row.error) == ("my-scores", "srgb", "")
-    assert row.summary.startswith("Contrast of the middle")
-    env = gym.make("ae_env:ae_env/AutoExposure-v0", scorer="centre_contrast", **SMALL)
-    env.reset(seed=0)
-    assert 0.0 <= env.step(env.action_space.sample())[1] <= 1.0
-    sys.modules.pop(module, None)
+    assert project["project"]["entry-points"] == {
+        "ae_env.scorers": {"centre_contrast": f"{module}:CentreContrast"}
+    }
+    assert (my_scorer / f"{module}.py").is_file()

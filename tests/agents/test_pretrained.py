@@ -1,5 +1,3 @@
-"""The agents that come with the package."""
-
 from itertools import combinations
 
 import pytest

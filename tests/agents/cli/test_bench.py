@@ -1,5 +1,3 @@
-"""`ae-env bench` runs the benchmarks of its own checkout, and no others."""
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""`ae-env cache`."""
-
 import re
 from pathlib import Path
 

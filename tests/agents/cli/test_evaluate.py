@@ -1,5 +1,3 @@
-"""`ae-env evaluate`: how its options become a plan, presets, and benchmarks."""
-
 import csv
 import json
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""`ae-env scorers` and `ae-env convert-nima`."""
-
 from pathlib import Path
 
 import h5py

@@ -1,5 +1,3 @@
-"""`ae-env simulate` and `ae-env sweep`, without networks and with them."""
-
 import re
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""`ae-env train`."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""`ae-env train-simulator`: stopped and resumed, its options, its scenes."""
-
 from collections import Counter
 from pathlib import Path
 

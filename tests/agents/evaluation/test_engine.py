@@ -11,7 +11,6 @@ from agents import Policy, evaluate, fit_policies, make_policy, run_plan
 from agents.episodes import make_envs
 from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
 from agents.policy import PolicyContext
-from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 OPTIONS = {"scenes": "bundled:small", "split": "test", "resolution": 36}
 
@@ -166,20 +165,3 @@ def test_fit_makes_tuned_and_fixed_policies_better_than_random(small):
     np.testing.assert_array_equal(
         again.regression.scores, policies["average:tuned"].regression.scores
     )
-
-
-def test_a_recorded_sequence_is_watched_frame_by_frame(tmp_path):
-    """Three raws, each twice as bright as the last one: one episode, whose scores change."""
-    camera = get_camera("nikon_z6")
-    for i in range(3):
-        light = torch.full((4, 40, 40), 0.05) * 2.0**i
-        write_dng(tmp_path / f"{i}.dng", RawImage(light, CameraSettings(100, 1 / 64, 5.6), camera))
-    options = {"scenes": {"sequence": str(tmp_path)}, "resolution": 36, "split": "all"}
-    with closing(make_envs(options, num_envs=1, frames=1)) as envs:
-        policy = make_policy(f"recorded:{tmp_path}", PolicyContext.from_envs(envs))
-    result = evaluate({"recorded": policy}, options, frames=3)
-    assert result.scores.shape == (1, 3, 64)
-    best = result.grid.ev100[result.scores[0].argmax(axis=-1)]
-    assert best[1] > best[0] - 0.1
-    assert not np.array_equal(result.scores[0, 0], result.scores[0, 1])
-    np.testing.assert_array_equal(result.scores[0, 1], result.scores[0, 2])  # the last one stays

@@ -1,5 +1,3 @@
-"""A plan's parts: measured once, measured again where they are missing, the same in any process."""
-
 from pathlib import Path
 
 import numpy as np

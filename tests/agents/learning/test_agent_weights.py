@@ -1,8 +1,4 @@
-"""Agents on disk: safetensors and JSON, and clear words when they do not fit."""
-
-import hashlib
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import nn
 
 from ae_env.grid import ExposureGrid
@@ -83,18 +79,13 @@ def test_damaged_file(agent: Path, suffix: str, content: bytes | None, message: 
         load_agent(agent, "regression")
 
 
-def change_card(agent: Path, **entries: Any) -> None:
-    card = sibling(agent, ".json")
-    card.write_text(json.dumps(json.loads(card.read_text()) | entries))
-
-
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
         ({"aliases": 3}, r"regression-0.5.json: aliases \(=3\): must be a mapping"),
         ({"width": True}, r"width \(=True\): .* valid integer"),
         ({"width": 10**9}, r"width \(=1000000000\): .* less than or equal to 65536"),
-        ({"width": 9}, "do not fit the network"),
+        ({"width": 9}, r"do not fit the network: [^\n]*weight[^\n]*\Z"),
         ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
         ({"context": {"resolution": [4]}}, r"trained with resolution = \[4\]"),
         ({"kind": "ppo"}, "must be a regression agent of format 1, got 'ppo'"),
@@ -103,11 +94,12 @@ def change_card(agent: Path, **entries: Any) -> None:
 def test_wrong_types_in_the_card(
     agent: Path, context: PolicyContext, entries: dict[str, Any], message: str
 ) -> None:
-    card = json.loads(sibling(agent, ".json").read_text())
+    file = sibling(agent, ".json")
+    card = json.loads(file.read_text())
     del card["sha256"]  # a card of an earlier version, which is fine
-    sibling(agent, ".json").write_text(json.dumps(card))
+    file.write_text(json.dumps(card))
     assert make_policy(f"regression:{agent}", context).name == "regression"
-    change_card(agent, **entries)
+    file.write_text(json.dumps(card | entries))
     with pytest.raises(ValueError, match=message):
         make_policy(f"regression:{agent}", context)
 
@@ -119,19 +111,6 @@ def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> Non
     with pytest.raises(ValueError, match="must be finite: their training has failed"):
         save_agent(agent, "regression", network, describe_agent(8, context, {}))
     assert sibling(agent, ".safetensors").read_bytes() == before
-
-
-def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None:
-    file = sibling(agent, ".safetensors")
-    tensors = load_file(file)
-    name = next(iter(tensors))
-    tensors[name] = torch.zeros(63, 7)
-    file.write_bytes(save(tensors))
-    change_card(agent, sha256=hashlib.sha256(file.read_bytes()).hexdigest())
-    message = rf"do not fit the network: .*{re.escape(name)}"
-    with pytest.raises(ValueError, match=message) as caught:
-        make_policy(f"regression:{agent}", context)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -163,11 +142,8 @@ def test_other_observation(agent: Path, context: PolicyContext) -> None:
 def test_a_finer_grid_gives_known_states_their_values(name: str, context: PolicyContext) -> None:
     """The states' scale is that of the training: it is not worked out anew from the grid."""
     coarse = context.grid
-    finer = ExposureGrid(
-        tuple(sorted({*coarse.isos, 200.0, 3200.0})),
-        tuple(sorted({*coarse.exposure_times, 1 / 30})),
-        coarse.f_numbers[:3],
-    )
+    isos, times = {*coarse.isos, 200.0, 3200.0}, {*coarse.exposure_times, 1 / 30}
+    finer = ExposureGrid(tuple(sorted(isos)), tuple(sorted(times)), coarse.f_numbers[:3])
     raw, settings, sensors = torch.rand(2, 4, 64, 64), torch.rand(2, 3), torch.rand(2, 2)
     frame = {"raw": raw, "settings": settings * 2 - 1, "sensors": sensors * 2 - 1}
     values = []

@@ -1,5 +1,3 @@
-"""The CNN features: what they see of a real environment, and which sizes they take."""
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -22,8 +20,7 @@ def space(size: int, *, sensors: bool = True, dtype: type = np.uint8) -> gym.spa
     return gym.spaces.Dict(spaces)
 
 
-@pytest.mark.parametrize("size", [36, 37, 64])
-@pytest.mark.parametrize("sensors", [True, False])
+@pytest.mark.parametrize(("size", "sensors"), [(36, True), (37, False), (64, True)])
 def test_shapes(size: int, sensors: bool) -> None:
     features = ExposureFeatures(space(size, sensors=sensors), width=24)
     speed = torch.zeros(5, 2) if sensors else None

@@ -1,5 +1,3 @@
-"""The PPO agent: a CNN, deterministic, resumable, the same after saving."""
-
 from pathlib import Path
 
 import numpy as np

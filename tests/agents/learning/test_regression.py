@@ -1,5 +1,3 @@
-"""The regression agent: how it adds up its predictions."""
-
 import numpy as np
 import pytest
 import torch

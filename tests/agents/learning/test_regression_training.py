@@ -1,5 +1,3 @@
-"""Training of the regression agent: it learns, is reproducible, and goes on after Ctrl-C."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""From YAML to an agent: what is accepted, what is refused and how, and that nothing is redone."""
-
 import json
 import multiprocessing
 import os
