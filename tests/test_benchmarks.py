@@ -59,11 +59,10 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(harness, "isolated", isolated)
     monkeypatch.setattr(harness, "RUNS", tmp_path / "runs")
-    parts = [Part(name, print, {"name": name}) for name in ("first", "second")]
     benchmark = Benchmark(
         name="mine",
         title="Mine",
-        parts=lambda seed, quick: parts,
+        parts=lambda *_: [Part(name, print, {"name": name}) for name in ("first", "second")],
         report=lambda results, meta: Report(list(results.values()), ["text"]),
         code=("benchmarks/isolated",),
     )

@@ -20,7 +20,6 @@ def noisy(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Random weights that do something."""
     torch.manual_seed(0)
     modules = build_modules("compact").requires_grad_(False)
     modules["noise"].network.tail.weight.mul_(5)

@@ -2,12 +2,13 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+import yaml
 
 from agents.cli import train_simulator
 from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
-from simulator.training.config import SimulatorConfig, StageConfig
+from simulator.training.config import SimulatorConfig
 from simulator.training.data import ReferencePairs
 
 TINY = """\
@@ -19,14 +20,10 @@ aperture: {steps: 2, batch: 2, crop: 16}
 """
 
 
-@pytest.fixture(autouse=True)
-def tiny_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
-    (tmp_path / "tiny.yaml").write_text(TINY)
-
-
 def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the second stage; the same command finishes, and simulate takes the result."""
+    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    (tmp_path / "tiny.yaml").write_text(TINY)
     real, steps = ReferencePairs.batch, []
 
     def batch(self, step, *arguments, **options):
@@ -58,15 +55,10 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
 
 
-def config(**scenes: object) -> SimulatorConfig:
-    stage = StageConfig(steps=1, crop=16)
-    return SimulatorConfig.model_validate(
-        {"preset": "pc", "scenes": {"size": 32, **scenes}, "baseline": stage}
-    )
-
-
-def test_scenes_of_a_training() -> None:
-    splits = {s: reference_scenes_of(config(procedural=4), s) for s in ("train", "validation")}
+def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    config = SimulatorConfig.model_validate(yaml.safe_load(TINY))
+    splits = {s: reference_scenes_of(config, s) for s in ("train", "validation")}
     groups = {split: {scene.group for scene in scenes} for split, scenes in splits.items()}
     assert not groups["train"] & groups["validation"]
     # Three of four procedural scenes have depth; the fourth is draped over two depths.

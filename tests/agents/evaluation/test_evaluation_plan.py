@@ -99,7 +99,6 @@ def test_starts_are_the_ends_of_the_grid_and_the_right_exposure(scenes):
 def test_episodes_of_another_start_share_everything_but_the_start(scenes):
     plan = PLAN.changed(seeds=(0, 7), starts=("dark", "bright"))
     episodes = plan_episodes(plan, scenes, PLAN.options().make_grid())
-    assert len(episodes) == 2 * 2 * 5
     assert episodes.seeds[:10] == episodes.seeds[10:]
     assert len(set(episodes.seeds)) == 10
     assert episodes.seeds[5] == 7 * 2**20

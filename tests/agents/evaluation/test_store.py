@@ -57,7 +57,7 @@ NAMES = ("matrix:tuned?weights={0}/a", "ppo:{0}/a?device=cpu", "ppo:{0}/a", "rec
 @pytest.mark.parametrize("name", [*NAMES, "{0}/a.py:C"])
 def test_what_a_name_points_to_counts(name, tmp_path):
     name = name.format(tmp_path)
-    files = [tmp_path / "a", tmp_path / "a.safetensors", tmp_path / "a.json", tmp_path / "a.py"]
+    files = [tmp_path / f"a{suffix}" for suffix in ("", ".safetensors", ".json", ".py")]
     for file in files:
         file.write_text("before")
     before = policy_content(name)

@@ -10,13 +10,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.agent_weights import (
-    describe_agent,
-    describe_context,
-    load_agent,
-    load_into,
-    save_agent,
-)
+from agents.learning import agent_weights
 from agents.learning.regression import RegressionPolicy, ScoreRegressor
 from agents.policy import PolicyContext, make_policy
 from simulator.utils.files import sibling
@@ -30,30 +24,32 @@ def make_network(context: PolicyContext) -> ScoreRegressor:
 @pytest.fixture
 def agent(context: PolicyContext, tmp_path: Path) -> Path:
     path = tmp_path / "regression-0.5"
-    description = describe_agent(8, context, {"agent": "regression"})
-    save_agent(path, "regression", make_network(context), description)
+    description = agent_weights.describe_agent(8, context, {"agent": "regression"})
+    agent_weights.save_agent(path, "regression", make_network(context), description)
     return path
 
 
 def test_round_trip(agent: Path, context: PolicyContext) -> None:
     files = {path.name for path in agent.parent.iterdir()}
     assert files == {"regression-0.5.json", "regression-0.5.safetensors"}
-    tensors, card = load_agent(agent, "regression")
+    tensors, card = agent_weights.load_agent(agent, "regression")
     expected = {"width": 8, "training": {"agent": "regression"}}
-    assert card | expected | {"context": describe_context(context)} == card
+    assert card | expected | {"context": agent_weights.describe_context(context)} == card
     network, on_disk = make_network(context), load_file(sibling(agent, ".safetensors"))
     for parameter in network.parameters():
         parameter.data.zero_()
-    load_into(network, tensors, agent)
+    agent_weights.load_into(network, tensors, agent)
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
 
 
 def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
     module["again"] = module["a"]
-    save_agent(tmp_path / "m", "ppo", module, {"width": 2, "context": {}, "training": {}})
+    agent_weights.save_agent(
+        tmp_path / "m", "ppo", module, {"width": 2, "context": {}, "training": {}}
+    )
     assert len(load_file(tmp_path / "m.safetensors")) == 4
-    tensors, _ = load_agent(tmp_path / "m", "ppo")
+    tensors, _ = agent_weights.load_agent(tmp_path / "m", "ppo")
     assert set(tensors) == set(module.state_dict())
     assert torch.equal(tensors["again.weight"], module["a"].weight)
 
@@ -76,7 +72,7 @@ def test_damaged_file(agent: Path, suffix: str, content: bytes | None, message: 
     if content is not None:
         sibling(agent, suffix).write_bytes(content)
     with pytest.raises(FileNotFoundError if content is None else ValueError, match=message):
-        load_agent(agent, "regression")
+        agent_weights.load_agent(agent, "regression")
 
 
 @pytest.mark.parametrize(
@@ -109,7 +105,9 @@ def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> Non
     network = make_network(context)
     next(network.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="must be finite: their training has failed"):
-        save_agent(agent, "regression", network, describe_agent(8, context, {}))
+        agent_weights.save_agent(
+            agent, "regression", network, agent_weights.describe_agent(8, context, {})
+        )
     assert sibling(agent, ".safetensors").read_bytes() == before
 
 

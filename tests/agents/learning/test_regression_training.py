@@ -38,7 +38,6 @@ def test_same_seed_same_weights_whatever_the_global_state(make_tiny_envs) -> Non
 
 
 def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
-    """Ctrl-C keeps the state, however short a time ago the last checkpoint was."""
     path = tmp_path / "regression.checkpoint"
 
     def stop(done: int, total: int, values: dict[str, float]) -> None:

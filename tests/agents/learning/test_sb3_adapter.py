@@ -77,19 +77,14 @@ class Forbids(gym.vector.VectorWrapper):
         return masks
 
 
-def test_wrappers_of_the_batch_count(make_tiny_envs) -> None:
-    envs = SB3VectorAdapter(gym.vector.VectorWrapper(Forbids(make_tiny_envs(num_envs=2))))
+def test_wrappers_of_the_batch_and_pictures(make_tiny_envs) -> None:
+    inner = make_tiny_envs(num_envs=2, render_mode="rgb_array")
+    envs = SB3VectorAdapter(gym.vector.VectorWrapper(Forbids(inner)))
     envs.seed(0)
     envs.reset()
     assert envs.has_attr("action_masks")  # as MaskablePPO asks
     assert [bool(mask[3]) for mask in envs.env_method("action_masks")] == [False, False]
     assert len(envs.get_attr("grid")[0]) == 64
-
-
-def test_pictures(make_tiny_envs) -> None:
-    envs = SB3VectorAdapter(make_tiny_envs(num_envs=2, render_mode="rgb_array"))
-    envs.seed(0)
-    envs.reset()
     shown = [(picture.dtype, picture.shape[2]) for picture in envs.get_images()]
     assert shown == [(np.uint8, 3)] * 2
     assert envs.render("rgb_array").ndim == 3  # SB3 tiles them

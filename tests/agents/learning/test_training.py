@@ -13,16 +13,6 @@ import yaml
 from agents.learning import training
 from agents.learning.ppo import PPOTraining
 from agents.learning.regression_training import RegressionTraining
-from agents.learning.training import (
-    AgentConfig,
-    TrainingJob,
-    is_trained,
-    load_config,
-    run_in_parallel,
-    tell,
-    train_agent,
-    train_in_parallel,
-)
 from simulator.utils.files import sibling
 
 CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
@@ -33,18 +23,18 @@ HYPERPARAMETERS: dict[str, dict[str, Any]] = {
 }
 
 
-def tiny(agent: str = "regression", **training: Any) -> AgentConfig:
-    return AgentConfig(
+def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
+    return training.AgentConfig(
         agent=agent,  # type: ignore[arg-type]
         num_envs=4,
         environment=ENVIRONMENT,
-        training=HYPERPARAMETERS[agent] | training,
+        training=HYPERPARAMETERS[agent] | changes,
     )
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs(path: Path) -> None:
-    config = load_config(path)
+    config = training.load_config(path)
     text = yaml.safe_load(path.read_text())
     kind = {"regression": RegressionTraining, "ppo": PPOTraining}[config.agent]
     hyperparameters = config.hyperparameters()
@@ -82,32 +72,32 @@ def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(ValueError, match=rf"^.*mine\.yaml.*{message}.*\Z"):  # one line
-        load_config(path)
+        training.load_config(path)
 
 
 def test_bad_values_from_python() -> None:
     with pytest.raises(ValueError, match=r"training.seed \(=4294967296\)"):
         tiny("ppo").with_seed(2**32)
     with pytest.raises(ValueError, match="must be a JSON value"):
-        AgentConfig(agent="regression", environment={"scenes": Path("raws")})
+        training.AgentConfig(agent="regression", environment={"scenes": Path("raws")})
 
 
 @pytest.mark.parametrize("agent", ["regression", "ppo"])
 def test_trained_once(agent: str, tmp_path: Path) -> None:
     config, out = tiny(agent), tmp_path / "runs" / f"{agent}-0.1"
-    assert not is_trained(config, out)
+    assert not training.is_trained(config, out)
     calls: list[int] = []
-    train_agent(config, out, progress=lambda done, total, values: calls.append(done))
+    training.train_agent(config, out, progress=lambda done, total, values: calls.append(done))
     assert calls[-1] == {"regression": 24, "ppo": 32}[agent]
     names = {path.name for path in out.parent.iterdir()}
     assert names == {f"{agent}-0.1.json", f"{agent}-0.1.safetensors"}  # no checkpoint is left
-    assert is_trained(config, out)
-    train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
+    assert training.is_trained(config, out)
+    training.train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
     # Another training, or a damaged file, is not taken for this one.
-    assert not is_trained(config.with_seed(1), out)
-    assert not is_trained(tiny(agent, width=9), out)
+    assert not training.is_trained(config.with_seed(1), out)
+    assert not training.is_trained(tiny(agent, width=9), out)
     (out.parent / f"{agent}-0.1.json").write_text("[]")
-    assert not is_trained(config, out)
+    assert not training.is_trained(config, out)
 
 
 def test_a_failed_save_keeps_the_training_and_its_log(tmp_path: Path, monkeypatch) -> None:
@@ -120,25 +110,25 @@ def test_a_failed_save_keeps_the_training_and_its_log(tmp_path: Path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr("agents.learning.training.save_agent", full)
         with pytest.raises(OSError, match="no space"):
-            train_agent(config, out, tensorboard=tmp_path / "log")
+            training.train_agent(config, out, tensorboard=tmp_path / "log")
     (events,) = (tmp_path / "log").glob("events*")
     assert events.stat().st_size > 200
-    train_agent(config, out, progress=lambda *_: pytest.fail("all the frames had been seen"))
-    assert is_trained(config, out)
+    training.train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
+    assert training.is_trained(config, out)
     assert json.loads((tmp_path / "agent.json").read_text())["training"]["training"]["seed"] == 1
 
 
 @pytest.mark.usefixtures("quick_spawn")
 def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
     trainings = {"regression": {"frames": 240}, "ppo": {"total_timesteps": 240}}
-    todo = [TrainingJob(n, tiny(n, **own), tmp_path / n) for n, own in trainings.items()]
+    todo = [training.TrainingJob(n, tiny(n, **own), tmp_path / n) for n, own in trainings.items()]
     running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
 
     with pytest.raises(KeyboardInterrupt):
-        train_in_parallel(todo, workers=1, progress=stop)
+        training.train_in_parallel(todo, workers=1, progress=stop)
     assert running.is_file()
     assert not waiting.exists()
     seen: list[int] = []
@@ -147,14 +137,14 @@ def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
         assert (name, total) == ("regression", 240)
         seen.append(done)
 
-    train_in_parallel(todo[:1], progress=report)
-    assert is_trained(todo[0].config, todo[0].out)
+    training.train_in_parallel(todo[:1], progress=report)
+    assert training.is_trained(todo[0].config, todo[0].out)
     assert seen[0] > 4  # it went on
     assert seen == list(range(seen[0], 241, 4))
 
 
 def _share(job: int) -> None:
-    tell(job, torch.get_num_threads())
+    training.tell(job, torch.get_num_threads())
     if job == 2:
         raise ValueError("job 2 has failed")
 
@@ -164,19 +154,19 @@ def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(training, "core_count", lambda: 6)
     seen: list[tuple[object, ...]] = []
     with pytest.raises(ValueError, match="job 2 has failed"):
-        run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
+        training.run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
     assert (2, 3) in seen
 
 
 def _never_end(job: int) -> None:
-    tell(os.getpid())
+    training.tell(os.getpid())
     time.sleep(600)
 
 
 def _wait_for_ever(pipe: Connection) -> None:
-    forkserver = multiprocessing.get_context("forkserver")
-    multiprocessing.get_context = {"spawn": forkserver}.__getitem__  # type: ignore[assignment]
-    run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
+    contexts = {"spawn": multiprocessing.get_context("fork")}
+    multiprocessing.get_context = contexts.__getitem__  # type: ignore[assignment]
+    training.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
 
 
 def _runs(pid: int) -> bool:
