@@ -138,7 +138,6 @@ def test_commands_parse(page: Path) -> None:
 
 @pytest.fixture
 def my_scorer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with the page's file in it."""
     (tmp_path / "my_scorer.py").write_text(_blocks(SCORER_PAGE, "python")[0])
     monkeypatch.chdir(tmp_path)
     return tmp_path

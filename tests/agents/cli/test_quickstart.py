@@ -19,8 +19,6 @@ FILES |= {"ev_error.png", "cost.png", "contact_sheet.png", "contact_sheet_2.png"
 
 
 class Bars:
-    """Progress bars that remember how far they were moved."""
-
     def __init__(self) -> None:
         self.last: dict[str, tuple[int, int]] = {}
         self.notes: list[str] = []

@@ -11,7 +11,6 @@ from ae_env.scorers.nima import PUBLISHED, _layout, git_blob_id
 
 @pytest.fixture
 def keras_file(tmp_path: Path) -> Path:
-    """Random weights in the layout of the published files."""
     rng = np.random.default_rng(0)
     with h5py.File(tmp_path / "weights.hdf5", "w") as file:
         for (layer, array), (_, _, shape) in _layout().items():

@@ -78,7 +78,6 @@ class Bad(Policy):
         (np.full(8, -1), r"state -1 is not in \[0, 64\)"),
         ([[0], [0, 1]], r"must return 8 integers"),
         (torch.zeros(8, requires_grad=True), r"must return 8 integers"),
-        (None, r"must return 8 integers"),
     ],
 )
 def test_wrong_actions_name_the_policy(small, answer, message):
@@ -109,7 +108,7 @@ def holes() -> dict:
     return {**OPTIONS, "scenes": scenes}
 
 
-def test_no_policy_chooses_a_forbidden_state(small, holes):
+def test_no_policy_chooses_a_forbidden_state_or_may(small, holes):
     names = ("random", "best_fixed", "oracle", "spot:P", "zhang:A", "average:S", "matrix:M")
     policies = {n: make_policy(n, small) for n in (*names, "average:tuned", "rpi_agc")}
     policies["best_fixed"].mean_scores = np.linspace(0, 1, 64)
@@ -129,13 +128,10 @@ def test_no_policy_chooses_a_forbidden_state(small, holes):
     mean = (result.scores[:, 0] * allowed).sum(axis=1) / allowed.sum(axis=1)
     np.testing.assert_allclose(result.random, mean)
     assert (result.scores[:, 0].max(axis=1) > best + 1e-3).any()  # a forbidden one would be better
-
-
-def test_a_forbidden_choice_is_refused(small, holes):
-    policy = Bad(small)
-    policy.answer = np.zeros(6, int)
+    stubborn = Bad(small)
+    stubborn.answer = np.zeros(6, int)
     with pytest.raises(ValueError, match="policy 'mine': state 0 is masked in this scene"):
-        evaluate({"mine": policy}, holes, frames=1)
+        evaluate({"mine": stubborn}, holes, frames=1)
 
 
 def test_delay_scores_the_frame_that_was_exposed(small):

@@ -58,7 +58,6 @@ def test_light_and_delay_are_those_of_the_conditions(results):
 
 
 def _check_same(first: Path, second: Path) -> None:
-    """Raises unless the parts of two folders are the same, bit for bit, but for times."""
     names = [sorted(file.name for file in folder.glob("*.npz")) for folder in (first, second)]
     assert names[0] == names[1]
     for name in names[0]:
@@ -89,9 +88,8 @@ def test_a_second_run_does_only_what_is_missing(results, folder, tmp_path, monke
     _check_same(tmp_path, folder)
     run_plan(PLAN, tmp_path)
     assert len(ran) == 2
-    np.testing.assert_array_equal(
-        again["static"].tracks["matrix:P"].states, results["static"].tracks["matrix:P"].states
-    )
+    states = [one["static"].tracks["matrix:P"].states for one in (again, results)]
+    np.testing.assert_array_equal(*states)
 
 
 def test_what_was_interrupted_keeps_what_was_finished(tmp_path, monkeypatch):

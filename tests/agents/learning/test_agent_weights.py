@@ -45,9 +45,8 @@ def test_round_trip(agent: Path, context: PolicyContext) -> None:
 def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
     module["again"] = module["a"]
-    agent_weights.save_agent(
-        tmp_path / "m", "ppo", module, {"width": 2, "context": {}, "training": {}}
-    )
+    description = {"width": 2, "context": {}, "training": {}}
+    agent_weights.save_agent(tmp_path / "m", "ppo", module, description)
     assert len(load_file(tmp_path / "m.safetensors")) == 4
     tensors, _ = agent_weights.load_agent(tmp_path / "m", "ppo")
     assert set(tensors) == set(module.state_dict())
@@ -62,7 +61,6 @@ def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
         (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
         (".json", b"{", "regression-0.5.json is damaged"),
         (".json", b"[1]", "must hold a JSON object"),
-        (".json", b"{}", "must be a regression agent of format 1, got None"),
         (".json", b'{"kind": "regression", "format": 1}', "width: Field required; context: Field"),
         (".json", b'{"kind": "regression", "format": 2}', "format 1, got 'regression' of format 2"),
     ],

@@ -8,8 +8,6 @@ from agents.policy import PolicyContext
 
 
 class Stub(nn.Module):
-    """Predicts what it is told, frame by frame."""
-
     def __init__(self, frames: list[tuple[np.ndarray, np.ndarray]]) -> None:
         super().__init__()
         self.anchor = nn.Parameter(torch.zeros(()))

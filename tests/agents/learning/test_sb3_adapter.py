@@ -69,8 +69,6 @@ def test_attributes_and_methods(make_tiny_envs) -> None:
 
 
 class Forbids(gym.vector.VectorWrapper):
-    """A user's own rule on top of the environment's masks."""
-
     def action_masks(self) -> np.ndarray:
         masks = self.env.unwrapped.action_masks()
         masks[:, 3] = False

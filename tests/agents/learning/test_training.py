@@ -34,8 +34,7 @@ def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs(path: Path) -> None:
-    config = training.load_config(path)
-    text = yaml.safe_load(path.read_text())
+    config, text = training.load_config(path), yaml.safe_load(path.read_text())
     kind = {"regression": RegressionTraining, "ppo": PPOTraining}[config.agent]
     hyperparameters = config.hyperparameters()
     assert isinstance(hyperparameters, kind)
