@@ -58,7 +58,6 @@ TINY = {"scenes": "bundled:small", "resolution": 36}
 
 @pytest.fixture
 def make_tiny_envs() -> Iterator[Callable[..., gym.vector.VectorEnv]]:
-    """Makes small native vector environments, and closes them after the test."""
     made: list[gym.vector.VectorEnv] = []
 
     def make(num_envs: int = 4, mode: str = "SAME_STEP", **arguments: Any) -> gym.vector.VectorEnv:

@@ -11,7 +11,6 @@ OURS = "def run(out, *, seed, quick): (out / 'ours').write_text(f'{seed} {quick}
 
 @pytest.fixture
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A checkout, and benchmarks of the user's own where Python looks first."""
     for folder, code in (("checkout", OURS), ("mine", "raise RuntimeError('not ours')")):
         (tmp_path / folder / "benchmarks").mkdir(parents=True)
         (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")
