@@ -13,7 +13,7 @@ import torch
 from agents.learning.training import is_trained, load_config, train_agent
 from simulator.utils.checkpoint import Checkpoint, load_checkpoint
 
-STOPPED = "stopped; the same command goes on where it was"
+STOPPED = "stopped; run the same command again to continue"
 
 
 def command(folder: Path, started: Any, saves: bool) -> None:
