@@ -108,7 +108,7 @@ def holes() -> dict:
     return {**OPTIONS, "scenes": scenes}
 
 
-def test_no_policy_chooses_a_forbidden_state_or_may(small, holes):
+def test_forbidden_states_are_neither_chosen_nor_taken(small, holes):
     names = ("random", "best_fixed", "oracle", "spot:P", "zhang:A", "average:S", "matrix:M")
     policies = {n: make_policy(n, small) for n in (*names, "average:tuned", "rpi_agc")}
     policies["best_fixed"].mean_scores = np.linspace(0, 1, 64)

@@ -84,7 +84,8 @@ def test_convergence_after_a_step_counts_from_the_step():
     frames, converged = metrics.frames_to_converge(errors, since=since)
     assert (frames.tolist(), converged.tolist()) == ([3], [True])
     at_once = np.where(np.arange(10) == 3, 4.0, 0.0)[None]
-    assert metrics.frames_to_converge(at_once, since=since)[0].tolist() == [1]
+    for errors in (at_once, np.zeros((1, 10))):
+        assert metrics.frames_to_converge(errors, since=since)[0].tolist() == [1]
     # Never: as many frames as there are after the step, not T.
     frames, converged = metrics.frames_to_converge(np.ones((1, 10)), since=since)
     assert (frames.tolist(), converged.tolist()) == ([6], [False])
@@ -109,8 +110,8 @@ def test_overshoot_after_a_step_is_that_of_the_answer_to_it():
     # 9 -> 5 before the step; then 5 -> 8 by way of 10: two beyond. Counted from the start, the
     # way down from 9 would make it 2 in the other direction: 8 - 5 = 3.
     evs = np.array([[9.0, 5.0, 5.0, 5.0, 10.0, 8.0]])
-    assert metrics.overshoot(evs, since=np.array([3])).tolist() == [2.0]
-    assert metrics.overshoot(evs).tolist() == [3.0]
+    found = [metrics.overshoot(evs, since=since).tolist() for since in (np.array([3]), 0)]
+    assert found == [[2.0], [3.0]]
 
 
 def test_ev_error_percentiles_and_share_of_a_known_trajectory():
