@@ -1,11 +1,12 @@
 """Fixtures shared by all tests."""
 
-from __future__ import annotations
-
 import logging
+import multiprocessing
+import multiprocessing.forkserver
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -53,6 +54,24 @@ def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def the_same_random_numbers() -> None:
     """A test that draws from torch's own generator draws the same on every run, in any order."""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def forkserver() -> Any:
+    """Starts processes from a server that has imported everything and computed nothing."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        pytest.skip("needs POSIX processes")
+    context = multiprocessing.get_context("forkserver")
+    used = ("agents.cli.main", "agents.learning.ppo", "agents.learning.training", "torch._dynamo")
+    context.set_forkserver_preload([*used, "ae_env.vector_env", "agents.evaluation.plan_run"])
+    multiprocessing.forkserver.ensure_running()
+    return context
+
+
+@pytest.fixture
+def quick_spawn(forkserver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that the package spawns come from `forkserver`: importing torch takes seconds."""
+    monkeypatch.setattr(multiprocessing, "get_context", {"spawn": forkserver}.__getitem__)
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Strategies of property tests: settings, camera bodies, grids and images of any shape."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -40,7 +38,6 @@ def settings_within(
     exposure_time: tuple[float, float] = (1e-9, 1e5),
     f_number: tuple[float, float] = (0.5, 1024.0),
 ) -> st.SearchStrategy[CameraSettings]:
-    """Settings in these ranges, by default in all that there are."""
     ranges = iso, exposure_time, f_number
     return st.builds(CameraSettings, *(log_uniform(*limits) for limits in ranges))
 
@@ -100,7 +97,6 @@ def prepared(
 
 @st.composite
 def grids(draw: st.DrawFn) -> ExposureGrid:
-    """Grids of one to four values each."""
     ranges = (50.0, 409_600.0), (1 / 8000, 30.0), (1.0, 32.0)
     lists = (st.lists(log_uniform(*r), min_size=1, max_size=4, unique=True) for r in ranges)
     return ExposureGrid(*(tuple(sorted(draw(values))) for values in lists))

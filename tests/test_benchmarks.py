@@ -1,7 +1,6 @@
 """The harness of the benchmarks: tables, rounding, runs that continue where they were stopped."""
 
-from __future__ import annotations
-
+import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -60,11 +59,10 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(harness, "isolated", isolated)
     monkeypatch.setattr(harness, "RUNS", tmp_path / "runs")
-    parts = [Part(name, print, {"name": name}) for name in ("first", "second")]
     benchmark = Benchmark(
         name="mine",
         title="Mine",
-        parts=lambda seed, quick: parts,
+        parts=lambda *_: [Part(name, print, {"name": name}) for name in ("first", "second")],
         report=lambda results, meta: Report(list(results.values()), ["text"]),
         code=("benchmarks/isolated",),
     )
@@ -80,8 +78,6 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_every_benchmark_of_the_command_can_be_imported() -> None:
-    import importlib
-
     for name in BENCHMARKS:
         stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
         assert callable(importlib.import_module(f"benchmarks.{stem}").run)

@@ -1,1 +1,0 @@
-"""Tests of the project, in the folders of its packages."""

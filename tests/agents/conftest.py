@@ -1,7 +1,5 @@
 """A camera, a grid and synthetic frames for the policies' tests."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -42,19 +40,13 @@ def photograph(context: PolicyContext) -> Callable[..., dict[str, np.ndarray]]:
         # Independent of the code under test: x = 0.12 * light * 2^(scene EV - state EV).
         gain = 2.0 ** (scene_ev - context.grid.ev100[states])
         signal = 0.12 * gain[:, None, None, None] * np.broadcast_to(light, (4, SIZE, SIZE))
-        apex = np.array(
-            [
-                (s.aperture_value, s.time_value, s.speed_value)
-                for s in (context.grid[int(i)] for i in states)
-            ]
-        )
-        count = len(states)
+        settings = [context.grid[int(i)] for i in states]
+        apex = [(s.aperture_value, s.time_value, s.speed_value) for s in settings]
+        sensors = np.full((2, len(states)), [[speed], [defocus]])
         return {
             "raw": encode_observation(torch.from_numpy(signal.astype(np.float32))).numpy(),
-            "settings": encode_settings(apex),
-            "sensors": encode_sensors(
-                np.full(count, speed), np.full(count, defocus), np.zeros((count, 2))
-            ),
+            "settings": encode_settings(np.array(apex)),
+            "sensors": encode_sensors(*sensors, np.zeros((len(states), 2))),
         }
 
     return take
@@ -66,7 +58,6 @@ TINY = {"scenes": "bundled:small", "resolution": 36}
 
 @pytest.fixture
 def make_tiny_envs() -> Iterator[Callable[..., gym.vector.VectorEnv]]:
-    """Makes small native vector environments, and closes them after the test."""
     made: list[gym.vector.VectorEnv] = []
 
     def make(num_envs: int = 4, mode: str = "SAME_STEP", **arguments: Any) -> gym.vector.VectorEnv:

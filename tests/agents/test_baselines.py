@@ -1,9 +1,10 @@
-from __future__ import annotations
+from contextlib import closing
 
 import numpy as np
 import pytest
 import torch
 
+from agents import evaluate
 from agents.episodes import make_envs
 from agents.policy import PolicyContext, make_policy
 from simulator import CameraSettings, RawImage, get_camera, write_dng
@@ -42,8 +43,6 @@ def test_oracle_reads_info_and_nothing_else(context):
         policy.act({})
 
 
-# -- recorded settings ----------------------------------------------------------------------------
-
 SETTINGS = (
     (100, 1 / 1000, 4.0),
     (400, 1 / 125, 5.6),
@@ -51,36 +50,28 @@ SETTINGS = (
 )
 
 
-@pytest.fixture
-def folder(tmp_path):
-    camera = get_camera("nikon_z6")
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_recording_is_replayed_on_its_own_raws(tmp_path, delay):
+    """Every frame of the sequence is shot at the settings that its raw was recorded at."""
     for i, settings in enumerate(SETTINGS):
-        raw = RawImage(torch.full((4, 16, 16), 0.1), CameraSettings(*settings), camera=camera)
+        light = torch.full((4, 40, 40), 0.1)
+        raw = RawImage(light, CameraSettings(*settings), get_camera("nikon_z6"))
         write_dng(tmp_path / f"frame_{i:02d}.dng", raw)
     (tmp_path / "notes.txt").write_text("not a raw")
-    return tmp_path
-
-
-@pytest.mark.parametrize("delay", [0, 1])
-def test_a_recording_is_replayed_on_its_own_raws(folder, delay):
-    """Every frame of the sequence is shot at the settings that its raw was recorded at."""
-    options = {"scenes": {"sequence": str(folder)}, "split": "test", "resolution": 36}
-    for i, settings in enumerate(SETTINGS):  # large enough for an environment
-        raw = RawImage(
-            torch.full((4, 40, 40), 0.1), CameraSettings(*settings), camera=get_camera("nikon_z6")
-        )
-        write_dng(folder / f"frame_{i:02d}.dng", raw)
-    envs = make_envs({**options, "delay": delay, "depth": "far"}, num_envs=1, frames=4)
-    policy = make_policy(f"recorded:{folder}", PolicyContext.from_envs(envs))
-    policy.reset(1)
-    observations, _ = envs.reset(seed=0, options={"state": 0})
-    for frame in range(1, 4):
-        observations, _, _, _, info = envs.step(policy.act(observations))
-        if frame > delay:
-            _, time, f_number = SETTINGS[min(frame, 2)]
-            assert info["f_number"][0] == f_number
-            assert info["exposure_time"][0] == pytest.approx(time, rel=0.07)
-    envs.close()
+    options = {"scenes": {"sequence": str(tmp_path)}, "split": "test", "resolution": 36}
+    options |= {"delay": delay, "depth": "far"}
+    with closing(make_envs(options, num_envs=1, frames=1)) as envs:
+        policy = make_policy(f"recorded:{tmp_path}", PolicyContext.from_envs(envs))
+    result = evaluate({"recorded": policy}, options, frames=4)
+    assert result.scores.shape == (1, 4, 64)
+    states = result.tracks["recorded"].states[0, 0]
+    for frame in range(delay, 4):
+        _, time, f_number = SETTINGS[min(frame + 1, 2)]
+        assert result.grid[states[frame]].f_number == f_number
+        assert result.grid[states[frame]].exposure_time == pytest.approx(time, rel=0.07)
+    # The raws show light of 10, 6 and 1.1 EV, and the last one stays.
+    assert len(np.unique(result.scores[0], axis=0)) == 2
+    np.testing.assert_array_equal(result.scores[0, 1], result.scores[0, 3])
 
 
 def test_a_folder_without_raws_is_refused(context, tmp_path):

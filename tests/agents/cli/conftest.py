@@ -1,7 +1,5 @@
 """A raw to give to the command line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,3 @@
-"""`ae-env bench` runs the benchmarks of its own checkout, and no others."""
-
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +11,6 @@ OURS = "def run(out, *, seed, quick): (out / 'ours').write_text(f'{seed} {quick}
 
 @pytest.fixture
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A checkout, and benchmarks of the user's own where Python looks first."""
     for folder, code in (("checkout", OURS), ("mine", "raise RuntimeError('not ours')")):
         (tmp_path / folder / "benchmarks").mkdir(parents=True)
         (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")

@@ -1,7 +1,3 @@
-"""`ae-env cache`."""
-
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,3 @@
-"""`ae-env scorers` and `ae-env convert-nima`."""
-
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py
@@ -15,7 +11,6 @@ from ae_env.scorers.nima import PUBLISHED, _layout, git_blob_id
 
 @pytest.fixture
 def keras_file(tmp_path: Path) -> Path:
-    """Random weights in the layout of the published files."""
     rng = np.random.default_rng(0)
     with h5py.File(tmp_path / "weights.hdf5", "w") as file:
         for (layer, array), (_, _, shape) in _layout().items():
@@ -27,7 +22,7 @@ def keras_file(tmp_path: Path) -> Path:
     return tmp_path / "weights.hdf5"
 
 
-def test_all_scorers_are_listed(ae_env, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_scorers_are_listed(ae_env) -> None:
     code, out, _ = ae_env("scorers")
     assert code == 0
     for name in list_scorers():

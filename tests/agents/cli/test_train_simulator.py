@@ -1,17 +1,14 @@
-"""`ae-env train-simulator`: stopped and resumed, its options, its scenes."""
-
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 
 import pytest
+import yaml
 
 from agents.cli import train_simulator
 from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
-from simulator.training.config import SimulatorConfig, StageConfig
+from simulator.training.config import SimulatorConfig
 from simulator.training.data import ReferencePairs
 
 TINY = """\
@@ -23,14 +20,10 @@ aperture: {steps: 2, batch: 2, crop: 16}
 """
 
 
-@pytest.fixture(autouse=True)
-def tiny_training(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
-    (tmp_path / "tiny.yaml").write_text(TINY)
-
-
 def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C in the second stage; the same command finishes, and simulate takes the result."""
+    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    (tmp_path / "tiny.yaml").write_text(TINY)
     real, steps = ReferencePairs.batch, []
 
     def batch(self, step, *arguments, **options):
@@ -62,25 +55,15 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
 
 
-def config(**scenes: object) -> SimulatorConfig:
-    stage = StageConfig(steps=1, crop=16)
-    return SimulatorConfig.model_validate(
-        {"preset": "pc", "scenes": {"size": 32, **scenes}, "baseline": stage}
-    )
-
-
-def test_scenes_of_a_training() -> None:
-    splits = {s: reference_scenes_of(config(procedural=4), s) for s in ("train", "validation")}
+def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    config = SimulatorConfig.model_validate(yaml.safe_load(TINY))
+    splits = {s: reference_scenes_of(config, s) for s in ("train", "validation")}
     groups = {split: {scene.group for scene in scenes} for split, scenes in splits.items()}
     assert not groups["train"] & groups["validation"]
     # Three of four procedural scenes have depth; the fourth is draped over two depths.
-    deep = {
-        split: Counter(s.kind for s in scenes if s.depth is not None)
-        for split, scenes in splits.items()
-    }
-    assert deep == {"train": {"depth": 3, "draped": 2}, "validation": {"depth": 2}}
-    for scenes in splits.values():
-        sizes = {s.kind == "draped": s.light.shape for s in scenes}
-        assert sizes[False] == (4, 32, 32)
-        assert sizes.get(True, (4, 16, 16)) == (4, 16, 16)
-        assert all(s.illuminance is not None for s in scenes)
+    deep = [Counter(s.kind for s in own if s.depth is not None) for own in splits.values()]
+    assert deep == [{"depth": 3, "draped": 2}, {"depth": 2}]
+    for scene in (scene for scenes in splits.values() for scene in scenes):
+        assert scene.light.shape == ((4, 16, 16) if scene.kind == "draped" else (4, 32, 32))
+        assert scene.illuminance is not None

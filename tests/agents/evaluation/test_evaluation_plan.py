@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -53,11 +51,10 @@ def test_mistakes_in_a_plan_are_told(entries, message):
         EvaluationPlan.model_validate(entries)
 
 
-@pytest.mark.parametrize(("name", "conditions"), [("quick", 4), ("standard", 28)])
-def test_presets_are_valid(name, conditions):
-    plan = load_plan(name)
-    assert plan.policies
-    assert len(plan.all_conditions) == conditions
+def test_presets_are_valid():
+    plans = {name: load_plan(name) for name in ("quick", "standard")}
+    assert all(plan.policies for plan in plans.values())
+    assert [len(plan.all_conditions) for plan in plans.values()] == [4, 28]
 
 
 def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
@@ -72,16 +69,20 @@ def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
     assert found == "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd"
 
 
-def test_objects_of_a_callers_own_are_described_but_are_no_protocol():
-    plan = PLAN.changed(environment={**PLAN.environment, "scenes": plan_scenes(PLAN)[:1]})
+@pytest.fixture(scope="module")
+def scenes():
+    return plan_scenes(PLAN)
+
+
+def test_objects_of_a_callers_own_are_described_but_are_no_protocol(scenes):
+    plan = PLAN.changed(environment={**PLAN.environment, "scenes": scenes[:1]})
     assert "dead_leaves" in str(plan.describe()["environment"]["scenes"])
     with pytest.raises(ValueError, match="must be a JSON value, not"):
         plan.protocol()
 
 
-def test_starts_are_the_ends_of_the_grid_and_the_right_exposure():
-    scenes, grid = plan_scenes(PLAN), PLAN.options().make_grid()
-    scene = scenes[0]
+def test_starts_are_the_ends_of_the_grid_and_the_right_exposure(scenes):
+    scene, grid = scenes[0], PLAN.options().make_grid()
     dark, middle, bright = (start_state(s, scene, grid) for s in ("dark", "middle", "bright"))
     # f/11 (11.3), 1/1000 s, ISO 100 and f/4, 1/2 s, ISO 6400.
     assert grid.ev100[dark] == pytest.approx(np.log2(128 * 1000), abs=0.01)
@@ -95,11 +96,9 @@ def test_starts_are_the_ends_of_the_grid_and_the_right_exposure():
     assert start_state("middle", holes, grid) != middle
 
 
-def test_episodes_of_another_start_share_everything_but_the_start():
-    scenes, grid = plan_scenes(PLAN), PLAN.options().make_grid()
+def test_episodes_of_another_start_share_everything_but_the_start(scenes):
     plan = PLAN.changed(seeds=(0, 7), starts=("dark", "bright"))
-    episodes = plan_episodes(plan, scenes, grid)
-    assert len(episodes) == 2 * 2 * 5
+    episodes = plan_episodes(plan, scenes, PLAN.options().make_grid())
     assert episodes.seeds[:10] == episodes.seeds[10:]
     assert len(set(episodes.seeds)) == 10
     assert episodes.seeds[5] == 7 * 2**20

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.stats
@@ -14,35 +12,25 @@ def _data(groups=60, seeds=1, seed=0):
     return gains, span
 
 
-def test_interval_over_groups_agrees_with_scipy():
-    gains, span = _data()
-    expected = scipy.stats.bootstrap(
-        (gains[0], span),
-        lambda g, s, axis=-1: g.sum(axis) / s.sum(axis),
-        paired=True,
-        n_resamples=20_000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
-    found = score_interval(gains, span, resamples=20_000)
-    assert found.value == pytest.approx(gains.sum() / span.sum())
-    assert found.pair == pytest.approx([expected.low, expected.high], abs=2e-3)
+def test_intervals_agree_with_scipy_and_differences_are_paired():
+    def expected(tolerance, statistic, *samples):
+        options = {"paired": True, "n_resamples": 20_000, "method": "percentile"}
+        rng = np.random.default_rng(1)
+        found = scipy.stats.bootstrap(samples, statistic, **options, rng=rng).confidence_interval
+        return pytest.approx([found.low, found.high], abs=tolerance)
 
-
-def test_paired_difference_agrees_with_scipy_and_is_narrower_than_unpaired():
     first, span = _data()
     second = first * 0.95
-    expected = scipy.stats.bootstrap(
-        (first[0], second[0], span),
-        lambda a, b, s, axis=-1: (a.sum(axis) - b.sum(axis)) / s.sum(axis),
-        paired=True,
-        n_resamples=20_000,
-        method="percentile",
-        rng=np.random.default_rng(1),
-    ).confidence_interval
+    alone = score_interval(first, span, resamples=20_000)
+    assert alone.value == pytest.approx(first.sum() / span.sum())
+    mean = expected(2e-3, lambda g, s, axis=-1: g.sum(axis) / s.sum(axis), first[0], span)
+    assert alone.pair == mean
     found = difference_interval(first, second, span, resamples=20_000)
-    assert found.pair == pytest.approx([expected.low, expected.high], abs=5e-4)
-    alone = score_interval(first, span)
+    assert found.pair == expected(
+        5e-4,
+        lambda a, b, s, axis=-1: (a.sum(axis) - b.sum(axis)) / s.sum(axis),
+        *(first[0], second[0], span),
+    )
     assert found.high - found.low < 0.2 * (alone.high - alone.low)
 
 
@@ -58,16 +46,6 @@ def test_training_seeds_that_differ_widen_the_interval_by_their_variance():
     one = score_interval(gains.mean(axis=0), span)
     assert one.high - one.low == pytest.approx(0.0, abs=1e-12)
 
-
-def test_below_fifteen_groups_there_is_no_interval():
-    gains, span = _data(MIN_GROUPS - 1)
-    found = score_interval(gains, span)
-    assert (found.low, found.high, found.pair) == (None, None, None)
-    assert "no interval" in str(found)
-    assert score_interval(*_data(MIN_GROUPS)).pair is not None
-
-
-# -- ranking --------------------------------------------------------------------------------------
 
 SPAN = np.ones(60)
 
@@ -106,7 +84,11 @@ def test_more_policies_widen_the_intervals_as_tukeys_range_does():
     assert half == pytest.approx(factor * error, rel=0.06)
 
 
-def test_few_groups_have_an_order_but_no_claims():
+def test_below_fifteen_groups_there_is_an_order_but_no_interval():
+    found = score_interval(*_data(MIN_GROUPS - 1))
+    assert (found.low, found.high, found.pair) == (None, None, None)
+    assert "no interval" in str(found)
+    assert score_interval(*_data(MIN_GROUPS)).pair is not None
     gains = {"a": np.full((1, MIN_GROUPS - 1), 0.9), "b": np.zeros((1, MIN_GROUPS - 1))}
     found = rank(gains, np.ones(MIN_GROUPS - 1))
     assert [(one.policy, one.tier) for one in found] == [("a", None), ("b", None)]

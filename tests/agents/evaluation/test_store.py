@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -53,19 +51,13 @@ def test_keys_depend_on_their_parts_and_the_version(monkeypatch):
     assert part_key("k", 1) != first
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "matrix:tuned?weights={0}/a",
-        "ppo:{0}/a?device=cpu",
-        "ppo:{0}/a",
-        "recorded:{0}",
-        "{0}/a.py:C",
-    ],
-)
+NAMES = ("matrix:tuned?weights={0}/a", "ppo:{0}/a?device=cpu", "ppo:{0}/a", "recorded:{0}")
+
+
+@pytest.mark.parametrize("name", [*NAMES, "{0}/a.py:C"])
 def test_what_a_name_points_to_counts(name, tmp_path):
     name = name.format(tmp_path)
-    files = [tmp_path / "a", tmp_path / "a.safetensors", tmp_path / "a.json", tmp_path / "a.py"]
+    files = [tmp_path / f"a{suffix}" for suffix in ("", ".safetensors", ".json", ".py")]
     for file in files:
         file.write_text("before")
     before = policy_content(name)

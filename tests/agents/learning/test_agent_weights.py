@@ -1,10 +1,4 @@
-"""Agents on disk: safetensors and JSON, and clear words when they do not fit."""
-
-from __future__ import annotations
-
-import hashlib
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,62 +6,49 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.agent_weights import (
-    describe_agent,
-    describe_context,
-    load_agent,
-    load_into,
-    save_agent,
-)
+from agents.learning import agent_weights
 from agents.learning.regression import RegressionPolicy, ScoreRegressor
 from agents.policy import PolicyContext, make_policy
 from simulator.utils.files import sibling
 
 
 def make_network(context: PolicyContext) -> ScoreRegressor:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        return ScoreRegressor(context.observation_space, context.grid, width=8)
+    torch.manual_seed(0)
+    return ScoreRegressor(context.observation_space, context.grid, width=8)
 
 
 @pytest.fixture
 def agent(context: PolicyContext, tmp_path: Path) -> Path:
     path = tmp_path / "regression-0.5"
-    description = describe_agent(8, context, {"agent": "regression"})
-    save_agent(path, "regression", make_network(context), description)
+    description = agent_weights.describe_agent(8, context, {"agent": "regression"})
+    agent_weights.save_agent(path, "regression", make_network(context), description)
     return path
 
 
 def test_round_trip(agent: Path, context: PolicyContext) -> None:
-    assert sorted(p.name for p in agent.parent.iterdir()) == [
-        "regression-0.5.json",
-        "regression-0.5.safetensors",
-    ]
-    tensors, card = load_agent(agent, "regression")
-    on_disk = load_file(sibling(agent, ".safetensors"))
-    assert set(tensors) == set(on_disk)
-    assert all(torch.equal(tensors[name], on_disk[name]) for name in on_disk)
-    assert card["width"] == 8
-    assert card["training"] == {"agent": "regression"}
-    assert card["context"] == describe_context(context)
-    network = make_network(context)
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter.zero_()
-    load_into(network, tensors, agent)
+    files = {path.name for path in agent.parent.iterdir()}
+    assert files == {"regression-0.5.json", "regression-0.5.safetensors"}
+    tensors, card = agent_weights.load_agent(agent, "regression")
+    expected = {"width": 8, "training": {"agent": "regression"}}
+    assert card | expected | {"context": agent_weights.describe_context(context)} == card
+    network, on_disk = make_network(context), load_file(sibling(agent, ".safetensors"))
+    for parameter in network.parameters():
+        parameter.data.zero_()
+    agent_weights.load_into(network, tensors, agent)
     assert all(torch.equal(value, on_disk[name]) for name, value in network.state_dict().items())
 
 
 def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
     module = nn.ModuleDict({"a": nn.Linear(3, 2), "b": nn.Linear(2, 1)})
     module["again"] = module["a"]
-    save_agent(tmp_path / "m", "ppo", module, {"width": 2, "context": {}, "training": {}})
+    description = {"width": 2, "context": {}, "training": {}}
+    agent_weights.save_agent(tmp_path / "m", "ppo", module, description)
     assert len(load_file(tmp_path / "m.safetensors")) == 4
-    tensors, _ = load_agent(tmp_path / "m", "ppo")
+    tensors, _ = agent_weights.load_agent(tmp_path / "m", "ppo")
     assert set(tensors) == set(module.state_dict())
     assert torch.equal(tensors["again.weight"], module["a"].weight)
 
@@ -80,7 +61,6 @@ def test_a_module_under_two_names_is_stored_once(tmp_path: Path) -> None:
         (".safetensors", b"", r"the hash of regression-0.5.safetensors \(=e3b0c44298fc"),
         (".json", b"{", "regression-0.5.json is damaged"),
         (".json", b"[1]", "must hold a JSON object"),
-        (".json", b"{}", "must be a regression agent of format 1, got None"),
         (".json", b'{"kind": "regression", "format": 1}', "width: Field required; context: Field"),
         (".json", b'{"kind": "regression", "format": 2}', "format 1, got 'regression' of format 2"),
     ],
@@ -90,14 +70,7 @@ def test_damaged_file(agent: Path, suffix: str, content: bytes | None, message: 
     if content is not None:
         sibling(agent, suffix).write_bytes(content)
     with pytest.raises(FileNotFoundError if content is None else ValueError, match=message):
-        load_agent(agent, "regression")
-
-
-def change_card(agent: Path, **entries: Any) -> None:
-    """Replaces entries of the card, or removes those that are None."""
-    card = json.loads(sibling(agent, ".json").read_text()) | entries
-    text = json.dumps({name: value for name, value in card.items() if value is not None})
-    sibling(agent, ".json").write_text(text)
+        agent_weights.load_agent(agent, "regression")
 
 
 @pytest.mark.parametrize(
@@ -106,7 +79,7 @@ def change_card(agent: Path, **entries: Any) -> None:
         ({"aliases": 3}, r"regression-0.5.json: aliases \(=3\): must be a mapping"),
         ({"width": True}, r"width \(=True\): .* valid integer"),
         ({"width": 10**9}, r"width \(=1000000000\): .* less than or equal to 65536"),
-        ({"width": 9}, "do not fit the network"),
+        ({"width": 9}, r"do not fit the network: [^\n]*weight[^\n]*\Z"),
         ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
         ({"context": {"resolution": [4]}}, r"trained with resolution = \[4\]"),
         ({"kind": "ppo"}, "must be a regression agent of format 1, got 'ppo'"),
@@ -115,9 +88,12 @@ def change_card(agent: Path, **entries: Any) -> None:
 def test_wrong_types_in_the_card(
     agent: Path, context: PolicyContext, entries: dict[str, Any], message: str
 ) -> None:
-    change_card(agent, sha256=None)  # a card of an earlier version, which is fine
+    file = sibling(agent, ".json")
+    card = json.loads(file.read_text())
+    del card["sha256"]  # a card of an earlier version, which is fine
+    file.write_text(json.dumps(card))
     assert make_policy(f"regression:{agent}", context).name == "regression"
-    change_card(agent, **entries)
+    file.write_text(json.dumps(card | entries))
     with pytest.raises(ValueError, match=message):
         make_policy(f"regression:{agent}", context)
 
@@ -125,24 +101,12 @@ def test_wrong_types_in_the_card(
 def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> None:
     before = sibling(agent, ".safetensors").read_bytes()
     network = make_network(context)
-    with torch.no_grad():
-        next(network.parameters()).fill_(float("nan"))
+    next(network.parameters()).data.fill_(float("nan"))
     with pytest.raises(ValueError, match="must be finite: their training has failed"):
-        save_agent(agent, "regression", network, describe_agent(8, context, {}))
+        agent_weights.save_agent(
+            agent, "regression", network, agent_weights.describe_agent(8, context, {})
+        )
     assert sibling(agent, ".safetensors").read_bytes() == before
-
-
-def test_tensors_of_another_network(agent: Path, context: PolicyContext) -> None:
-    file = sibling(agent, ".safetensors")
-    tensors = load_file(file)
-    name = next(iter(tensors))
-    tensors[name] = torch.zeros(63, 7)
-    file.write_bytes(save(tensors))
-    change_card(agent, sha256=hashlib.sha256(file.read_bytes()).hexdigest())
-    message = rf"do not fit the network: .*{re.escape(name)}"
-    with pytest.raises(ValueError, match=message) as caught:
-        make_policy(f"regression:{agent}", context)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -174,17 +138,10 @@ def test_other_observation(agent: Path, context: PolicyContext) -> None:
 def test_a_finer_grid_gives_known_states_their_values(name: str, context: PolicyContext) -> None:
     """The states' scale is that of the training: it is not worked out anew from the grid."""
     coarse = context.grid
-    finer = ExposureGrid(
-        tuple(sorted({*coarse.isos, 200.0, 3200.0})),
-        tuple(sorted({*coarse.exposure_times, 1 / 30})),
-        coarse.f_numbers[:3],
-    )
-    generator = torch.Generator().manual_seed(4)
-    frame = {
-        "raw": torch.rand(2, 4, 64, 64, generator=generator),
-        "settings": torch.rand(2, 3, generator=generator) * 2 - 1,
-        "sensors": torch.rand(2, 2, generator=generator) * 2 - 1,
-    }
+    isos, times = {*coarse.isos, 200.0, 3200.0}, {*coarse.exposure_times, 1 / 30}
+    finer = ExposureGrid(tuple(sorted(isos)), tuple(sorted(times)), coarse.f_numbers[:3])
+    raw, settings, sensors = torch.rand(2, 4, 64, 64), torch.rand(2, 3), torch.rand(2, 2)
+    frame = {"raw": raw, "settings": settings * 2 - 1, "sensors": sensors * 2 - 1}
     values = []
     for grid in (coarse, finer):
         network = make_policy(name, replace(context, grid=grid)).network

@@ -1,7 +1,3 @@
-"""The CNN features: what they see of a real environment, and which sizes they take."""
-
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -24,8 +20,7 @@ def space(size: int, *, sensors: bool = True, dtype: type = np.uint8) -> gym.spa
     return gym.spaces.Dict(spaces)
 
 
-@pytest.mark.parametrize("size", [36, 37, 64])
-@pytest.mark.parametrize("sensors", [True, False])
+@pytest.mark.parametrize(("size", "sensors"), [(36, True), (37, False), (64, True)])
 def test_shapes(size: int, sensors: bool) -> None:
     features = ExposureFeatures(space(size, sensors=sensors), width=24)
     speed = torch.zeros(5, 2) if sensors else None
@@ -43,16 +38,6 @@ def test_other_observations_are_refused() -> None:
         StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
 
 
-def planes_of(features: ExposureFeatures, frames: dict[str, np.ndarray]) -> torch.Tensor:
-    """The six planes that enter the network."""
-    seen = []
-    handle = features.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    with torch.no_grad():
-        features(*observation_tensors(frames))
-    handle.remove()
-    return seen[0]
-
-
 def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> None:
     # One scene at four states, four stops apart in all, without noise and blur.
     envs = make_tiny_envs(num_envs=4, noise=False, motion="none", depth="far", split="test")
@@ -61,8 +46,11 @@ def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> N
     exposure = scene.ev100 - np.array(base.grid.ev100)  # stops above the proper one
     wanted = [int(np.argmin(np.abs(exposure - stops))) for stops in (-2.5, -1.5, -0.5, 0.5)]
     frames, _ = envs.reset(seed=0, options={"scene": scene.scene_id, "state": wanted})
-    planes = planes_of(ExposureFeatures(base.single_observation_space), frames)
-    raw, luminance = planes[:, :4], planes[:, 4]
+    features, seen = ExposureFeatures(base.single_observation_space), []
+    features.cnn.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    with torch.no_grad():
+        features(*observation_tensors(frames))
+    raw, luminance = seen[0][:, :4], seen[0][:, 4]  # of the planes that enter the network
     # Only where the darkest frame has many codes and the brightest is not clipped.
     usable = (raw[:, 1:3].amin(dim=(0, 1)) > 12 / 255) & (raw[:, 1:3].amax(dim=(0, 1)) < 0.95)
     assert usable.float().mean() > 0.2

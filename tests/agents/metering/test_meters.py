@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,27 +19,14 @@ def test_a_grey_card_reads_the_incident_ev(context, photograph, name):
     assert not reading.black.any()
 
 
-@pytest.mark.parametrize("name", [m for m in METERS if m not in ("shim", "zhang")])
-def test_twice_the_light_reads_one_ev_more(context, photograph, name):
-    state = context.grid.nearest(9.0)
-    light = np.linspace(0.5, 2.0, 64)[:, None] * np.linspace(0.7, 1.3, 64)[None]
-    meter = make_meter(name, context.camera)
-    dim, bright = (meter(photograph(light, ev, state)).ev100[0] for ev in (8.0, 9.0))
-    assert bright - dim == pytest.approx(1.0, abs=0.03)
-
-
 def test_weighted_mean_matches_a_direct_sum(context, photograph):
-    rng = np.random.default_rng(0)
-    light = rng.uniform(0.2, 3.0, (64, 64))
-    state = context.grid.nearest(9.0)
-    frame = photograph(light, 9.0, state)
-    signal = 0.12 * light * 2.0 ** (9.0 - context.grid.ev100[state])
+    light = np.random.default_rng(0).uniform(0.2, 3.0, (64, 64))
+    frame = photograph(light, 9.0, context.grid.nearest(9.0))
     y, x = np.mgrid[:64, :64]
     inside = np.hypot(x - 31.5, y - 31.5) <= 16
-    mean = 0.75 * signal[inside].mean() + 0.25 * signal[~inside].mean()
-    expected = context.grid.ev100[state] + math.log2(mean / 0.12)
+    mean = 0.75 * light[inside].mean() + 0.25 * light[~inside].mean()
     reading = make_meter("centre_weighted", context.camera)(frame)
-    assert reading.ev100[0] == pytest.approx(expected, abs=0.02)
+    assert reading.ev100[0] == pytest.approx(9.0 + math.log2(mean), abs=0.02)
 
 
 def test_weights_sum_to_one_and_spot_covers_four_percent():
@@ -92,11 +77,9 @@ def test_matrix_is_held_by_its_highlights_and_lifted_by_their_lack(context, phot
 def test_clipped_frames_are_lower_bounds_and_black_ones_upper_bounds(context, photograph):
     bright, dark = context.grid.nearest(-1.0), context.grid.nearest(17.0)
     meter = make_meter("average", context.camera)
-    white = meter(photograph(GREY, 15.0, bright))
-    assert white.saturated[0] == 1.0
+    white, black = meter(photograph(GREY, 15.0, bright)), meter(photograph(GREY, -1.0, dark))
+    assert (white.saturated[0], black.black[0]) == (1.0, True)
     assert context.grid.ev100[bright] + 3 < white.ev100[0] < 15.0
-    black = meter(photograph(GREY, -1.0, dark))
-    assert black.black[0]
     assert -1.0 < black.ev100[0] < context.grid.ev100[dark] - 8
 
 
@@ -105,8 +88,9 @@ def test_every_kind_of_observation_reads_the_same(context, photograph, name):
     light = np.geomspace(0.2, 3.0, 64)[None] * np.ones((64, 1))
     frame = photograph(light, 9.0, context.grid.nearest(9.0))
     signal = decode_observation(frame["raw"])
-    span = np.array(context.camera.span)[:, None, None]
-    black = np.array(context.camera.black_level)[:, None, None]
+    span, black = (
+        np.array(c)[:, None, None] for c in (context.camera.span, context.camera.black_level)
+    )
     numbers = np.rint(signal * span + black).astype(np.uint16)
     meter = make_meter(name, context.camera)
     found = [meter({**frame, "raw": raw}).ev100[0] for raw in (frame["raw"], signal, numbers)]

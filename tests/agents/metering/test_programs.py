@@ -1,7 +1,5 @@
 """The programs' arithmetic on a grid whose APEX values are written out by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A result put together by hand, for the tests of tables and reports."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ae_env.grid import ExposureGrid

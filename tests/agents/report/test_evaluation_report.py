@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import base64
 import json
 from dataclasses import replace
@@ -39,15 +37,6 @@ def test_files_of_a_report(tmp_path):
         assert data in files["report.html"].read_text()
 
 
-def test_few_groups_print_every_value_and_no_interval(tmp_path):
-    files = write_report(made_result(4), tmp_path, command="x", source="mine", split="all")
-    results = json.loads(files["results.json"].read_text())
-    assert {row["ci95"] for row in results["rows"]} == {None}
-    text = files["report.md"].read_text()
-    assert "no intervals, but every value" in text
-    assert all(f"| group-{i:02d} |" in text for i in range(4))
-
-
 def test_several_conditions_no_meter_and_one_part(tmp_path):
     result = made_result()
     result = replace(result, hard=np.zeros_like(result.hard), tracks={"ppo": result.tracks["ppo"]})
@@ -58,7 +47,7 @@ def test_several_conditions_no_meter_and_one_part(tmp_path):
     assert "## Conditions" in files["report.md"].read_text()
 
 
-def test_names_from_outside_show_no_file(tmp_path):
+def test_names_from_outside_show_no_file_and_few_groups_every_value(tmp_path):
     """Scenes, policies and folders may be called anything, a picture in Markdown included."""
     hostile = "![x](secret.png)<b>|`$x^$"
     (tmp_path / "secret.png").write_bytes(b"\x89PNG secret")
@@ -68,11 +57,15 @@ def test_names_from_outside_show_no_file(tmp_path):
         groups=np.array([hostile + group for group in result.groups]),
         tracks={hostile: result.tracks["ppo"], "spot:P": result.tracks["spot:P"]},
     )
-    files = write_report(
-        result, tmp_path, command=hostile, source=hostile, split="all", next_commands=[hostile]
-    )
+    names = {"command": hostile, "source": hostile, "next_commands": [hostile]}
+    files = write_report(result, tmp_path, **names, split="all")
     page = files["report.html"].read_text()
     assert base64.b64encode(b"\x89PNG secret").decode() not in page
     assert page.count("<img") == page.count('<img src="data:') == 2
     assert "<b>" not in page
     assert page.count("![x](secret.png)&lt;b&gt;|`$x^$") >= 8
+    # Four groups are too few for intervals: every value is printed.
+    results = json.loads(files["results.json"].read_text())
+    assert {row["ci95"] for row in results["rows"]} == {None}
+    assert "no intervals, but every value" in page
+    assert all(f"group-{i:02d}<" in page for i in range(4))
