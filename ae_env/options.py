@@ -27,6 +27,7 @@ from ae_env.utils.checks import check_flag, check_integer, check_number, check_w
 from simulator.camera import CameraProfile, get_camera
 from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.plan import check_tolerance
+from simulator.capture.prepared_scene import MAX_DISC_PX, MAX_IMAGE_SPEED
 from simulator.utils.cache import LruCache
 
 #: Smallest frame that the default networks of the common libraries take.
@@ -39,8 +40,6 @@ Noise = Literal["bank", "exact"]
 Reward = Literal["capture", "expected"]
 #: Longest delay [frame].
 MAX_DELAY = 16
-#: Highest image speed [frame heights/s] and blur diameter [pixel of a 64-pixel frame].
-MAX_BLUR = 1e3
 #: Relative tolerance of the range of settings, because nominal ones are rounded: 1/30 s for 1/32 s.
 _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
@@ -89,12 +88,17 @@ class EnvOptions:
         delay = check_integer("delay", self.delay, 0, MAX_DELAY, more=" frames")
         object.__setattr__(self, "resolution", resolution)  # NumPy's integers as an int
         object.__setattr__(self, "delay", delay)
-        for name, words in (("motion", get_args(Motion)), ("depth", get_args(Depth))):
+        # A blur diameter in pixels of a 64-pixel frame.
+        widest = 64.0 * max(1.0, MAX_DISC_PX / resolution)
+        for name, words, most in (
+            ("motion", get_args(Motion), MAX_IMAGE_SPEED),
+            ("depth", get_args(Depth), widest),
+        ):
             value = getattr(self, name)
             if isinstance(value, str):
                 check_word(name, value, words)
             else:
-                check_number(name, value, 0.0, MAX_BLUR, more=f", or one of {list(words)}")
+                check_number(name, value, 0.0, most, more=f", or one of {list(words)}")
         if self.depth == "unknown" and self.simulator is None:
             raise ValueError(
                 "`depth` (='unknown') needs the networks that find a scene's defocus: give "

@@ -102,6 +102,7 @@ GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
         ({"lighting": "tunel"}, "did you mean 'tunnel'"),
         ({"simulator": "compcat"}, "did you mean 'compact'"),
         ({"depth": "unknwon"}, "did you mean 'unknown'"),
+        ({"depth": 300.0, "resolution": 128}, r"`depth` \(=300.0\) must be .*256"),
         ({"depth": "unknown", "simulator": None}, r"`depth` \(='unknown'\) needs.*`simulator`"),
         ({"grid": "third_stops"}, "did you mean 'third_stop'"),
         *(
