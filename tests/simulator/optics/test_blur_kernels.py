@@ -27,33 +27,16 @@ def lamp(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("extent", EXTENTS)
-def test_streaks(shape: tuple[int, ...], extent: float) -> None:
+@pytest.mark.parametrize(
+    ("blur", "plain", "extent"),
+    [(streak, motion_blur, e) for e in EXTENTS] + [(disc, disc_blur, d) for d in DIAMETERS],
+)
+def test_blurs_are_those_in_float64(blur, plain, extent: float, shape: tuple[int, ...]) -> None:  # type: ignore[no-untyped-def]
     light = lamp(*shape)
-    found, wanted = streak(light, extent), motion_blur(light.double(), extent)
-    np.testing.assert_allclose(found.numpy(), wanted.numpy(), rtol=2e-6)
-
-
-@pytest.mark.parametrize("extent", [1.0, 5.0, 17.0])
-def test_streaks_are_scipys_correlation(extent: float) -> None:
-    light = lamp(4, 20, 40)
-    wanted = ndimage.correlate1d(light.double().numpy(), motion_kernel(extent), mode="nearest")
-    np.testing.assert_allclose(streak(light, extent).numpy(), wanted, rtol=2e-6)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("diameter", DIAMETERS)
-def test_discs(shape: tuple[int, ...], diameter: float) -> None:
-    light = lamp(*shape)
-    found, wanted = disc(light, diameter), disc_blur(light.double(), diameter)
-    np.testing.assert_allclose(found.numpy(), wanted.numpy(), rtol=5e-6)
-
-
-@pytest.mark.parametrize("diameter", [2.0, 8.0])
-def test_discs_are_scipys_correlation(diameter: float) -> None:
-    light = lamp(20, 40)
-    wanted = ndimage.correlate(light.double().numpy(), disc_kernel(diameter), mode="nearest")
-    np.testing.assert_allclose(disc(light, diameter).numpy(), wanted, rtol=5e-6)
+    wanted = plain(light.double(), extent).numpy()
+    np.testing.assert_allclose(
+        blur(light, extent).numpy(), wanted, rtol=2e-6 if blur is streak else 5e-6
+    )
 
 
 @pytest.mark.parametrize(("blur", "extent"), [(streak, 9.0), (disc, 4.0)])
@@ -73,24 +56,19 @@ def test_threads_outputs_and_views_change_nothing(blur, extent: float) -> None: 
 def test_no_extent_leaves_the_light_as_it_is(blur, plain) -> None:  # type: ignore[no-untyped-def]
     light = lamp(4, 8, 8)
     assert blur(light, 0.0) is light
+    assert plain(light, 0.0) is light
     assert torch.equal(blur(light, 0.0, torch.empty(4, 8, 8)), light)
     assert torch.equal(plain(light, 3.0), blur(light, 3.0))  # what blurs on the CPU
-    for bad in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="px"):
-            blur(light, bad)
 
 
 @pytest.mark.parametrize("extent", [3.0, 9.0, 200.0])
 def test_light_beyond_the_limit_is_clipped_first(extent: float) -> None:
     light = lamp(4, 16, 24)
     light[0, 3, 4], light[1, 5, 6] = 1e30, -1e30
-    limited = light.clamp(-1e9, 1e9)
-    np.testing.assert_allclose(
-        streak(light, extent, limit=1e9), motion_blur(limited.double(), extent), rtol=2e-6, atol=300
-    )
-    if extent < 100:
-        wanted = disc_blur(limited.double(), extent)
-        np.testing.assert_allclose(disc(light, extent, limit=1e9), wanted, rtol=2e-6, atol=300)
+    limited = light.clamp(-1e9, 1e9).double()
+    for blur, plain in [(streak, motion_blur)] + [(disc, disc_blur)] * (extent < 100):
+        found = blur(light, extent, limit=1e9).numpy()
+        np.testing.assert_allclose(found, plain(limited, extent), rtol=2e-6, atol=300)
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.5, 0.6, 1.0, 2.49, 2.5, 7.3])
@@ -105,7 +83,7 @@ def test_coverage_is_that_of_many_rows_and_columns(radius: float) -> None:
     np.testing.assert_allclose(coverage(radius), wanted, atol=1e-14)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("threads", [1, 3])
 def test_many_images_are_scipys_correlation(threads: int) -> None:
     generator = torch.Generator().manual_seed(0)
     extents = [(0.0, 5.0), (3.3, 0.0), (8.0, 17.0), (1e-4, 1e-7), (2.0, 90.0), (0.7, 0.4)]
@@ -117,9 +95,8 @@ def test_many_images_are_scipys_correlation(threads: int) -> None:
         blurs.append(Blur(light, diameter, defocused, extent, moved))
     blur_many(blurs, threads=threads)
     for light, diameter, defocused, extent, moved in blurs:
-        wanted = ndimage.correlate(
-            light.double().numpy(), disc_kernel(diameter)[None], mode="nearest"
-        )
+        exact = light.double().numpy()
+        wanted = ndimage.correlate(exact, disc_kernel(diameter)[None], mode="nearest")
         if defocused is not None:
             np.testing.assert_allclose(defocused, wanted, rtol=5e-6)
         wanted = ndimage.correlate1d(wanted, motion_kernel(extent), mode="nearest")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,26 +62,21 @@ def test_pulsed_light_is_the_exact_overlap(frequency: int, duty: float, time: fl
 def test_a_flash_is_its_integral(time: float, decay: float) -> None:
     lamp = Flash(at=0.01, decay=decay, energy=0.02)
     for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
-        begin, stop = max(start, 0.01), start + time
-        integral = 0.0
-        if stop > begin:  # beyond 60 decays there is nothing left
+        begin = max(start, 0.01)
+        end = max(begin, min(start + time, begin + 60 * decay))  # then there is nothing left
 
-            def light(t: float) -> float:
-                return 0.02 / decay * math.exp(-(t - 0.01) / decay)
+        def light(t: float) -> float:
+            return 0.02 / decay * math.exp(-(t - 0.01) / decay)
 
-            near = min(stop, begin + 60 * decay)
-            integral, _ = quad(light, begin, near, epsabs=0, epsrel=1e-12, limit=500)
-        wanted = 1.0 + integral / time
-        assert lamp.mean_light(start, time) == pytest.approx(wanted, rel=1e-9)
+        integral, _ = quad(light, begin, end, epsabs=0, epsrel=1e-12, limit=500)
+        assert lamp.mean_light(start, time) == pytest.approx(1.0 + integral / time, rel=1e-9)
 
 
 def test_rows_are_exposed_one_after_the_other() -> None:
     lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
     rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
-    wanted = [
-        np.mean([lamp.mean_light(0.5 + row_time * (4 * row + k), time) for k in range(4)])
-        for row in range(64)
-    ]
+    starts = 0.5 + row_time * np.arange(64 * 4).reshape(64, 4)
+    wanted = np.vectorize(lamp.mean_light)(starts, time).mean(1)
     np.testing.assert_allclose(rows, wanted, rtol=1e-12)
     # Bands of one period: 10 ms are 500 sensor rows of 20 us, 125 rows of four.
     repeated = lamp.row_light(0.5, time, 250, row_time, sensor_rows=4)
@@ -103,22 +100,22 @@ def test_extremes_stay_finite_and_in_range(time: float) -> None:
 @pytest.mark.parametrize(
     ("make", "rule"),
     [
-        (lambda: MainsLamp(0.0), "`frequency` \\(=0.0\\) must be in"),
-        (lambda: MainsLamp(depth=1.5), "`depth` \\(=1.5\\) must be in"),
-        (lambda: MainsLamp(phase=math.nan), "`phase` \\(=nan\\) must be a finite number"),
-        (lambda: PulsedLamp(duty=0.0), "`duty` \\(=0.0\\) must be in"),
-        (lambda: PulsedLamp("100"), "`frequency` \\(='100'\\) must be a finite number"),  # type: ignore[arg-type]
-        (lambda: Flash(decay=0.0), "`decay` \\(=0.0\\) must be in"),
-        (lambda: Flash(energy=-1.0), "`energy` \\(=-1.0\\) must be in"),
-        (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` \\(=0.0\\) must be in"),
-        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` \\(=0\\) must be an integer"),
-        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` \\(=-1e-05\\) must be in"),
+        (lambda: MainsLamp(0.0), "`frequency` (=0.0) must be in"),
+        (lambda: MainsLamp(depth=1.5), "`depth` (=1.5) must be in"),
+        (lambda: MainsLamp(phase=math.nan), "`phase` (=nan) must be a finite number"),
+        (lambda: PulsedLamp(duty=0.0), "`duty` (=0.0) must be in"),
+        (lambda: PulsedLamp("100"), "`frequency` (='100') must be a finite number"),
+        (lambda: Flash(decay=0.0), "`decay` (=0.0) must be in"),
+        (lambda: Flash(energy=-1.0), "`energy` (=-1.0) must be in"),
+        (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` (=0.0) must be in"),
+        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` (=0) must be an integer"),
+        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` (=-1e-05) must be in"),
         (lambda: Lamp().mean_light(math.inf, 1.0), "`start` must be finite"),
     ],
 )
-def test_bad_values_are_refused(make: object, rule: str) -> None:
-    with pytest.raises(ValueError, match=rule):
-        make()  # type: ignore[operator]
+def test_bad_values_are_refused(make: Any, rule: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(rule)):
+        make()
 
 
 # -- any lamp at any moment ---------------------------------------------------------------------
@@ -136,8 +133,7 @@ LAMPS = st.one_of(
 def test_lamps_add_up_over_time(lamp: Lamp, start: float, first: float, second: float) -> None:
     def light(begin: float, time: float) -> float:
         mean = float(lamp.mean_light(begin, time))
-        assert math.isfinite(mean)
-        assert mean >= 0.0
+        assert 0.0 <= mean < math.inf
         return mean * time
 
     parts = light(start, first) + light(start + first, second)
@@ -156,11 +152,3 @@ def _brightest(lamp: Lamp) -> float:
 def test_long_exposures_see_the_mean(lamp: Lamp, start: float) -> None:
     bound = 2e-6 * max(1.0, getattr(lamp, "energy", 0.0))
     assert float(lamp.mean_light(start, 1e6)) == pytest.approx(1.0, abs=bound)
-
-
-@given(log_uniform(1e-3, 1e9), PHASES, st.floats(-1e3, 1e3), log_uniform(1e-9, 1e6))
-def test_a_pulse_as_long_as_its_period_is_steady(
-    frequency: float, phase: float, start: float, time: float
-) -> None:
-    lamp = PulsedLamp(frequency, 1.0, phase)
-    assert float(lamp.mean_light(start, time)) == pytest.approx(1.0, abs=1e-12)
