@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from simulator.utils.config_file import Configuration, load_yaml, read_yaml
 
@@ -15,8 +15,7 @@ BOMB = "a0: &a0 [x]\n" + "".join(
 )
 
 
-class Part(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class Part(Configuration):
     steps: int = Field(ge=1)
 
     @field_validator("steps")
@@ -27,10 +26,12 @@ class Part(BaseModel):
         return value
 
 
-class Whole(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class Whole(Configuration):
     name: str
     part: Part | None = None
+    parts: dict[str, Part] = Field(default_factory=dict)
+    rows: tuple[Part, ...] = ()
+    share: float = 0.5
 
 
 def load(folder: Path, text: str | bytes) -> Whole:
@@ -82,19 +83,27 @@ def test_what_cannot_be_read(
         ("name: x\nprat: {steps: 2}", ["prat (={'steps': 2}): unknown", "did you mean `part`?"]),
         ("part: {}", ["name: Field required; part.steps: Field required"]),
         ("name: x\npart: {stesp: 2}", ["part.stesp (=2): unknown", "did you mean `steps`?"]),
-        ("", ["is empty: it must have entries, of name, part"]),
+        ("", ["is empty: it must have entries, of name, part, parts"]),
         ("- a\n- b", ["holds ['a', 'b']: it must have entries"]),
         ("name: x\npart: {steps: 2}\nname: y", ["'name' is given twice, again in line 3"]),
         ("name: " + "[" * 100 + "]" * 100, ["nested deeper than 50"]),
-        ("name: " + "[" * 3000, ["nested too deeply"]),
+        ("name: " + "[" * 1500, ["nested too deeply"]),
         ("name: &a [*a]", ["nested deeper than 50"]),
         (BOMB, ["at most 10000 entries"]),
         ("name: !!int x", ["is not YAML: invalid literal"]),
         ("name: 2001-13-45", ["is not YAML: month must be"]),
         ("name: x" + " " * 2**20, ["must not be larger than"]),
-        ("name: true", ["name (=True): Input should be a valid string"]),
+        ("name: true", ["name (=True): Input should not be true or false"]),
         ("name: [", ["is not YAML"]),
         (b"name: \xff\xfe", ["is not YAML"]),
+        ("name: x\nparts: {a: {stesp: 3}}", ["parts.a.stesp (=3): unknown, the", "mean `steps`"]),
+        ("name: x\nrows: [{steps: 2}, {foo: 3}]", ["rows.1.foo (=3): unknown", "'steps'"]),
+        ("name: x\npart: {foo: 3}", ["part.foo (=3): unknown", "'steps'"]),
+        ("name: x\nrows: 3", ["rows (=3): must be a list"]),
+        ("name: x\nparts: 3", ["parts (=3): must be a mapping"]),
+        ("name: x\nparts: {a: 3}", ["parts.a (=3): must be a mapping"]),
+        ("name: x\nshare: yes", ["share (=True)", "not be true or false"]),
+        ("name: x\npart: {steps: yes}", ["part.steps (=True)", "not be true or false"]),
         ("name: !!python/object/apply:os.getcwd []", ["is not YAML"]),  # nothing is executed
     ],
 )
@@ -107,32 +116,4 @@ def test_errors_name_file_and_entry_in_one_line(
     assert message.startswith(f"`config` (={str(tmp_path / 'a.yaml')!r})")
     assert "\n" not in message
     assert "Value error" not in message
-    for part in parts:
-        assert part in message
-
-
-class Many(Configuration):
-    parts: dict[str, Part] = Field(default_factory=dict)
-    rows: tuple[Part, ...] = ()
-    one: Part | None = None
-    share: float = 0.5
-    steps: int = 1
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("parts: {a: {stesp: 3}}", r"parts\.a\.stesp \(=3\): unknown, the .*mean `steps`"),
-        ("rows: [{steps: 2}, {foo: 3}]", r"rows\.1\.foo \(=3\): unknown, .*'steps'"),
-        ("one: {foo: 3}", r"one\.foo \(=3\): unknown, .*'steps'"),
-        ("rows: 3", r"rows \(=3\): must be a list"),
-        ("parts: 3", r"parts \(=3\): must be a mapping"),
-        ("parts: {a: 3}", r"parts\.a \(=3\): must be a mapping"),
-        ("share: yes", r"share \(=True\): .*not be true or false"),
-        ("steps: yes", r"steps \(=True\): .*not be true or false"),
-    ],
-)
-def test_entries_of_mappings_and_lists(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        load_yaml(tmp_path / "a.yaml", Many)
+    assert [part for part in parts if part not in message] == []

@@ -29,10 +29,8 @@ def test_meta_says_where_a_number_comes_from():
 
 def test_commit_is_that_of_this_checkout():
     def git(*arguments):
-        folder = Path(__file__).parent
-        return subprocess.run(
-            ["git", *arguments], cwd=folder, capture_output=True, text=True, check=False
-        )
+        command = ["git", "-C", Path(__file__).parent, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
 
     head = git("rev-parse", "--verify", "--quiet", "HEAD")
     changed = git("diff", "--quiet", "HEAD").returncode

@@ -14,10 +14,15 @@ from simulator.utils.threads import in_shares
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_every_item_is_done_once(count: int, threads: int) -> None:
-    done = np.zeros(count, int)
+    done = np.zeros((count, 10), int)
 
     def task(first: int, last: int) -> None:
-        done[first:last] += 1
+        for row in done[first:last]:  # a task may ask for shares itself
+
+            def inner(a: int, b: int, row: np.ndarray = row) -> None:
+                row[a:b] += 1
+
+            in_shares(inner, 10, threads=2)
 
     in_shares(task, count, threads=threads)
     assert (done == 1).all()
@@ -32,27 +37,9 @@ def test_shares_are_contiguous_and_run_at_the_same_time() -> None:
 
     in_shares(task, 9, threads=3)
     assert sorted(shares) == [(0, 3), (3, 6), (6, 9)]
-
-
-def test_little_work_stays_on_the_callers_thread() -> None:
     names: list[str] = []
     in_shares(lambda *_: names.append(threading.current_thread().name), 5, least=3, threads=4)
-    assert names == [threading.current_thread().name]
-
-
-def test_a_task_may_ask_for_shares_itself() -> None:
-    done = np.zeros((4, 10), int)
-
-    def outer(first: int, last: int) -> None:
-        for row in done[first:last]:
-
-            def inner(a: int, b: int, row: np.ndarray = row) -> None:
-                row[a:b] += 1
-
-            in_shares(inner, 10, threads=2)
-
-    in_shares(outer, 4, threads=2)
-    assert (done == 1).all()
+    assert names == [threading.current_thread().name]  # little work stays on the caller's
 
 
 @pytest.mark.parametrize("bad", [0, 3])
@@ -69,14 +56,14 @@ def test_errors_of_any_share_are_raised_once_all_are_done(bad: int) -> None:
     assert done == [3 - bad]
 
 
-def _sum_in_child(queue: object) -> None:
+def _sum_in_child(queue: multiprocessing.Queue) -> None:
     totals = np.zeros(2)
 
     def task(first: int, last: int) -> None:
         totals[first:last] = last
 
     in_shares(task, 2, threads=2)
-    queue.put(totals.tolist())  # type: ignore[attr-defined]
+    queue.put(totals.tolist())
 
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])

@@ -50,33 +50,26 @@ def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once() -> None:
     assert sizes == [(24, 20)]
 
 
-def changed_outside(image: Tensor, halo: int) -> Tensor:
-    """Everything farther than `halo` from the central 4 x 4 block is another picture."""
-    other = frame(*image.shape[-2:], seed=7) * 3
-    first, last = (side // 2 // 4 * 4 for side in image.shape[-2:])
-    keep = (..., slice(first - halo, first + 4 + halo), slice(last - halo, last + 4 + halo))
-    other[keep] = image[keep]
-    return other
-
-
 def test_the_halo_covers_what_the_networks_see() -> None:
-    """What lies beyond the halo changes no bit; what lies within does."""
-    torch.manual_seed(0)
+    """What lies beyond the halo changes no bit of the centre; what lies within does."""
     noise = NoiseModule("compact").eval().requires_grad_(False)
     noise.network = CompactDenoiser((4, 6, 8)).requires_grad_(False)
     noise.network.tail.weight.mul_(30)
     blur = DefocusMap(width=6).eval().requires_grad_(False)
     shot, read = torch.full((1, 4), 1e-2), torch.full((1, 4), 1e-4)
-    image = frame(144, 148)
-    networks = [
+    image, centre = frame(144, 148), (..., slice(72, 76), slice(72, 76))
+    for network, halo in (
         (lambda x: noise(x, shot, read), camera_simulator._NOISE_HALO),
         (lambda x: blur(x, torch.full_like(x, 0.01)), camera_simulator._MAP_HALO),
-    ]
-    for network, halo in networks:
-        expected = network(image)[..., 72:76, 72:76]
-        assert torch.equal(network(changed_outside(image, halo))[..., 72:76, 72:76], expected)
-        near = network(changed_outside(image, 16))[..., 72:76, 72:76]
-        assert not torch.equal(near, expected)
+    ):
+        found = []
+        for seen in (halo, 16):
+            keep = (..., slice(72 - seen, 76 + seen), slice(72 - seen, 76 + seen))
+            other = frame(144, 148, seed=7) * 3
+            other[keep] = image[keep]
+            found.append(network(other)[centre])
+        assert torch.equal(found[0], network(image)[centre])
+        assert not torch.equal(found[1], found[0])
 
 
 # Where it is needed
@@ -106,14 +99,13 @@ def test_what_is_not_needed_is_not_computed() -> None:
         seen.append(image[0, 0].numel())
         return image + 1
 
-    image = frame(320, 480)
-    for needed, most in ((patches(320, 480), 0.05), (torch.zeros(320, 480, dtype=torch.bool), 0)):
+    image, nothing = frame(320, 480), torch.zeros(320, 480, dtype=torch.bool)
+    for needed, most in ((patches(320, 480), 0.05), (nothing, 0)):
         seen.clear()
         result = in_tiles(spy, image, halo=8, needed=needed, fallback=image)
         assert sum(seen) <= most * 320 * 480
         assert torch.equal(result, image + needed)
-    everything = torch.ones(320, 480, dtype=torch.bool)
-    assert len(make_tiles(320, 480, halo=8, needed=everything)) == 1
+    assert len(make_tiles(320, 480, halo=8, needed=~nothing)) == 1
 
 
 @pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
@@ -136,10 +128,12 @@ def test_bad_arguments_are_refused() -> None:
     for halo, tile in ((3, 8), (4, 10), (4, 0)):  # they would break the phase
         with pytest.raises(ValueError, match="multiples of 4"):
             in_tiles(lambda x: x, image, halo=halo, tile=tile)
-    with pytest.raises(ValueError, match=r"`fallback` \(=None\)"):
-        in_tiles(mean_of_neighbours, image, halo=4, needed=needed)
-    with pytest.raises(ValueError, match=r"`needed` \(shape \(12, 8\)\) must be that of the frame"):
-        in_tiles(mean_of_neighbours, image, halo=4, needed=needed.T, fallback=image)
+    for arguments, message in (
+        ({"needed": needed}, r"`fallback` \(=None\)"),
+        ({"needed": needed.T, "fallback": image}, r"`needed` \(shape \(12, 8\)\) must be that of"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            in_tiles(mean_of_neighbours, image, halo=4, **arguments)
     with pytest.raises(ValueError, match=r"`margin` \(=8\) must be a multiple of 16"):
         varying(image[0], 8)
 
@@ -154,3 +148,8 @@ def test_constant_parts_do_not_vary() -> None:
     assert torch.equal(varying(image), expected)
     expected[32:48] = expected[:, 48:] = expected[:, 32:48] = True
     assert torch.equal(varying(image, 16), expected)
+    # A cell of one pixel cannot show that it varies.
+    expected = torch.zeros(33, 49, dtype=torch.bool)
+    expected[32:, 48:] = True
+    assert torch.equal(varying(torch.ones(4, 33, 49)), expected)
+    assert not varying(torch.ones(4, 33, 48)).any()
