@@ -113,6 +113,9 @@ def test_noise_of_box_averages_and_beyond_the_whole_range(path: Path) -> None:
     with tifffile.TiffFile(path) as tiff:
         assert tiff.pages.first.tags["NoiseProfile"].value[0] == pytest.approx(1.5e-4 / 16)
     assert read_raw(path).noise.shot == pytest.approx(raw.noise.shot)
+    write_dng(path, make_raw(nlf=None))
+    with tifffile.TiffFile(path) as tiff:  # nothing is known of its noise
+        assert "NoiseProfile" not in tiff.pages.first.tags
     nlf = NoiseLevelFunction((3.0, 4.0, 4.0, 5.0), (30.0, 40.0, 40.0, 50.0))
     write_dng(path, make_raw(nlf=nlf, settings=CameraSettings(409_600, 4.0, 1.0)))
     back = read_raw(path)
@@ -195,16 +198,6 @@ def test_tags_as_tifffile_reads_them(path: Path) -> None:
     assert known.items() <= read_raw(path).metadata.items()
 
 
-def test_values_outside_the_sensor_are_clipped(path: Path) -> None:
-    raw = make_raw(nlf=None)
-    values = torch.linspace(-3.0, 3.0, raw.data.numel()).reshape(raw.data.shape)
-    write_dng(path, replace(raw, data=values))
-    with tifffile.TiffFile(path) as tiff:
-        numbers, tags = tiff.asarray(), tiff.pages.first.tags
-    assert (numbers.min(), numbers.max()) == (0, 15000)
-    assert "NoiseProfile" not in tags  # nothing is known of its noise
-
-
 def test_developed_level_is_right(path: Path) -> None:
     """A grey card of 0.18 after white balance comes out of LibRaw's sRGB as 118 of 255."""
     raw = make_raw(CameraProfile("bench_camera", BayerPattern.GBRG, (512.0,) * 4, 15000, 14))
@@ -217,16 +210,14 @@ def test_developed_level_is_right(path: Path) -> None:
     np.testing.assert_allclose(picture.reshape(-1, 3).mean(0), [118, 118, 118], atol=1.5)
 
 
-def test_any_size_and_order_of_memory_gives_the_same_file(tmp_path: Path) -> None:
+def test_any_size_and_order_of_memory(path: Path) -> None:
     """Rows are written a few at a time."""
     mosaic = np.random.default_rng(0).integers(0, 4096, (1300, 10), dtype=np.uint16)
     raw = RawImage.from_mosaic(mosaic, CameraSettings(100, 1, 4), make_raw().camera, nlf=NLF)
     turned = replace(raw, data=raw.data.permute(2, 0, 1).contiguous().permute(1, 2, 0))
-    assert not turned.data.is_contiguous()
-    write_dng(tmp_path / "plain.dng", raw)
-    write_dng(tmp_path / "turned.dng", turned)
-    np.testing.assert_array_equal(tifffile.imread(tmp_path / "plain.dng"), mosaic)
-    assert (tmp_path / "turned.dng").read_bytes() == (tmp_path / "plain.dng").read_bytes()
+    for each in (raw, turned):
+        write_dng(path, each)
+        np.testing.assert_array_equal(tifffile.imread(path), mosaic)
 
 
 @pytest.mark.parametrize("value", [1 / 60, 0.0001, 2.8, 1 / 3, 2**0.5, 30.0, 1e-6, 4e9])

@@ -19,22 +19,24 @@ from tests.simulator.raw.test_read import CODE, MATRIX, write_sample_dng
 
 def tiff(entries: list[tuple[int, int, int, int]], following: int = 0, magic: int = 42) -> bytes:
     """A directory at 8 of (tag, type, count, value) entries."""
+    head = struct.pack("<2sHIH", b"II", magic, 8, len(entries))
     body = b"".join(struct.pack("<HHII", *entry) for entry in entries)
-    return (
-        struct.pack("<2sHIH", b"II", magic, 8, len(entries)) + body + struct.pack("<I", following)
-    )
+    return head + body + struct.pack("<I", following)
 
 
 def test_values_by_name_as_tifffile_wrote_them(tmp_path: Path) -> None:
     path = write_sample_dng(tmp_path / "a.dng", NoiseProfile=("d", (1e-4, 2e-6)))
     with path.open("rb") as stream:
         (tags,) = read_directories(stream)
-    assert tags["Model"] == ("Sensor",)
-    assert tags["CFAPattern"] == (0, 1, 1, 2)
-    assert tags["PhotometricInterpretation"] == (32803,)
-    assert tags["AsShotNeutral"] == (0.5, 1.0, pytest.approx(2 / 3))
-    assert tags["ColorMatrix1"] == pytest.approx(MATRIX)
-    assert tags["NoiseProfile"] == (1e-4, 2e-6)
+    expected = {
+        "Model": ("Sensor",),
+        "CFAPattern": (0, 1, 1, 2),
+        "PhotometricInterpretation": (32803,),
+        "AsShotNeutral": pytest.approx((0.5, 1.0, 2 / 3)),
+        "ColorMatrix1": pytest.approx(MATRIX),
+        "NoiseProfile": (1e-4, 2e-6),
+    }
+    assert {name: tags[name] for name in expected} == expected
 
 
 @pytest.mark.parametrize("byteorder", ["<", ">"])
@@ -82,7 +84,7 @@ def test_identities_of_other_containers(tmp_path: Path) -> None:
     assert describe_file(raf) == "a Fujifilm RAF file"
 
 
-@pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18, 2**16])
+@pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
 @pytest.mark.parametrize("kind", [1, 3, 4, 12])
 def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path: Path, count: int, kind: int) -> None:
     """Every tag there is claims `count` values, in a file that is long enough for them."""
