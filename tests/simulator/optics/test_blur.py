@@ -1,7 +1,5 @@
 """Blur kernels against closed forms, and their application against SciPy's convolution."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,7 +19,7 @@ def picture(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("extent", EXTENTS)
-def test_second_moments_are_those_of_uniform_motion_and_of_a_uniform_disc(extent: float) -> None:
+def test_second_moments_are_those_of_uniform_motion_and_of_a_uniform_disc(extent):
     streak, disc = motion_kernel(extent), disc_kernel(extent)
     # A disc's to a hundredth of a pixel: a tenth is where a blur begins to matter to any score.
     assert disc.shape == (len(disc),) * 2
@@ -40,9 +38,7 @@ def test_second_moments_are_those_of_uniform_motion_and_of_a_uniform_disc(extent
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", [(23, 29), (3, 8), (1, 1)])
 @pytest.mark.parametrize("extent", [*EXTENTS, 40.0, 300.5])
-def test_application_is_scipys_convolution(
-    extent: float, size: tuple[int, int], dtype: torch.dtype
-) -> None:
+def test_application_is_scipys_convolution(extent, size, dtype):
     """Direct and Fourier sums of discs, running sums of streaks, streaks longer than the row."""
     image = picture(4, *size).to(dtype)
     before = image.double().numpy().copy()
@@ -57,7 +53,7 @@ def test_application_is_scipys_convolution(
 
 @BOTH
 @pytest.mark.parametrize("extent", [0.4, 3.0, 9.0, 30.0])
-def test_a_bright_lamp_leaves_no_ringing(blur, extent: float) -> None:  # type: ignore[no-untyped-def]
+def test_a_bright_lamp_leaves_no_ringing(blur, extent):
     image = torch.full((4, 64, 64), 1e-3)
     image[:, 32, 32] = 1e6
     out = blur(image, extent)
@@ -68,13 +64,13 @@ def test_a_bright_lamp_leaves_no_ringing(blur, extent: float) -> None:  # type: 
 
 @BOTH
 @pytest.mark.parametrize("shape", [(4, 1, 9), (4, 9, 1), (2, 9), (2, 3, 4, 5, 6)])
-def test_any_number_of_planes(blur, shape: tuple[int, ...]) -> None:  # type: ignore[no-untyped-def]
+def test_any_number_of_planes(blur, shape):
     image = picture(*shape)
     frames = [blur(frame, 3.0) for frame in image.reshape(-1, *shape[-2:])]
     torch.testing.assert_close(blur(image, 3.0), torch.stack(frames).reshape(shape))
 
 
-def test_bad_extents_are_named() -> None:
+def test_bad_extents_are_named():
     for bad in (-1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="`extent_px`"):
             motion_blur(torch.zeros(4, 2, 2), bad)
@@ -85,7 +81,7 @@ def test_bad_extents_are_named() -> None:
 @pytest.mark.parametrize(
     ("motion", "defocus"), [(0, 0), (3.0, 0), (0, 4.0), (7.5, 2.5), (0.4, 14), (5000.3, 4.0)]
 )
-def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(motion: float, defocus: float) -> None:
+def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(motion, defocus):
     """Averaging independent pixels multiplies the variance by the sum of squared weights."""
     disc, streak = disc_kernel(defocus), motion_kernel(motion)
     response = np.stack([np.convolve(row, streak) for row in disc])
@@ -97,7 +93,7 @@ def test_kernel_energy_is_what_a_blur_leaves_of_white_noise(motion: float, defoc
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @BOTH
 @pytest.mark.parametrize("extent", [0.4, 3.0, 30.0])
-def test_cuda_agrees(blur, extent: float) -> None:  # type: ignore[no-untyped-def]
+def test_cuda_agrees(blur, extent):
     image = picture(4, 33, 31)
     torch.testing.assert_close(
         blur(image.cuda(), extent).cpu(), blur(image, extent), atol=2e-5, rtol=0
@@ -106,7 +102,7 @@ def test_cuda_agrees(blur, extent: float) -> None:  # type: ignore[no-untyped-de
 
 @pytest.mark.parametrize("window", [1, 3, 5, 7, 9, 25])
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (1, 30), (23, 41)])
-def test_box_mean_is_scipys_uniform_filter(window: int, size: tuple[int, int]) -> None:
+def test_box_mean_is_scipys_uniform_filter(window, size):
     image = picture(2, 3, *size)
     sides = (1, 1, window, window)
     expected = ndimage.uniform_filter(image.double().numpy(), sides, mode="nearest")

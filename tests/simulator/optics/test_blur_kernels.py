@@ -1,7 +1,5 @@
 """Row-by-row blur against the definitions in `simulator.optics.blur`, and brute force."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -31,7 +29,7 @@ def lamp(*shape: int) -> torch.Tensor:
     ("blur", "plain", "extent"),
     [(streak, motion_blur, e) for e in EXTENTS] + [(disc, disc_blur, d) for d in DIAMETERS],
 )
-def test_blurs_are_those_in_float64(blur, plain, extent: float, shape: tuple[int, ...]) -> None:  # type: ignore[no-untyped-def]
+def test_blurs_are_those_in_float64(blur, plain, extent, shape):
     light = lamp(*shape)
     wanted = plain(light.double(), extent).numpy()
     np.testing.assert_allclose(
@@ -40,7 +38,7 @@ def test_blurs_are_those_in_float64(blur, plain, extent: float, shape: tuple[int
 
 
 @pytest.mark.parametrize(("blur", "extent"), [(streak, 9.0), (disc, 4.0)])
-def test_threads_outputs_and_views_change_nothing(blur, extent: float) -> None:  # type: ignore[no-untyped-def]
+def test_threads_outputs_and_views_change_nothing(blur, extent):
     light = lamp(4, 301, 257)
     alone = blur(light, extent, threads=1)
     for threads in (2, 3):
@@ -53,7 +51,7 @@ def test_threads_outputs_and_views_change_nothing(blur, extent: float) -> None: 
 
 
 @pytest.mark.parametrize(("blur", "plain"), [(streak, motion_blur), (disc, disc_blur)])
-def test_no_extent_leaves_the_light_as_it_is(blur, plain) -> None:  # type: ignore[no-untyped-def]
+def test_no_extent_leaves_the_light_as_it_is(blur, plain):
     light = lamp(4, 8, 8)
     assert blur(light, 0.0) is light
     assert plain(light, 0.0) is light
@@ -62,7 +60,7 @@ def test_no_extent_leaves_the_light_as_it_is(blur, plain) -> None:  # type: igno
 
 
 @pytest.mark.parametrize("extent", [3.0, 9.0, 200.0])
-def test_light_beyond_the_limit_is_clipped_first(extent: float) -> None:
+def test_light_beyond_the_limit_is_clipped_first(extent):
     light = lamp(4, 16, 24)
     light[0, 3, 4], light[1, 5, 6] = 1e30, -1e30
     limited = light.clamp(-1e9, 1e9).double()
@@ -72,7 +70,7 @@ def test_light_beyond_the_limit_is_clipped_first(extent: float) -> None:
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.5, 0.6, 1.0, 2.49, 2.5, 7.3])
-def test_coverage_is_that_of_many_rows_and_columns(radius: float) -> None:
+def test_coverage_is_that_of_many_rows_and_columns(radius):
     reach, rows = max(math.ceil(radius - 0.5), 0), 32
     edges = np.arange(-reach, reach + 2) - 0.5
     y = (np.arange((2 * reach + 1) * rows) + 0.5) / rows - reach - 0.5
@@ -84,7 +82,7 @@ def test_coverage_is_that_of_many_rows_and_columns(radius: float) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_many_images_are_scipys_correlation(threads: int) -> None:
+def test_many_images_are_scipys_correlation(threads):
     generator = torch.Generator().manual_seed(0)
     extents = [(0.0, 5.0), (3.3, 0.0), (8.0, 17.0), (1e-4, 1e-7), (2.0, 90.0), (0.7, 0.4)]
     blurs = []
@@ -106,9 +104,7 @@ def test_many_images_are_scipys_correlation(threads: int) -> None:
 
 
 @pytest.mark.parametrize("extent", [0.0, 5.0])
-def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(
-    monkeypatch: pytest.MonkeyPatch, extent: float
-) -> None:
+def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(monkeypatch, extent):
     light = torch.rand(4, 64, 48, generator=torch.Generator().manual_seed(0))
     light[:, 20, 20], results = 1e6, []
     for widest in (blur_kernels._WIDE_PX, 1e9):

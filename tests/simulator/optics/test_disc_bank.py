@@ -1,7 +1,5 @@
 """Blends of a bank of discs: against one disc, and the CPU's kernels against torch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -35,14 +33,14 @@ def through_torch(image: torch.Tensor, diameter: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("diameter", [*DIAMETERS, 100.0])
-def test_at_its_diameters_and_beyond_them_it_is_the_disc_blur(diameter: float) -> None:
+def test_at_its_diameters_and_beyond_them_it_is_the_disc_blur(diameter):
     image = uniform(2, 24, 31)
     expected = disc_blur(image, min(diameter, DIAMETERS[-1]))
     torch.testing.assert_close(blurred(image, diameter), expected, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("diameter", [*BETWEEN, 0.0, 11.3, 100.0])
-def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter: float) -> None:
+def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter):
     """d^2 / 16 per axis: the moment of a uniform disc of diameter d."""
     point = torch.zeros(81, 81)
     point[40, 40] = 1.0
@@ -58,7 +56,7 @@ def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter: fl
     assert left == pytest.approx((spread**2).sum(), rel=1e-4)
 
 
-def test_each_pixel_has_its_own_blur() -> None:
+def test_each_pixel_has_its_own_blur():
     image, diameter = uniform(4, 20, 20), torch.zeros(20, 20)
     diameter[:, 10:] = 4.0
     result = DiscBank(image).blurred(diameter)
@@ -66,7 +64,7 @@ def test_each_pixel_has_its_own_blur() -> None:
     torch.testing.assert_close(result[..., 10:], disc_blur(image, 4.0)[..., 10:])
 
 
-def test_gradient_is_finite_everywhere_and_right() -> None:
+def test_gradient_is_finite_everywhere_and_right():
     image = uniform(1, 16, 16).requires_grad_()
     values = torch.tensor([0.0, 1e-9, 0.7, 1.3, 4.0, 32.0, 50.0])
     diameter = values.repeat(16, 3)[:, :16].clone().requires_grad_()
@@ -85,14 +83,14 @@ def test_gradient_is_finite_everywhere_and_right() -> None:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 300), (40, 1), (130, 131), (9, 257)])
 @pytest.mark.parametrize("high", [0.3, 3.0, 40.0])
-def test_it_is_the_blend_of_whole_frames(size: tuple[int, int], high: float) -> None:
+def test_it_is_the_blend_of_whole_frames(size, high):
     image, diameter = uniform(4, *size, high=2.0), uniform(*size, high=high, seed=1)
     diameter.view(-1)[::7] = 0.0
     found = DiscBank(image).blurred(diameter)
     torch.testing.assert_close(found, through_torch(image, diameter), rtol=1e-6, atol=1e-6)
 
 
-def test_only_the_discs_in_use_are_computed() -> None:
+def test_only_the_discs_in_use_are_computed():
     image, diameter = uniform(4, 40, 600), torch.full((40, 600), 0.3)
     diameter[20:] = 9.0
     assert needed(diameter, KNOTS) == [0, 1, *(DIAMETERS.index(d) for d in (8.0, 11.3))]
@@ -102,7 +100,7 @@ def test_only_the_discs_in_use_are_computed() -> None:
     torch.testing.assert_close(found, through_torch(image, diameter), rtol=1e-6, atol=1e-6)
 
 
-def test_interpolation_is_linear_in_the_squared_diameter() -> None:
+def test_interpolation_is_linear_in_the_squared_diameter():
     """Images that are constants, by NumPy's own interpolation."""
     images = {i: torch.full((2, 3, 200), float(i * i)) for i in range(len(DIAMETERS))}
     diameter = uniform(3, 200, high=35.0)
@@ -111,7 +109,7 @@ def test_interpolation_is_linear_in_the_squared_diameter() -> None:
     np.testing.assert_allclose(found.numpy(), np.stack([expected] * 2), rtol=1e-5, atol=1e-5)
 
 
-def test_remaining_variance_is_that_of_torch() -> None:
+def test_remaining_variance_is_that_of_torch():
     diameter = uniform(70, 130, high=35.0)
     expected = remaining_variance(diameter.double())  # no kernel takes float64
     torch.testing.assert_close(remaining_variance(diameter), expected.float(), rtol=2e-5, atol=1e-6)

@@ -1,11 +1,8 @@
 """Light integrated in closed form against SciPy's adaptive quadrature and exact fractions."""
 
-from __future__ import annotations
-
 import math
 import re
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +22,7 @@ LATER = (3600.123, 86_400.7, -1e6 / 3)
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("frequency", [100.0, 120.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0])
-def test_mains_light_is_its_integral(time: float, frequency: float, depth: float) -> None:
+def test_mains_light_is_its_integral(time, frequency, depth):
     lamp = MainsLamp(frequency, depth, phase=0.2)
     for start in STARTS:
 
@@ -49,7 +46,7 @@ def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction
 @pytest.mark.parametrize("frequency", [1000, 7919, 20_000])
 @pytest.mark.parametrize("duty", [0.01, 0.5, 0.99])
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 1000, 1 / 60])
-def test_pulsed_light_is_the_exact_overlap(frequency: int, duty: float, time: float) -> None:
+def test_pulsed_light_is_the_exact_overlap(frequency, duty, time):
     lamp = PulsedLamp(frequency, duty)
     for start in (*STARTS, *LATER):
         exact = _pulses(Fraction(start), Fraction(time), Fraction(frequency), Fraction(duty))
@@ -59,7 +56,7 @@ def test_pulsed_light_is_the_exact_overlap(frequency: int, duty: float, time: fl
 
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])
 @pytest.mark.parametrize("decay", [1e-6, 50e-6, 1e-3])
-def test_a_flash_is_its_integral(time: float, decay: float) -> None:
+def test_a_flash_is_its_integral(time, decay):
     lamp = Flash(at=0.01, decay=decay, energy=0.02)
     for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
         begin = max(start, 0.01)
@@ -72,7 +69,7 @@ def test_a_flash_is_its_integral(time: float, decay: float) -> None:
         assert lamp.mean_light(start, time) == pytest.approx(1.0 + integral / time, rel=1e-9)
 
 
-def test_rows_are_exposed_one_after_the_other() -> None:
+def test_rows_are_exposed_one_after_the_other():
     lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
     rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
     starts = 0.5 + row_time * np.arange(64 * 4).reshape(64, 4)
@@ -84,7 +81,7 @@ def test_rows_are_exposed_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("time", [1e-9, 1e-3, 1e6])
-def test_extremes_stay_finite_and_in_range(time: float) -> None:
+def test_extremes_stay_finite_and_in_range(time):
     for lamp, most in (
         (MainsLamp(1e9), 2.0),
         (MainsLamp(1e-9), 2.0),
@@ -113,7 +110,7 @@ def test_extremes_stay_finite_and_in_range(time: float) -> None:
         (lambda: Lamp().mean_light(math.inf, 1.0), "`start` must be finite"),
     ],
 )
-def test_bad_values_are_refused(make: Any, rule: str) -> None:
+def test_bad_values_are_refused(make, rule):
     with pytest.raises(ValueError, match=re.escape(rule)):
         make()
 
@@ -130,7 +127,7 @@ LAMPS = st.one_of(
 
 
 @given(LAMPS, st.floats(-10, 10), log_uniform(1e-6, 10), log_uniform(1e-6, 10))
-def test_lamps_add_up_over_time(lamp: Lamp, start: float, first: float, second: float) -> None:
+def test_lamps_add_up_over_time(lamp, start, first, second):
     def light(begin: float, time: float) -> float:
         mean = float(lamp.mean_light(begin, time))
         assert 0.0 <= mean < math.inf
@@ -149,6 +146,6 @@ def _brightest(lamp: Lamp) -> float:
 
 
 @given(LAMPS, st.floats(-10, 10))
-def test_long_exposures_see_the_mean(lamp: Lamp, start: float) -> None:
+def test_long_exposures_see_the_mean(lamp, start):
     bound = 2e-6 * max(1.0, getattr(lamp, "energy", 0.0))
     assert float(lamp.mean_light(start, 1e6)) == pytest.approx(1.0, abs=bound)

@@ -4,8 +4,6 @@ Nothing here uses the layers that the code under test works with: expected pictu
 points of the aperture, each of which sees two planes through its own pinhole.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 
@@ -23,7 +21,7 @@ DOUBLE = torch.float64
 
 @pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0, 2.0, 500.0])
-def test_circle_of_confusion_follows_from_similar_triangles(focus: float, depth: float) -> None:
+def test_circle_of_confusion_follows_from_similar_triangles(focus, depth):
     # The cone from the aperture (diameter f / N) converges at v, the sensor stands at v_focus.
     focal_length, f_number = 0.05, 2.8
     v = 1.0 / (1.0 / focal_length - 1.0 / depth)
@@ -33,7 +31,7 @@ def test_circle_of_confusion_follows_from_similar_triangles(focus: float, depth:
     assert found == pytest.approx(expected, rel=1e-12, abs=1e-18)
 
 
-def test_circle_of_confusion_of_far_points() -> None:
+def test_circle_of_confusion_of_far_points():
     # Focused at infinity: f^2 / (N z). Focused at s, a point at infinity: f^2 / (N (s - f)).
     assert Lens(0.05, math.inf).circle_of_confusion(10.0, 4.0) == pytest.approx(-0.0025 / 40)
     assert Lens(0.05, math.inf).circle_of_confusion(math.inf, 4.0) == 0.0
@@ -45,7 +43,7 @@ def test_circle_of_confusion_of_far_points() -> None:
     [((bad, math.inf), "focal_length") for bad in (0.0, math.inf, math.nan)]
     + [((0.05, bad), "focus_distance") for bad in (0.05, -1.0, math.nan)],
 )
-def test_lens_refuses(values: tuple[float, float], name: str) -> None:
+def test_lens_refuses(values, name):
     with pytest.raises(ValueError, match=f"`{name}`.*must be"):
         Lens(*values)
 
@@ -55,7 +53,7 @@ def test_lens_refuses(values: tuple[float, float], name: str) -> None:
 
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("diameter", [0.4, 1.0, 2.7, 6.3, 14.0])
-def test_point_source_becomes_its_disc(diameter: float, sign: int) -> None:
+def test_point_source_becomes_its_disc(diameter, sign):
     lamp = torch.zeros(1, 41, 41, dtype=DOUBLE)
     lamp[0, 20, 20] = 1.0
     spread = defocus(lamp, torch.full((41, 41), sign * diameter, dtype=DOUBLE))[0].numpy()
@@ -70,7 +68,7 @@ def test_point_source_becomes_its_disc(diameter: float, sign: int) -> None:
         np.testing.assert_allclose(inside, 4 / (math.pi * diameter**2), rtol=0.05)
 
 
-def test_blur_too_small_to_see_leaves_every_bit() -> None:
+def test_blur_too_small_to_see_leaves_every_bit():
     light = torch.rand(4, 9, 13, generator=torch.Generator().manual_seed(0))
     ripple = 0.1 * torch.rand(9, 13, generator=torch.Generator().manual_seed(1))
     assert torch.equal(defocus(light, ripple - 0.05), light)
@@ -80,7 +78,7 @@ def test_blur_too_small_to_see_leaves_every_bit() -> None:
 
 
 @pytest.mark.parametrize("case", ["step", "ramp", "through_focus", "stairs", "noise", "islands"])
-def test_equal_light_shows_no_seam(case: str) -> None:
+def test_equal_light_shows_no_seam(case):
     rng = np.random.default_rng(3)
     rows, columns = np.mgrid[:48, :40]
     diameter = {
@@ -97,7 +95,7 @@ def test_equal_light_shows_no_seam(case: str) -> None:
 
 
 @pytest.mark.parametrize("row", range(20, 44, 3))
-def test_lamp_on_a_receding_floor_keeps_its_energy(row: int) -> None:
+def test_lamp_on_a_receding_floor_keeps_its_energy(row):
     # The floor rises through many layers of blur; none of them stands in the way of its neighbour.
     diameter = torch.linspace(10, 2, 64, dtype=DOUBLE)[:, None].expand(64, 48)
     floor = torch.full((1, 64, 48), 0.2, dtype=DOUBLE)
@@ -107,7 +105,7 @@ def test_lamp_on_a_receding_floor_keeps_its_energy(row: int) -> None:
     assert gained == pytest.approx(100.0, rel=0.05)
 
 
-def test_sharp_foreground_is_untouched_by_a_bright_blurred_background() -> None:
+def test_sharp_foreground_is_untouched_by_a_bright_blurred_background():
     rng = np.random.default_rng(0)
     columns = np.arange(60)[None, :].repeat(40, 0)
     light = torch.from_numpy(rng.uniform(0.01, 0.1, (4, 40, 60)).astype(np.float32))
@@ -124,7 +122,7 @@ def beyond_chord(diameter: np.ndarray | float) -> np.ndarray:
     return 1 - (np.arccos(x) - x * np.sqrt(1 - x * x)) / math.pi
 
 
-def test_blurred_foreground_spills_over_a_sharp_background() -> None:
+def test_blurred_foreground_spills_over_a_sharp_background():
     # The same picture, the sides of the focus exchanged: a sign error would swap both tests.
     columns = np.arange(60)[None, :].repeat(40, 0)
     light = torch.from_numpy(np.where(columns < 30, 0.0, 1.0))[None]
@@ -132,7 +130,7 @@ def test_blurred_foreground_spills_over_a_sharp_background() -> None:
     np.testing.assert_allclose(found, beyond_chord(10.0), atol=0.005)
 
 
-def test_what_a_blurred_foreground_hides_is_continued() -> None:
+def test_what_a_blurred_foreground_hides_is_continued():
     # Stripes across the edge go on behind the foreground, and show through its blurred border.
     rows, columns = np.mgrid[:40, :60]
     stripes = 1.0 + (rows // 4 % 2)
@@ -178,7 +176,7 @@ SHAPES: dict[str, Texture] = {
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("blurs", [(0, 8), (-8, 0), (4, 10), (-10, -4), (-8, 8), (-8, 4)])
-def test_two_planes_against_rays(shape: str, blurs: tuple[float, float]) -> None:
+def test_two_planes_against_rays(shape, blurs):
     # What is hidden is not in the picture: it can be right only as far as the texture is smooth.
     rows, columns = np.mgrid[:56, :72]
     mask = SHAPES[shape](rows, columns)

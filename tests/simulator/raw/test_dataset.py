@@ -1,7 +1,5 @@
 """Both layouts of the paper's dataset, on files made as the authors' preprocessing makes them."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import math
@@ -63,9 +61,7 @@ def assert_same(back: Sequence[RawImage], raws: Sequence[RawImage]) -> None:
 
 @WRITERS
 @pytest.mark.parametrize("camera", ["nikon_z6", "canon_70d"])
-def test_captures_of_the_reference_camera_come_back(
-    tmp_path: Path, write: Any, camera: str
-) -> None:
+def test_captures_of_the_reference_camera_come_back(tmp_path, write, camera):
     raws, folder = captures(camera), tmp_path / "scene_007"
     write(folder, raws)
     sequence = read_sequence(folder)
@@ -120,7 +116,7 @@ def nikon(tmp_path: Path) -> tuple[Path, dict[str, np.ndarray]]:
     return root, mosaics
 
 
-def test_the_authors_nikon_files(nikon: tuple[Path, dict[str, np.ndarray]]) -> None:
+def test_the_authors_nikon_files(nikon):
     root, mosaics = nikon
     sequences = read_dataset(root)
     assert [(s.name, len(s.captures)) for s in sequences] == [("scene_001", 2), ("scene_002", 1)]
@@ -142,7 +138,7 @@ def test_the_authors_nikon_files(nikon: tuple[Path, dict[str, np.ndarray]]) -> N
     np.testing.assert_array_equal(alone.to_mosaic(), expected)
 
 
-def test_the_authors_canon_files(tmp_path: Path) -> None:
+def test_the_authors_canon_files(tmp_path):
     mosaic = np.random.default_rng(1).integers(2000, 16000, (4, 8))
     author_file(tmp_path / "s1" / "IMG_1.npy", mosaic, 2048, 15000)
     path = "D:\\data\\Canon\\s1\\IMG_1.jpg"
@@ -162,7 +158,7 @@ def test_the_authors_canon_files(tmp_path: Path) -> None:
     assert raw.white_balance == pytest.approx((2.0, 1.0, 1.6))
 
 
-def test_the_canons_noise_moves_to_the_levels_of_the_files() -> None:
+def test_the_canons_noise_moves_to_the_levels_of_the_files():
     # One electron is the same digital numbers on either scale: shot goes with it, read squared.
     built_in, packed = get_camera("canon_70d"), packed_camera("canon_70d")
     factor = built_in.span[0] / (15000 - 2048)
@@ -176,7 +172,7 @@ def test_the_canons_noise_moves_to_the_levels_of_the_files() -> None:
         packed_camera("sony")
 
 
-def test_a_camera_given_replaces_the_guess(nikon: tuple[Path, Any]) -> None:
+def test_a_camera_given_replaces_the_guess(nikon):
     root, _ = nikon
     assert read_dataset(root, camera="canon_70d")[0].captures[0].camera.name == "canon_70d"
     mine = get_camera("nikon_z6")
@@ -186,9 +182,7 @@ def test_a_camera_given_replaces_the_guess(nikon: tuple[Path, Any]) -> None:
     assert named.captures[0].camera.name == "canon_70d"
 
 
-def test_a_partial_copy_is_read_with_a_warning(
-    nikon: tuple[Path, Any], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_partial_copy_is_read_with_a_warning(nikon, caplog):
     root, _ = nikon
     (root / "scene_002" / "DSC_0001.npy").unlink()
     assert [s.name for s in read_dataset(root)] == ["scene_001"]
@@ -208,9 +202,7 @@ def test_a_partial_copy_is_read_with_a_warning(
         ({"noiseprofile": "1e-5 1e-8 1e-5"}, r"row 2: `noiseprofile` .* must be 2 or 6 numbers"),
     ],
 )
-def test_a_cell_that_is_no_value_is_named(
-    tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_a_cell_that_is_no_value_is_named(tmp_path, changes, message):
     author_file(tmp_path / "s" / "a.npy", np.full((4, 4), 3000), 1008, 15520)
     author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("s/a.jpg", **changes))
     with pytest.raises(ValueError, match=message):
@@ -229,9 +221,7 @@ def test_a_cell_that_is_no_value_is_named(
         (np.array([{}], dtype=object), "allow_pickle"),  # nothing pickled is run
     ],
 )
-def test_files_that_are_no_packed_raw_are_refused(
-    tmp_path: Path, content: np.ndarray | bytes, message: str
-) -> None:
+def test_files_that_are_no_packed_raw_are_refused(tmp_path, content, message):
     file = tmp_path / "a.npy"
     file.write_bytes(content) if isinstance(content, bytes) else np.save(file, content)
     author_table(tmp_path / "camera_params.csv", NIKON, nikon_row("a.jpg"))
@@ -243,7 +233,7 @@ def test_files_that_are_no_packed_raw_are_refused(
 # --- folders of raws ---------------------------------------------------------------------------
 
 
-def test_every_folder_of_raws_is_a_sequence(tmp_path: Path) -> None:
+def test_every_folder_of_raws_is_a_sequence(tmp_path):
     raws = captures("nikon_z6")
     write_raw_sequence(tmp_path / "nikon" / "b", raws)
     write_raw_sequence(tmp_path / "nikon" / "a", raws[:2])
@@ -257,7 +247,7 @@ def test_every_folder_of_raws_is_a_sequence(tmp_path: Path) -> None:
 
 
 @WRITERS
-def test_what_cannot_be_written(tmp_path: Path, write: Any) -> None:
+def test_what_cannot_be_written(tmp_path, write):
     nikon, canon = captures("nikon_z6"), captures("canon_70d")
     (tmp_path / "a.txt").write_text("words")
     with pytest.raises(ValueError, match="must be new or empty"):
@@ -272,7 +262,7 @@ def test_what_cannot_be_written(tmp_path: Path, write: Any) -> None:
     assert not (tmp_path / "b").exists()
 
 
-def test_what_is_no_dataset_is_refused(nikon: tuple[Path, Any], tmp_path: Path) -> None:
+def test_what_is_no_dataset_is_refused(nikon, tmp_path):
     with pytest.raises(ValueError, match="lists 2; use read_dataset"):
         read_sequence(nikon[0])
     for read, name in ((read_sequence, "folder"), (read_dataset, "root")):

@@ -1,7 +1,5 @@
 """Against colour-demosaicing, an independent implementation, and hand-computed pixels."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

@@ -1,7 +1,5 @@
 """DNG files that were written: the same numbers back, through LibRaw, tifffile and exiftool."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Iterator
 from dataclasses import replace
@@ -29,7 +27,7 @@ from simulator import (
 from simulator.camera import BayerPattern
 from simulator.raw import dng as dng_module
 from simulator.raw.dng import DEFAULT_COLOUR_MATRIX, as_rational
-from tests.strategies import Mosaic, cameras, log_uniform, mosaics, settings_within
+from tests.strategies import cameras, log_uniform, mosaics, settings_within
 
 NLF = NoiseLevelFunction((1.5e-4, 2e-4, 2e-4, 2.5e-4), (1e-6, 2e-6, 2e-6, 3e-6))
 
@@ -52,7 +50,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize("black", [(500.0, 510.0, 520.0, 530.0), (64.25,) * 4])
-def test_libraw_sees_the_same_mosaic(path: Path, cfa: str, black: tuple[float, ...]) -> None:
+def test_libraw_sees_the_same_mosaic(path, cfa, black):
     raw = make_raw(CameraProfile("bench_camera", cfa, black, 15000, 14))  # type: ignore[arg-type]
     write_dng(path, raw)
     back = read_raw(path)
@@ -79,13 +77,7 @@ def bodies(draw: st.DrawFn) -> CameraProfile:
     st.tuples(log_uniform(1 / 64, 64), st.just(1.0), log_uniform(1 / 64, 64)),
     st.integers(1, 16),
 )
-def test_writing_and_reading_invert(
-    tmp_path: Path,
-    mosaic: Mosaic,
-    settings: CameraSettings,
-    white_balance: tuple[float, float, float],
-    box_factor: int,
-) -> None:
+def test_writing_and_reading_invert(tmp_path, mosaic, settings, white_balance, box_factor):
     camera, numbers = mosaic
     target = tmp_path / "a.dng"
     nlf = camera.nlf(settings.iso)
@@ -107,7 +99,7 @@ def test_writing_and_reading_invert(
         assert getattr(back.noise, name) == pytest.approx((red, green, green, blue), rel=1e-12)
 
 
-def test_noise_of_box_averages_and_beyond_the_whole_range(path: Path) -> None:
+def test_noise_of_box_averages_and_beyond_the_whole_range(path):
     raw = make_raw(box_factor=4)
     write_dng(path, raw)
     with tifffile.TiffFile(path) as tiff:
@@ -131,7 +123,7 @@ def test_noise_of_box_averages_and_beyond_the_whole_range(path: Path) -> None:
         CameraSettings(102400, 1e-6, 5.6),
     ],
 )
-def test_libraw_reads_the_settings(path: Path, settings: CameraSettings) -> None:
+def test_libraw_reads_the_settings(path, settings):
     write_dng(path, make_raw(settings=settings))
     assert read_raw(path).settings == settings
     with rawpy.imread(str(path)) as libraw:
@@ -141,7 +133,7 @@ def test_libraw_reads_the_settings(path: Path, settings: CameraSettings) -> None
         assert libraw.other.iso_speed == pytest.approx(min(settings.iso, 65535), abs=0.5)
 
 
-def test_exif_edited_by_others_wins(path: Path) -> None:
+def test_exif_edited_by_others_wins(path):
     write_dng(path, make_raw())
     old, new = (np.array([1, n], "<u4").tobytes() for n in (60, 30))
     content = path.read_bytes()
@@ -150,7 +142,7 @@ def test_exif_edited_by_others_wins(path: Path) -> None:
     assert read_raw(path).settings.exposure_time == pytest.approx(1 / 30)
 
 
-def test_colour_matrix_and_camera_survive(path: Path) -> None:
+def test_colour_matrix_and_camera_survive(path):
     matrix = ((1.0, -0.25, 0.0), (-0.5, 1.5, 0.125), (0.0, -0.25, 0.75))
     z6 = replace(get_camera("nikon_z6"), colour_matrix=matrix, colour_matrix_source="measured")
     write_dng(path, make_raw(z6, nlf=None))
@@ -164,7 +156,7 @@ def test_colour_matrix_and_camera_survive(path: Path) -> None:
 # -- the file -------------------------------------------------------------------------------------
 
 
-def test_tags_as_tifffile_reads_them(path: Path) -> None:
+def test_tags_as_tifffile_reads_them(path):
     known = {"datetime": "2024-02-03T04:05:06", "flip": 6}
     raw = make_raw(metadata=known)
     write_dng(path, raw)
@@ -198,7 +190,7 @@ def test_tags_as_tifffile_reads_them(path: Path) -> None:
     assert known.items() <= read_raw(path).metadata.items()
 
 
-def test_developed_level_is_right(path: Path) -> None:
+def test_developed_level_is_right(path):
     """A grey card of 0.18 after white balance comes out of LibRaw's sRGB as 118 of 255."""
     raw = make_raw(CameraProfile("bench_camera", BayerPattern.GBRG, (512.0,) * 4, 15000, 14))
     grey = torch.tensor([0.18 / 2.1, 0.18, 0.18, 0.18 / 1.6])[:, None, None].expand(4, 40, 40)
@@ -210,7 +202,7 @@ def test_developed_level_is_right(path: Path) -> None:
     np.testing.assert_allclose(picture.reshape(-1, 3).mean(0), [118, 118, 118], atol=1.5)
 
 
-def test_any_size_and_order_of_memory(path: Path) -> None:
+def test_any_size_and_order_of_memory(path):
     """Rows are written a few at a time."""
     mosaic = np.random.default_rng(0).integers(0, 4096, (1300, 10), dtype=np.uint16)
     raw = RawImage.from_mosaic(mosaic, CameraSettings(100, 1, 4), make_raw().camera, nlf=NLF)
@@ -221,7 +213,7 @@ def test_any_size_and_order_of_memory(path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [1 / 60, 0.0001, 2.8, 1 / 3, 2**0.5, 30.0, 1e-6, 4e9])
-def test_rationals(value: float) -> None:
+def test_rationals(value):
     numerator, denominator = as_rational(value)
     assert max(numerator, denominator) < 2**32
     assert numerator / denominator == pytest.approx(value, rel=1e-9)
@@ -230,9 +222,7 @@ def test_rationals(value: float) -> None:
 # -- what cannot be written -----------------------------------------------------------------------
 
 
-def test_bad_arguments_and_a_full_disk_leave_nothing_and_keep_the_old(
-    tmp_path: Path, path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_arguments_and_a_full_disk_leave_nothing_and_keep_the_old(tmp_path, path, monkeypatch):
     with pytest.raises(ValueError, match=r"`path`.*'\.dng'"):
         write_dng(tmp_path / "a.tif", make_raw())
     with pytest.raises(ValueError, match="`raw`"):

@@ -1,9 +1,6 @@
 """Raw images: digital numbers in, digital numbers out, and what is refused."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ from hypothesis import strategies as st
 
 from simulator import CameraProfile, CameraSettings, NoiseLevelFunction, RawImage, get_camera
 from simulator.raw.image import pack_mosaic, unpack_mosaic
-from tests.strategies import Mosaic, cameras, mosaics
+from tests.strategies import cameras, mosaics
 
 SETTINGS = CameraSettings(100, 1 / 64, 4.0)
 BLACK = (64.0, 60.25, 59.5, 63.0)  # R, G1, G2, B
@@ -24,7 +21,7 @@ def camera(cfa: str = "RGGB", black: tuple[float, ...] | float = BLACK) -> Camer
 
 
 @given(mosaics(cameras()), st.booleans(), st.booleans())
-def test_packing_and_unpacking_invert(mosaic: Mosaic, odd: bool, as_float: bool) -> None:
+def test_packing_and_unpacking_invert(mosaic, odd, as_float):
     profile, numbers = mosaic
     given_numbers = np.pad(numbers, ((0, odd), (0, odd))).astype(float if as_float else np.uint16)
     packed = pack_mosaic(given_numbers, profile)
@@ -43,7 +40,7 @@ def test_packing_and_unpacking_invert(mosaic: Mosaic, odd: bool, as_float: bool)
 
 @pytest.mark.parametrize("cfa", ["RGGB", "BGGR", "GRBG", "GBRG"])
 @pytest.mark.parametrize("dtype", [np.uint16, np.int32, np.float32, ">u2"])
-def test_any_layout_of_a_mosaic_is_packed_alike(cfa: str, dtype: str) -> None:
+def test_any_layout_of_a_mosaic_is_packed_alike(cfa, dtype):
     whole = np.random.default_rng(4).integers(0, 4096, (300, 40)).astype(dtype)
     visible = whole[3:295, 5:34]  # odd columns, more rows than are converted at a time
     plain = np.array(visible.tolist(), np.uint16)
@@ -52,14 +49,14 @@ def test_any_layout_of_a_mosaic_is_packed_alike(cfa: str, dtype: str) -> None:
     assert torch.equal(pack_mosaic(turned, camera(cfa)), pack_mosaic(plain, camera(cfa)))
 
 
-def test_unpack_clips_to_the_sensor_and_rounds() -> None:
+def test_unpack_clips_to_the_sensor_and_rounds():
     data = torch.tensor([-9.0, 9.0, 0.4 / 4031, 0.6 / 4031]).reshape(4, 1, 1)
     numbers = unpack_mosaic(data, camera(black=64))
     assert numbers.tolist() == [[0, 4095], [64, 65]]
 
 
 @pytest.mark.parametrize("shape", [(4,), (1, 8), (8, 1), (2, 2, 2), (0, 4)])
-def test_bad_mosaic(shape: tuple[int, ...]) -> None:
+def test_bad_mosaic(shape):
     with pytest.raises(ValueError, match="`mosaic`"):
         pack_mosaic(np.zeros(shape, np.uint16), camera())
 
@@ -94,13 +91,13 @@ BAD_DATA = [
         ({"box_factor": 1.5}, r"`box_factor` \(=1.5\)"),
     ],
 )
-def test_bad_arguments(changes: dict[str, Any], message: str) -> None:
+def test_bad_arguments(changes, message):
     arguments = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()} | changes
     with pytest.raises(ValueError, match=message):
         RawImage(**arguments)
 
 
-def test_noise_is_the_files_own_before_the_cameras() -> None:
+def test_noise_is_the_files_own_before_the_cameras():
     z6, data = get_camera("nikon_z6"), torch.zeros(4, 2, 2)
     assert RawImage(data, SETTINGS, z6).noise.shot[1] == pytest.approx(7.47234302281224e-06)
     own = NoiseLevelFunction((1e-3,) * 4, (1e-6,) * 4)
@@ -114,7 +111,7 @@ def test_noise_is_the_files_own_before_the_cameras() -> None:
 
 
 @pytest.mark.parametrize("rows", [1, 127, 300])
-def test_saturated_pixels_of_frames_in_shares(rows: int) -> None:
+def test_saturated_pixels_of_frames_in_shares(rows):
     """Each plane has a limit of its own; NumPy marks the same pixels."""
     limits = [1 - 0.5 / (4095 - black) for black in BLACK]
     levels = np.random.default_rng(6).uniform(0.9995, 1.0001, (4, 9, rows)).astype(np.float32)

@@ -1,13 +1,10 @@
 """Tags and identities of files: read by name, from every container, in bounded time and memory."""
 
-from __future__ import annotations
-
 import io
 import os
 import struct
 import time
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +21,7 @@ def tiff(entries: list[tuple[int, int, int, int]], following: int = 0, magic: in
     return head + body + struct.pack("<I", following)
 
 
-def test_values_by_name_as_tifffile_wrote_them(tmp_path: Path) -> None:
+def test_values_by_name_as_tifffile_wrote_them(tmp_path):
     path = write_sample_dng(tmp_path / "a.dng", NoiseProfile=("d", (1e-4, 2e-6)))
     with path.open("rb") as stream:
         (tags,) = read_directories(stream)
@@ -40,7 +37,7 @@ def test_values_by_name_as_tifffile_wrote_them(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("byteorder", ["<", ">"])
-def test_sub_directories_and_both_byte_orders(tmp_path: Path, byteorder: str) -> None:
+def test_sub_directories_and_both_byte_orders(tmp_path, byteorder):
     model = (CODE["Model"], "s", 0, "Sensor", True)
     white = (CODE["WhiteLevel"], "I", 1, 4095, True)
     with tifffile.TiffWriter(tmp_path / "a.tif", byteorder=byteorder) as writer:  # type: ignore[arg-type]
@@ -55,13 +52,13 @@ def test_sub_directories_and_both_byte_orders(tmp_path: Path, byteorder: str) ->
 
 
 @pytest.mark.parametrize("magic", [42, 0x4F52, 0x5352, 0x55])
-def test_makers_with_a_magic_of_their_own(magic: int) -> None:
+def test_makers_with_a_magic_of_their_own(magic):
     content = tiff([(CODE["Model"], 2, 4, int.from_bytes(b"X-1\0", "little"))], magic=magic)
     assert read_directories(io.BytesIO(content)) == [{"Model": ("X-1",)}]
     assert read_directories(io.BytesIO(b"II\0\0" + content[4:])) == []
 
 
-def test_identities_of_other_containers(tmp_path: Path) -> None:
+def test_identities_of_other_containers(tmp_path):
     dng = write_sample_dng(tmp_path / "a.dng").read_bytes()
     raf = b"FUJIFILMCCD-RAW 0201FF159501" + b"X-T1".ljust(32, b"\0") + bytes(99)
     mrw = b"\0MRM" + bytes(4) + b"\0PRD" + bytes(28) + b"\0TTW" + bytes(4) + dng
@@ -86,7 +83,7 @@ def test_identities_of_other_containers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])
 @pytest.mark.parametrize("kind", [1, 3, 4, 12])
-def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path: Path, count: int, kind: int) -> None:
+def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path, count, kind):
     """Every tag there is claims `count` values, in a file that is long enough for them."""
     codes = sorted({*range(254, 345), *tifffile.TIFF.TAG_READERS, *range(50706, 50830), 34665})
     path = tmp_path / "a.dng"
@@ -101,7 +98,7 @@ def test_tags_of_any_size_are_read_in_bounded_memory(tmp_path: Path, count: int,
     tracemalloc.stop()
 
 
-def test_structures_that_never_end_are_left() -> None:
+def test_structures_that_never_end_are_left():
     start = time.perf_counter()
     # A directory that is its own sub-directory, EXIF directory and successor.
     loop = [(CODE[name], 4, 1, 8) for name in ("SubIFDs", "ExifTag")]
@@ -117,7 +114,7 @@ def test_structures_that_never_end_are_left() -> None:
     assert time.perf_counter() - start < 5.0
 
 
-def test_one_damaged_tag_costs_no_other() -> None:
+def test_one_damaged_tag_costs_no_other():
     entries = [
         (CODE["BitsPerSample"], 99, 1, 0),  # no such type
         (CODE["StripOffsets"], 4, 7, 2**31),  # beyond the end

@@ -1,10 +1,7 @@
 """Blind noise estimation against noise that was put in, at the built-in cameras' levels."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,15 +69,13 @@ def photographs() -> Iterator[Any]:
         *photographs(),
     ],
 )
-def test_noise_that_was_put_in_is_found(
-    light: np.ndarray, camera: str, iso: int, least: float, most: float
-) -> None:
+def test_noise_that_was_put_in_is_found(light, camera, iso, least, most):
     nlf = get_camera(camera).nlf(iso)
     low, high = worst_ratio(estimate_nlf(with_noise(light, nlf, seed=1)), nlf)
     assert least < low <= high < most
 
 
-def test_clipped_half_does_not_count() -> None:
+def test_clipped_half_does_not_count():
     nlf = get_camera("canon_70d").nlf(1600)
     sides = np.full((4, 256, 200), 1.2), np.zeros((4, 256, 90))
     noisy = with_noise(np.concatenate([ramp(), *sides], axis=2), nlf, seed=4)
@@ -90,7 +85,7 @@ def test_clipped_half_does_not_count() -> None:
         assert high < 1.15
 
 
-def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level() -> None:
+def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level():
     rng = np.random.default_rng(6)
     noise = rng.standard_normal((4, 128, 128))
     dark = estimate_nlf(1e-3 * noise)
@@ -109,13 +104,13 @@ def test_dark_frame_is_read_noise_and_grey_card_is_right_at_its_level() -> None:
         (np.ones((4, 64, 64)), "0 unclipped blocks"),
     ],
 )
-def test_bad_input(data: np.ndarray, words: str) -> None:
+def test_bad_input(data, words):
     with pytest.raises(ValueError, match=words):
         estimate_nlf(data)
 
 
 @pytest.mark.real_data
-def test_real_raws_of_one_camera_agree(data_dir: Path) -> None:
+def test_real_raws_of_one_camera_agree(data_dir):
     """Shot noise is the camera's, whatever the subject; a chart's patches are the reference."""
     folder = data_dir / "canon_crw_cc0"
     raws = {n: read_raw(folder / f"CRW_{n}.CRW") for n in ("0101", "0118")}

@@ -1,7 +1,5 @@
 """Reading raw files: orders, levels, margins, noise, and damaged files refused in words."""
 
-from __future__ import annotations
-
 import errno
 import gc
 import os
@@ -122,9 +120,7 @@ def expected_planes(order: str, area: tuple[int, int, int, int]) -> dict[str, np
 
 @pytest.mark.parametrize("order", list(CFA_BYTES))
 @pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (3, 5)])
-def test_cfa_orders_black_levels_and_margins(
-    tmp_path: Path, order: str, corner: tuple[int, int]
-) -> None:
+def test_cfa_orders_black_levels_and_margins(tmp_path, order, corner):
     area = (*corner, 62, 94)
     tags = {"CFAPattern": ("B", CFA_BYTES[order]), "ActiveArea": ("I", area)}
     path = write_sample_dng(tmp_path / "a.dng", black=BLACK, **tags)
@@ -135,7 +131,7 @@ def test_cfa_orders_black_levels_and_margins(
     assert raw.camera.black_level[1] == {"RGGB": 70, "BGGR": 80, "GRBG": 60, "GBRG": 90}[order]
 
 
-def test_levels_colour_and_metadata(tmp_path: Path) -> None:
+def test_levels_colour_and_metadata(tmp_path):
     path = write_sample_dng(tmp_path / "a.dng", Orientation=("H", (6,)))
     with pytest.raises(ValueError, match=r"`settings`.*iso, exposure_time, f_number"):
         read_raw(path)
@@ -157,7 +153,7 @@ def test_levels_colour_and_metadata(tmp_path: Path) -> None:
     assert torch.equal(raw.data, before)
 
 
-def test_second_colour_matrix_is_daylight(tmp_path: Path) -> None:
+def test_second_colour_matrix_is_daylight(tmp_path):
     path = write_sample_dng(
         tmp_path / "a.dng",
         CalibrationIlluminant1=("H", (17,)),
@@ -177,9 +173,7 @@ def test_second_colour_matrix_is_daylight(tmp_path: Path) -> None:
         *((pair, None, None) for pair in [(np.nan, 0), (1e300, 0), (-1, 0), (1e-4, -1e300)]),
     ],
 )
-def test_noise_profile_wins_if_it_can_be_one(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, profile: Any, shot: Any, read: Any
-) -> None:
+def test_noise_profile_wins_if_it_can_be_one(tmp_path, caplog, profile, shot, read):
     canon = {"Make": ("s", "Canon"), "Model": ("s", "Canon EOS 70D")}
     path = write_sample_dng(tmp_path / "a.dng", **canon, NoiseProfile=("d", profile))
     raw = read_raw(path, settings=SETTINGS)
@@ -196,7 +190,7 @@ def test_noise_profile_wins_if_it_can_be_one(
     assert raw.camera.nlf(400) == get_camera("canon_70d").nlf(400)
 
 
-def test_camera_argument(path: Path) -> None:
+def test_camera_argument(path):
     named = read_raw(path, settings=SETTINGS, camera="nikon_z6")
     assert named.noise == get_camera("nikon_z6").nlf(100)
     assert named.camera.white_level == 4095
@@ -214,7 +208,7 @@ def test_camera_argument(path: Path) -> None:
             read_raw(path, settings=SETTINGS, camera=camera)  # type: ignore[arg-type]
 
 
-def test_unknown_camera_is_estimated_and_declared(tmp_path: Path) -> None:
+def test_unknown_camera_is_estimated_and_declared(tmp_path):
     rng = np.random.default_rng(1)
     light = np.broadcast_to(np.linspace(0.02, 0.8, 384), (256, 384))
     noisy = light + np.sqrt(4e-4 * light + 4e-6) * rng.standard_normal(light.shape)
@@ -227,7 +221,7 @@ def test_unknown_camera_is_estimated_and_declared(tmp_path: Path) -> None:
     assert raw.camera.nlf(400).shot[1] == pytest.approx(4 * raw.noise.shot[1])
 
 
-def test_a_table_of_very_many_strips_is_read(tmp_path: Path) -> None:
+def test_a_table_of_very_many_strips_is_read(tmp_path):
     mosaic = np.full((17_000, 64), 1000, np.uint16)
     path = write_sample_dng(tmp_path / "a.dng", mosaic, rowsperstrip=1)
     raw = read_raw(path, settings=SETTINGS, nlf=NLF)
@@ -238,7 +232,7 @@ def test_a_table_of_very_many_strips_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.real_data
-def test_canon_crw(data_dir: Path) -> None:
+def test_canon_crw(data_dir):
     raw = read_raw(data_dir / "canon_crw_cc0" / "CRW_0101.CRW")
     assert (raw.settings.iso, raw.settings.f_number) == (50, pytest.approx(2.80, abs=0.005))
     assert raw.settings.exposure_time == pytest.approx(2 ** (-20 / 3))  # what 1/100 stands for
@@ -260,7 +254,7 @@ def test_canon_crw(data_dir: Path) -> None:
 
 
 @pytest.mark.parametrize("given", [None, 3, b"x", ["a.dng"]])
-def test_what_is_no_file(given: Any, own_dng: Path, tmp_path: Path) -> None:
+def test_what_is_no_file(given, own_dng, tmp_path):
     with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
         read_raw(given)
     with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
@@ -286,9 +280,7 @@ def test_what_is_no_file(given: Any, own_dng: Path, tmp_path: Path) -> None:
         (b"II*\0", "a TIFF-structured file"),
     ],
 )
-def test_files_that_are_no_raw_say_what_they_are(
-    tmp_path: Path, content: str | bytes, words: str
-) -> None:
+def test_files_that_are_no_raw_say_what_they_are(tmp_path, content, words):
     path = tmp_path / "a.dng"
     if isinstance(content, str):
         imsave(tmp_path / f"b.{content}", np.zeros((8, 8, 3), np.uint8), check_contrast=False)
@@ -300,7 +292,7 @@ def test_files_that_are_no_raw_say_what_they_are(
     assert str(tmp_path) not in str(caught.value)
 
 
-def test_arrays_that_are_not_bayer_are_refused(tmp_path: Path) -> None:
+def test_arrays_that_are_not_bayer_are_refused(tmp_path):
     path = tmp_path / "a.dng"
     write_sample_dng(path, np.stack([MOSAIC] * 3, axis=-1), photometric=34892)
     with pytest.raises(RawFileError, match="linear DNG"):
@@ -312,9 +304,7 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path: Path) -> None:
         read_raw(path, settings=SETTINGS)
 
 
-def test_files_that_may_not_be_read_or_shrink(
-    own_dng: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_may_not_be_read_or_shrink(own_dng, monkeypatch):
     real = read_module.read_own_record
 
     def shrinking(directories: Any) -> Any:
@@ -333,7 +323,7 @@ def test_files_that_may_not_be_read_or_shrink(
 
 
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
-def test_a_dng_cut_anywhere_is_refused(path: Path, own_dng: Path, name: str) -> None:
+def test_a_dng_cut_anywhere_is_refused(path, own_dng, name):
     cut = path.with_name(name)
     for size in range(cut.stat().st_size - 1, -1, -512):
         os.truncate(cut, size)
@@ -342,7 +332,7 @@ def test_a_dng_cut_anywhere_is_refused(path: Path, own_dng: Path, name: str) -> 
 
 
 @pytest.mark.real_data
-def test_a_cut_crw_says_so(data_dir: Path, tmp_path: Path) -> None:
+def test_a_cut_crw_says_so(data_dir, tmp_path):
     path = tmp_path / "cut.crw"
     path.write_bytes((data_dir / "canon_crw_cc0" / "CRW_0101.CRW").read_bytes())
     for size in range(path.stat().st_size - 1, 0, -10 * 1024):
@@ -373,7 +363,7 @@ def patch(path: Path, name: str, form: str, *values: Any) -> None:
     path.write_bytes(content)
 
 
-def test_numbers_far_above_white(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_numbers_far_above_white(path, caplog):
     patch(path, "WhiteLevel", "I", 1000)
     raw = read_raw(path, settings=SETTINGS, nlf=NLF)
     times = (MOSAIC.max() - 64.0) / (1000 - 64)
@@ -414,9 +404,7 @@ WORDS = "its white level (={}) must be in [1, 65535]"
         ("Sides", "I", (8_000,), "8000 x 8000 pixels.*at most 1024 a byte are read"),
     ],
 )
-def test_what_a_dng_lost_falls_back_or_is_named(
-    own_dng: Path, path: Path, caplog: Any, name: str, form: str, values: Any, changed: Any
-) -> None:
+def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, form, values, changed):
     of_any_program = name in ("WhiteLevel", "Sides")
     for file in (own_dng, path) if of_any_program else (own_dng,):
         given = {} if file is own_dng else {"settings": SETTINGS, "nlf": NLF}
@@ -437,7 +425,7 @@ def test_what_a_dng_lost_falls_back_or_is_named(
 
 
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
-def test_damaged_files_are_read_or_refused(path: Path, own_dng: Path, name: str) -> None:
+def test_damaged_files_are_read_or_refused(path, own_dng, name):
     content, rng = path.with_name(name).read_bytes(), np.random.default_rng(5)
     refused = 0
     for _ in range(150):

@@ -1,7 +1,5 @@
 """The reference camera against closed forms: geometry, Poisson and Gaussian statistics, ratios."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from dataclasses import replace
@@ -53,7 +51,7 @@ def diameter_px(depth: float, stop: float, pitch: float = 10e-6) -> float:
 
 
 @pytest.mark.parametrize("depth", [1.2, 1.5, 4.0])
-def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth: float) -> None:
+def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth):
     camera, light = ReferenceCamera(sensor(1e-4, 1e-7)), torch.zeros(4, 41, 41)
     light[:, 20, 20] = 1e4
     shot, expected = scene(light, torch.full((41, 41), depth)), diameter_px(depth, 4.0)
@@ -70,7 +68,7 @@ def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth: float) ->
         assert bool(white[1, 20, 20])
 
 
-def test_box_average_and_marked_stops_in_the_blur() -> None:
+def test_box_average_and_marked_stops_in_the_blur():
     shot = scene(flat(0.1, 4), torch.full((4, 4), 1.0))
     native, boxed = (ReferenceCamera(sensor(1e-4, 1e-8), box_factor=k) for k in (1, 4))
     expected = native.blur_diameter(shot, 4.0)
@@ -79,7 +77,7 @@ def test_box_average_and_marked_stops_in_the_blur() -> None:
     torch.testing.assert_close(native.blur_diameter(shot, 11.0), expected / (2 * math.sqrt(2)))
 
 
-def test_scene_without_depth_or_in_focus_is_left_as_it_is() -> None:
+def test_scene_without_depth_or_in_focus_is_left_as_it_is():
     light, camera = torch.rand(4, 7, 5), ReferenceCamera(sensor(1e-4, 1e-8))
     assert float(camera.blur_diameter(scene(light), 4.0).max()) == 0.0
     far = scene(light, torch.full((7, 5), math.inf), lens=Lens(0.05, math.inf))
@@ -97,7 +95,7 @@ def record(camera: ReferenceCamera, level: float, iso: float, size: int = 160) -
 
 @pytest.mark.parametrize("iso", Z6_GREEN)
 @pytest.mark.parametrize("level", [0.0, 0.003, 0.1, 0.6])
-def test_mean_and_variance_of_a_flat_field(iso: int, level: float) -> None:
+def test_mean_and_variance_of_a_flat_field(iso, level):
     shot, read = Z6_GREEN[iso]
     expected = read + shot * level
     sample = record(ReferenceCamera(Z6), level, iso)[1:3]
@@ -109,7 +107,7 @@ def test_mean_and_variance_of_a_flat_field(iso: int, level: float) -> None:
     assert abs(sample.var() - expected) < 5 * standard_error + 0.01 * expected
 
 
-def test_counts_are_poisson_and_read_noise_is_gaussian() -> None:
+def test_counts_are_poisson_and_read_noise_is_gaussian():
     # White is 64 electrons at ISO 100, each 250 numbers high; 0.05 of white is 3.2 electrons.
     sample = record(ReferenceCamera(sensor(1 / 64, 0.0)), 0.05, 100.0) * 64
     np.testing.assert_allclose(sample, sample.round(), atol=1e-4)
@@ -123,7 +121,7 @@ def test_counts_are_poisson_and_read_noise_is_gaussian() -> None:
         assert inside == pytest.approx(math.erf(numbers / 16 / math.sqrt(2)), abs=0.008)
 
 
-def test_rounding_and_box_average_in_the_variance() -> None:
+def test_rounding_and_box_average_in_the_variance():
     # sigma = 0.6 numbers: with 1/12 counted twice the variance would be 23 % too large.
     read = (0.6 / 16000) ** 2
     sample = record(ReferenceCamera(sensor(1e-5, read)), 0.0, 100.0)
@@ -133,7 +131,7 @@ def test_rounding_and_box_average_in_the_variance() -> None:
     assert plain / boxed == pytest.approx(9.0, rel=0.03)
 
 
-def test_no_noise_at_all_is_exact() -> None:
+def test_no_noise_at_all_is_exact():
     camera = ReferenceCamera(sensor(0.0, 0.0, span=1000.0))
     signal = torch.tensor([-1.0, -0.2, -0.0012, 0.1234, 0.9996, 7.0]).expand(4, 1, 6)
     found = camera.record(signal, 100.0, torch.Generator()) * 1000
@@ -143,14 +141,14 @@ def test_no_noise_at_all_is_exact() -> None:
 
 
 @pytest.mark.parametrize("iso", [100.0, 400.0, 6400.0])
-def test_clipped_flat_field_is_white_at_every_iso(iso: float) -> None:
+def test_clipped_flat_field_is_white_at_every_iso(iso):
     camera = ReferenceCamera(Z6, body=BodyError(black_offset=(-1e-4, -1e-4, 1e-4, 1e-4)))
     for level in (3.0, 1e30):
         bright = camera.capture(scene(flat(level, 32)), replace(BASE, iso=iso), 1)
         assert float(bright.sample.min()) == float(bright.mean.min()) == 1.0
 
 
-def test_full_well_ends_the_signal_below_white_under_the_base_iso() -> None:
+def test_full_well_ends_the_signal_below_white_under_the_base_iso():
     # At ISO 50 a number stands for twice the electrons: the well is full at half of white.
     camera = ReferenceCamera(sensor(1e-4, 0.0))
     capture = camera.capture(scene(flat(8.0, 16)), replace(BASE, iso=50), 0)
@@ -162,7 +160,7 @@ def test_full_well_ends_the_signal_below_white_under_the_base_iso() -> None:
 # --- hidden error of a body -------------------------------------------------------------------
 
 
-def test_ratio_of_two_captures_is_the_bodys() -> None:
+def test_ratio_of_two_captures_is_the_bodys():
     body = BodyError(shutter_delay=-20e-6, shutter_scale=0.01, transmission={12: 0.03, 21: -0.05})
     camera = ReferenceCamera(sensor(1e-6, 1e-9), body=body)
     first, second = CameraSettings(100, 1 / 4000, 4), CameraSettings(400, 1 / 125, 11)
@@ -178,7 +176,7 @@ def test_ratio_of_two_captures_is_the_bodys() -> None:
     assert float(captures[0].mean.mean() / plain) == pytest.approx(4 * 1.03, rel=1e-5)
 
 
-def test_black_offset_moves_the_numbers_but_not_the_noise_of_light() -> None:
+def test_black_offset_moves_the_numbers_but_not_the_noise_of_light():
     offset = (2 / 16000, -1.5 / 16000, 0.0, 1 / 16000)
     dark = ReferenceCamera(sensor(1e-4, 1e-6), body=BodyError(black_offset=offset))
     capture = dark.capture(scene(flat(0.0, 200)), BASE, 0)
@@ -188,7 +186,7 @@ def test_black_offset_moves_the_numbers_but_not_the_noise_of_light() -> None:
     np.testing.assert_allclose(sample.var((1, 2)), 1e-6, rtol=0.04)
 
 
-def test_drawn_bodies() -> None:
+def test_drawn_bodies():
     assert BodyError.none().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
     bodies = [BodyError.draw(Z6, seed) for seed in range(300)]
     assert bodies[5] == BodyError.draw(Z6, 5) != bodies[6]
@@ -207,7 +205,7 @@ def test_drawn_bodies() -> None:
 # --- motion, seeds, arguments -----------------------------------------------------------------
 
 
-def test_moving_image_is_smeared_over_the_true_exposure_time() -> None:
+def test_moving_image_is_smeared_over_the_true_exposure_time():
     light = torch.zeros(4, 20, 80)
     light[:, :, 40] = 1.0
     camera = ReferenceCamera(sensor(1e-4, 1e-8), body=BodyError(shutter_scale=0.5))
@@ -219,7 +217,7 @@ def test_moving_image_is_smeared_over_the_true_exposure_time() -> None:
     assert (signal * offset**2).sum() / 1.5 == pytest.approx(extent**2 / 12, rel=1e-3)
 
 
-def test_same_seed_same_capture() -> None:
+def test_same_seed_same_capture():
     camera, shot = ReferenceCamera(Z6), scene(flat(0.2, 16))
     first = camera.capture(shot, BASE, 4)
     state = torch.get_rng_state()
@@ -237,7 +235,7 @@ def test_same_seed_same_capture() -> None:
     assert float(correlation.abs().max()) < 5 / math.sqrt(4 * 40 * 40)
 
 
-def test_bad_input_is_refused() -> None:
+def test_bad_input_is_refused():
     depth = torch.full((8, 8), 2.0)
     bad = [torch.where(torch.eye(8) > 0, z, depth) for z in (0.0, -1.0, 0.04, math.nan)]
     for light, of_light, message in (
@@ -262,7 +260,7 @@ def test_bad_input_is_refused() -> None:
         late.capture(scene(flat(0.1)), replace(BASE, exposure_time=1 / 2000), 0)
 
 
-def test_a_rolling_shutter_shows_bands_of_a_lamp() -> None:
+def test_a_rolling_shutter_shows_bands_of_a_lamp():
     camera = ReferenceCamera(sensor(1e-5, 1e-8, row_time=1e-3), box_factor=2)
     # On for 5 ms of every 10; exposed for 1 us, four sensor rows of 1 ms to a packed row.
     lit = PulsedLamp(frequency=100.0, duty=0.5)

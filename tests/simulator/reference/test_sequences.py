@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -57,9 +55,7 @@ def drawn(illuminance: float, count: int, camera: CameraProfile = Z6) -> list[Ca
 
 
 @pytest.mark.parametrize("illuminance", [1.0, 300.0, 20_000.0])
-def test_a_sequence_has_20_to_25_different_captures_in_the_papers_ranges(
-    illuminance: float,
-) -> None:
+def test_a_sequence_has_20_to_25_different_captures_in_the_papers_ranges(illuminance):
     rng = np.random.default_rng(1)
     sequences = [draw_settings(illuminance, rng, Z6) for _ in range(40)]
     assert {20, 25} <= {len(settings) for settings in sequences} <= set(range(20, 26))
@@ -71,7 +67,7 @@ def test_a_sequence_has_20_to_25_different_captures_in_the_papers_ranges(
             assert s.f_number in EXACT_F
 
 
-def test_levels_are_what_cameras_offer() -> None:
+def test_levels_are_what_cameras_offer():
     assert tuple(EXACT_F) == F_NUMBERS
     assert (ISO_SPEEDS[0], ISO_SPEEDS[-1]) == (100, 16_000)
     np.testing.assert_allclose(np.diff(np.log2(ISO_SPEEDS)), 1 / 3, atol=0.04)
@@ -84,7 +80,7 @@ def test_levels_are_what_cameras_offer() -> None:
     assert times <= set(EXPOSURE_TIMES)
 
 
-def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures() -> None:
+def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures():
     means = []
     for illuminance in (1.0, 20.0, 400.0, 4000.0, 20_000.0):
         logs = [
@@ -96,7 +92,7 @@ def test_brighter_scenes_get_lower_iso_shorter_times_and_smaller_apertures() -> 
 
 
 @pytest.mark.parametrize("illuminance", [10.0, 320.0, 20_000.0])
-def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance: float) -> None:
+def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance):
     # EV100 = log2(N^2 / t) - log2(ISO / 100); incident light of 2.5 lux is EV 0.
     of_state = [
         math.log2(EXACT_F[s.f_number] ** 2 / s.exposure_time) - math.log2(s.iso / 100)
@@ -108,13 +104,13 @@ def test_exposures_scatter_around_the_right_one_by_three_ev(illuminance: float) 
     assert np.percentile(errors, 5) < -2 < 2 < np.percentile(errors, 95)
 
 
-def test_isos_stay_near_the_calibrated_ones() -> None:
+def test_isos_stay_near_the_calibrated_ones():
     table = dict.fromkeys((200.0, 1600.0), Z6.nlf(100.0))
     isos = {s.iso for s in drawn(30.0, 30, replace(Z6, nlf_by_iso=table))}
     assert (min(isos), max(isos)) == (200, 4000)
 
 
-def test_bad_arguments_are_refused() -> None:
+def test_bad_arguments_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match=r"`camera` \(='ideal'\)"):
         draw_settings(100.0, rng, ideal({}))
@@ -127,13 +123,13 @@ def test_bad_arguments_are_refused() -> None:
         select_pairs([], "noises", Z6)  # type: ignore[arg-type]
 
 
-def test_exposure_error_is_positive_where_it_is_too_bright() -> None:
+def test_exposure_error_is_positive_where_it_is_too_bright():
     # 320 lux is EV 7: ISO 100, 1/8 s, f/4 is right.
     for values, ev in (((100, 1 / 8, 4), 0), ((200, 1 / 4, 4), 2), ((100, 1 / 8, 5.6), -1)):
         assert exposure_error(320.0, CameraSettings(*values)) == pytest.approx(ev)
 
 
-def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter() -> None:
+def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter():
     # x = L t ISO / (120 N^2) with L = 0.18 E / pi and E = 2.5 lux at EV 0: 0.18 * 250 / (120 pi)
     card = 0.18 * 250 / (120 * math.pi)
     assert card == pytest.approx(0.119, abs=5e-4)
@@ -145,7 +141,7 @@ def test_a_grey_card_lies_at_12_percent_of_white_under_an_incident_meter() -> No
 
 
 @pytest.mark.parametrize("stage", ["exposure", "all"])
-def test_any_two_captures_of_one_sequence_train_the_exposure(stage: str) -> None:
+def test_any_two_captures_of_one_sequence_train_the_exposure(stage):
     settings = tuple(CameraSettings(100, t, 4) for t in (0.1, 0.2, 0.4))
     pairs = select_pairs([Sequence(scene(), settings), Sequence(scene(), settings[:2])], stage, Z6)  # type: ignore[arg-type]
     expected = [(0, 0, 1), (0, 0, 2), (0, 1, 0), (0, 1, 2), (0, 2, 0), (0, 2, 1)]
@@ -153,7 +149,7 @@ def test_any_two_captures_of_one_sequence_train_the_exposure(stage: str) -> None
     assert pairs == [Pair(*p) for p in expected]
 
 
-def test_noise_targets_collect_four_times_the_light_at_the_same_aperture() -> None:
+def test_noise_targets_collect_four_times_the_light_at_the_same_aperture():
     # With photon noise alone, variance at a common exposure goes as 1 / (light collected): at one
     # f-number the target's must be at most a quarter, so its exposure time at least fourfold.
     source = CameraSettings(6400, 1 / 128, 8)
@@ -169,14 +165,14 @@ def test_noise_targets_collect_four_times_the_light_at_the_same_aperture() -> No
     assert targets(SHOT_ONLY, 9, source, *candidates) == good
 
 
-def test_noise_targets_are_neither_black_nor_white() -> None:
+def test_noise_targets_are_neither_black_nor_white():
     source = CameraSettings(6400, 1 / 8192, 8)  # an eighth of the light of any target
     # EV 12 is ISO 100, 1/64 s, f/8; 3 EV below and 2 EV above are the limits.
     times = (2.0**-9 * 0.98, 2.0**-9 * 1.02, 2.0**-4 * 0.98, 2.0**-4 * 1.02)
     assert targets(SHOT_ONLY, 12, source, *(CameraSettings(100, t, 8) for t in times)) == {2, 3}
 
 
-def test_read_noise_counts_in_dim_light() -> None:
+def test_read_noise_counts_in_dim_light():
     # Source and target differ in exposure by 2 and in gain not at all: brought to the target's
     # exposure the source's read variance is 4 times as large.
     reads = ideal({100.0: (1e-12, 4e-6)})
@@ -184,7 +180,7 @@ def test_read_noise_counts_in_dim_light() -> None:
     assert not targets(reads, 5, *(CameraSettings(100, t, 4) for t in (0.1, 0.1999)))
 
 
-def test_the_aperture_only_opens_and_seldom_stays() -> None:
+def test_the_aperture_only_opens_and_seldom_stays():
     f_numbers = (4.0, 4.0, 5.6, 5.6, 8.0, 8.0, 11.0, 11.0, 16.0, 22.0)
     settings = tuple(CameraSettings(100, 0.1 + i / 10, n) for i, n in enumerate(f_numbers))
     pairs = select_pairs([Sequence(scene(), settings)] * 3, "aperture", Z6)

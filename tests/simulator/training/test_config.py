@@ -1,7 +1,5 @@
 """What a training may be, and what is said about one that it may not be."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ def load(folder: Path, text: str) -> SimulatorConfig:
     return load_config(folder / "a.yaml")
 
 
-def test_stages_in_order_with_their_defaults(tmp_path: Path) -> None:
+def test_stages_in_order_with_their_defaults(tmp_path):
     config = load(tmp_path, COMPACT)
     assert list(config.stages()) == ["exposure", "noise", "aperture"]
     assert (config.noise.steps, config.noise.minutes, config.noise.batch) == (3, None, 8)
@@ -28,7 +26,7 @@ def test_stages_in_order_with_their_defaults(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda f: f.name)
-def test_shipped_configurations_are_valid(file: Path) -> None:
+def test_shipped_configurations_are_valid(file):
     assert load_config(file).preset == file.stem
 
 
@@ -48,7 +46,7 @@ def test_shipped_configurations_are_valid(file: Path) -> None:
         (f"{COMPACT}camera: nikon_z7", "nikon_z6"),
     ],
 )
-def test_errors_name_the_entry(tmp_path: Path, text: str, message: str) -> None:
+def test_errors_name_the_entry(tmp_path, text, message):
     with pytest.raises(ValueError) as caught:
         load(tmp_path, text)
     assert message in str(caught.value)
@@ -60,7 +58,7 @@ def config(**changes: Any) -> SimulatorConfig:
     return SimulatorConfig.model_validate({"preset": "compact", **stages, **changes})
 
 
-def test_a_later_stage_does_not_change_what_an_earlier_one_is() -> None:
+def test_a_later_stage_does_not_change_what_an_earlier_one_is():
     """Else a checkpoint of the noise stage was lost when the aperture's budget is raised."""
     plain, longer = config(), config(aperture={"steps": 9})
     assert plain.card("noise") == longer.card("noise")

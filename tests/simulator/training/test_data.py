@@ -1,7 +1,5 @@
 """Batches: reproducible, aligned, and with the noise that they state."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import fields, replace
@@ -27,7 +25,7 @@ def pairs(*settings: CameraSettings, seed: int = 0, **scene_changes: object) -> 
     return ReferencePairs([sequence], ReferenceCamera(Z6), "exposure", seed=seed)
 
 
-def test_a_batch_is_that_of_its_step_process_and_seed_alone() -> None:
+def test_a_batch_is_that_of_its_step_process_and_seed_alone():
     made = pairs()
     batches = [made.batch(0, 4, 16), made.batch(1, 4, 16), made.batch(0, 4, 16, process=1)]
     batches.append(pairs(seed=1).batch(0, 4, 16))
@@ -40,14 +38,14 @@ def test_a_batch_is_that_of_its_step_process_and_seed_alone() -> None:
         assert torch.equal(getattr(batches[1], name), getattr(again, name))
 
 
-def test_the_target_is_clipped_as_the_camera_clips() -> None:
+def test_the_target_is_clipped_as_the_camera_clips():
     bright = CameraSettings(100, 1, 4)  # 16 x the light: most of it beyond white
     batch = pairs(LIGHT, bright, depth=False).batch(0, 8, 32)
     assert float(batch.target.max()) == float(batch.sample.max()) == 1.0
     assert bool((batch.target[batch.ratio > 1] == 1.0).float().mean() > 0.5)
 
 
-def test_sequences_are_drawn_by_seed_and_index() -> None:
+def test_sequences_are_drawn_by_seed_and_index():
     scenes = [scene("a"), scene("b")]
     first, again, other = (draw_sequences(scenes, Z6, seed) for seed in (0, 0, 1))
     assert [s.settings for s in first] == [s.settings for s in again]
@@ -62,7 +60,7 @@ def test_sequences_are_drawn_by_seed_and_index() -> None:
         pairs().batch(0, 1, 33)
 
 
-def test_source_and_sample_have_the_noise_that_is_stated() -> None:
+def test_source_and_sample_have_the_noise_that_is_stated():
     """Standardised by the noise level function, both have mean 0 and variance 1."""
     source, target = CameraSettings(1600, 1 / 512, 4), CameraSettings(400, 1 / 256, 4)
     made = pairs(source, target, size=64, depth=False)
@@ -87,7 +85,7 @@ def test_source_and_sample_have_the_noise_that_is_stated() -> None:
         assert float(z.var()) == pytest.approx(1.0, abs=0.02)
 
 
-def test_everything_of_a_pair_shows_the_same_crop() -> None:
+def test_everything_of_a_pair_shows_the_same_crop():
     """The light tells the depth of its pixel, so target, source and defocus must agree on it."""
     near = torch.rand(48, 48, generator=torch.Generator().manual_seed(0)) < 0.5
     depth = torch.where(near, 2.0, 8.0)
@@ -105,7 +103,7 @@ def test_everything_of_a_pair_shows_the_same_crop() -> None:
     assert not torch.equal(far[0], far[1])
 
 
-def test_settings_of_a_pair() -> None:
+def test_settings_of_a_pair():
     batch = pairs(DARK, LIGHT).batch(0, 8, 16)
     stop = 2**2.5  # f/5.6
     forward = [6, -11, 2.5, 0, -4, 2]
@@ -119,7 +117,7 @@ def test_settings_of_a_pair() -> None:
         assert stops == pytest.approx((stop, 4.0) if brighter else (4.0, stop))
 
 
-def test_defocus_is_the_thin_lens_at_the_sources_aperture() -> None:
+def test_defocus_is_the_thin_lens_at_the_sources_aperture():
     """f^2 / N (1/s - 1/z) / (1 - f/s), in packed pixels of 2 x 5.9 micrometres or so."""
     batch = pairs(DARK, LIGHT).batch(0, 8, 32)
     assert Z6.pixel_pitch_um is not None

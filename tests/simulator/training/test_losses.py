@@ -1,7 +1,5 @@
 """The losses in closed form, what they leave out, and what they train."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -67,7 +65,7 @@ def denoiser(output: Callable[..., Tensor]) -> NoiseModule:
 # Exposure
 
 
-def test_exposure_is_the_mean_error_of_what_is_not_over_exposed() -> None:
+def test_exposure_is_the_mean_error_of_what_is_not_over_exposed():
     data, loss = batch(noise=False), ExposureLoss(ExposureModule())
     data.source[:, :, :16] = 0.995  # half the pixels; their error would be large
     assert loss(data)["loss"].item() == pytest.approx(0.01, rel=1e-4)
@@ -75,7 +73,7 @@ def test_exposure_is_the_mean_error_of_what_is_not_over_exposed() -> None:
     assert loss(data)["loss"].item() == 0.0  # not NaN
 
 
-def test_the_noise_goes_with_the_exposure() -> None:
+def test_the_noise_goes_with_the_exposure():
     module, data = ExposureModule(), batch()
     module.load_state_dict({"w": torch.tensor(1.5), "b": torch.full((4,), 0.1)})
     exposed, shot, read = expose(module, data)
@@ -86,7 +84,7 @@ def test_the_noise_goes_with_the_exposure() -> None:
     assert not shot.requires_grad
 
 
-def test_a_baseline_is_compared_with_the_sample() -> None:
+def test_a_baseline_is_compared_with_the_sample():
     data = batch(noise=False)  # source 0.2, sample 0.41
     loss = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
     assert float(loss(data)["loss"].detach()) == pytest.approx(0.21, rel=1e-5)
@@ -97,7 +95,7 @@ def test_a_baseline_is_compared_with_the_sample() -> None:
 
 @pytest.mark.parametrize("ratio", [2.0**-8, 0.5, 3.0])
 @pytest.mark.parametrize("level", [0.01, 0.3])
-def test_not_denoising_costs_the_mean_of_a_half_normal(level: float, ratio: float) -> None:
+def test_not_denoising_costs_the_mean_of_a_half_normal(level, ratio):
     """In units of the noise: sqrt(2 / pi), at every signal and exposure. It gains 0 dB."""
     data = batch(level=level, ratio=ratio)
     values = NoiseLoss(ExposureModule(), denoiser(lambda image, _: image))(data)
@@ -109,7 +107,7 @@ def test_not_denoising_costs_the_mean_of_a_half_normal(level: float, ratio: floa
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 1e4])
 @pytest.mark.parametrize("noise", [0.0, SHOT])
-def test_black_and_blown_out_batches_teach_finite_gradients(level: float, noise: float) -> None:
+def test_black_and_blown_out_batches_teach_finite_gradients(level, noise):
     image = torch.full((2, 4, 32, 32), level)
     given = replace(
         batch(noise=False),
@@ -128,7 +126,7 @@ def test_black_and_blown_out_batches_teach_finite_gradients(level: float, noise:
     assert all(bool(torch.isfinite(g).all()) for g in gradients)
 
 
-def test_clipped_pixels_teach_no_denoising() -> None:
+def test_clipped_pixels_teach_no_denoising():
     data = batch()
     data.target[:, :, :8] = 1.0
     data.source[:, :, 8:16] = 1.0
@@ -160,7 +158,7 @@ def aperture_loss(log_blur: Callable[..., Tensor]) -> ApertureLoss:
     return ApertureLoss(ExposureModule(), denoiser(lambda image, _: image), module)
 
 
-def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change() -> None:
+def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change():
     """A map of no blur: relative error 1, and the map is off by log(2.3 / 0.3)."""
     data = opened(batch())
     values = aperture_loss(lambda *_: torch.log(data.defocus + 0.3))(data)
@@ -174,7 +172,7 @@ def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change() -> None:
 
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
-def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble(preset: str) -> None:
+def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble(preset):
     loss = ApertureLoss(ExposureModule(), NoiseModule("compact"), ApertureModule(preset))
     same = replace(opened(batch()), f_target=torch.full((2,), 8.0))
     white = replace(opened(batch()), source=torch.ones(2, 4, 32, 32))
@@ -186,7 +184,7 @@ def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble(preset: str) -> N
         assert all(p.grad is None or bool(p.grad.isfinite().all()) for p in loss.parameters())
 
 
-def test_seven_pixels_around_clipping_are_left_out() -> None:
+def test_seven_pixels_around_clipping_are_left_out():
     source, target = torch.zeros(1, 4, 40, 40), torch.zeros(1, 4, 40, 40)
     source[0, 2, 10, 10] = 0.995
     target[0, 0, 30, 39] = 1.0

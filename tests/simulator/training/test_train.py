@@ -1,7 +1,5 @@
 """From a configuration to weights, on scenes of 32 x 32 pixels; one stage alone on numbers."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -53,7 +51,7 @@ def same(a: nn.Module, b: nn.Module) -> bool:
     return all(torch.equal(value, others[name]) for name, value in a.state_dict().items())
 
 
-def test_the_card_says_what_was_done(trained: Path) -> None:
+def test_the_card_says_what_was_done(trained):
     names = ("aperture.checkpoint", "exposure.checkpoint", "net.json", trained.name)
     assert sorted(p.name for p in trained.parent.iterdir()) == [*names, "noise.checkpoint"]
     card = card_of(trained)
@@ -73,9 +71,7 @@ def test_the_card_says_what_was_done(trained: Path) -> None:
     assert card["stages"]["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
 
 
-def test_a_second_run_trains_nothing_and_ends_the_same(
-    trained: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):
     before, card = trained.read_bytes(), card_of(trained)
     calls: list[str] = []
     again = train_and_save(
@@ -94,7 +90,7 @@ def test_a_second_run_trains_nothing_and_ends_the_same(
         train_and_save(config(), scenes, trained.parent / "net", command="")
 
 
-def test_baselines_in_any_precision_and_their_logs(tmp_path: Path) -> None:
+def test_baselines_in_any_precision_and_their_logs(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     # One precision after another in one process.
@@ -109,7 +105,7 @@ def test_baselines_in_any_precision_and_their_logs(tmp_path: Path) -> None:
     assert entry.step == 2
 
 
-def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path) -> None:
+def test_the_seed_decides_and_progress_is_complete(trained, tmp_path):
     """Drawn weights are those of the seed, and the global generator stays as it was."""
     calls: list[tuple[str, float]] = []
     before = torch.random.get_rng_state()
@@ -133,7 +129,7 @@ def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path
         assert shares[-1] == 1.0
 
 
-def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
+def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing():
     camera = get_camera("nikon_z6")
     pairs = ReferencePairs(draw_sequences([scene()], camera, 0), ReferenceCamera(camera), "all")
     seen: list[float] = []
@@ -152,7 +148,7 @@ def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
     assert seen[8:] == seen[:8]
 
 
-def test_draped_scenes_teach_the_aperture_alone() -> None:
+def test_draped_scenes_teach_the_aperture_alone():
     for kind, teaches in ((DRAPED, ["aperture"]), ("flat", ["exposure", "noise", "baseline"])):
         one = replace(scene(depth=kind == DRAPED), kind=kind)
         stages = ("exposure", "noise", "aperture", "baseline")
@@ -214,7 +210,7 @@ def stop_at(step: int) -> Callable[[int], None]:
     return hook
 
 
-def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path: Path) -> None:
+def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path):
     whole, *_ = run(tmp_path / "whole")
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "part", stop_at(6))
@@ -224,7 +220,7 @@ def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path: Path) -> None:
     assert same(resumed, whole)
 
 
-def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path: Path) -> None:
+def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path):
     with pytest.raises(ValueError, match=r"stage 'noise': the loss \(=nan\) must be finite"):
         run(tmp_path / "a", broken=5)
     assert not (tmp_path / "a").exists()  # nothing is due yet, and a state of it is not written
@@ -242,9 +238,7 @@ class Watch:
         monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
 
 
-def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch = Watch(monkeypatch)
     clocks = [Clock(StageConfig(minutes=2), on_cpu=on_cpu) for on_cpu in (True, False)]
     for clock in clocks:
@@ -258,7 +252,7 @@ def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(
     assert (clocks[0].step, clocks[0].share) == (2, 1.0)
 
 
-def test_a_stage_ends_with_its_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stage_ends_with_its_minutes(tmp_path, monkeypatch):
     """A step takes 7 s here, a minute nine steps; stopped after four, five are left."""
     watch = Watch(monkeypatch)
 

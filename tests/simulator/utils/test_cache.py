@@ -1,7 +1,5 @@
 """The cache: its order and bound in memory, whole files on disk, several processes at once."""
 
-from __future__ import annotations
-
 import copy
 import errno
 import hashlib
@@ -32,7 +30,7 @@ from simulator.utils.cache import (
 KEYS = [cache_key({"i": i}) for i in range(64)]
 
 
-def test_the_variable_names_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_variable_names_the_folder(monkeypatch, tmp_path):
     usual = Path(platformdirs.user_cache_dir("ae-env"))
     for value, expected in (
         (tmp_path / "here", tmp_path / "here"),
@@ -47,7 +45,7 @@ def test_the_variable_names_the_folder(monkeypatch: pytest.MonkeyPatch, tmp_path
             cache(-1)
 
 
-def test_keys_depend_on_names_values_and_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keys_depend_on_names_values_and_the_version(monkeypatch):
     assert cache_key({"a": 1, "b": [2]}) == cache_key({"b": [2], "a": 1})
     keys = {cache_key({"a": 1}), cache_key({"a": 2}), cache_key({"b": 1}), cache_key({"a": [1]})}
     monkeypatch.setattr(cache_module, "package_version", lambda: "99.0")
@@ -60,7 +58,7 @@ def test_keys_depend_on_names_values_and_the_version(monkeypatch: pytest.MonkeyP
 # -- digests --------------------------------------------------------------------------------------
 
 
-def test_digest_sees_content_and_not_layout() -> None:
+def test_digest_sees_content_and_not_layout():
     light = torch.rand(2, 4, 6, 8)
     digest = content_digest({"light": light})
     expected = b"light:torch.float32:(2, 4, 6, 8);" + light.numpy().tobytes()
@@ -86,7 +84,7 @@ def test_digest_sees_content_and_not_layout() -> None:
 # -- in memory ------------------------------------------------------------------------------------
 
 
-def test_the_least_recently_used_goes_first() -> None:
+def test_the_least_recently_used_goes_first():
     """Against a plain list that does the same slowly."""
     rng = np.random.default_rng(0)
     cache: LruCache[int] = LruCache(40)
@@ -112,7 +110,7 @@ def test_the_least_recently_used_goes_first() -> None:
     assert (len(cache), cache.nbytes, cache.get(0)) == (0, 0, None)
 
 
-def test_threads_share_it() -> None:
+def test_threads_share_it():
     cache: LruCache[int] = LruCache(50)
 
     def work(first: int) -> None:
@@ -130,7 +128,7 @@ def test_threads_share_it() -> None:
 # -- on disk --------------------------------------------------------------------------------------
 
 
-def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
+def test_what_is_read_is_what_was_written(tmp_path):
     disk = DiskCache(tmp_path)
     tensors = {
         "light": torch.randn(1, 4, 5, 3).to(memory_format=torch.channels_last),
@@ -148,9 +146,7 @@ def test_what_is_read_is_what_was_written(tmp_path: Path) -> None:
         disk.get("pictures", KEYS[0])
 
 
-def test_damaged_files_are_as_if_not_there(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_damaged_files_are_as_if_not_there(tmp_path, caplog):
     disk, tensors = DiskCache(tmp_path), {"light": torch.rand(4, 8, 8)}
     disk.put("denoised", KEYS[0], tensors)
     path = disk.path("denoised", KEYS[0])
@@ -170,9 +166,7 @@ def test_damaged_files_are_as_if_not_there(
 
 
 @pytest.mark.parametrize("folder", ["file", "x" * 300, "loop", "full"])
-def test_a_folder_that_cannot_be_used_costs_one_warning(
-    tmp_path: Path, folder: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_cannot_be_used_costs_one_warning(tmp_path, folder, caplog, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -197,7 +191,7 @@ def _age(path: Path, seconds: float) -> None:
     os.utime(path, (used, used))
 
 
-def test_the_bound_on_disk_holds_and_what_was_used_longest_ago_goes_first(tmp_path: Path) -> None:
+def test_the_bound_on_disk_holds_and_what_was_used_longest_ago_goes_first(tmp_path):
     disk = DiskCache(tmp_path / "order", max_bytes=16_000)
     tensor = {"light": torch.zeros(700)}  # 2800 bytes and a header: five fit, six do not
     for i in range(5):
@@ -224,7 +218,7 @@ def test_the_bound_on_disk_holds_and_what_was_used_longest_ago_goes_first(tmp_pa
     assert size(found) <= 5000
 
 
-def test_nothing_else_is_ever_removed(tmp_path: Path) -> None:
+def test_nothing_else_is_ever_removed(tmp_path):
     disk = DiskCache(tmp_path, max_bytes=6000)
     folder = tmp_path / "denoised"
     folder.mkdir()
@@ -263,7 +257,7 @@ def _use(folder: Path, seed: int, ready: Any) -> None:
             assert len(set(found["light"].tolist())) == 1
 
 
-def test_processes_share_a_folder(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_processes_share_a_folder(tmp_path, caplog):
     context = multiprocessing.get_context("spawn")
     ready = context.Barrier(2)
     process = context.Process(target=_use, args=(tmp_path, 1, ready))

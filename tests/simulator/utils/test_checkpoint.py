@@ -3,8 +3,6 @@
 `tests/simulator/training/test_train.py` resumes a training and compares every weight.
 """
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ def store(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
     return Checkpoint(path, identity, lambda: {"step": 7, **values})
 
 
-def test_it_saves_when_it_is_due_and_at_the_end(tmp_path: Path, monkeypatch: Any) -> None:
+def test_it_saves_when_it_is_due_and_at_the_end(tmp_path, monkeypatch):
     path = tmp_path / "run"
     now = 100.0
     monkeypatch.setattr("time.monotonic", lambda: now)
@@ -44,7 +42,7 @@ def test_it_saves_when_it_is_due_and_at_the_end(tmp_path: Path, monkeypatch: Any
     assert not path.exists()
 
 
-def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
+def test_a_full_disk_stops_no_training(tmp_path, monkeypatch, caplog):
     path = tmp_path / "run"
     save_checkpoint(path, {"step": 1})
 
@@ -61,9 +59,7 @@ def test_a_full_disk_stops_no_training(tmp_path: Path, monkeypatch: Any, caplog:
 @pytest.mark.parametrize(
     ("error", "kept"), [(KeyboardInterrupt, True), (SystemExit, True), (ValueError, False)]
 )
-def test_what_ends_a_training_decides_whether_its_state_is_kept(
-    error: type[BaseException], kept: bool, tmp_path: Path
-) -> None:
+def test_what_ends_a_training_decides_whether_its_state_is_kept(error, kept, tmp_path):
     with pytest.raises(error), store(tmp_path / "run"):
         raise error
     assert (tmp_path / "run").exists() == kept
@@ -76,7 +72,7 @@ class Harm:
         return Path.touch, (Path("harmed"),)
 
 
-def test_damaged_or_foreign(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
+def test_damaged_or_foreign(tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "run"
     store(path, weight=torch.ones(1000)).save()
@@ -95,7 +91,7 @@ def test_damaged_or_foreign(tmp_path: Path, monkeypatch: Any, caplog: Any) -> No
     assert not (tmp_path / "harmed").exists()
 
 
-def test_another_training_or_version(tmp_path: Path, monkeypatch: Any, caplog: Any) -> None:
+def test_another_training_or_version(tmp_path, monkeypatch, caplog):
     path = tmp_path / "run"
     store(path, {"seed": 0}).save()
     assert store(path, {"seed": 0}).load() == {"step": 7}

@@ -1,7 +1,5 @@
 """YAML files and what is wrong with them, in one line that names the entry."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -40,7 +38,7 @@ def load(folder: Path, text: str | bytes) -> Whole:
     return load_yaml(file, Whole)
 
 
-def test_a_good_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_good_file(tmp_path, monkeypatch):
     assert load(tmp_path, "name: x\npart: {steps: 4}\n") == Whole(name="x", part=Part(steps=4))
     text = "name: &n x\npart:\n  <<: {steps: 2}\n"  # aliases and merges
     assert load(tmp_path, text) == Whole(name="x", part=Part(steps=2))
@@ -62,9 +60,7 @@ def test_a_good_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("a.yaml", "cannot be read: Permission denied"),
     ],
 )
-def test_what_cannot_be_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, message: str
-) -> None:
+def test_what_cannot_be_read(tmp_path, monkeypatch, name, message):
     def refuse(*args: object, **kwargs: object) -> str:
         raise PermissionError(13, "Permission denied")
 
@@ -107,9 +103,7 @@ def test_what_cannot_be_read(
         ("name: !!python/object/apply:os.getcwd []", ["is not YAML"]),  # nothing is executed
     ],
 )
-def test_errors_name_file_and_entry_in_one_line(
-    tmp_path: Path, text: str | bytes, parts: list[str]
-) -> None:
+def test_errors_name_file_and_entry_in_one_line(tmp_path, text, parts):
     with pytest.raises(ValueError) as caught:
         load(tmp_path, text)
     message = str(caught.value)

@@ -1,7 +1,5 @@
 """Files appear whole or not at all, and the folder of real files is found."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat
@@ -15,7 +13,7 @@ from simulator.utils.files import data_folder, write_atomically
 
 @pytest.mark.parametrize("content", [b"\x00\xffraw", "Grüße ☀", b"", ""])
 @pytest.mark.parametrize("name", ["file", "y" * 246 + ".dng", "\u5b57" * 84 + ".d"])
-def test_content_comes_back(tmp_path: Path, content: bytes | str, name: str) -> None:
+def test_content_comes_back(tmp_path, content, name):
     deep = tmp_path / "a" / "b" / name  # folders are made and files replaced
     assert write_atomically(str(deep), content) == deep
     assert deep.read_bytes() == (content.encode() if isinstance(content, str) else content)
@@ -31,9 +29,7 @@ def test_content_comes_back(tmp_path: Path, content: bytes | str, name: str) -> 
         (OSError(errno.ENOSPC, "No space left"), r"`path` \(='.*file'\) cannot be written: No sp"),
     ],
 )
-def test_a_crash_leaves_the_old_content(
-    tmp_path: Path, fault: BaseException, message: str | None
-) -> None:
+def test_a_crash_leaves_the_old_content(tmp_path, fault, message):
     path = write_atomically(tmp_path / "file", "old")
 
     def pieces() -> Iterator[bytes]:
@@ -47,7 +43,7 @@ def test_a_crash_leaves_the_old_content(
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
-def test_permissions_are_those_of_an_ordinary_file(tmp_path: Path, umask: int) -> None:
+def test_permissions_are_those_of_an_ordinary_file(tmp_path, umask):
     before = os.umask(umask)
     try:
         (tmp_path / "ordinary").write_text("x")
@@ -57,7 +53,7 @@ def test_permissions_are_those_of_an_ordinary_file(tmp_path: Path, umask: int) -
     assert len({stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}) == 1
 
 
-def test_targets_that_cannot_be_written(tmp_path: Path) -> None:
+def test_targets_that_cannot_be_written(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_text("x")
     targets = [tmp_path / "folder", tmp_path / "file" / "below", tmp_path / ("x" * 300)]
@@ -72,7 +68,7 @@ def test_targets_that_cannot_be_written(tmp_path: Path) -> None:
         write_atomically(3, "x")  # type: ignore[arg-type]
 
 
-def test_the_folder_of_real_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_folder_of_real_files(tmp_path, monkeypatch):
     beside = Path(__file__).resolve().parents[4] / "shared" / "data"
     unset = beside if beside.is_dir() else None
     for value, expected in ((tmp_path, tmp_path), (tmp_path / "none", None), ("", unset)):

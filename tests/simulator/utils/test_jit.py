@@ -1,12 +1,9 @@
 """Compilation: announced, cached on disk, stale when code changes, possible without a cache."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 
 import numba
-import pytest
 from numba.core import caching
 
 from simulator.utils import jit
@@ -17,7 +14,7 @@ def add(a: int, b: int) -> int:
     return a + b
 
 
-def test_kernels_run_without_the_lock_and_are_cached() -> None:
+def test_kernels_run_without_the_lock_and_are_cached():
     compiled = kernel(fastmath=True)(add)
     assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
     assert compiled(1, 2) == 3
@@ -26,18 +23,14 @@ def test_kernels_run_without_the_lock_and_are_cached() -> None:
     assert compiled.stats.cache_path is not None
 
 
-def test_they_run_where_nothing_can_be_cached(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_they_run_where_nothing_can_be_cached(monkeypatch, caplog):
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     with caplog.at_level(logging.INFO, "simulator.utils.jit"):
         assert kernel()(add)(1, 2) == 3
     assert "compiled again in each process" in caplog.text
 
 
-def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, monkeypatch):
     """Numba itself would run the kernel that it compiled with a constant's old value."""
     monkeypatch.setattr(jit, "_ROOT", tmp_path)
     texts = {

@@ -1,7 +1,5 @@
 """Result files: what they say about themselves, and nothing that JSON cannot hold."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Shares of work: each item once, on as many threads as asked for, after a fork as well."""
 
-from __future__ import annotations
-
 import multiprocessing
 import threading
 
@@ -13,7 +11,7 @@ from simulator.utils.threads import in_shares
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_every_item_is_done_once(count: int, threads: int) -> None:
+def test_every_item_is_done_once(count, threads):
     done = np.zeros((count, 10), int)
 
     def task(first: int, last: int) -> None:
@@ -28,7 +26,7 @@ def test_every_item_is_done_once(count: int, threads: int) -> None:
     assert (done == 1).all()
 
 
-def test_shares_are_contiguous_and_run_at_the_same_time() -> None:
+def test_shares_are_contiguous_and_run_at_the_same_time():
     barrier, shares = threading.Barrier(3, timeout=30), []
 
     def task(first: int, last: int) -> None:
@@ -43,7 +41,7 @@ def test_shares_are_contiguous_and_run_at_the_same_time() -> None:
 
 
 @pytest.mark.parametrize("bad", [0, 3])
-def test_errors_of_any_share_are_raised_once_all_are_done(bad: int) -> None:
+def test_errors_of_any_share_are_raised_once_all_are_done(bad):
     done: list[int] = []
 
     def task(first: int, last: int) -> None:
@@ -68,7 +66,7 @@ def _sum_in_child(queue: multiprocessing.Queue) -> None:
 
 @pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
-def test_child_processes_make_threads_of_their_own(method: str) -> None:
+def test_child_processes_make_threads_of_their_own(method):
     in_shares(lambda *_: None, 2, threads=2)  # this process has some already
     context = multiprocessing.get_context(method)
     queue = context.Queue()

@@ -1,7 +1,5 @@
 """Tiles: what a network gives on the whole frame, on any size, in bounded memory."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 import torch.nn.functional as F
@@ -25,14 +23,14 @@ def mean_of_neighbours(*images: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (12, 16), (16, 17), (17, 16), (40, 41), (5, 93), (93, 5)])
-def test_tiles_of_a_function_of_neighbourhood_and_phase(size: tuple[int, int]) -> None:
+def test_tiles_of_a_function_of_neighbourhood_and_phase(size):
     image, other = frame(*size), frame(*size, seed=1)
     tiled = in_tiles(mean_of_neighbours, image, other, halo=4, tile=12)
     torch.testing.assert_close(tiled, mean_of_neighbours(image, other), rtol=0, atol=1e-6)
     assert torch.equal(in_tiles(lambda x: x.sum(1), image, halo=4, tile=8), image.sum(1))
 
 
-def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once() -> None:
+def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once():
     sizes: list[tuple[int, ...]] = []
 
     def spy(image: Tensor) -> Tensor:
@@ -50,7 +48,7 @@ def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once() -> None:
     assert sizes == [(24, 20)]
 
 
-def test_the_halo_covers_what_the_networks_see() -> None:
+def test_the_halo_covers_what_the_networks_see():
     """What lies beyond the halo changes no bit of the centre; what lies within does."""
     noise = NoiseModule("compact").eval().requires_grad_(False)
     noise.network = CompactDenoiser((4, 6, 8)).requires_grad_(False)
@@ -85,14 +83,14 @@ def patches(height: int, width: int) -> Tensor:
 
 @pytest.mark.parametrize("size", [(16, 16), (1, 90), (90, 1), (61, 203), (200, 130)])
 @pytest.mark.parametrize("tile", [16, 64, 512])
-def test_where_it_is_needed_it_is_what_it_is_without(size: tuple[int, int], tile: int) -> None:
+def test_where_it_is_needed_it_is_what_it_is_without(size, tile):
     image, needed = frame(*size), patches(*size)
     expected = torch.where(needed, mean_of_neighbours(image), -image)
     tiled = in_tiles(mean_of_neighbours, image, halo=4, tile=tile, needed=needed, fallback=-image)
     torch.testing.assert_close(tiled, expected, rtol=0, atol=1e-6)
 
 
-def test_what_is_not_needed_is_not_computed() -> None:
+def test_what_is_not_needed_is_not_computed():
     seen: list[int] = []
 
     def spy(image: Tensor) -> Tensor:
@@ -109,7 +107,7 @@ def test_what_is_not_needed_is_not_computed() -> None:
 
 
 @pytest.mark.parametrize("density", [0.0005, 0.01, 0.3])
-def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density: float) -> None:
+def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density):
     needed = torch.rand(333, 270, generator=torch.Generator().manual_seed(1)) < density
     tiles = make_tiles(333, 270, halo=12, tile=128, needed=needed)
     count = torch.zeros(333, 270)
@@ -123,7 +121,7 @@ def test_tiles_cover_every_needed_pixel_once_at_no_more_than_the_whole(density: 
     assert sum(t.area for t in tiles) <= sum(t.area for t in whole)
 
 
-def test_bad_arguments_are_refused() -> None:
+def test_bad_arguments_are_refused():
     image, needed = frame(8, 12), torch.ones(8, 12, dtype=torch.bool)
     for halo, tile in ((3, 8), (4, 10), (4, 0)):  # they would break the phase
         with pytest.raises(ValueError, match="multiples of 4"):
@@ -138,7 +136,7 @@ def test_bad_arguments_are_refused() -> None:
         varying(image[0], 8)
 
 
-def test_constant_parts_do_not_vary() -> None:
+def test_constant_parts_do_not_vary():
     image = frame(75, 100)[0]
     image[:, 32:, :50] = 1.0  # saturated
     image[:, :16, 64:] = 0.0  # black, but for one plane's pixel
