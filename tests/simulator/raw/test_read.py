@@ -100,35 +100,23 @@ def own_dng(tmp_path: Path) -> Path:
 # -- what is read ---------------------------------------------------------------------------------
 
 
-def expected_planes(order: str, area: tuple[int, int, int, int]) -> dict[str, np.ndarray]:
-    """Planes by the DNG specification's rule, pixel by pixel from the tile at the area's corner.
-
-    LibRaw begins an odd visible area one row or column further in.
-    """
-    top, left, bottom, right = area
-    rows = np.arange(top + top % 2, bottom)
-    columns = np.arange(left + left % 2, right)
-    rows, columns = rows[: len(rows) // 2 * 2], columns[: len(columns) // 2 * 2]
-    greens = ("G1", "G2") if order.index("R") // 2 == 0 else ("G2", "G1")
-    names = np.array([c if c != "G" else greens[i // 2] for i, c in enumerate(order)])
-    tile = 2 * ((rows[:, None] - top) % 2) + (columns[None] - left) % 2
-    black = np.array(BLACK, float)[tile]
-    values = (MOSAIC[np.ix_(rows, columns)] - black) / (4095 - black)
-    shape = (len(rows) // 2, len(columns) // 2)
-    return {n: values[names[tile] == n].reshape(shape) for n in ("R", "G1", "G2", "B")}
-
-
 @pytest.mark.parametrize("order", list(CFA_BYTES))
 @pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (3, 5)])
 def test_cfa_orders_black_levels_and_margins(tmp_path, order, corner):
-    area = (*corner, 62, 94)
-    tags = {"CFAPattern": ("B", CFA_BYTES[order]), "ActiveArea": ("I", area)}
+    """By the DNG specification's rule: the tile begins at the area's corner."""
+    top, left = corner
+    tags = {"CFAPattern": ("B", CFA_BYTES[order]), "ActiveArea": ("I", (top, left, 62, 94))}
     path = write_sample_dng(tmp_path / "a.dng", black=BLACK, **tags)
     raw = read_raw(path, settings=SETTINGS, nlf=NLF)
-    for plane, name in zip(raw.data.numpy(), ("R", "G1", "G2", "B"), strict=True):
-        np.testing.assert_allclose(plane, expected_planes(order, area)[name], atol=1e-7)
-    assert raw.camera.black_level[0] == BLACK[order.index("R")]
-    assert raw.camera.black_level[1] == {"RGGB": 70, "BGGR": 80, "GRBG": 60, "GBRG": 90}[order]
+    # LibRaw begins an odd visible area one row or column further in.
+    rows, columns = np.mgrid[top + top % 2 : 62, left + left % 2 : 94]
+    tile = 2 * ((rows - top) % 2) + (columns - left) % 2
+    values = (MOSAIC[rows, columns] - np.take(BLACK, tile)) / (4095 - np.take(BLACK, tile))
+    red, blue = order.index("R"), order.index("B")
+    planes = [red, red ^ 1, blue ^ 1, blue]  # G1 is on red's rows, G2 on blue's
+    expected = [values[tile == i].reshape(len(rows) // 2, -1) for i in planes]
+    np.testing.assert_allclose(raw.data, expected, atol=1e-7)
+    assert raw.camera.black_level == tuple(BLACK[i] for i in planes)
 
 
 def test_levels_colour_and_metadata(tmp_path):
@@ -154,14 +142,13 @@ def test_levels_colour_and_metadata(tmp_path):
 
 
 def test_second_colour_matrix_is_daylight(tmp_path):
-    path = write_sample_dng(
-        tmp_path / "a.dng",
-        CalibrationIlluminant1=("H", (17,)),
-        ColorMatrix2=("2i", fractions(2 * np.eye(3))),
-        CameraCalibration2=("2i", fractions(np.diag([0.5, 1, 2]))),
-        CalibrationIlluminant2=("H", (21,)),
-    )
-    raw = read_raw(path, settings=SETTINGS, nlf=NLF)
+    tags = {
+        "CalibrationIlluminant1": ("H", (17,)),
+        "ColorMatrix2": ("2i", fractions(2 * np.eye(3))),
+        "CameraCalibration2": ("2i", fractions(np.diag([0.5, 1, 2]))),
+        "CalibrationIlluminant2": ("H", (21,)),
+    }
+    raw = read_raw(write_sample_dng(tmp_path / "a.dng", **tags), settings=SETTINGS, nlf=NLF)
     np.testing.assert_allclose(raw.camera.colour_matrix, np.diag([1.0, 2.0, 4.0]))
 
 
@@ -182,12 +169,11 @@ def test_noise_profile_wins_if_it_can_be_one(tmp_path, caplog, profile, shot, re
         assert raw.noise == get_camera("canon_70d").nlf(100)
         assert raw.metadata["nlf_source"] == "camera calibration (canon_70d)"
     else:
-        assert raw.noise.shot == pytest.approx(shot)
-        assert raw.noise.read == pytest.approx(read)
+        assert (raw.noise.shot, raw.noise.read) == (pytest.approx(shot), pytest.approx(read))
         assert raw.metadata["nlf_source"] == "DNG NoiseProfile"
-    assert raw.camera.name == "canon_70d"
-    assert (raw.camera.black_level[0], raw.camera.white_level) == (64.0, 4095.0)  # the file's
-    assert raw.camera.nlf(400) == get_camera("canon_70d").nlf(400)
+    camera = raw.camera
+    assert (camera.name, camera.black_level[0], camera.white_level) == ("canon_70d", 64, 4095)
+    assert camera.nlf(400) == get_camera("canon_70d").nlf(400)
 
 
 def test_camera_argument(path):
@@ -241,7 +227,6 @@ def test_canon_crw(data_dir):
     assert (known["make"], known["model"]) == ("Canon", "Canon PowerShot S40")
     assert known["datetime"].startswith("2021-04-08T14:51:12")
     assert known["nlf_source"] == "blind estimate"
-    assert camera.colour_matrix is not None
     assert camera.colour_matrix[0] == (0.8606, -0.2573, -0.0949)  # dcraw's table
     assert "LibRaw" in camera.colour_matrix_source
     # The chart's neutral row (white to black) has falling levels in every plane.
@@ -255,15 +240,11 @@ def test_canon_crw(data_dir):
 
 @pytest.mark.parametrize("given", [None, 3, b"x", ["a.dng"]])
 def test_what_is_no_file(given, own_dng, tmp_path):
-    with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
-        read_raw(given)
-    with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
-        write_dng(given, read_raw(own_dng))
-    for path, words in (
-        (tmp_path / "none.dng", "does not exist"),
-        (tmp_path, "is a folder"),
-        (Path(os.devnull), "no ordinary file"),
-    ):
+    for call in (read_raw, lambda path: write_dng(path, read_raw(own_dng))):
+        with pytest.raises(ValueError, match=r"`path` .* must be a file's name"):
+            call(given)
+    faults = {tmp_path / "none": "does not exist", tmp_path: "is a folder"}
+    for path, words in (faults | {Path(os.devnull): "no ordinary file"}).items():
         with pytest.raises(FileNotFoundError, match=words):
             read_raw(path)
 
@@ -296,12 +277,12 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path):
     path = tmp_path / "a.dng"
     write_sample_dng(path, np.stack([MOSAIC] * 3, axis=-1), photometric=34892)
     with pytest.raises(RawFileError, match="linear DNG"):
-        read_raw(path, settings=SETTINGS)
+        read_raw(path)
     tile = "GBGGRGRGBRGBGBGGRGGRGGBGBGBRGRGRGGBG"
     colours = tuple("RGB".index(c) for c in tile)
     write_sample_dng(path, CFAPattern=("B", colours), CFARepeatPatternDim=("H", (6, 6)))
     with pytest.raises(RawFileError, match="X-Trans"):
-        read_raw(path, settings=SETTINGS)
+        read_raw(path)
 
 
 def test_files_that_may_not_be_read_or_shrink(own_dng, monkeypatch):
@@ -372,7 +353,7 @@ def test_numbers_far_above_white(path, caplog):
 
 
 NEUTRAL, EXACT = ("white_balance", (1.0, 1.0, 1.0)), ("settings", SETTINGS)
-WORDS = "its white level (={}) must be in [1, 65535]"
+LARGEST = ("white_level", 65535)
 
 
 @pytest.mark.parametrize(
@@ -398,37 +379,36 @@ WORDS = "its white level (={}) must be in [1, 65535]"
         ("CFAPattern", "4B", (0, 0, 0, 0), "CFAPattern"),
         ("BlackLevel", "I", (70_000,), "white level above its black levels"),
         # Also in a DNG of another program:
-        *(("WhiteLevel", "I", (white,), WORDS.format(white)) for white in (0, 65536, 2**32 - 1)),
+        *(("WhiteLevel", "I", (white,), LARGEST) for white in (0, 65536, 2**32 - 1)),
         ("WhiteLevel", "I", (64,), "above its black levels, .* white 64"),
         ("Sides", "I", (20_000,), "20000 x 20000 pixels.*at most 268435456 are read"),
         ("Sides", "I", (8_000,), "8000 x 8000 pixels.*at most 1024 a byte are read"),
     ],
 )
 def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, form, values, changed):
-    of_any_program = name in ("WhiteLevel", "Sides")
-    for file in (own_dng, path) if of_any_program else (own_dng,):
+    for file in (own_dng, path) if name in ("WhiteLevel", "Sides") else (own_dng,):
         given = {} if file is own_dng else {"settings": SETTINGS, "nlf": NLF}
         for each in ("ImageWidth", "ImageLength") if name == "Sides" else (name,):
             patch(file, each, form, *values)
-        if isinstance(changed, str) and not changed.startswith("its"):
+        if isinstance(changed, str):
             with pytest.raises(RawFileError, match=changed):
                 read_raw(file, **given)
             continue
         raw = read_raw(file, **given)
         np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)
-        if isinstance(changed, str):  # the largest number is taken for white
-            assert f"{file.name}: {changed}" in caplog.text
-            assert raw.camera.white_level == 65535
-        else:
-            key, value = changed
-            assert getattr(raw, key, raw.metadata.get(key)) == value
+        known = {"white_level": raw.camera.white_level, "settings": raw.settings}
+        known |= {"white_balance": raw.white_balance, **raw.metadata}
+        assert known.get(changed[0]) == changed[1]
+        if changed == LARGEST:
+            message = f"{file.name}: its white level (={values[0]}) must be in [1, 65535]"
+            assert message in caplog.text
 
 
 @pytest.mark.parametrize("name", ["a.dng", "own.dng"])
 def test_damaged_files_are_read_or_refused(path, own_dng, name):
     content, rng = path.with_name(name).read_bytes(), np.random.default_rng(5)
     refused = 0
-    for _ in range(150):
+    for _ in range(120):
         damaged = bytearray(content)
         for at in rng.integers(0, 900, rng.integers(1, 5)):
             damaged[at] = rng.choice([0, 1, 127, 255])
@@ -439,4 +419,4 @@ def test_damaged_files_are_read_or_refused(path, own_dng, name):
             refused += 1
         else:
             assert bool(torch.isfinite(raw.data).all())
-    assert 15 < refused < 150
+    assert 12 < refused < 120
