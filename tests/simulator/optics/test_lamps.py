@@ -115,8 +115,6 @@ def test_bad_values_are_refused(make, rule):
         make()
 
 
-# -- any lamp at any moment ---------------------------------------------------------------------
-
 PHASES = st.floats(0.0, 1.0)
 LAMPS = st.one_of(
     st.builds(Lamp),

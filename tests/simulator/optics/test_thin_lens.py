@@ -16,9 +16,6 @@ from simulator.optics.thin_lens import Lens, defocus
 DOUBLE = torch.float64
 
 
-# --- circle of confusion ----------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0, 2.0, 500.0])
 def test_circle_of_confusion_follows_from_similar_triangles(focus, depth):
@@ -48,9 +45,6 @@ def test_lens_refuses(values, name):
         Lens(*values)
 
 
-# --- one plane --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("diameter", [0.4, 1.0, 2.7, 6.3, 14.0])
 def test_point_source_becomes_its_disc(diameter, sign):
@@ -72,9 +66,6 @@ def test_blur_too_small_to_see_leaves_every_bit():
     light = torch.rand(4, 9, 13, generator=torch.Generator().manual_seed(0))
     ripple = 0.1 * torch.rand(9, 13, generator=torch.Generator().manual_seed(1))
     assert torch.equal(defocus(light, ripple - 0.05), light)
-
-
-# --- what keeps -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("case", ["step", "ramp", "through_focus", "stairs", "noise", "islands"])
@@ -122,24 +113,14 @@ def beyond_chord(diameter: np.ndarray | float) -> np.ndarray:
     return 1 - (np.arccos(x) - x * np.sqrt(1 - x * x)) / math.pi
 
 
-def test_blurred_foreground_spills_over_a_sharp_background():
-    # The same picture, the sides of the focus exchanged: a sign error would swap both tests.
-    columns = np.arange(60)[None, :].repeat(40, 0)
-    light = torch.from_numpy(np.where(columns < 30, 0.0, 1.0))[None]
-    found = defocus(light, torch.from_numpy(np.where(columns < 30, -10.0, 0.0)))[0, 20].numpy()
-    np.testing.assert_allclose(found, beyond_chord(10.0), atol=0.005)
-
-
 def test_what_a_blurred_foreground_hides_is_continued():
-    # Stripes across the edge go on behind the foreground, and show through its blurred border.
+    # Stripes across the edge go on behind the foreground, and show through its blurred border. The
+    # sides of the focus are exchanged here: a sign error would swap this test and the one before.
     rows, columns = np.mgrid[:40, :60]
     stripes = 1.0 + (rows // 4 % 2)
     light = torch.from_numpy(np.where(columns < 30, 0.0, stripes))[None]
     found = defocus(light, torch.from_numpy(np.where(columns < 30, -10.0, 0.0)))[0].numpy()
     np.testing.assert_allclose(found[8:32], (beyond_chord(10.0) * stripes)[8:32], atol=0.01)
-
-
-# --- two planes, ray by ray -------------------------------------------------------------------
 
 
 Texture = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -80,9 +80,6 @@ def test_captures_of_the_reference_camera_come_back(tmp_path, write, camera):
         sequence.captures[3]
 
 
-# --- files as the authors' preprocessing leaves them -------------------------------------------
-
-
 def author_file(path: Path, mosaic: np.ndarray, black: float, white: float) -> None:
     """Subtract black, divide, pack top-left, top-right, bottom-right, bottom-left, save."""
     bayer = (mosaic.astype(np.float32) - black) / (white - black)
@@ -219,9 +216,6 @@ def test_files_that_are_no_packed_raw_are_refused(tmp_path, content, message):
     captures = read_sequence(tmp_path).captures
     with pytest.raises(ValueError, match=message):
         captures[0]
-
-
-# --- folders of raws ---------------------------------------------------------------------------
 
 
 def test_every_folder_of_raws_is_a_sequence(tmp_path):

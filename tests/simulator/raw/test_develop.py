@@ -46,10 +46,9 @@ def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
 def test_develop_follows_the_formula():
     """R, mean green, B -> gains -> matrix -> sRGB, computed with numpy for one colour."""
     out = develop(flat(0.1, 0.2, 0.15), (2.0, 1.0, 1.5), Z6.colour_matrix, tone="linear")
-    xyz_from_srgb = np.array(  # IEC 61966-2-1
-        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    )
-    camera_from_srgb = np.array(Z6.colour_matrix) @ xyz_from_srgb
+    # IEC 61966-2-1
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    camera_from_srgb = np.array(Z6.colour_matrix) @ to_xyz
     camera_from_srgb /= camera_from_srgb.sum(axis=1, keepdims=True)
     linear = np.linalg.solve(camera_from_srgb, [0.2, 0.2, 0.225])
     assert out.shape == (1, 3, 4, 4)

@@ -61,40 +61,35 @@ def test_bad_mosaic(shape):
         pack_mosaic(np.zeros(shape, np.uint16), camera())
 
 
-BAD_DATA = [
-    (torch.zeros(3, 4, 4), r"`data` \(shape \(3, 4, 4\)\) must be \(4, H, W\)"),
-    (torch.zeros(4, 4), r"`data` \(shape \(4, 4\)\)"),
-    (torch.zeros(1, 4, 4, 4), r"must be \(4, H, W\)"),
-    (torch.zeros(4, 0, 4), "`data`"),
-    (torch.zeros(4, 2, 2, dtype=torch.int16), "from_mosaic"),
-    (np.zeros((4, 2, 2), np.uint16), "from_mosaic"),
-    (torch.full((4, 2, 2), math.nan), r"\(16 values NaN or infinite\)"),
-    (torch.tensor([1.0, -math.inf, 0.0, 0.0]).reshape(4, 1, 1), r"\(1 values"),
-    (torch.full((4, 2, 2), 1e300, dtype=torch.float64), "infinite"),  # beyond float32
-    ([[0.0]], "`data` .=list. must be a dense torch tensor"),
-    (np.array(["a"]), "`data` .=ndarray. must be a dense torch tensor"),
-    (torch.zeros(4, 2, 2).to_sparse(), "`data` .=torch.sparse_coo. must be a dense"),
-    (None, "`data`"),
-]
-
-
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("name", "value", "message"),
     [
-        *(({"data": data}, message) for data, message in BAD_DATA),
-        ({"white_balance": (1.0, 1.0)}, "`white_balance`"),
-        *(({"white_balance": (1.0, v, 1.0)}, "`white_balance`") for v in (0.0, -1.0, math.nan)),
-        ({"camera": "nikon_z6"}, r"`camera` \(='nikon_z6'\) must be a CameraProfile"),
-        ({"settings": (100, 0.01)}, r"`settings` \(=\(100, 0.01\)\) must be a CameraSettings"),
-        ({"nlf": (1e-4, 1e-6)}, "`nlf` .* must be a NoiseLevelFunction"),
-        ({"box_factor": 0}, r"`box_factor` \(=0\)"),
-        ({"box_factor": 1.5}, r"`box_factor` \(=1.5\)"),
+        ("data", torch.zeros(3, 4, 4), r"`data` \(shape \(3, 4, 4\)\) must be \(4, H, W\)"),
+        ("data", torch.zeros(4, 4), r"`data` \(shape \(4, 4\)\)"),
+        ("data", torch.zeros(1, 4, 4, 4), r"must be \(4, H, W\)"),
+        ("data", torch.zeros(4, 0, 4), "`data`"),
+        ("data", torch.zeros(4, 2, 2, dtype=torch.int16), "from_mosaic"),
+        ("data", np.zeros((4, 2, 2), np.uint16), "from_mosaic"),
+        ("data", torch.full((4, 2, 2), math.nan), r"\(16 values NaN or infinite\)"),
+        ("data", torch.tensor([1.0, -math.inf, 0.0, 0.0]).reshape(4, 1, 1), r"\(1 values"),
+        ("data", torch.full((4, 2, 2), 1e300, dtype=torch.float64), "infinite"),  # beyond float32
+        ("data", [[0.0]], "`data` .=list. must be a dense torch tensor"),
+        ("data", np.array(["a"]), "`data` .=ndarray. must be a dense torch tensor"),
+        ("data", torch.zeros(4, 2, 2).to_sparse(), "`data` .=torch.sparse_coo. must be a dense"),
+        ("data", None, "`data`"),
+        ("white_balance", (1.0, 1.0), "`white_balance`"),
+        *(("white_balance", (1.0, v, 1.0), "`white_balance`") for v in (0.0, -1.0, math.nan)),
+        ("camera", "nikon_z6", r"`camera` \(='nikon_z6'\) must be a CameraProfile"),
+        ("settings", (100, 0.01), r"`settings` \(=\(100, 0.01\)\) must be a CameraSettings"),
+        ("nlf", (1e-4, 1e-6), "`nlf` .* must be a NoiseLevelFunction"),
+        ("box_factor", 0, r"`box_factor` \(=0\)"),
+        ("box_factor", 1.5, r"`box_factor` \(=1.5\)"),
     ],
 )
-def test_bad_arguments(changes, message):
-    arguments = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()} | changes
+def test_bad_arguments(name, value, message):
+    usual = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()}
     with pytest.raises(ValueError, match=message):
-        RawImage(**arguments)
+        RawImage(**(usual | {name: value}))
 
 
 def test_noise_is_the_files_own_before_the_cameras():

@@ -97,9 +97,6 @@ def own_dng(tmp_path: Path) -> Path:
     return path
 
 
-# -- what is read ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("order", list(CFA_BYTES))
 @pytest.mark.parametrize("corner", [(0, 0), (1, 0), (0, 1), (3, 5)])
 def test_cfa_orders_black_levels_and_margins(tmp_path, order, corner):
@@ -233,9 +230,6 @@ def test_canon_crw(data_dir):
     assert raw.data.shape == (4, 860, 1156)
     white, black = raw.data[:, 600:640, 160:200], raw.data[:, 600:640, 950:990]
     assert float(white.mean()) > 10 * float(black.mean())
-
-
-# -- what is refused ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("given", [None, 3, b"x", ["a.dng"]])

@@ -47,9 +47,6 @@ def diameter_px(depth: float, stop: float, pitch: float = 10e-6) -> float:
     return 0.05 / stop * abs(focus - image) / image / pitch
 
 
-# --- optics -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("depth", [1.2, 1.5, 4.0])
 def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth):
     camera, light = ReferenceCamera(sensor(1e-4, 1e-7)), torch.zeros(4, 41, 41)
@@ -83,9 +80,6 @@ def test_scene_without_depth_or_in_focus_is_left_as_it_is():
     far = scene(light, torch.full((7, 5), math.inf), lens=Lens(0.05, math.inf))
     for sharp in (scene(light), scene(light, torch.full((7, 5), 2.0)), far):
         assert torch.equal(camera.blurred_light(sharp, 4.0), light)
-
-
-# --- noise ------------------------------------------------------------------------------------
 
 
 def record(camera: ReferenceCamera, level: float, iso: float, size: int = 160) -> np.ndarray:
@@ -157,9 +151,6 @@ def test_full_well_ends_the_signal_below_white_under_the_base_iso():
         np.testing.assert_allclose(recorded, 0.5, rtol=0.005)
 
 
-# --- hidden error of a body -------------------------------------------------------------------
-
-
 def test_ratio_of_two_captures_is_the_bodys():
     body = BodyError(shutter_delay=-20e-6, shutter_scale=0.01, transmission={12: 0.03, 21: -0.05})
     camera = ReferenceCamera(sensor(1e-6, 1e-9), body=body)
@@ -200,9 +191,6 @@ def test_drawn_bodies():
     stops = {CameraSettings(100, 1, f).aperture_stop for f in (1, 1.4, 2.8, 4, 5.6, 11, 22, 32)}
     assert stops <= set(bodies[5].transmission)
     assert min(b.exposure_time(1 / 8000) for b in bodies) > 0
-
-
-# --- motion, seeds, arguments -----------------------------------------------------------------
 
 
 def test_moving_image_is_smeared_over_the_true_exposure_time():

@@ -62,9 +62,6 @@ def denoiser(output: Callable[..., Tensor]) -> NoiseModule:
     return made
 
 
-# Exposure
-
-
 def test_exposure_is_the_mean_error_of_what_is_not_over_exposed():
     data, loss = batch(noise=False), ExposureLoss(ExposureModule())
     data.source[:, :, :16] = 0.995  # half the pixels; their error would be large
@@ -88,9 +85,6 @@ def test_a_baseline_is_compared_with_the_sample():
     data = batch(noise=False)  # source 0.2, sample 0.41
     loss = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
     assert float(loss(data)["loss"].detach()) == pytest.approx(0.21, rel=1e-5)
-
-
-# Noise
 
 
 @pytest.mark.parametrize("ratio", [2.0**-8, 0.5, 3.0])
@@ -138,9 +132,6 @@ def test_clipped_pixels_teach_no_denoising():
         assert float(loss(data)["loss"].detach()) == 0.0
     data.source[:] = 1.0
     assert float(loss(data)["loss"].detach()) == 0.0  # no pixel at all: no NaN
-
-
-# Aperture
 
 
 def opened(data: Batch) -> Batch:

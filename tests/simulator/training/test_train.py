@@ -155,8 +155,6 @@ def test_draped_scenes_teach_the_aperture_alone():
         assert [stage for stage in stages if train._teaches(one, stage)] == teaches
 
 
-# The loop of one stage
-
 STEPS = 12
 
 
@@ -224,9 +222,6 @@ def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_pa
     with pytest.raises(ValueError, match=r"stage 'noise': the loss \(=nan\) must be finite"):
         run(tmp_path / "a", broken=5)
     assert not (tmp_path / "a").exists()  # nothing is due yet, and a state of it is not written
-
-
-# Budgets
 
 
 class Watch:

@@ -7,7 +7,6 @@ import json
 import multiprocessing
 import os
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +54,6 @@ def test_keys_depend_on_names_values_and_the_version(monkeypatch):
     assert cache_key({"a": 1}) == hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-# -- digests --------------------------------------------------------------------------------------
-
-
 def test_digest_sees_content_and_not_layout():
     light = torch.rand(2, 4, 6, 8)
     digest = content_digest({"light": light})
@@ -79,9 +75,6 @@ def test_digest_sees_content_and_not_layout():
         {"light": torch.ones(3, dtype=torch.bfloat16)},
     ]
     assert len({digest, *map(content_digest, others)}) == 1 + len(others)
-
-
-# -- in memory ------------------------------------------------------------------------------------
 
 
 def test_the_least_recently_used_goes_first():
@@ -108,24 +101,6 @@ def test_the_least_recently_used_goes_first():
         assert (len(other), other.nbytes, other.max_bytes) == (0, 0, 40)
     cache.clear()
     assert (len(cache), cache.nbytes, cache.get(0)) == (0, 0, None)
-
-
-def test_threads_share_it():
-    cache: LruCache[int] = LruCache(50)
-
-    def work(first: int) -> None:
-        for i in range(4000):
-            key = (first + 7 * i) % 97
-            assert cache.get(key) in (None, key)
-            cache.put(key, key, 1 + key % 5)
-
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(work, range(4)))
-    assert cache.nbytes <= 50
-    assert cache.nbytes == sum(1 + k % 5 for k in range(97) if cache.get(k) is not None)
-
-
-# -- on disk --------------------------------------------------------------------------------------
 
 
 def test_what_is_read_is_what_was_written(tmp_path):

@@ -70,9 +70,6 @@ def test_the_halo_covers_what_the_networks_see():
         assert not torch.equal(found[1], found[0])
 
 
-# Where it is needed
-
-
 def patches(height: int, width: int) -> Tensor:
     """Two corners and a pixel in between."""
     needed = torch.zeros(height, width, dtype=torch.bool)
