@@ -62,14 +62,6 @@ def test_a_bright_lamp_leaves_no_ringing(blur, extent):
     np.testing.assert_allclose(out.double().sum((1, 2)), [1e6] * 4, rtol=1e-5)
 
 
-@BOTH
-@pytest.mark.parametrize("shape", [(4, 1, 9), (4, 9, 1), (2, 9), (2, 3, 4, 5, 6)])
-def test_any_number_of_planes(blur, shape):
-    image = picture(*shape)
-    frames = [blur(frame, 3.0) for frame in image.reshape(-1, *shape[-2:])]
-    torch.testing.assert_close(blur(image, 3.0), torch.stack(frames).reshape(shape))
-
-
 def test_bad_extents_are_named():
     for bad in (-1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="`extent_px`"):

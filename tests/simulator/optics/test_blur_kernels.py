@@ -12,7 +12,7 @@ from simulator.optics.blur import disc_blur, motion_blur
 from simulator.optics.blur_kernels import Blur, blur_many, disc, streak
 from simulator.optics.shapes import coverage, disc_kernel, motion_kernel
 
-SHAPES = [(1, 1, 1), (1, 1, 5), (4, 5, 1), (4, 37, 53), (2, 3, 16, 24), (4, 128, 128)]
+SHAPES = [(1, 1, 1), (1, 1, 5), (4, 5, 1), (37, 53), (2, 3, 4, 6, 24), (4, 128, 128)]
 EXTENTS = [0.02, 0.3, 1.0, 2.0, 2.9, 5.0, 8.0, 17.0, 31.0, 52.0, 130.0, 260.0, 5000.0]
 DIAMETERS = [0.1, 0.5, 1.0, 2.0, 3.3, 5.0, 8.0, 12.0, 20.0]
 

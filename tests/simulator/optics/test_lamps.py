@@ -132,15 +132,12 @@ def test_lamps_add_up_over_time(lamp, start, first, second):
         return mean * time
 
     parts = light(start, first) + light(start + first, second)
-    whole = light(start, first + second)
+    brightest = 1.0 / lamp.duty if isinstance(lamp, PulsedLamp) else 2.0
+    if isinstance(lamp, Flash):
+        brightest = 1.0 + lamp.energy / lamp.decay
     # A moment is known to an ulp of 16 s: so the light at both ends of a part, at its brightest.
-    assert parts == pytest.approx(whole, rel=1e-12, abs=8 * 2.0**-48 * _brightest(lamp))
-
-
-def _brightest(lamp: Lamp) -> float:
-    if isinstance(lamp, PulsedLamp):
-        return 1.0 / lamp.duty
-    return 1.0 + lamp.energy / lamp.decay if isinstance(lamp, Flash) else 2.0
+    bound = 8 * 2.0**-48 * brightest
+    assert parts == pytest.approx(light(start, first + second), rel=1e-12, abs=bound)
 
 
 @given(LAMPS, st.floats(-10, 10))

@@ -82,9 +82,9 @@ def test_the_noise_goes_with_the_exposure():
 
 
 def test_a_baseline_is_compared_with_the_sample():
-    data = batch(noise=False)  # source 0.2, sample 0.41
     loss = BaselineLoss(Fixed(lambda image, parameters: image + parameters.sum()))
-    assert float(loss(data)["loss"].detach()) == pytest.approx(0.21, rel=1e-5)
+    values = loss(batch(noise=False))  # source 0.2, sample 0.41
+    assert float(values["loss"].detach()) == pytest.approx(0.21, rel=1e-5)
 
 
 @pytest.mark.parametrize("ratio", [2.0**-8, 0.5, 3.0])

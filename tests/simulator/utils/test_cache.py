@@ -9,6 +9,7 @@ import os
 import pickle
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import platformdirs
@@ -30,15 +31,11 @@ KEYS = [cache_key({"i": i}) for i in range(64)]
 
 
 def test_the_variable_names_the_folder(monkeypatch, tmp_path):
-    usual = Path(platformdirs.user_cache_dir("ae-env"))
-    for value, expected in (
-        (tmp_path / "here", tmp_path / "here"),
-        ("~/there", Path.home() / "there"),
-        ("", usual),
-    ):
+    usual, here = Path(platformdirs.user_cache_dir("ae-env")), tmp_path / "here"
+    for value, expected in ((here, here), ("~/there", Path.home() / "there"), ("", usual)):
         monkeypatch.setenv("AE_ENV_CACHE", str(value))
         assert cache_dir() == expected
-    assert not (tmp_path / "here").exists()
+    assert not here.exists()
     for cache in (LruCache, lambda size: DiskCache(max_bytes=size)):
         with pytest.raises(ValueError, match=r"`max_bytes` \(=-1\) must be at least 0"):
             cache(-1)
@@ -46,10 +43,9 @@ def test_the_variable_names_the_folder(monkeypatch, tmp_path):
 
 def test_keys_depend_on_names_values_and_the_version(monkeypatch):
     assert cache_key({"a": 1, "b": [2]}) == cache_key({"b": [2], "a": 1})
-    keys = {cache_key({"a": 1}), cache_key({"a": 2}), cache_key({"b": 1}), cache_key({"a": [1]})}
+    keys = {cache_key(parts) for parts in ({"a": 1}, {"a": 2}, {"b": 1}, {"a": [1]})}
     monkeypatch.setattr(cache_module, "package_version", lambda: "99.0")
-    keys |= {cache_key({"a": 1})}
-    assert len(keys) == 5
+    assert len(keys | {cache_key({"a": 1})}) == 5
     text = json.dumps({"package": "99.0", "parts": {"a": 1}}, separators=(",", ":"))
     assert cache_key({"a": 1}) == hashlib.sha256(text.encode()).hexdigest()[:24]
 
@@ -59,8 +55,8 @@ def test_digest_sees_content_and_not_layout():
     digest = content_digest({"light": light})
     expected = b"light:torch.float32:(2, 4, 6, 8);" + light.numpy().tobytes()
     assert digest == hashlib.sha256(expected).hexdigest()
-    assert content_digest({"light": light.to(memory_format=torch.channels_last)}) == digest
-    assert content_digest({"light": light.clone().requires_grad_()}) == digest
+    for same in (light.to(memory_format=torch.channels_last), light.clone().requires_grad_()):
+        assert content_digest({"light": same}) == digest
     one = light.clone()
     one[1, 3, 5, 7] = torch.nextafter(one[1, 3, 5, 7], torch.tensor(2.0))
     others = [
@@ -78,25 +74,21 @@ def test_digest_sees_content_and_not_layout():
 
 
 def test_the_least_recently_used_goes_first():
-    """Against a plain list that does the same slowly."""
-    rng = np.random.default_rng(0)
-    cache: LruCache[int] = LruCache(40)
-    model: list[tuple[int, int, int]] = []  # (key, value, size), the oldest first
+    """Against a plain dict that does the same slowly."""
+    rng, cache = np.random.default_rng(0), LruCache(40)
+    model: dict[int, tuple[int, int]] = {}  # value and size by key, the oldest first
     for step in range(2000):
         key, size = int(rng.integers(12)), int(rng.integers(1, 50))
-        found = [item for item in model if item[0] == key]
+        item = model.pop(key, None)
         if rng.random() < 0.5:
-            assert cache.get(key) == (found[0][1] if found else None)
-            model = [item for item in model if item[0] != key] + found
+            assert cache.get(key) == (item[0] if item else None)
         else:
             cache.put(key, step, size)
-            model = [item for item in model if item[0] != key]
-            if size <= 40:
-                model.append((key, step, size))
-            while sum(item[2] for item in model) > 40:
-                model.pop(0)
-        assert cache.nbytes == sum(item[2] for item in model) <= 40
-        assert len(cache) == len(model)
+            item = (step, size) if size <= 40 else None
+        model |= {key: item} if item else {}
+        while sum(size for _, size in model.values()) > 40:
+            del model[next(iter(model))]
+        assert (len(cache), cache.nbytes) == (len(model), sum(size for _, size in model.values()))
     for other in (pickle.loads(pickle.dumps(cache)), copy.deepcopy(cache)):
         assert (len(other), other.nbytes, other.max_bytes) == (0, 0, 40)
     cache.clear()
@@ -111,10 +103,8 @@ def test_what_is_read_is_what_was_written(tmp_path):
     }
     assert disk.get("denoised", KEYS[0]) is None
     disk.put("denoised", KEYS[0], tensors)
-    found = disk.get("denoised", KEYS[0])
-    assert found is not None
-    for each in (found, load_file(disk.path("denoised", KEYS[0]))):  # by another reader, too
-        assert content_digest(each) == content_digest(tensors)  # to the bit: NaN and -0.0
+    for found in (disk.get("denoised", KEYS[0]), load_file(disk.path("denoised", KEYS[0]))):
+        assert content_digest(found) == content_digest(tensors)  # to the bit: NaN and -0.0
     assert disk.get("denoised", KEYS[1]) is None
     assert disk.get("opened", KEYS[0]) is None
     with pytest.raises(ValueError, match=r"`kind` \(='pictures'\) must be one of"):
@@ -142,11 +132,9 @@ def test_damaged_files_are_as_if_not_there(tmp_path, caplog):
 
 @pytest.mark.parametrize("folder", ["file", "x" * 300, "loop", "full"])
 def test_a_folder_that_cannot_be_used_costs_one_warning(tmp_path, folder, caplog, monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     if folder == "full":
-        monkeypatch.setattr("simulator.utils.files.os.replace", full)
+        error = OSError(errno.ENOSPC, "No space left on device")
+        monkeypatch.setattr("simulator.utils.files.os.replace", Mock(side_effect=error))
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     for key in KEYS[:3]:  # every environment has a cache of its own
@@ -232,8 +220,9 @@ def _use(folder: Path, seed: int, ready: Any) -> None:
             assert len(set(found["light"].tolist())) == 1
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
 def test_processes_share_a_folder(tmp_path, caplog):
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     ready = context.Barrier(2)
     process = context.Process(target=_use, args=(tmp_path, 1, ready))
     process.start()

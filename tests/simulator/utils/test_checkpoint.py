@@ -6,6 +6,7 @@
 import errno
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -46,10 +47,8 @@ def test_a_full_disk_stops_no_training(tmp_path, monkeypatch, caplog):
     path = tmp_path / "run"
     save_checkpoint(path, {"step": 1})
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("simulator.utils.files.os.replace", full)
+    error = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr("simulator.utils.files.os.replace", Mock(side_effect=error))
     save_checkpoint(path, {"step": 2})
     assert "not saved" in caplog.text
     assert [p.name for p in tmp_path.iterdir()] == ["run"]

@@ -1,6 +1,7 @@
 """YAML files and what is wrong with them, in one line that names the entry."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from pydantic import Field, field_validator
@@ -61,12 +62,10 @@ def test_a_good_file(tmp_path, monkeypatch):
     ],
 )
 def test_what_cannot_be_read(tmp_path, monkeypatch, name, message):
-    def refuse(*args: object, **kwargs: object) -> str:
-        raise PermissionError(13, "Permission denied")
-
     if name == "a.yaml":
         (tmp_path / name).touch()
-        monkeypatch.setattr(Path, "read_text", refuse)  # root may read anything
+        error = PermissionError(13, "Permission denied")  # root may read anything
+        monkeypatch.setattr(Path, "read_text", Mock(side_effect=error))
     with pytest.raises(ValueError, match=rf"`config` .*{message}"):
         load_yaml(tmp_path / name, Whole)
 
