@@ -56,14 +56,6 @@ def test_between_its_diameters_energy_and_second_moment_are_a_discs(diameter):
     assert left == pytest.approx((spread**2).sum(), rel=1e-4)
 
 
-def test_each_pixel_has_its_own_blur():
-    image, diameter = uniform(4, 20, 20), torch.zeros(20, 20)
-    diameter[:, 10:] = 4.0
-    result = DiscBank(image).blurred(diameter)
-    assert torch.equal(result[..., :10], image[..., :10])
-    torch.testing.assert_close(result[..., 10:], disc_blur(image, 4.0)[..., 10:])
-
-
 def test_gradient_is_finite_everywhere_and_right():
     image = uniform(1, 16, 16).requires_grad_()
     values = torch.tensor([0.0, 1e-9, 0.7, 1.3, 4.0, 32.0, 50.0])

@@ -51,8 +51,7 @@ def test_develop_follows_the_formula():
     camera_from_srgb = np.array(Z6.colour_matrix) @ to_xyz
     camera_from_srgb /= camera_from_srgb.sum(axis=1, keepdims=True)
     linear = np.linalg.solve(camera_from_srgb, [0.2, 0.2, 0.225])
-    assert out.shape == (1, 3, 4, 4)
-    assert out.dtype == torch.float32
+    assert (out.shape, out.dtype) == ((1, 3, 4, 4), torch.float32)
     np.testing.assert_allclose(out[0, :, 0, 0].numpy(), srgb(linear), atol=1e-6)
 
 
@@ -107,8 +106,7 @@ def test_render_sizes(size):
     camera = CameraProfile("c", "GBRG", 0, 1023, 10)
     raw = RawImage(torch.full((4, *size), 0.5), CameraSettings(100, 0.01, 4), camera)
     full, half = render_srgb(raw), render_srgb(raw, "half")
-    assert full.shape == (3, 2 * size[0], 2 * size[1])
-    assert half.shape == (3, *size)
+    assert (full.shape, half.shape) == ((3, 2 * size[0], 2 * size[1]), (3, *size))
     assert full.dtype == half.dtype == torch.uint8
     # Schlick: 1.618 * .5 / (.618 * .5 + 1) = .618; sRGB .8077; 206
     assert set(full.unique().tolist()) == set(half.unique().tolist()) == {206}

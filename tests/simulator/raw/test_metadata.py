@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from simulator.raw.metadata import camera_identity, describe_file, read_directories
-from tests.simulator.raw.test_read import CODE, MATRIX, write_sample_dng
+from tests.simulator.raw.test_read import CODE, write_sample_dng
 
 
 def tiff(entries: list[tuple[int, int, int, int]], following: int = 0, magic: int = 42) -> bytes:
@@ -18,21 +18,6 @@ def tiff(entries: list[tuple[int, int, int, int]], following: int = 0, magic: in
     head = struct.pack("<2sHIH", b"II", magic, 8, len(entries))
     body = b"".join(struct.pack("<HHII", *entry) for entry in entries)
     return head + body + struct.pack("<I", following)
-
-
-def test_values_by_name_as_tifffile_wrote_them(tmp_path):
-    path = write_sample_dng(tmp_path / "a.dng", NoiseProfile=("d", (1e-4, 2e-6)))
-    with path.open("rb") as stream:
-        (tags,) = read_directories(stream)
-    expected = {
-        "Model": ("Sensor",),
-        "CFAPattern": (0, 1, 1, 2),
-        "PhotometricInterpretation": (32803,),
-        "AsShotNeutral": pytest.approx((0.5, 1.0, 2 / 3)),
-        "ColorMatrix1": pytest.approx(MATRIX),
-        "NoiseProfile": (1e-4, 2e-6),
-    }
-    assert {name: tags[name] for name in expected} == expected
 
 
 @pytest.mark.parametrize("byteorder", ["<", ">"])

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from simulator import (
 )
 from simulator.camera import BayerPattern
 from simulator.raw import read as read_module
+from simulator.raw.metadata import read_own_record
 
 SETTINGS = CameraSettings(iso=100, exposure_time=1 / 60, f_number=4.0)
 NLF = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
@@ -280,19 +282,15 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path):
 
 
 def test_files_that_may_not_be_read_or_shrink(own_dng, monkeypatch):
-    real = read_module.read_own_record
-
     def shrinking(directories: Any) -> Any:
         os.truncate(own_dng, 2000)
-        return real(directories)
-
-    def forbidden(*_: Any) -> Any:
-        raise PermissionError(errno.EACCES, "Permission denied", str(own_dng))
+        return read_own_record(directories)
 
     monkeypatch.setattr(read_module, "read_own_record", shrinking)
     with pytest.raises(RawFileError, match=r"truncated or damaged|became shorter"):
         read_raw(own_dng)
-    monkeypatch.setattr(Path, "open", forbidden)
+    forbidden = PermissionError(errno.EACCES, "Permission denied", str(own_dng))
+    monkeypatch.setattr(Path, "open", Mock(side_effect=forbidden))
     with pytest.raises(RawFileError, match=r"cannot be read: .*Permission denied"):
         read_raw(own_dng)
 

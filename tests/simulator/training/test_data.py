@@ -93,8 +93,7 @@ def test_everything_of_a_pair_shows_the_same_crop():
     settings = LIGHT, replace(LIGHT, exposure_time=1 / 17)
     sequence = Sequence(replace(scene(size=48), light=light, depth=depth), settings)
     made = ReferencePairs([sequence], ReferenceCamera(Z6), "exposure")
-    # Sharp: each pixel has its own light.
-    made._blurred_light = dict.fromkeys(made._blurred_light, light)
+    made._blurred_light = dict.fromkeys(made._blurred_light, light)  # sharp
     batch = made.batch(0, 6, 24)
     far = batch.target[:, 0] / batch.target.amax((1, 2, 3))[:, None, None] > 0.7
     assert torch.equal(batch.defocus > 0, far)
@@ -120,10 +119,8 @@ def test_settings_of_a_pair():
 def test_defocus_is_the_thin_lens_at_the_sources_aperture():
     """f^2 / N (1/s - 1/z) / (1 - f/s), in packed pixels of 2 x 5.9 micrometres or so."""
     batch = pairs(DARK, LIGHT).batch(0, 8, 32)
-    assert Z6.pixel_pitch_um is not None
     blur = 0.035**2 / batch.f_source * (1 / 2 - 1 / 8) / (1 - 0.035 / 2)
-    np.testing.assert_allclose(
-        batch.defocus.amax((1, 2)), blur / (2e-6 * Z6.pixel_pitch_um), rtol=1e-4
-    )
+    expected = blur / (2e-6 * Z6.pixel_pitch_um)
+    np.testing.assert_allclose(batch.defocus.amax((1, 2)), expected, rtol=1e-4)
     assert not batch.defocus.amin((1, 2)).any()
     assert ((batch.defocus > 0).float().mean((1, 2)) == 0.5).all()
