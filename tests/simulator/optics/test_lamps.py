@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -19,25 +20,27 @@ STARTS = (0.0, 0.0013, 0.00499999, 3.7)
 LATER = (3600.123, 86_400.7, -1e6 / 3)
 
 
+def integral(light: Callable[[float], float], begin: float, end: float) -> float:
+    return quad(light, begin, end, epsabs=0, epsrel=1e-12, limit=500)[0]
+
+
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("frequency", [100.0, 120.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0])
 def test_mains_light_is_its_integral(time, frequency, depth):
+    def light(t: float) -> float:
+        return 1.0 + depth * math.cos(2 * math.pi * (frequency * t + 0.2))
+
     lamp = MainsLamp(frequency, depth, phase=0.2)
     for start in STARTS:
-
-        def light(t: float) -> float:
-            return 1.0 + depth * math.cos(2 * math.pi * (frequency * t + 0.2))
-
-        integral, _ = quad(light, start, start + time, epsabs=0, epsrel=1e-12, limit=500)
-        assert lamp.mean_light(start, time) == pytest.approx(integral / time, rel=1e-9)
+        expected = integral(light, start, start + time) / time
+        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
 
 
 def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction) -> Fraction:
     """Exact mean of a pulsed lamp: what each pulse and the exposure share, pulse by pulse."""
     on, stop = Fraction(0), start + time
-    first, last = math.floor(start * frequency) - 1, math.ceil(stop * frequency) + 1
-    for pulse in range(first, last + 1):
+    for pulse in range(math.floor(start * frequency) - 1, math.ceil(stop * frequency) + 2):
         begin = pulse / frequency
         on += max(Fraction(0), min(stop, begin + duty / frequency) - max(start, begin))
     return on / (time * duty)
@@ -49,24 +52,22 @@ def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction
 def test_pulsed_light_is_the_exact_overlap(frequency, duty, time):
     lamp = PulsedLamp(frequency, duty)
     for start in (*STARTS, *LATER):
-        exact = _pulses(Fraction(start), Fraction(time), Fraction(frequency), Fraction(duty))
-        found = float(lamp.mean_light(start, time))
-        assert found == pytest.approx(float(exact), rel=1e-9, abs=1e-12)
+        exact = float(_pulses(*map(Fraction, (start, time, frequency, duty))))
+        assert lamp.mean_light(start, time) == pytest.approx(exact, rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])
 @pytest.mark.parametrize("decay", [1e-6, 50e-6, 1e-3])
 def test_a_flash_is_its_integral(time, decay):
+    def light(t: float) -> float:
+        return 0.02 / decay * math.exp(-(t - 0.01) / decay)
+
     lamp = Flash(at=0.01, decay=decay, energy=0.02)
     for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
         begin = max(start, 0.01)
         end = max(begin, min(start + time, begin + 60 * decay))  # then there is nothing left
-
-        def light(t: float) -> float:
-            return 0.02 / decay * math.exp(-(t - 0.01) / decay)
-
-        integral, _ = quad(light, begin, end, epsabs=0, epsrel=1e-12, limit=500)
-        assert lamp.mean_light(start, time) == pytest.approx(1.0 + integral / time, rel=1e-9)
+        expected = 1.0 + integral(light, begin, end) / time
+        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
 
 
 def test_rows_are_exposed_one_after_the_other():

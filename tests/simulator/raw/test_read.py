@@ -128,8 +128,8 @@ def test_levels_colour_and_metadata(tmp_path):
     assert known.items() <= raw.metadata.items()
     assert (raw.noise, raw.white_balance) == (NLF, pytest.approx((2.0, 1.0, 1.5)))
     camera = raw.camera
-    assert (camera.name, camera.black_level) == ("test_sensor", (64.0,) * 4)
-    assert (camera.white_level, camera.bit_depth) == (4095, 12)
+    levels = camera.name, camera.black_level, camera.white_level, camera.bit_depth
+    assert levels == ("test_sensor", (64.0,) * 4, 4095, 12)
     np.testing.assert_allclose(np.ravel(camera.colour_matrix), MATRIX, atol=1e-6)
     assert "ColorMatrix of the file" in camera.colour_matrix_source
     np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)  # the rotation is not applied
@@ -196,7 +196,7 @@ def test_camera_argument(path):
 def test_unknown_camera_is_estimated_and_declared(tmp_path):
     rng = np.random.default_rng(1)
     light = np.broadcast_to(np.linspace(0.02, 0.8, 384), (256, 384))
-    noisy = light + np.sqrt(4e-4 * light + 4e-6) * rng.standard_normal(light.shape)
+    noisy = rng.normal(light, np.sqrt(4e-4 * light + 4e-6))
     numbers = np.rint(np.clip(64 + 4031 * noisy, 0, 4095)).astype(np.uint16)
     raw = read_raw(write_sample_dng(tmp_path / "a.dng", numbers), settings=SETTINGS)
     assert raw.metadata["nlf_source"] == "blind estimate"
@@ -274,8 +274,7 @@ def test_arrays_that_are_not_bayer_are_refused(tmp_path):
     write_sample_dng(path, np.stack([MOSAIC] * 3, axis=-1), photometric=34892)
     with pytest.raises(RawFileError, match="linear DNG"):
         read_raw(path)
-    tile = "GBGGRGRGBRGBGBGGRGGRGGBGBGBRGRGRGGBG"
-    colours = tuple("RGB".index(c) for c in tile)
+    colours = tuple("RGB".index(c) for c in "GBGGRGRGBRGBGBGGRGGRGGBGBGBRGRGRGGBG")
     write_sample_dng(path, CFAPattern=("B", colours), CFARepeatPatternDim=("H", (6, 6)))
     with pytest.raises(RawFileError, match="X-Trans"):
         read_raw(path)

@@ -64,15 +64,16 @@ def test_the_card_says_what_was_done(trained):
     known = {"preset": "compact", "training": config().card(), "scenes": {"depth": 1, "flat": 1}}
     assert (known | {"command": "ae-env train-simulator x.yaml"}).items() <= card.items()
     assert {"commit", "date", "machine", "versions", "sha256"} <= set(card)
+    stages = card["stages"]
     values = {"exposure": {"loss"}, "noise": {"loss", "gain_db"}}
     values["aperture"] = {"loss", "map", "relative"}
-    assert {name: set(stage["validation"]) for name, stage in card["stages"].items()} == values
-    for stage in card["stages"].values():
+    assert {name: set(stage["validation"]) for name, stage in stages.items()} == values
+    for stage in stages.values():
         assert stage["steps"] == 2
         assert stage["validation"]["loss"] > 0
     # Any two of 20 to 25 captures of 2 scenes; the aperture's come from the one with depth.
-    assert 2 * 20 * 19 <= card["stages"]["exposure"]["pairs"] <= 2 * 25 * 24
-    assert card["stages"]["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
+    assert 2 * 20 * 19 <= stages["exposure"]["pairs"] <= 2 * 25 * 24
+    assert stages["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
 
 
 def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):

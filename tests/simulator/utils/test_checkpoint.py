@@ -21,8 +21,7 @@ def store(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
 
 
 def test_it_saves_when_it_is_due_and_at_the_end(tmp_path, monkeypatch):
-    path = tmp_path / "run"
-    now = 100.0
+    path, now = tmp_path / "run", 100.0
     monkeypatch.setattr("time.monotonic", lambda: now)
     own = store(path)
     now += checkpoint.INTERVAL
@@ -46,7 +45,6 @@ def test_it_saves_when_it_is_due_and_at_the_end(tmp_path, monkeypatch):
 def test_a_full_disk_stops_no_training(tmp_path, monkeypatch, caplog):
     path = tmp_path / "run"
     save_checkpoint(path, {"step": 1})
-
     error = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr("simulator.utils.files.os.replace", Mock(side_effect=error))
     save_checkpoint(path, {"step": 2})

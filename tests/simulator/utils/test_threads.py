@@ -64,13 +64,12 @@ def _sum_in_child(queue: multiprocessing.Queue) -> None:
     queue.put(totals.tolist())
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
-def test_child_processes_make_threads_of_their_own(method):
+def test_child_processes_make_threads_of_their_own():
     in_shares(lambda *_: None, 2, threads=2)  # this process has some already
-    context = multiprocessing.get_context(method)
+    context = multiprocessing.get_context("fork")
     queue = context.Queue()
-    child = context.Process(target=_sum_in_child, args=(queue,))  # type: ignore[attr-defined]
+    child = context.Process(target=_sum_in_child, args=(queue,))
     child.start()
     assert queue.get(timeout=60) == [1.0, 2.0]
     child.join(timeout=60)
