@@ -252,10 +252,10 @@ def test_what_is_no_dataset_is_refused(nikon, tmp_path):
         read_sequence(folder)
     with pytest.raises(ValueError, match=r"`root` .* must hold a camera_params\.csv"):
         read_dataset(folder)
-    for header, missing in (
-        ("path,ExposureTime,iso,aperture\n", r"path, ExposureTime, iso, aperture\).*: time"),
-        ("", "columns: none"),
-    ):
+    for header, missing in {
+        "path,ExposureTime,iso,aperture": ": time",
+        "": "columns: none",
+    }.items():
         (folder / "camera_params.csv").write_text(header)
-        with pytest.raises(ValueError, match=missing):
+        with pytest.raises(ValueError, match=f"`.*camera_params.csv`.*{missing}"):
             read_dataset(folder)

@@ -1,5 +1,3 @@
-"""Raw images: digital numbers in, digital numbers out, and what is refused."""
-
 import math
 
 import numpy as np

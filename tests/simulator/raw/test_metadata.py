@@ -1,5 +1,3 @@
-"""Tags and identities of files: read by name, from every container, in bounded time and memory."""
-
 import io
 import os
 import struct

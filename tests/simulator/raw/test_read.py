@@ -1,5 +1,3 @@
-"""Reading raw files: orders, levels, margins, noise, and damaged files refused in words."""
-
 import errno
 import gc
 import os

@@ -1,5 +1,3 @@
-"""What a training may be, and what is said about one that it may not be."""
-
 from pathlib import Path
 from typing import Any
 

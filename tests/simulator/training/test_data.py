@@ -1,5 +1,3 @@
-"""Batches: reproducible, aligned, and with the noise that they state."""
-
 import itertools
 import math
 from dataclasses import fields, replace

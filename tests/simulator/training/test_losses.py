@@ -1,5 +1,3 @@
-"""The losses in closed form, what they leave out, and what they train."""
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

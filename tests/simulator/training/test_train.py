@@ -1,10 +1,8 @@
-"""From a configuration to weights, on scenes of 32 x 32 pixels; one stage alone on numbers."""
-
 import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,11 +47,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def card_of(file: Path) -> dict[str, Any]:
     return json.loads(file.with_suffix(".json").read_text())
-
-
-def same(a: nn.Module, b: nn.Module) -> bool:
-    others = b.state_dict()
-    return all(torch.equal(value, others[name]) for name, value in a.state_dict().items())
 
 
 def test_the_card_says_what_was_done(trained):
@@ -145,18 +138,19 @@ def test_draped_scenes_teach_the_aperture_alone():
         assert [stage for stage in stages if train._teaches(one, stage)] == teaches
 
 
-STEPS = 12
+class Watch:
+    """Stands for both clocks of the machine; gives batches of numbers by step, in 7 s each."""
 
-
-class Pairs:
-    """Batches of numbers by step; calls `hook` before each."""
-
-    def __init__(self, hook: Callable[[int], None], broken: int) -> None:
-        self.hook, self.broken, self.steps = hook, broken, []
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.cpu, self.wall, self.steps, self.stop, self.broken = 1000.0, 50.0, [], -1, -1
+        monkeypatch.setattr("time.process_time", lambda: self.cpu)
+        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> torch.Tensor:
         assert (size, crop, process) == (3, 16, 0)
-        self.hook(step)
+        if step == self.stop:
+            raise KeyboardInterrupt
+        self.cpu += 7.0
         self.steps.append(step)
         values = torch.randn(size, 4, generator=torch.Generator().manual_seed(step))
         return values * (math.inf if step == self.broken else 1.0)
@@ -173,54 +167,34 @@ class Loss(nn.Module):
         return {"loss": value, "undefined": value.detach() * math.nan}
 
 
-def run(
-    file: Path, hook: Callable[[int], None] = lambda _: None, *, broken: int = -1, **budget: float
-) -> tuple[Loss, Clock, Pairs]:
-    made, pairs = Loss(), Pairs(hook, broken)
-    clock = train_stage(
-        "noise",
-        made,
-        made.trained,
-        pairs,  # type: ignore[arg-type]
-        StageConfig(batch=3, crop=16, learning_rate=0.05, **(budget or {"steps": STEPS})),  # type: ignore[arg-type]
-        make_accelerator(config("pc"), "cpu", None),
-        checkpoint=file,
-        identity="one",
-    )
-    return made, clock, pairs
+def run(file: Path, watch: Watch, **budget: int) -> tuple[Loss, Clock]:
+    loss, stage = Loss(), StageConfig(batch=3, crop=16, learning_rate=0.05, **budget)
+    accelerator = make_accelerator(config("pc"), "cpu", None)
+    options = {"checkpoint": file, "identity": "one"}
+    return loss, train_stage("noise", loss, loss.trained, watch, stage, accelerator, **options)
 
 
-def stop_at(step: int) -> Callable[[int], None]:
-    def hook(now: int) -> None:
-        if now == step:
-            raise KeyboardInterrupt
-
-    return hook
-
-
-def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path):
-    whole, *_ = run(tmp_path / "whole")
+@pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}])
+def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path, monkeypatch, budget):
+    watch = Watch(monkeypatch)
+    whole, clock = run(tmp_path / "whole", watch, **budget)
+    assert (clock.step, clock.seconds) == (9, 63.0)
+    watch.stop = 4
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "part", stop_at(6))
-    resumed, clock, pairs = run(tmp_path / "part")
-    assert pairs.steps == list(range(6, STEPS))
-    assert clock.step == STEPS
-    assert same(resumed, whole)
+        run(tmp_path / "part", watch, **budget)
+    watch.stop, watch.steps = -1, []
+    resumed, clock = run(tmp_path / "part", watch, **budget)
+    assert watch.steps == [4, 5, 6, 7, 8]
+    assert (clock.step, clock.seconds) == (9, 63.0)
+    torch.testing.assert_close(resumed.state_dict(), whole.state_dict(), rtol=0, atol=0)
 
 
-def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path):
+def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path, monkeypatch):
+    watch = Watch(monkeypatch)
+    watch.broken = 5
     with pytest.raises(ValueError, match=r"stage 'noise': the loss \(=nan\) must be finite"):
-        run(tmp_path / "a", broken=5)
+        run(tmp_path / "a", watch, steps=9)
     assert not (tmp_path / "a").exists()  # nothing is due yet, and a state of it is not written
-
-
-class Watch:
-    """Stands for both clocks of the machine."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.cpu, self.wall = 1000.0, 50.0
-        monkeypatch.setattr("time.process_time", lambda: self.cpu)
-        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
 
 
 def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
@@ -235,24 +209,3 @@ def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch.cpu = 1e6
     clocks[0].tick()
     assert (clocks[0].step, clocks[0].share) == (2, 1.0)
-
-
-def test_a_stage_ends_with_its_minutes(tmp_path, monkeypatch):
-    """A step takes 7 s here, a minute nine steps; stopped after four, five are left."""
-    watch = Watch(monkeypatch)
-
-    def second(step: int) -> None:
-        watch.cpu += 7.0
-
-    def stopped(step: int) -> None:
-        stop_at(4)(step)
-        second(step)
-
-    whole, clock, _ = run(tmp_path / "whole", second, minutes=1)
-    assert (clock.step, clock.seconds) == (9, 63.0)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "part", stopped, minutes=1)
-    resumed, clock, pairs = run(tmp_path / "part", second, minutes=1)
-    assert pairs.steps == [4, 5, 6, 7, 8]
-    assert clock.seconds == 63.0
-    assert same(resumed, whole)

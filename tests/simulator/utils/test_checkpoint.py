@@ -1,8 +1,3 @@
-"""Training states: saved when due, and a warning where they do not fit.
-
-`tests/simulator/training/test_train.py` resumes a training and compares every weight.
-"""
-
 import errno
 from pathlib import Path
 from typing import Any

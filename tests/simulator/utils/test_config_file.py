@@ -1,5 +1,3 @@
-"""YAML files and what is wrong with them, in one line that names the entry."""
-
 from pathlib import Path
 from unittest.mock import Mock
 

@@ -1,5 +1,3 @@
-"""Files appear whole or not at all, and the folder of real files is found."""
-
 import errno
 import os
 import stat

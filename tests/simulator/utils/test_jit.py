@@ -1,5 +1,3 @@
-"""Compilation: announced, cached on disk, stale when code changes, possible without a cache."""
-
 import logging
 from pathlib import Path
 

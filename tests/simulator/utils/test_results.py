@@ -1,5 +1,3 @@
-"""Result files: what they say about themselves, and nothing that JSON cannot hold."""
-
 import datetime
 import json
 import subprocess

@@ -1,5 +1,3 @@
-"""Shares of work: each item once, on as many threads as asked for, after a fork as well."""
-
 import multiprocessing
 import threading
 

@@ -1,5 +1,3 @@
-"""Tiles: what a network gives on the whole frame, on any size, in bounded memory."""
-
 from functools import partial
 
 import pytest
