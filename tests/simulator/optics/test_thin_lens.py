@@ -13,18 +13,14 @@ import torch
 
 from simulator.optics.thin_lens import Lens, defocus
 
-DOUBLE = torch.float64
-
 
 @pytest.mark.parametrize("focus", [0.5, 2.0, 30.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0, 2.0, 500.0])
 def test_circle_of_confusion_follows_from_similar_triangles(focus, depth):
     # The cone from the aperture (diameter f / N) converges at v, the sensor stands at v_focus.
-    focal_length, f_number = 0.05, 2.8
-    v = 1.0 / (1.0 / focal_length - 1.0 / depth)
-    v_focus = 1.0 / (1.0 / focal_length - 1.0 / focus)
-    expected = (focal_length / f_number) * (v_focus - v) / v
-    found = Lens(focal_length, focus).circle_of_confusion(depth, f_number)
+    v, v_focus = (1.0 / (1.0 / 0.05 - 1.0 / distance) for distance in (depth, focus))
+    expected = (0.05 / 2.8) * (v_focus - v) / v
+    found = Lens(0.05, focus).circle_of_confusion(depth, 2.8)
     assert found == pytest.approx(expected, rel=1e-12, abs=1e-18)
 
 
@@ -48,9 +44,9 @@ def test_lens_refuses(values, name):
 @pytest.mark.parametrize("sign", [-1, 1])
 @pytest.mark.parametrize("diameter", [0.4, 1.0, 2.7, 6.3, 14.0])
 def test_point_source_becomes_its_disc(diameter, sign):
-    lamp = torch.zeros(1, 41, 41, dtype=DOUBLE)
+    lamp = torch.zeros(1, 41, 41, dtype=torch.float64)
     lamp[0, 20, 20] = 1.0
-    spread = defocus(lamp, torch.full((41, 41), sign * diameter, dtype=DOUBLE))[0].numpy()
+    spread = defocus(lamp, torch.full((41, 41), sign * diameter, dtype=torch.float64))[0].numpy()
     assert spread.sum() == pytest.approx(1.0, abs=1e-9)
     offset = np.arange(41) - 20
     for marginal in (spread.sum(0), spread.sum(1)):  # of a uniform disc: d^2 / 16
@@ -88,8 +84,8 @@ def test_equal_light_shows_no_seam(case):
 @pytest.mark.parametrize("row", range(20, 44, 3))
 def test_lamp_on_a_receding_floor_keeps_its_energy(row):
     # The floor rises through many layers of blur; none of them stands in the way of its neighbour.
-    diameter = torch.linspace(10, 2, 64, dtype=DOUBLE)[:, None].expand(64, 48)
-    floor = torch.full((1, 64, 48), 0.2, dtype=DOUBLE)
+    diameter = torch.linspace(10, 2, 64, dtype=torch.float64)[:, None].expand(64, 48)
+    floor = torch.full((1, 64, 48), 0.2, dtype=torch.float64)
     lit = floor.clone()
     lit[0, row, 24] += 100.0
     gained = float((defocus(lit, diameter) - defocus(floor, diameter)).sum())

@@ -164,7 +164,7 @@ def test_a_camera_given_replaces_the_guess(nikon):
 
 
 def test_a_partial_copy_is_read_with_a_warning(nikon, caplog):
-    root, _ = nikon
+    root = nikon[0]
     (root / "scene_002" / "DSC_0001.npy").unlink()
     assert [s.name for s in read_dataset(root)] == ["scene_001"]
     assert "1 of 3 files are not there" in caplog.text
@@ -252,10 +252,7 @@ def test_what_is_no_dataset_is_refused(nikon, tmp_path):
         read_sequence(folder)
     with pytest.raises(ValueError, match=r"`root` .* must hold a camera_params\.csv"):
         read_dataset(folder)
-    for header, missing in {
-        "path,ExposureTime,iso,aperture": ": time",
-        "": "columns: none",
-    }.items():
+    for header, words in ("path,iso,aperture\n", "missing: time"), ("", "columns: none"):
         (folder / "camera_params.csv").write_text(header)
-        with pytest.raises(ValueError, match=f"`.*camera_params.csv`.*{missing}"):
+        with pytest.raises(ValueError, match=words):
             read_dataset(folder)

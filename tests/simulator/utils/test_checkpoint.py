@@ -19,15 +19,11 @@ def test_it_saves_when_it_is_due_and_at_the_end(tmp_path, monkeypatch):
     path, now = tmp_path / "run", 100.0
     monkeypatch.setattr("time.monotonic", lambda: now)
     own = store(path)
-    now += checkpoint.INTERVAL
-    own.save_when_due()
-    assert not path.exists()
-    now += 1.0
-    own.save_when_due()
-    assert path.exists()
-    path.unlink()
-    own.save_when_due()
-    assert not path.exists()
+    for seconds, due in ((checkpoint.INTERVAL, False), (1.0, True), (0.0, False)):
+        now += seconds
+        own.save_when_due()
+        assert path.exists() == due
+        path.unlink(missing_ok=True)
     with own:  # at the end
         assert not path.exists()
     assert path.exists()

@@ -1,4 +1,5 @@
 import logging
+from functools import partial
 from pathlib import Path
 
 import numba
@@ -16,8 +17,7 @@ def test_kernels_run_without_the_lock_and_are_cached():
     compiled = kernel(fastmath=True)(add)
     assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
     assert compiled(1, 2) == 3
-    assert compiled.targetoptions["nogil"]
-    assert compiled.targetoptions["fastmath"]
+    assert {"nogil": True, "fastmath": True}.items() <= compiled.targetoptions.items()
     assert compiled.stats.cache_path is not None
 
 
@@ -41,9 +41,7 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, mo
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
 
-    def checksum() -> int:
-        return jit._checksum.__wrapped__(tmp_path / "ae_env/kernels.py")
-
+    checksum = partial(jit._checksum.__wrapped__, tmp_path / "ae_env/kernels.py")
     before = checksum()
     (tmp_path / "simulator/a/others.py").write_text("FACTOR = 3.0")
     assert checksum() == before

@@ -14,8 +14,7 @@ from simulator.utils.results import result_meta, write_results
 def test_meta_says_where_a_number_comes_from():
     meta = result_meta("ae-env bench throughput", seed=3)
     assert set(meta) == {"command", "commit", "seed", "date", "machine", "versions"}
-    assert meta["command"] == "ae-env bench throughput"
-    assert meta["seed"] == 3
+    assert (meta["command"], meta["seed"]) == ("ae-env bench throughput", 3)
     assert meta["machine"]["threads"] == torch.get_num_threads()
     assert meta["versions"]["torch"] == version("torch")
     age = datetime.datetime.now(datetime.UTC) - datetime.datetime.fromisoformat(meta["date"])
