@@ -114,9 +114,6 @@ def test_render_sizes(size):
     assert darker.unique().tolist() == [round(255 * float(srgb(np.array(0.25))))]
 
 
-RAW = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
-
-
 @pytest.mark.parametrize(
     ("function", "arguments", "message"),
     [
@@ -144,7 +141,8 @@ RAW = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
     ],
 )
 def test_bad_arguments(function, arguments, message):
-    usual = {"images": torch.zeros(2, 4, 2, 2)} if function is develop else {"raw": RAW}
+    raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
+    usual = {"images": torch.zeros(2, 4, 2, 2)} if function is develop else {"raw": raw}
     with pytest.raises(ValueError, match=message):
         function(**(usual | arguments))
 

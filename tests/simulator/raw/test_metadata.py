@@ -86,9 +86,6 @@ def test_structures_that_never_end_are_left():
 
 
 def test_one_damaged_tag_costs_no_other():
-    entries = [
-        (CODE["BitsPerSample"], 99, 1, 0),  # no such type
-        (CODE["StripOffsets"], 4, 7, 2**31),  # beyond the end
-        (CODE["WhiteLevel"], 4, 1, 4095),
-    ]
+    no_such_type, beyond_the_end = (CODE["Make"], 99, 1, 0), (CODE["StripOffsets"], 4, 7, 2**31)
+    entries = [no_such_type, beyond_the_end, (CODE["WhiteLevel"], 4, 1, 4095)]
     assert read_directories(io.BytesIO(tiff(entries))) == [{"WhiteLevel": (4095,)}]
