@@ -1,8 +1,8 @@
 """Light integrated in closed form against SciPy's adaptive quadrature and exact fractions."""
 
-from __future__ import annotations
-
 import math
+import re
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -20,25 +20,27 @@ STARTS = (0.0, 0.0013, 0.00499999, 3.7)
 LATER = (3600.123, 86_400.7, -1e6 / 3)
 
 
+def integral(light: Callable[[float], float], begin: float, end: float) -> float:
+    return quad(light, begin, end, epsabs=0, epsrel=1e-12, limit=500)[0]
+
+
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("frequency", [100.0, 120.0])
 @pytest.mark.parametrize("depth", [0.3, 1.0])
-def test_mains_light_is_its_integral(time: float, frequency: float, depth: float) -> None:
+def test_mains_light_is_its_integral(time, frequency, depth):
+    def light(t: float) -> float:
+        return 1.0 + depth * math.cos(2 * math.pi * (frequency * t + 0.2))
+
     lamp = MainsLamp(frequency, depth, phase=0.2)
     for start in STARTS:
-
-        def light(t: float) -> float:
-            return 1.0 + depth * math.cos(2 * math.pi * (frequency * t + 0.2))
-
-        integral, _ = quad(light, start, start + time, epsabs=0, epsrel=1e-12, limit=500)
-        assert lamp.mean_light(start, time) == pytest.approx(integral / time, rel=1e-9)
+        expected = integral(light, start, start + time) / time
+        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
 
 
 def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction) -> Fraction:
     """Exact mean of a pulsed lamp: what each pulse and the exposure share, pulse by pulse."""
     on, stop = Fraction(0), start + time
-    first, last = math.floor(start * frequency) - 1, math.ceil(stop * frequency) + 1
-    for pulse in range(first, last + 1):
+    for pulse in range(math.floor(start * frequency) - 1, math.ceil(stop * frequency) + 2):
         begin = pulse / frequency
         on += max(Fraction(0), min(stop, begin + duty / frequency) - max(start, begin))
     return on / (time * duty)
@@ -47,39 +49,32 @@ def _pulses(start: Fraction, time: Fraction, frequency: Fraction, duty: Fraction
 @pytest.mark.parametrize("frequency", [1000, 7919, 20_000])
 @pytest.mark.parametrize("duty", [0.01, 0.5, 0.99])
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 1000, 1 / 60])
-def test_pulsed_light_is_the_exact_overlap(frequency: int, duty: float, time: float) -> None:
+def test_pulsed_light_is_the_exact_overlap(frequency, duty, time):
     lamp = PulsedLamp(frequency, duty)
     for start in (*STARTS, *LATER):
-        exact = _pulses(Fraction(start), Fraction(time), Fraction(frequency), Fraction(duty))
-        found = float(lamp.mean_light(start, time))
-        assert found == pytest.approx(float(exact), rel=1e-9, abs=1e-12)
+        exact = float(_pulses(*map(Fraction, (start, time, frequency, duty))))
+        assert lamp.mean_light(start, time) == pytest.approx(exact, rel=1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("time", [1 / 8000, 1 / 60, 4.0])
 @pytest.mark.parametrize("decay", [1e-6, 50e-6, 1e-3])
-def test_a_flash_is_its_integral(time: float, decay: float) -> None:
+def test_a_flash_is_its_integral(time, decay):
+    def light(t: float) -> float:
+        return 0.02 / decay * math.exp(-(t - 0.01) / decay)
+
     lamp = Flash(at=0.01, decay=decay, energy=0.02)
     for start in (0.0, 0.009_99, 0.01, 0.01 + decay, 0.02):
-        begin, stop = max(start, 0.01), start + time
-        integral = 0.0
-        if stop > begin:  # beyond 60 decays there is nothing left
-
-            def light(t: float) -> float:
-                return 0.02 / decay * math.exp(-(t - 0.01) / decay)
-
-            near = min(stop, begin + 60 * decay)
-            integral, _ = quad(light, begin, near, epsabs=0, epsrel=1e-12, limit=500)
-        wanted = 1.0 + integral / time
-        assert lamp.mean_light(start, time) == pytest.approx(wanted, rel=1e-9)
+        begin = max(start, 0.01)
+        end = max(begin, min(start + time, begin + 60 * decay))  # then there is nothing left
+        expected = 1.0 + integral(light, begin, end) / time
+        assert lamp.mean_light(start, time) == pytest.approx(expected, rel=1e-9)
 
 
-def test_rows_are_exposed_one_after_the_other() -> None:
+def test_rows_are_exposed_one_after_the_other():
     lamp, time, row_time = MainsLamp(100.0, 0.8), 1 / 1000, 20e-6
     rows = lamp.row_light(0.5, time, 64, row_time, sensor_rows=4)
-    wanted = [
-        np.mean([lamp.mean_light(0.5 + row_time * (4 * row + k), time) for k in range(4)])
-        for row in range(64)
-    ]
+    starts = 0.5 + row_time * np.arange(64 * 4).reshape(64, 4)
+    wanted = np.vectorize(lamp.mean_light)(starts, time).mean(1)
     np.testing.assert_allclose(rows, wanted, rtol=1e-12)
     # Bands of one period: 10 ms are 500 sensor rows of 20 us, 125 rows of four.
     repeated = lamp.row_light(0.5, time, 250, row_time, sensor_rows=4)
@@ -87,7 +82,7 @@ def test_rows_are_exposed_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("time", [1e-9, 1e-3, 1e6])
-def test_extremes_stay_finite_and_in_range(time: float) -> None:
+def test_extremes_stay_finite_and_in_range(time):
     for lamp, most in (
         (MainsLamp(1e9), 2.0),
         (MainsLamp(1e-9), 2.0),
@@ -103,25 +98,23 @@ def test_extremes_stay_finite_and_in_range(time: float) -> None:
 @pytest.mark.parametrize(
     ("make", "rule"),
     [
-        (lambda: MainsLamp(0.0), "`frequency` \\(=0.0\\) must be in"),
-        (lambda: MainsLamp(depth=1.5), "`depth` \\(=1.5\\) must be in"),
-        (lambda: MainsLamp(phase=math.nan), "`phase` \\(=nan\\) must be a finite number"),
-        (lambda: PulsedLamp(duty=0.0), "`duty` \\(=0.0\\) must be in"),
-        (lambda: PulsedLamp("100"), "`frequency` \\(='100'\\) must be a finite number"),  # type: ignore[arg-type]
-        (lambda: Flash(decay=0.0), "`decay` \\(=0.0\\) must be in"),
-        (lambda: Flash(energy=-1.0), "`energy` \\(=-1.0\\) must be in"),
-        (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` \\(=0.0\\) must be in"),
-        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` \\(=0\\) must be an integer"),
-        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` \\(=-1e-05\\) must be in"),
+        (lambda: MainsLamp(0.0), "`frequency` (=0.0) must be in"),
+        (lambda: MainsLamp(depth=1.5), "`depth` (=1.5) must be in"),
+        (lambda: MainsLamp(phase=math.nan), "`phase` (=nan) must be a finite number"),
+        (lambda: PulsedLamp(duty=0.0), "`duty` (=0.0) must be in"),
+        (lambda: PulsedLamp("100"), "`frequency` (='100') must be a finite number"),
+        (lambda: Flash(decay=0.0), "`decay` (=0.0) must be in"),
+        (lambda: Flash(energy=-1.0), "`energy` (=-1.0) must be in"),
+        (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` (=0.0) must be in"),
+        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` (=0) must be an integer"),
+        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` (=-1e-05) must be in"),
         (lambda: Lamp().mean_light(math.inf, 1.0), "`start` must be finite"),
     ],
 )
-def test_bad_values_are_refused(make: object, rule: str) -> None:
-    with pytest.raises(ValueError, match=rule):
-        make()  # type: ignore[operator]
+def test_bad_values_are_refused(make, rule):
+    with pytest.raises(ValueError, match=re.escape(rule)):
+        make()
 
-
-# -- any lamp at any moment ---------------------------------------------------------------------
 
 PHASES = st.floats(0.0, 1.0)
 LAMPS = st.one_of(
@@ -133,34 +126,22 @@ LAMPS = st.one_of(
 
 
 @given(LAMPS, st.floats(-10, 10), log_uniform(1e-6, 10), log_uniform(1e-6, 10))
-def test_lamps_add_up_over_time(lamp: Lamp, start: float, first: float, second: float) -> None:
+def test_lamps_add_up_over_time(lamp, start, first, second):
     def light(begin: float, time: float) -> float:
         mean = float(lamp.mean_light(begin, time))
-        assert math.isfinite(mean)
-        assert mean >= 0.0
+        assert 0.0 <= mean < math.inf
         return mean * time
 
     parts = light(start, first) + light(start + first, second)
-    whole = light(start, first + second)
+    brightest = 1.0 / lamp.duty if isinstance(lamp, PulsedLamp) else 2.0
+    if isinstance(lamp, Flash):
+        brightest = 1.0 + lamp.energy / lamp.decay
     # A moment is known to an ulp of 16 s: so the light at both ends of a part, at its brightest.
-    assert parts == pytest.approx(whole, rel=1e-12, abs=8 * 2.0**-48 * _brightest(lamp))
-
-
-def _brightest(lamp: Lamp) -> float:
-    if isinstance(lamp, PulsedLamp):
-        return 1.0 / lamp.duty
-    return 1.0 + lamp.energy / lamp.decay if isinstance(lamp, Flash) else 2.0
+    bound = 8 * 2.0**-48 * brightest
+    assert parts == pytest.approx(light(start, first + second), rel=1e-12, abs=bound)
 
 
 @given(LAMPS, st.floats(-10, 10))
-def test_long_exposures_see_the_mean(lamp: Lamp, start: float) -> None:
+def test_long_exposures_see_the_mean(lamp, start):
     bound = 2e-6 * max(1.0, getattr(lamp, "energy", 0.0))
     assert float(lamp.mean_light(start, 1e6)) == pytest.approx(1.0, abs=bound)
-
-
-@given(log_uniform(1e-3, 1e9), PHASES, st.floats(-1e3, 1e3), log_uniform(1e-9, 1e6))
-def test_a_pulse_as_long_as_its_period_is_steady(
-    frequency: float, phase: float, start: float, time: float
-) -> None:
-    lamp = PulsedLamp(frequency, 1.0, phase)
-    assert float(lamp.mean_light(start, time)) == pytest.approx(1.0, abs=1e-12)

@@ -1,6 +1,6 @@
 """Against scikit-image, LibRaw's published matrix arithmetic and closed forms."""
 
-from __future__ import annotations
+import math
 
 import numpy as np
 import pytest
@@ -31,33 +31,27 @@ def test_encoding_is_the_standard():
     ours = srgb_encode(torch.from_numpy(linear).float()).numpy()
     np.testing.assert_allclose(ours, srgb(linear), atol=5e-7)
     assert (np.diff(ours) >= 0).all()
-    assert ours[0] == pytest.approx(0, abs=1e-7)
-    assert ours[-1] == pytest.approx(1, abs=2e-7)
 
 
 def test_tone_curve_is_monotone_and_shows_the_grey_card_as_grey():
     linear = torch.linspace(0, 1, 10_001, dtype=torch.float64)
     curve = apply_tone(linear, "photographic")
     assert (curve.diff() > 0).all()
-    assert curve[0] == 0
-    assert curve[-1] == pytest.approx(1, abs=1e-15)
     assert (curve.diff().diff() < 1e-12).all()  # concave: contrast falls towards the highlights
-    card = apply_tone(torch.tensor([0.18 * 0.6635], dtype=torch.float64), "photographic")
-    assert card.item() == pytest.approx(0.18, abs=1e-12)
+    known = apply_tone(torch.tensor([0, 0.18 * 0.6635, 1], dtype=torch.float64), "photographic")
+    np.testing.assert_allclose(known, [0, 0.18, 1], atol=1e-12)
     assert torch.equal(apply_tone(linear, "linear"), linear)
 
 
 def test_develop_follows_the_formula():
     """R, mean green, B -> gains -> matrix -> sRGB, computed with numpy for one colour."""
     out = develop(flat(0.1, 0.2, 0.15), (2.0, 1.0, 1.5), Z6.colour_matrix, tone="linear")
-    xyz_from_srgb = np.array(  # IEC 61966-2-1
-        [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    )
-    camera_from_srgb = np.array(Z6.colour_matrix) @ xyz_from_srgb
+    # IEC 61966-2-1
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    camera_from_srgb = np.array(Z6.colour_matrix) @ to_xyz
     camera_from_srgb /= camera_from_srgb.sum(axis=1, keepdims=True)
     linear = np.linalg.solve(camera_from_srgb, [0.2, 0.2, 0.225])
-    assert out.shape == (1, 3, 4, 4)
-    assert out.dtype == torch.float32
+    assert (out.shape, out.dtype) == ((1, 3, 4, 4), torch.float32)
     np.testing.assert_allclose(out[0, :, 0, 0].numpy(), srgb(linear), atol=1e-6)
 
 
@@ -65,7 +59,7 @@ def test_develop_follows_the_formula():
 @pytest.mark.parametrize("level", [1.0, 1.0001, 7.0, 1e6])
 def test_saturated_areas_are_white(gains, level):
     out = develop(flat(level, level, level), gains, Z6.colour_matrix)
-    torch.testing.assert_close(out, torch.ones_like(out), atol=1e-6, rtol=0)
+    np.testing.assert_allclose(out, 1.0, atol=1e-6)
     raw = RawImage(flat(level, level, level)[0], CameraSettings(100, 0.01, 4), Z6, None, gains)
     for demosaic in ("malvar", "half"):
         assert (render_srgb(raw, demosaic) == 255).all()
@@ -79,9 +73,7 @@ def test_saturated_areas_are_white(gains, level):
     st.tuples(*[log_uniform(1e-30, 1e30)] * 3),
     st.sampled_from(["linear", "photographic"]),
 )
-def test_any_light_is_developed_within_the_range(
-    light: torch.Tensor, white_balance: tuple[float, float, float], tone: str
-) -> None:
+def test_any_light_is_developed_within_the_range(light, white_balance, tone):
     before = light.clone()
     rgb = develop(light[None], white_balance, Z6.colour_matrix, tone=tone)
     assert bool(((rgb >= 0) & (rgb <= 1)).all())
@@ -102,9 +94,7 @@ def test_shadow_noise_keeps_its_mean():
 
 
 def test_per_image_white_balance_and_batching():
-    generator = torch.Generator().manual_seed(3)
-    images = torch.rand(40, 4, 40, 48, generator=generator) * 1.2 - 0.1
-    gains = 1 + torch.rand(40, 3, generator=generator)
+    images, gains = torch.rand(40, 4, 40, 48) * 1.2 - 0.1, 1 + torch.rand(40, 3)
     together = develop(images, gains, Z6.colour_matrix)
     for image, gain, expected in zip(images, gains, together, strict=True):
         alone = develop(image[None], tuple(gain.tolist()), Z6.colour_matrix)
@@ -116,8 +106,7 @@ def test_render_sizes(size):
     camera = CameraProfile("c", "GBRG", 0, 1023, 10)
     raw = RawImage(torch.full((4, *size), 0.5), CameraSettings(100, 0.01, 4), camera)
     full, half = render_srgb(raw), render_srgb(raw, "half")
-    assert full.shape == (3, 2 * size[0], 2 * size[1])
-    assert half.shape == (3, *size)
+    assert (full.shape, half.shape) == ((3, 2 * size[0], 2 * size[1]), (3, *size))
     assert full.dtype == half.dtype == torch.uint8
     # Schlick: 1.618 * .5 / (.618 * .5 + 1) = .618; sRGB .8077; 206
     assert set(full.unique().tolist()) == set(half.unique().tolist()) == {206}
@@ -126,61 +115,49 @@ def test_render_sizes(size):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("function", "arguments", "message"),
     [
-        ({"demosaic": "malvr"}, r"`demosaic` .* \['half', 'malvar'\]; did you mean 'malv"),
-        ({"tone": "aces"}, "`tone` "),
-        ({"exposure_ev": float("nan")}, "`exposure_ev` "),
-        ({"raw": object()}, r"`raw` \(=object\) must be a RawImage"),
+        (render_srgb, {"demosaic": "malvr"}, r"`demosaic` .*'malvar'\]; did you mean 'malv"),
+        (render_srgb, {"tone": "aces"}, "`tone` "),
+        (render_srgb, {"exposure_ev": math.nan}, "`exposure_ev` "),
+        (render_srgb, {"raw": object()}, r"`raw` \(=object\) must be a RawImage"),
+        (
+            develop,
+            {"images": torch.zeros(4, 8, 8)},
+            r"\(shape \(4, 8, 8\)\) must be \(B, 4, H, W\)",
+        ),
+        (develop, {"images": torch.zeros(1, 3, 8, 8)}, r"`images` \(shape"),
+        (develop, {"images": torch.full((1, 4, 2, 2), math.nan)}, "`images` .* finite"),
+        (develop, {"images": torch.zeros(1, 4, 2, 2, dtype=torch.uint8)}, "`images` .* floating"),
+        (develop, {"white_balance": (1.0, 1.0)}, r"`white_balance` \(shape \(2,\)\)"),
+        (develop, {"white_balance": torch.ones(3, 3)}, r"`white_balance` \(shape \(3, 3\)\)"),
+        (develop, {"white_balance": (1.0, 0.0, 1.0)}, "`white_balance` .* positive"),
+        (develop, {"white_balance": (1.0, math.nan, 1.0)}, "`white_balance` .* positive"),
+        (develop, {"colour_matrix": torch.eye(4)}, "`colour_matrix` .* 3 x 3"),
+        (develop, {"colour_matrix": torch.full((3, 3), math.inf)}, "`colour_matrix` .* finite"),
+        (develop, {"colour_matrix": torch.ones(3, 3)}, "`colour_matrix` .* invertible"),
+        (develop, {"colour_matrix": -torch.eye(3)}, "`colour_matrix` .* white"),
+        (develop, {"tone": "photografic"}, r"`tone` .* \['linear', 'photographic'\]; .* 'photo"),
     ],
 )
-def test_render_refuses(changes, message):
+def test_bad_arguments(function, arguments, message):
     raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 0.01, 4), Z6)
+    usual = {"images": torch.zeros(2, 4, 2, 2)} if function is develop else {"raw": raw}
     with pytest.raises(ValueError, match=message):
-        render_srgb(**({"raw": raw} | changes))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"images": torch.zeros(4, 8, 8)}, r"\(shape \(4, 8, 8\)\) must be \(B, 4, H, W\)"),
-        ({"images": torch.zeros(1, 3, 8, 8)}, r"`images` \(shape"),
-        ({"images": torch.full((1, 4, 2, 2), float("nan"))}, "`images` .* finite"),
-        ({"images": torch.zeros(1, 4, 2, 2, dtype=torch.uint8)}, "`images` .* floating point"),
-        ({"white_balance": (1.0, 1.0)}, r"`white_balance` \(shape \(2,\)\)"),
-        ({"white_balance": torch.ones(3, 3)}, r"`white_balance` \(shape \(3, 3\)\)"),
-        ({"white_balance": (1.0, 0.0, 1.0)}, "`white_balance` .* positive"),
-        ({"white_balance": (1.0, float("nan"), 1.0)}, "`white_balance` .* positive"),
-        ({"colour_matrix": torch.eye(4)}, "`colour_matrix` .* 3 x 3"),
-        ({"colour_matrix": torch.full((3, 3), float("inf"))}, "`colour_matrix` .* finite"),
-        ({"colour_matrix": torch.ones(3, 3)}, "`colour_matrix` .* invertible"),
-        ({"colour_matrix": -torch.eye(3)}, "`colour_matrix` .* white"),
-        ({"tone": "photografic"}, r"`tone` .* \['linear', 'photographic'\]; did you mean 'photo"),
-    ],
-)
-def test_develop_refuses(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        develop(**({"images": torch.zeros(2, 4, 2, 2)} | arguments))
+        function(**(usual | arguments))
 
 
 @pytest.mark.real_data
 @pytest.mark.parametrize("exposure_ev", [0.0, 2.0])
 def test_a_real_raw_looks_as_libraw_shows_it(data_dir, exposure_ev):
     path = data_dir / "canon_crw_cc0" / "CRW_0101.CRW"
+    as_ours = {"half_size": True, "use_camera_wb": True, "user_flip": 0, "gamma": (2.4, 12.92)}
+    plain = {"no_auto_bright": True, "adjust_maximum_thr": 0.0, "output_bps": 16}
     with rawpy.imread(str(path)) as file:
-        theirs = file.postprocess(
-            half_size=True,
-            use_camera_wb=True,
-            no_auto_bright=True,
-            adjust_maximum_thr=0.0,
-            gamma=(2.4, 12.92),
-            user_flip=0,
-            output_bps=16,
-            bright=2.0**exposure_ev,
-        )
+        theirs = file.postprocess(**as_ours, **plain, bright=2.0**exposure_ev)
     raw = read_raw(path)
     ours = render_srgb(raw, "half", exposure_ev, tone="linear").permute(1, 2, 0).numpy()
     assert ours.shape == theirs.shape
-    difference = ours.astype(np.float64) - theirs / 257.0
+    difference = ours - theirs / 257.0
     assert np.abs(difference.mean(axis=(0, 1))).max() < 0.25
     assert np.quantile(np.abs(difference), 0.999) < 1.5

@@ -1,7 +1,5 @@
 """Tiny scenes to train on."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,12 +1,9 @@
-"""From a configuration to weights, on scenes of 32 x 32 pixels; one stage alone on numbers."""
-
-from __future__ import annotations
-
 import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,7 @@ from torch import nn
 
 from simulator import get_camera
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import DRAPED, ReferenceCamera, ReferenceScene
 from simulator.training import train
 from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
@@ -37,93 +34,75 @@ def scenes(config: SimulatorConfig, split: str) -> Sequence[ReferenceScene]:
     return [scene(f"{split}-deep", seed=first), scene(f"{split}-flat", seed=first + 1, depth=False)]
 
 
+def save(folder: Path, *given: Any, progress: Any = None, **changes: Any) -> Path:
+    command = "ae-env train-simulator x.yaml"
+    made, file = config(*given, **changes), folder / "net"
+    return train_and_save(made, scenes, file, command=command, tensorboard=True, progress=progress)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("trained")
-    return train_and_save(config(), scenes, folder / "net", command="ae-env train-simulator x.yaml")
+    return save(tmp_path_factory.mktemp("trained"))
 
 
 def card_of(file: Path) -> dict[str, Any]:
     return json.loads(file.with_suffix(".json").read_text())
 
 
-def same(a: nn.Module, b: nn.Module) -> bool:
-    others = b.state_dict()
-    return all(torch.equal(value, others[name]) for name, value in a.state_dict().items())
-
-
-def test_the_card_says_what_was_done(trained: Path) -> None:
+def test_the_card_says_what_was_done(trained):
     names = ("aperture.checkpoint", "exposure.checkpoint", "net.json", trained.name)
-    assert sorted(p.name for p in trained.parent.iterdir()) == [*names, "noise.checkpoint"]
+    found = sorted(p.name for p in trained.parent.iterdir())
+    assert found == [*names, "noise.checkpoint", "tensorboard"]
     card = card_of(trained)
-    assert card["preset"] == "compact"
-    assert card["training"] == config().card()
-    assert card["command"] == "ae-env train-simulator x.yaml"
-    assert card["scenes"] == {"depth": 1, "flat": 1}
+    known = {"preset": "compact", "training": config().card(), "scenes": {"depth": 1, "flat": 1}}
+    assert (known | {"command": "ae-env train-simulator x.yaml"}).items() <= card.items()
     assert {"commit", "date", "machine", "versions", "sha256"} <= set(card)
-    assert list(card["stages"]) == ["exposure", "noise", "aperture"]
-    for stage in card["stages"].values():
+    stages = card["stages"]
+    values = {"exposure": {"loss"}, "noise": {"loss", "gain_db"}}
+    values["aperture"] = {"loss", "map", "relative"}
+    assert {name: set(stage["validation"]) for name, stage in stages.items()} == values
+    for stage in stages.values():
         assert stage["steps"] == 2
         assert stage["validation"]["loss"] > 0
-    assert "gain_db" in card["stages"]["noise"]["validation"]
-    assert {"map", "relative"} <= set(card["stages"]["aperture"]["validation"])
     # Any two of 20 to 25 captures of 2 scenes; the aperture's come from the one with depth.
-    assert 2 * 20 * 19 <= card["stages"]["exposure"]["pairs"] <= 2 * 25 * 24
-    assert card["stages"]["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
+    assert 2 * 20 * 19 <= stages["exposure"]["pairs"] <= 2 * 25 * 24
+    assert stages["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
 
 
-def test_a_second_run_trains_nothing_and_ends_the_same(
-    trained: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):
     before, card = trained.read_bytes(), card_of(trained)
     calls: list[str] = []
-    again = train_and_save(
-        config(),
-        scenes,
-        trained.parent / "net",
-        command="",
-        progress=lambda task, share, values: calls.append(task),
-    )
+    again = save(trained.parent, progress=lambda *at: calls.append(at[0]))
     assert again.read_bytes() == before
     assert card_of(again)["stages"] == card["stages"]
+    assert calls
     assert not any("training" in task for task in calls)
     monkeypatch.setitem(sys.modules, "accelerate", None)
     with pytest.raises(ImportError, match=r"pip install 'ae-env\[train\]'"):
-        train_and_save(config(), scenes, trained.parent / "net", command="")
+        save(trained.parent)
 
 
-def test_baselines_in_any_precision_and_their_logs(tmp_path: Path) -> None:
+def test_baselines_in_any_precision_and_their_logs(tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     # One precision after another in one process.
-    for preset, precision in (("pc", "float32"), ("dl", "bfloat16"), ("pc", "float32")):
-        folder = tmp_path / f"{preset}-{precision}"
-        made = config(preset, precision=precision)
-        file = train_and_save(made, scenes, folder / preset, command="", tensorboard=True)
-        modules, card = load_modules(file)
+    for preset, precision in (("dl", "bfloat16"), ("pc", "float32")):
+        modules, card = load_modules(save(tmp_path / preset, preset, precision=precision))
         assert list(modules) == list(card["stages"]) == ["baseline"]
         assert all(p.dtype == torch.float32 for p in modules.parameters())
-    (events,) = (tmp_path / "dl-bfloat16" / "tensorboard").rglob("events.out*")
+    (events,) = (tmp_path / "dl" / "tensorboard").rglob("events.out*")
     (entry,) = EventAccumulator(str(events.parent)).Reload().Scalars("baseline/loss")
     assert entry.step == 2
 
 
-def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path) -> None:
-    """Drawn weights are those of the seed, and the global generator stays as it was."""
+def test_the_seed_decides_and_progress_is_complete(trained, tmp_path):
     calls: list[tuple[str, float]] = []
     before = torch.random.get_rng_state()
-    other = train_and_save(
-        config(seed=1),
-        scenes,
-        tmp_path / "net",
-        command="",
-        progress=lambda task, share, values: calls.append((task, share)),
-    )
+    other = save(tmp_path, progress=lambda *at: calls.append(at[:2]), seed=1)
     assert torch.equal(torch.random.get_rng_state(), before)
     first, second = (load_modules(file)[0].state_dict() for file in (trained, other))
-    assert not any(
-        torch.equal(first[n], second[n]) for n in ("exposure.b", "noise.network.head.weight")
-    )
+    for name in ("exposure.b", "noise.network.head.weight"):
+        assert not torch.equal(first[name], second[name])
     order = list(dict.fromkeys(task for task, _ in calls))
     stages = itertools.product(("exposure", "noise", "aperture"), ("rendering", "training"))
     assert order == [f"{stage}: {task}" for stage, task in stages]
@@ -133,7 +112,7 @@ def test_the_seed_decides_and_progress_is_complete(trained: Path, tmp_path: Path
         assert shares[-1] == 1.0
 
 
-def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
+def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing():
     camera = get_camera("nikon_z6")
     pairs = ReferencePairs(draw_sequences([scene()], camera, 0), ReferenceCamera(camera), "all")
     seen: list[float] = []
@@ -152,21 +131,26 @@ def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing() -> None:
     assert seen[8:] == seen[:8]
 
 
-# The loop of one stage
+def test_draped_scenes_teach_the_aperture_alone():
+    for kind, teaches in ((DRAPED, ["aperture"]), ("flat", ["exposure", "noise", "baseline"])):
+        one = replace(scene(depth=kind == DRAPED), kind=kind)
+        stages = ("exposure", "noise", "aperture", "baseline")
+        assert [stage for stage in stages if train._teaches(one, stage)] == teaches
 
-STEPS = 12
 
+class Watch:
+    """Stands for both clocks of the machine; gives batches of numbers by step, in 7 s each."""
 
-class Pairs:
-    """Batches of numbers by step; calls `hook` before each."""
-
-    def __init__(self, hook: Callable[[int], None] | None = None, *, broken: int = -1) -> None:
-        self.hook, self.broken, self.steps = hook, broken, []
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.cpu, self.wall, self.steps, self.stop, self.broken = 1000.0, 50.0, [], -1, -1
+        monkeypatch.setattr("time.process_time", lambda: self.cpu)
+        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> torch.Tensor:
         assert (size, crop, process) == (3, 16, 0)
-        if self.hook is not None:
-            self.hook(step)
+        if step == self.stop:
+            raise KeyboardInterrupt
+        self.cpu += 7.0
         self.steps.append(step)
         values = torch.randn(size, 4, generator=torch.Generator().manual_seed(step))
         return values * (math.inf if step == self.broken else 1.0)
@@ -183,99 +167,45 @@ class Loss(nn.Module):
         return {"loss": value, "undefined": value.detach() * math.nan}
 
 
-def run(
-    file: Path,
-    hook: Callable[[int], None] | None = None,
-    *,
-    broken: int = -1,
-    stage: StageConfig | None = None,
-    identity: Any = "one",
-    progress: Any = None,
-) -> tuple[Loss, Clock, Pairs]:
-    made, pairs = Loss(), Pairs(hook, broken=broken)
-    clock = train_stage(
-        "noise",
-        made,
-        made.trained,
-        pairs,  # type: ignore[arg-type]
-        stage or StageConfig(steps=STEPS, batch=3, crop=16, learning_rate=0.05),
-        make_accelerator(config("pc"), "cpu", None),
-        checkpoint=file,
-        identity=identity,
-        progress=progress,
-    )
-    return made, clock, pairs
+def run(file: Path, watch: Watch, **budget: int) -> tuple[Loss, Clock]:
+    loss, stage = Loss(), StageConfig(batch=3, crop=16, learning_rate=0.05, **budget)
+    accelerator = make_accelerator(config("pc"), "cpu", None)
+    options = {"checkpoint": file, "identity": "one"}
+    return loss, train_stage("noise", loss, loss.trained, watch, stage, accelerator, **options)
 
 
-def stop_at(step: int) -> Callable[[int], None]:
-    def hook(now: int) -> None:
-        if now == step:
-            raise KeyboardInterrupt
-
-    return hook
-
-
-def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path: Path) -> None:
-    whole, *_ = run(tmp_path / "whole")
+@pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}])
+def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path, monkeypatch, budget):
+    watch = Watch(monkeypatch)
+    whole, clock = run(tmp_path / "whole", watch, **budget)
+    assert (clock.step, clock.seconds) == (9, 63.0)
+    watch.stop = 4
     with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "part", stop_at(6))
-    resumed, clock, pairs = run(tmp_path / "part")
-    assert pairs.steps == list(range(6, STEPS))
-    assert clock.step == STEPS
-    assert same(resumed, whole)
+        run(tmp_path / "part", watch, **budget)
+    watch.stop, watch.steps = -1, []
+    resumed, clock = run(tmp_path / "part", watch, **budget)
+    assert watch.steps == [4, 5, 6, 7, 8]
+    assert (clock.step, clock.seconds) == (9, 63.0)
+    torch.testing.assert_close(resumed.state_dict(), whole.state_dict(), rtol=0, atol=0)
 
 
-def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path: Path) -> None:
+def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path, monkeypatch):
+    watch = Watch(monkeypatch)
+    watch.broken = 5
     with pytest.raises(ValueError, match=r"stage 'noise': the loss \(=nan\) must be finite"):
-        run(tmp_path / "a", broken=5)
+        run(tmp_path / "a", watch, steps=9)
     assert not (tmp_path / "a").exists()  # nothing is due yet, and a state of it is not written
 
 
-# Budgets
-
-
-class Watch:
-    """Stands for both clocks of the machine."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.cpu, self.wall = 1000.0, 50.0
-        monkeypatch.setattr("time.process_time", lambda: self.cpu)
-        monkeypatch.setattr(train.time, "monotonic", lambda: self.wall)
-
-
-@pytest.mark.parametrize("on_cpu", [True, False])
-def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(
-    on_cpu: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch = Watch(monkeypatch)
-    clock = Clock(StageConfig(minutes=2), on_cpu=on_cpu)
-    clock.start()
+    clocks = [Clock(StageConfig(minutes=2), on_cpu=on_cpu) for on_cpu in (True, False)]
+    for clock in clocks:
+        clock.start()
     watch.cpu, watch.wall = 1030.0, 140.0  # 30 s of work in 90 s
-    clock.tick()
-    assert clock.seconds == (30.0 if on_cpu else 90.0)
-    assert clock.share == (0.25 if on_cpu else 0.75)
-    watch.cpu = watch.wall = 1e6
-    clock.tick()
-    assert (clock.step, clock.share) == (2, 1.0)
-
-
-def test_a_stage_ends_with_its_minutes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step takes 7 s here, a minute nine steps; stopped after four, five are left."""
-    watch = Watch(monkeypatch)
-
-    def second(step: int) -> None:
-        watch.cpu += 7.0
-
-    def stopped(step: int) -> None:
-        stop_at(4)(step)
-        second(step)
-
-    stage = StageConfig(minutes=1, batch=3, crop=16)
-    whole, clock, _ = run(tmp_path / "whole", second, stage=stage)
-    assert (clock.step, clock.seconds) == (9, 63.0)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path / "part", stopped, stage=stage)
-    resumed, clock, pairs = run(tmp_path / "part", second, stage=stage)
-    assert pairs.steps == [4, 5, 6, 7, 8]
-    assert clock.seconds == 63.0
-    assert same(resumed, whole)
+    for clock, seconds in zip(clocks, (30.0, 90.0), strict=True):
+        clock.tick()
+        assert (clock.seconds, clock.share) == (seconds, seconds / 120)
+    watch.cpu = 1e6
+    clocks[0].tick()
+    assert (clocks[0].step, clocks[0].share) == (2, 1.0)

@@ -1,11 +1,8 @@
-"""YAML files and what is wrong with them, in one line that names the entry."""
-
-from __future__ import annotations
-
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from simulator.utils.config_file import Configuration, load_yaml, read_yaml
 
@@ -15,8 +12,7 @@ BOMB = "a0: &a0 [x]\n" + "".join(
 )
 
 
-class Part(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class Part(Configuration):
     steps: int = Field(ge=1)
 
     @field_validator("steps")
@@ -27,10 +23,12 @@ class Part(BaseModel):
         return value
 
 
-class Whole(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class Whole(Configuration):
     name: str
     part: Part | None = None
+    parts: dict[str, Part] = Field(default_factory=dict)
+    rows: tuple[Part, ...] = ()
+    share: float = 0.5
 
 
 def load(folder: Path, text: str | bytes) -> Whole:
@@ -39,10 +37,9 @@ def load(folder: Path, text: str | bytes) -> Whole:
     return load_yaml(file, Whole)
 
 
-def test_a_good_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert load(tmp_path, "name: x\npart: {steps: 4}\n") == Whole(name="x", part=Part(steps=4))
-    text = "name: &n x\npart:\n  <<: {steps: 2}\n"  # aliases and merges
-    assert load(tmp_path, text) == Whole(name="x", part=Part(steps=2))
+def test_a_good_file(tmp_path, monkeypatch):
+    for text in ("name: x\npart: {steps: 2}\n", "name: &n x\npart:\n  <<: {steps: 2}\n"):  # merges
+        assert load(tmp_path, text) == Whole(name="x", part=Part(steps=2))
     monkeypatch.setenv("HOME", str(tmp_path))
     assert load_yaml("~/a.yaml", Whole).name == "x"
     (tmp_path / "a.yaml").write_text("[1, 2.5, null]")
@@ -61,15 +58,11 @@ def test_a_good_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("a.yaml", "cannot be read: Permission denied"),
     ],
 )
-def test_what_cannot_be_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, message: str
-) -> None:
-    def refuse(*args: object, **kwargs: object) -> str:
-        raise PermissionError(13, "Permission denied")
-
+def test_what_cannot_be_read(tmp_path, monkeypatch, name, message):
     if name == "a.yaml":
         (tmp_path / name).touch()
-        monkeypatch.setattr(Path, "read_text", refuse)  # root may read anything
+        error = PermissionError(13, "Permission denied")  # root may read anything
+        monkeypatch.setattr(Path, "read_text", Mock(side_effect=error))
     with pytest.raises(ValueError, match=rf"`config` .*{message}"):
         load_yaml(tmp_path / name, Whole)
 
@@ -82,57 +75,35 @@ def test_what_cannot_be_read(
         ("name: x\nprat: {steps: 2}", ["prat (={'steps': 2}): unknown", "did you mean `part`?"]),
         ("part: {}", ["name: Field required; part.steps: Field required"]),
         ("name: x\npart: {stesp: 2}", ["part.stesp (=2): unknown", "did you mean `steps`?"]),
-        ("", ["is empty: it must have entries, of name, part"]),
+        ("", ["is empty: it must have entries, of name, part, parts"]),
         ("- a\n- b", ["holds ['a', 'b']: it must have entries"]),
         ("name: x\npart: {steps: 2}\nname: y", ["'name' is given twice, again in line 3"]),
         ("name: " + "[" * 100 + "]" * 100, ["nested deeper than 50"]),
-        ("name: " + "[" * 3000, ["nested too deeply"]),
+        ("name: " + "[" * 700, ["nested too deeply"]),
         ("name: &a [*a]", ["nested deeper than 50"]),
         (BOMB, ["at most 10000 entries"]),
         ("name: !!int x", ["is not YAML: invalid literal"]),
         ("name: 2001-13-45", ["is not YAML: month must be"]),
         ("name: x" + " " * 2**20, ["must not be larger than"]),
-        ("name: true", ["name (=True): Input should be a valid string"]),
+        ("name: true", ["name (=True): Input should not be true or false"]),
         ("name: [", ["is not YAML"]),
         (b"name: \xff\xfe", ["is not YAML"]),
+        ("name: x\nparts: {a: {stesp: 3}}", ["parts.a.stesp (=3): unknown, the", "mean `steps`"]),
+        ("name: x\nrows: [{steps: 2}, {foo: 3}]", ["rows.1.foo (=3): unknown", "'steps'"]),
+        ("name: x\npart: {foo: 3}", ["part.foo (=3): unknown", "'steps'"]),
+        ("name: x\nrows: 3", ["rows (=3): must be a list"]),
+        ("name: x\nparts: 3", ["parts (=3): must be a mapping"]),
+        ("name: x\nparts: {a: 3}", ["parts.a (=3): must be a mapping"]),
+        ("name: x\nshare: yes", ["share (=True)", "not be true or false"]),
+        ("name: x\npart: {steps: yes}", ["part.steps (=True)", "not be true or false"]),
         ("name: !!python/object/apply:os.getcwd []", ["is not YAML"]),  # nothing is executed
     ],
 )
-def test_errors_name_file_and_entry_in_one_line(
-    tmp_path: Path, text: str | bytes, parts: list[str]
-) -> None:
+def test_errors_name_file_and_entry_in_one_line(tmp_path, text, parts):
     with pytest.raises(ValueError) as caught:
         load(tmp_path, text)
     message = str(caught.value)
     assert message.startswith(f"`config` (={str(tmp_path / 'a.yaml')!r})")
     assert "\n" not in message
     assert "Value error" not in message
-    for part in parts:
-        assert part in message
-
-
-class Many(Configuration):
-    parts: dict[str, Part] = Field(default_factory=dict)
-    rows: tuple[Part, ...] = ()
-    one: Part | None = None
-    share: float = 0.5
-    steps: int = 1
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("parts: {a: {stesp: 3}}", r"parts\.a\.stesp \(=3\): unknown, the .*mean `steps`"),
-        ("rows: [{steps: 2}, {foo: 3}]", r"rows\.1\.foo \(=3\): unknown, .*'steps'"),
-        ("one: {foo: 3}", r"one\.foo \(=3\): unknown, .*'steps'"),
-        ("rows: 3", r"rows \(=3\): must be a list"),
-        ("parts: 3", r"parts \(=3\): must be a mapping"),
-        ("parts: {a: 3}", r"parts\.a \(=3\): must be a mapping"),
-        ("share: yes", r"share \(=True\): .*not be true or false"),
-        ("steps: yes", r"steps \(=True\): .*not be true or false"),
-    ],
-)
-def test_entries_of_mappings_and_lists(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "a.yaml").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        load_yaml(tmp_path / "a.yaml", Many)
+    assert [part for part in parts if part not in message] == []

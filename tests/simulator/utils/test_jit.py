@@ -1,12 +1,8 @@
-"""Compilation: announced, cached on disk, stale when code changes, possible without a cache."""
-
-from __future__ import annotations
-
 import logging
+from functools import partial
 from pathlib import Path
 
 import numba
-import pytest
 from numba.core import caching
 
 from simulator.utils import jit
@@ -17,27 +13,22 @@ def add(a: int, b: int) -> int:
     return a + b
 
 
-def test_kernels_run_without_the_lock_and_are_cached() -> None:
+def test_kernels_run_without_the_lock_and_are_cached():
     compiled = kernel(fastmath=True)(add)
     assert isinstance(compiled, numba.core.dispatcher.Dispatcher)
     assert compiled(1, 2) == 3
-    assert compiled.targetoptions["nogil"]
-    assert compiled.targetoptions["fastmath"]
+    assert {"nogil": True, "fastmath": True}.items() <= compiled.targetoptions.items()
     assert compiled.stats.cache_path is not None
 
 
-def test_they_run_where_nothing_can_be_cached(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_they_run_where_nothing_can_be_cached(monkeypatch, caplog):
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     with caplog.at_level(logging.INFO, "simulator.utils.jit"):
         assert kernel()(add)(1, 2) == 3
     assert "compiled again in each process" in caplog.text
 
 
-def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(tmp_path, monkeypatch):
     """Numba itself would run the kernel that it compiled with a constant's old value."""
     monkeypatch.setattr(jit, "_ROOT", tmp_path)
     texts = {
@@ -50,9 +41,7 @@ def test_a_kernel_is_stale_when_a_module_changes_that_it_depends_on(
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
 
-    def checksum() -> int:
-        return jit._checksum.__wrapped__(tmp_path / "ae_env/kernels.py")
-
+    checksum = partial(jit._checksum.__wrapped__, tmp_path / "ae_env/kernels.py")
     before = checksum()
     (tmp_path / "simulator/a/others.py").write_text("FACTOR = 3.0")
     assert checksum() == before

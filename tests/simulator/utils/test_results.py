@@ -1,7 +1,3 @@
-"""Result files: what they say about themselves, and nothing that JSON cannot hold."""
-
-from __future__ import annotations
-
 import datetime
 import json
 import subprocess
@@ -18,8 +14,7 @@ from simulator.utils.results import result_meta, write_results
 def test_meta_says_where_a_number_comes_from():
     meta = result_meta("ae-env bench throughput", seed=3)
     assert set(meta) == {"command", "commit", "seed", "date", "machine", "versions"}
-    assert meta["command"] == "ae-env bench throughput"
-    assert meta["seed"] == 3
+    assert (meta["command"], meta["seed"]) == ("ae-env bench throughput", 3)
     assert meta["machine"]["threads"] == torch.get_num_threads()
     assert meta["versions"]["torch"] == version("torch")
     age = datetime.datetime.now(datetime.UTC) - datetime.datetime.fromisoformat(meta["date"])
@@ -29,10 +24,8 @@ def test_meta_says_where_a_number_comes_from():
 
 def test_commit_is_that_of_this_checkout():
     def git(*arguments):
-        folder = Path(__file__).parent
-        return subprocess.run(
-            ["git", *arguments], cwd=folder, capture_output=True, text=True, check=False
-        )
+        command = ["git", "-C", Path(__file__).parent, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
 
     head = git("rev-parse", "--verify", "--quiet", "HEAD")
     changed = git("diff", "--quiet", "HEAD").returncode

@@ -1,7 +1,3 @@
-"""Shares of work: each item once, on as many threads as asked for, after a fork as well."""
-
-from __future__ import annotations
-
 import multiprocessing
 import threading
 
@@ -13,17 +9,22 @@ from simulator.utils.threads import in_shares
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
-def test_every_item_is_done_once(count: int, threads: int) -> None:
-    done = np.zeros(count, int)
+def test_every_item_is_done_once(count, threads):
+    done = np.zeros((count, 10), int)
 
     def task(first: int, last: int) -> None:
-        done[first:last] += 1
+        for row in done[first:last]:  # a task may ask for shares itself
+
+            def inner(a: int, b: int, row: np.ndarray = row) -> None:
+                row[a:b] += 1
+
+            in_shares(inner, 10, threads=2)
 
     in_shares(task, count, threads=threads)
     assert (done == 1).all()
 
 
-def test_shares_are_contiguous_and_run_at_the_same_time() -> None:
+def test_shares_are_contiguous_and_run_at_the_same_time():
     barrier, shares = threading.Barrier(3, timeout=30), []
 
     def task(first: int, last: int) -> None:
@@ -32,31 +33,13 @@ def test_shares_are_contiguous_and_run_at_the_same_time() -> None:
 
     in_shares(task, 9, threads=3)
     assert sorted(shares) == [(0, 3), (3, 6), (6, 9)]
-
-
-def test_little_work_stays_on_the_callers_thread() -> None:
-    names: list[str] = []
-    in_shares(lambda *_: names.append(threading.current_thread().name), 5, least=3, threads=4)
-    assert names == [threading.current_thread().name]
-
-
-def test_a_task_may_ask_for_shares_itself() -> None:
-    done = np.zeros((4, 10), int)
-
-    def outer(first: int, last: int) -> None:
-        for row in done[first:last]:
-
-            def inner(a: int, b: int, row: np.ndarray = row) -> None:
-                row[a:b] += 1
-
-            in_shares(inner, 10, threads=2)
-
-    in_shares(outer, 4, threads=2)
-    assert (done == 1).all()
+    names = []  # little work stays on the caller's thread
+    in_shares(lambda *_: names.append(threading.current_thread()), 5, least=3, threads=4)
+    assert names == [threading.current_thread()]
 
 
 @pytest.mark.parametrize("bad", [0, 3])
-def test_errors_of_any_share_are_raised_once_all_are_done(bad: int) -> None:
+def test_errors_of_any_share_are_raised_once_all_are_done(bad):
     done: list[int] = []
 
     def task(first: int, last: int) -> None:
@@ -69,23 +52,22 @@ def test_errors_of_any_share_are_raised_once_all_are_done(bad: int) -> None:
     assert done == [3 - bad]
 
 
-def _sum_in_child(queue: object) -> None:
+def _sum_in_child(queue: multiprocessing.Queue) -> None:
     totals = np.zeros(2)
 
     def task(first: int, last: int) -> None:
         totals[first:last] = last
 
     in_shares(task, 2, threads=2)
-    queue.put(totals.tolist())  # type: ignore[attr-defined]
+    queue.put(totals.tolist())
 
 
-@pytest.mark.parametrize("method", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
-def test_child_processes_make_threads_of_their_own(method: str) -> None:
+def test_child_processes_make_threads_of_their_own():
     in_shares(lambda *_: None, 2, threads=2)  # this process has some already
-    context = multiprocessing.get_context(method)
+    context = multiprocessing.get_context("fork")
     queue = context.Queue()
-    child = context.Process(target=_sum_in_child, args=(queue,))  # type: ignore[attr-defined]
+    child = context.Process(target=_sum_in_child, args=(queue,))
     child.start()
     assert queue.get(timeout=60) == [1.0, 2.0]
     child.join(timeout=60)
