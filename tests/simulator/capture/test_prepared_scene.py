@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import weakref
 from dataclasses import replace
 from random import Random
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,10 +22,12 @@ from simulator import (
     get_camera,
 )
 from simulator.camera import CameraProfile
+from simulator.capture import prepared_scene
 from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
 from simulator.capture.blurred_light import Denoised
 from simulator.capture.exposure import Exposure
 from simulator.networks.aperture_module import ApertureModule
+from simulator.noise.generator import Noise
 from simulator.raw.image import unpack_mosaic
 from tests.strategies import (
     SEEDS,
@@ -65,6 +67,7 @@ def variance(frame: Tensor) -> np.ndarray:
 
 
 TOLERANCE = 4 * math.sqrt(2) / SIDE
+ROUNDING = 1 / 12 / 14512**2  # variance of whole digital numbers
 
 
 def error_of(exposure: Exposure, name: str) -> float:
@@ -82,42 +85,26 @@ def prepared(
 # The noise-reduced light
 
 
-def test_denoised_light_is_used_where_the_source_is_noisier() -> None:
-    """ISO 6400 to 100 at the same exposure: 64 times the noise. The output has the target's."""
-    target = CameraSettings(100, 1.0, 8)
-    source = prepared()
+@pytest.mark.parametrize(
+    ("reference", "target", "denoised"),
+    [
+        (HIGH, CameraSettings(100, 1.0, 8), True),  # 64 times the noise that is wanted
+        (CameraSettings(100, 1.0, 8), HIGH, False),
+        (HIGH, HIGH, False),  # a network must not touch what is exact already
+    ],
+)
+def test_denoised_light_is_used_where_the_source_is_noisier(
+    reference: CameraSettings, target: CameraSettings, denoised: bool
+) -> None:
+    source = prepared(reference=reference)
     exposure = source.exposure(target)
-    assert exposure.denoised
-    assert exposure.source.is_zero
-    assert torch.equal(source.expected(target), flat(0.2))
+    assert exposure.denoised is exposure.source.is_zero is denoised
+    assert torch.equal(source.source_light(exposure), flat(0.2)) is denoised
     frame, excess = source.capture(target, 3)
-    assert excess == 0.0
-    np.testing.assert_allclose(
-        variance(frame), expected_variance(0.2, Z6.nlf(100)), rtol=TOLERANCE, atol=1 / 12 / 14512**2
-    )
-    assert source.plan(target).excess_noise == 0.0
-    assert source.output_noise(target) == Z6.nlf(100)
-
-
-def test_light_as_recorded_is_used_where_noise_is_only_to_be_added() -> None:
-    target = CameraSettings(6400, 1 / 64, 8)
-    source = prepared(reference=CameraSettings(100, 1.0, 8))
-    exposure = source.exposure(target)
-    assert not exposure.denoised
-    frame, excess = source.capture(target, 3)
-    assert excess == 0.0
-    np.testing.assert_allclose(
-        variance(frame), expected_variance(0.2, Z6.nlf(6400)), rtol=TOLERANCE
-    )
-
-
-def test_the_same_settings_give_the_recorded_light_back() -> None:
-    """No excess at ratio 1: a network must not touch what is exact already."""
-    source = prepared()
-    assert not source.exposure(HIGH).denoised
-    span, white = 14512, 15520  # its DNs as they were, unless they were clipped
-    kept = (source.light * span + 1008).round().clamp(0, white).sub(1008) / span
-    torch.testing.assert_close(source.capture(HIGH, 0)[0], kept, rtol=0, atol=1e-6)
+    assert excess == source.plan(target).excess_noise == 0.0
+    wanted = expected_variance(0.2, Z6.nlf(target.iso)) + ROUNDING
+    np.testing.assert_allclose(variance(frame), wanted, rtol=TOLERANCE)
+    assert source.output_noise(target) == Z6.nlf(target.iso)
 
 
 @pytest.mark.parametrize(("tolerance", "denoised"), [(0.13, False), (0.12, True), (0.0, True)])
@@ -147,21 +134,6 @@ def test_a_source_with_next_to_no_noise_keeps_it() -> None:
     dark = prepared(0.01, LOW).exposure(CameraSettings(100, 1 / 16, 8))  # 3 % of the light
     assert (bright.denoised, dark.denoised) == (False, True)
     assert bright.source_noise.shot == pytest.approx([4 * s for s in Z6.nlf(100).shot])
-
-
-def test_without_a_noise_module_the_excess_is_declared() -> None:
-    target = CameraSettings(100, 1.0, 8)
-    source = prepared(denoised=None)
-    assert not source.exposure(target).denoised
-    wanted, given = (expected_variance(0.2, Z6.nlf(iso)) for iso in (100, 6400))
-    stated = source.plan(target).excess_noise
-    assert stated == pytest.approx(float((given / wanted - 1).mean()), rel=0.02)
-    assert source.capture(target, 0)[1] == pytest.approx(stated, rel=1e-4)
-
-
-def test_the_denoised_light_has_the_shape_of_the_light() -> None:
-    with pytest.raises(ValueError, match=r"`denoised` \(shape \(4, 8, 8\)\) must have the shape"):
-        prepared(denoised=Denoised(torch.zeros(4, 8, 8)))
 
 
 def test_noise_is_compared_with_the_averaged_sensors() -> None:
@@ -206,7 +178,7 @@ def test_noise_that_the_blur_removed_is_topped_up(diameter: float, level: float)
     assert (blurred < 0.75 * expected_variance(level, Z6.nlf(6400))).all()  # it did remove some
     frame, excess = source.capture(target, 9)
     assert excess == 0.0
-    wanted = expected_variance(level, Z6.nlf(6400)) + 1 / 12 / 14512**2
+    wanted = expected_variance(level, Z6.nlf(6400)) + ROUNDING
     inner = frame[:, 16:, 16:]
     np.testing.assert_allclose(variance(inner), wanted, rtol=1.6 * TOLERANCE)
     assert inner.double().mean() == pytest.approx(level, rel=0.01)
@@ -218,26 +190,14 @@ def test_the_denoised_light_is_opened_where_the_target_is_cleaner() -> None:
     exposure = source.exposure(target)
     assert (exposure.denoised, exposure.opened_to, exposure.remaining_variance) == (True, 4.0, None)
     torch.testing.assert_close(source.expected(target)[:, 16:, 16:], flat(0.2)[:, 16:, 16:])
-    frame, _ = source.capture(target, 3)
-    np.testing.assert_allclose(
-        variance(frame[:, 16:, 16:]),
-        expected_variance(0.2, Z6.nlf(100)),
-        rtol=TOLERANCE,
-        atol=1 / 12 / 14512**2,
-    )
 
 
-@pytest.mark.parametrize("f_number", [8, 11, 16])
-def test_the_same_and_smaller_apertures_leave_every_bit(f_number: float) -> None:
+@pytest.mark.parametrize(("f_number", "diameter"), [(8, 9.0), (16, 9.0), (4, 0.0)])
+def test_smaller_apertures_and_what_is_in_focus_leave_every_bit(
+    f_number: float, diameter: float
+) -> None:
     target = CameraSettings(6400, 1 / 64 * 2 ** ((f_number - 8) / 8), f_number)
-    source, plain = with_aperture_blur(prepared(), 9.0), prepared()
-    assert source.exposure(target).opened_to is None
-    assert torch.equal(source.capture(target, 1)[0], plain.capture(target, 1)[0])
-
-
-def test_what_is_in_focus_stays_as_it_is() -> None:
-    target = CameraSettings(6400, 1 / 256, 4)
-    source, plain = with_aperture_blur(prepared(), 0.0), prepared()
+    source, plain = with_aperture_blur(prepared(), diameter), prepared()
     assert source.exposure(target).opened_to is None
     assert torch.equal(source.capture(target, 1)[0], plain.capture(target, 1)[0])
 
@@ -289,7 +249,7 @@ def test_blur_of_a_wave_by_hand(blur: str, factor: float) -> None:
     assert applied == (pytest.approx(0.4) if factor < 1 else 0.0)
 
 
-@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 0.01, 0.1, 0.3, 1.0, 10.0])
+@pytest.mark.parametrize("tolerance", [0.0, 1e-4, 0.1, 10.0])
 def test_what_is_left_out_stays_within_the_tolerance(tolerance: float) -> None:
     """Over all kinds of transitions of a textured, noisy, moving scene of unknown depth."""
     rng = np.random.default_rng(2)
@@ -341,83 +301,91 @@ def test_copies_share_what_is_known_of_the_light() -> None:
 # Sweeps
 
 
-STATES = [
-    CameraSettings(iso, time, f_number)
-    for iso, time, f_number in itertools.product((100, 6400), (1 / 500, 1 / 8), (4, 8, 16))
-]
-
-
 @pytest.mark.parametrize("noise", ["exact", "bank"])
-@pytest.mark.parametrize("scene", [{}, {"image_speed": 0.2, "defocus": 2.0}])
-def test_frames_are_the_same_alone_and_in_any_sweep(noise: str, scene: dict) -> None:
-    source = with_aperture_blur(with_detail(prepared(**scene)), 2.0)
-    sweep = source.expose(STATES, seed=4, noise=noise)  # type: ignore[arg-type]
-    backwards = source.expose(STATES[::-1], seed=4, noise=noise)  # type: ignore[arg-type]
-    assert torch.equal(sweep.flip(0), backwards)
-    for frame, streamed, settings in zip(
-        sweep,
-        source.stream(STATES, seed=4, noise=noise),  # type: ignore[arg-type]
-        STATES,
-        strict=True,
-    ):
-        assert torch.equal(frame, streamed)
-        assert torch.equal(frame, source.capture(settings, 4, noise=noise)[0])  # type: ignore[arg-type]
-    assert not torch.equal(sweep, source.expose(STATES, seed=5, noise=noise))  # type: ignore[arg-type]
-
-
-def test_noise_from_the_bank_has_the_right_variance() -> None:
-    source = prepared(nlf=NoiseLevelFunction.zero(), light=flat(0.2), denoised=None)
-    frame, _ = source.capture(HIGH, 1, noise="bank")
-    np.testing.assert_allclose(
-        variance(frame), expected_variance(0.2, Z6.nlf(6400)), rtol=TOLERANCE
+def test_frames_are_the_same_alone_and_in_a_sweep_whatever_is_blurred(
+    noise: Noise, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the light of all states is too large to be held at once."""
+    source = with_aperture_blur(with_detail(prepared(image_speed=0.2, defocus=2.0)), 2.0)
+    states = list(
+        itertools.starmap(CameraSettings, itertools.product((100, 6400), (1 / 500, 1 / 8), (4, 16)))
     )
-    assert not torch.equal(frame, source.capture(HIGH, 1)[0])
+    sweep = source.expose(states, seed=4, noise=noise)
+    for frame, settings in zip(sweep, states, strict=True):
+        assert torch.equal(frame, source.capture(settings, 4, noise=noise)[0])
+    assert not torch.equal(sweep, source.expose(states, seed=5, noise=noise))
+    monkeypatch.setattr(prepared_scene, "_TOGETHER_BYTES", 0)
+    assert torch.equal(source.expose(states, seed=4, noise=noise), sweep)
 
 
-def test_unknown_noise() -> None:
-    with pytest.raises(ValueError, match=r"`noise` \(='none'\) must be one of \['exact', 'bank'\]"):
-        prepared().capture(HIGH, noise="none")  # type: ignore[arg-type]
+def test_a_stream_takes_states_one_by_one_and_keeps_no_frame() -> None:
+    taken: list[CameraSettings] = []
+    frames = prepared().stream(taken.append(state) or state for state in (LOW, HIGH))  # type: ignore[func-returns-value]
+    assert not taken
+    frame = next(frames)
+    assert taken == [LOW]
+    kept = weakref.ref(frame)
+    del frame
+    assert kept() is None
+    assert len(list(frames)) == 1
 
 
-def test_no_states_no_frames() -> None:
-    assert prepared().expose([]).shape == (0, 4, SIDE, SIDE)
+def test_light_of_each_state_and_of_each_row() -> None:
+    """Flickering light: half of it in one state, and in the lower rows of the other."""
+    source = prepared(nlf=NoiseLevelFunction.zero(), denoised=None, light=flat(0.2))
+    gain, rows = np.array([0.5, 1.0]), np.ones((2, SIDE))
+    rows[1, 64:] = 0.25
+    wanted = [[0.2 / 64 / 2, 0.2 / 64 / 2], [0.2, 0.05]]
+    source = replace(source, reference=HIGH)
+    found = source.expected_sweep([LOW, HIGH], gain=gain, row_gain=rows)
+    np.testing.assert_allclose(found[:, 0, [0, -1], 0], wanted, rtol=1e-6)
+    assert torch.equal(source.expected_sweep([LOW])[0], source.expected(LOW))
+    frames = source.expose([LOW, HIGH], gain=gain, row_gain=rows)
+    for state, frame in enumerate(frames):
+        halves = frame[:, :64].mean(), frame[:, 64:].mean()
+        np.testing.assert_allclose(halves, wanted[state], rtol=0.01)
 
 
 def test_frames_are_written_where_they_are_wanted() -> None:
-    states = [CameraSettings(100, 1 / 64, 4.0), CameraSettings(800, 1 / 8, 4.0)]
     place = torch.full((3, 4, SIDE, SIDE), -7.0)
-    frames = prepared().expose(states, seed=3, out=place[1:])
+    frames = prepared().expose([LOW, HIGH], seed=3, out=place[1:])
     assert frames.data_ptr() == place[1:].data_ptr()
-    assert torch.equal(frames, prepared().expose(states, seed=3))
+    assert torch.equal(frames, prepared().expose([LOW, HIGH], seed=3))
     assert bool((place[0] == -7.0).all())
+    assert prepared().expose([]).shape == (0, 4, SIDE, SIDE)
 
 
 @pytest.mark.parametrize(
-    "out",
+    ("arguments", "rule"),
     [
-        torch.empty(1, 4, SIDE, SIDE),
-        torch.empty(2, 4, SIDE, SIDE, dtype=torch.float64),
-        torch.empty(2, 4, SIDE, 2 * SIDE)[..., ::2],
+        ({"states": [HIGH, 3]}, "`states` .*must be several CameraSettings"),
+        ({"states": HIGH}, "`states` .*must be several CameraSettings"),
+        ({"noise": "none"}, r"`noise` \(='none'\) must be one of \['exact', 'bank'\]"),
+        ({"out": [1]}, "`out` .=list. must be a torch tensor"),
+        *(
+            ({"out": out}, r"`out` .*must be contiguous float32 \(1, 4.*without gradient")
+            for out in (
+                torch.empty(2, 4, SIDE, SIDE),
+                torch.empty(1, 4, SIDE, SIDE, dtype=torch.float64),
+                torch.empty(1, 4, SIDE, 2 * SIDE)[..., ::2],
+                torch.empty(1, 4, SIDE, SIDE, requires_grad=True),
+            )
+        ),
     ],
 )
-def test_frames_do_not_fit_everywhere(out: torch.Tensor) -> None:
-    states = [CameraSettings(100, 1 / 64, 4.0)] * 2
-    with pytest.raises(ValueError, match=r"`out` .*must be contiguous float32 \(2, 4"):
-        prepared().expose(states, out=out)
+def test_bad_sweeps_are_refused(arguments: dict, rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        prepared().expose(**{"states": [HIGH], **arguments})
 
 
-def test_only_settings_are_exposed_and_never_into_the_light() -> None:
+def test_light_is_not_overwritten_and_its_noise_free_twin_has_its_shape() -> None:
     own = prepared()
-    with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
-        own.expose([HIGH, 3])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match=r"`states` .*must be several CameraSettings"):
-        own.expose(HIGH)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"`out` .=list. must be a torch tensor"):
-        own.expose([HIGH], out=[1])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="`out` must not be the memory of the light"):
         own.expose([HIGH], out=own.light[None])
-    with pytest.raises(ValueError, match="without gradient"):
-        own.expose([HIGH], out=torch.empty(1, 4, SIDE, SIDE, requires_grad=True))
+    with pytest.raises(ValueError, match=r"`denoised` \(shape \(4, 8, 8\)\) must have the shape"):
+        prepared(denoised=Denoised(torch.zeros(4, 8, 8)))
+    with pytest.raises(ValueError, match=r"`denoised` \(=Tensor\) must be Denoised or None"):
+        prepared(denoised=own.light)
 
 
 ANY_SETTINGS = settings_within()
@@ -483,8 +451,8 @@ def test_a_frame_is_the_same_alone_in_a_sweep_and_in_any_order(
     fields: dict[str, float],
     is_noisy: bool,
     seed: int,
-    noise: Any,
-    random: Any,
+    noise: Noise,
+    random: Random,
 ) -> None:
     nlf = camera.nlf(reference.iso) if is_noisy else None
     source = any_prepared(light, reference, camera, nlf, **fields)
