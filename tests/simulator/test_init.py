@@ -18,5 +18,8 @@ def test_public_names_are_all_there_is_and_load_when_used() -> None:
     assert sorted(listed) == simulator.__all__
     with pytest.raises(AttributeError, match="module 'simulator' has no attribute 'Raw'"):
         simulator.Raw  # noqa: B018
-    program = "import sys, simulator; assert not {'torch', 'numpy'} & set(sys.modules)"
+    program = (
+        "import sys, simulator; assert not {'torch', 'numpy'} & set(sys.modules); "
+        "import ae_env; assert not {'torch', 'numba'} & set(sys.modules)"
+    )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -22,10 +22,8 @@ from simulator.capture.sensor import (
     clip_and_quantise,
     noise_balance,
     record,
-    record_stepwise,
     sensor_light,
 )
-from simulator.noise.generator import Noise
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
@@ -265,40 +263,6 @@ def test_blur_averages_the_noise_of_the_source() -> None:
     count = capture.numel() / 12
     expected = 1e-4 + 1 / 12 / SPAN**2
     assert float(capture.double().var()) == pytest.approx(expected, rel=5 * math.sqrt(2 / count))
-
-
-def recorded(
-    light: torch.Tensor, exposure: Exposure, key: int, noise: Noise = "exact"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """One frame (4, H, W) by the fused kernel, and by the steps one by one."""
-    transitions, keys = Transitions.of([light], [exposure]), np.array([key], np.uint64)
-    fused, steps = torch.empty(1, *light.shape), torch.empty(1, *light.shape)
-    record(transitions, Z6, keys=keys, noise=noise, signals=fused)
-    record_stepwise(transitions, Z6, keys, noise, steps)
-    return fused[0], steps[0]
-
-
-@pytest.mark.parametrize("noise", ["exact", "bank"])
-@pytest.mark.parametrize("noisy_source", [False, True])
-@pytest.mark.parametrize("blurred_noise", [False, True])
-@pytest.mark.parametrize("iso", [100, 6400])
-def test_the_kernel_has_the_missing_variance_of_the_steps(
-    iso: float, noisy_source: bool, blurred_noise: bool, noise: Noise
-) -> None:
-    """Within one digital number, where float32 decides a tie the other way."""
-    rng = np.random.default_rng(0)
-    light = torch.from_numpy(rng.normal(0.3, 0.4, (4, 96, 96)).astype(np.float32))
-    light[:, 0] = torch.tensor([-1e30, 1e30, 3e38, 0.0]).repeat(24)
-    before = light.clone()
-    source = Z6.nlf(400) if noisy_source else NoiseLevelFunction.zero()
-    remaining = torch.rand(96, 96, generator=torch.Generator().manual_seed(1))
-    share = remaining if blurred_noise else None
-    exposure = Exposure(1.3, source, Z6.nlf(iso), motion_px=3.0, remaining_variance=share)
-    fused, steps = recorded(light, exposure, 3, noise)
-    difference = ((fused - steps).double() * SPAN).abs().round()
-    assert difference.max() <= 1
-    assert float((difference > 0).double().mean()) <= 1e-4
-    assert torch.equal(light, before)
 
 
 def test_bands_come_before_the_noise() -> None:
