@@ -24,9 +24,7 @@ from simulator.capture.blurred_light import Denoised
 from simulator.capture.exposure import Exposure, Step
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.plan import (
-    BIAS,
     DEFAULT_TOLERANCE,
-    GAMMA,
     Situation,
     check_tolerance,
     decide,
@@ -48,9 +46,8 @@ from tests.strategies import (
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)
 CLEANER = CameraSettings(100, 1 / 4, 8)
-BRIGHTER = CameraSettings(100, 4, 8)
 OPENER = CameraSettings(1600, 1 / 256, 4)
-STEPS = {
+STEPS = [
     "exposure",
     "noise_reduction",
     "aperture",
@@ -58,65 +55,96 @@ STEPS = {
     "motion_blur",
     "noise",
     "clip_and_quantise",
-}
+]
+ZERO = NoiseLevelFunction.zero()
 
 
-def prepared(*, networks: bool = True, **changes: object) -> PreparedScene:
+def prepared(*, networks: bool = True, diameter: float = 2.0, **changes: object) -> PreparedScene:
     light = torch.rand(4, 16, 20, generator=torch.Generator().manual_seed(0)) * 0.3
     made = PreparedScene(light, SOURCE, Z6, Z6.nlf(1600))
     if networks:
-        made = replace(made, denoised=Denoised(light))
-        made = replace(
-            made,
-            aperture_blur=MapApertureBlur(light, made.denoised, torch.full((16, 20), 2.0), 8.0),
-        )
+        denoised, found = Denoised(light), torch.full((16, 20), diameter)
+        blur = MapApertureBlur(light, denoised, found, 8.0)
+        made = replace(made, denoised=denoised, aperture_blur=blur)
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
 @pytest.mark.parametrize("networks", [True, False])
-def test_every_step_runs_or_has_a_reason(settings: CameraSettings, networks: bool) -> None:
-    plan = prepared(networks=networks).plan(settings)
-    assert set(plan.modules) | set(plan.left_out) == STEPS
-    assert not set(plan.modules) & set(plan.left_out)
+@pytest.mark.parametrize("tolerance", [0.0, 0.1, 5.0])
+def test_every_step_runs_or_has_a_reason(
+    settings: CameraSettings, networks: bool, tolerance: float
+) -> None:
+    plan = prepared(networks=networks, tolerance=tolerance, image_speed=1e-3).plan(settings)
+    assert [step.name for step in plan.steps] == STEPS
+    assert plan.modules == tuple(s.name for s in plan.steps if s.runs)
+    assert plan.left_out == {s.name: s.reason for s in plan.steps if not s.runs}
     assert all(plan.left_out.values())
+    assert plan.operations == sum(s.operations for s in plan.steps)
+    assert all(s.error == 0 if s.runs else s.operations == 0 for s in plan.steps)
+    assert plan.tolerance == tolerance
+    assert plan.predicted_error == pytest.approx(math.sqrt(sum(s.error**2 for s in plan.steps)))
+    assert not networks or plan.predicted_error <= tolerance
+    assert plan.predicted_difference >= plan.predicted_error * networks
 
 
 def test_the_networks_run_where_they_are_needed() -> None:
-    """In the order of the pipeline."""
-    cleaner, opener = prepared().plan(CLEANER), prepared().plan(OPENER)
-    assert cleaner.modules == ("exposure", "noise_reduction", "noise", "clip_and_quantise")
-    assert opener.modules == ("exposure", "aperture", "noise", "clip_and_quantise")
-    both = prepared().plan(CameraSettings(100, 1 / 16, 4))
-    assert both.modules[:3] == ("exposure", "noise_reduction", "aperture")
+    first, last = ("exposure",), ("noise", "clip_and_quantise")
+    for settings, modules in (
+        (CLEANER, ("noise_reduction",)),
+        (OPENER, ("aperture",)),
+        (CameraSettings(100, 1 / 16, 4), ("noise_reduction", "aperture")),
+    ):
+        assert prepared().plan(settings).modules == first + modules + last
 
 
 @pytest.mark.parametrize(
-    ("changes", "settings", "step", "reason"),
+    ("changes", "settings", "line"),
     [
-        ({"networks": False}, CLEANER, "noise_reduction", "no noise module"),
-        ({"nlf": NoiseLevelFunction.zero()}, CLEANER, "noise_reduction", "carries no noise"),
-        ({}, OPENER, "noise_reduction", "at least as noisy"),
-        ({"networks": False}, OPENER, "aperture", "`depth` is not 'unknown'"),
-        ({}, CLEANER, "aperture", "does not open"),
-        ({"aperture_blur": None}, CLEANER, "defocus", "far or in focus"),
-        ({}, CLEANER, "defocus", "each pixel's was estimated"),
+        ({"networks": False}, CLEANER, "left out  noise_reduction: the simulator has no noise"),
+        ({"nlf": ZERO}, CLEANER, "left out  noise_reduction: the source carries no noise"),
+        ({}, OPENER, "left out  noise_reduction: the target is at least as noisy: noise is added"),
+        ({"tolerance": 9}, CLEANER, "left out  noise_reduction: the source is hardly noisier"),
+        (
+            {"tolerance": 9, "noise": False},
+            OPENER,
+            "left out  noise_reduction: the source's noise is small against the target's",
+        ),
         (
             {"nlf": Z6.nlf(100).scaled(0.1)},
-            BRIGHTER,
-            "noise_reduction",
-            "network's own error is as large",
+            CameraSettings(100, 4, 8),
+            "left out  noise_reduction: the source has so little noise that the network's own",
         ),
-        ({"defocus": 1e-4}, CLEANER, "defocus", "pixel wide, which would hardly show"),
-        ({}, CLEANER, "motion_blur", "does not move"),
-        ({"image_speed": 1e-6}, CLEANER, "motion_blur", "which would hardly show"),
-        ({}, SOURCE, "noise", "has the target's already"),
+        ({"networks": False}, OPENER, "left out  aperture: no defocus was estimated: `depth` is"),
+        ({}, CLEANER, "left out  aperture: the aperture does not open"),
+        ({"diameter": 0.0}, OPENER, "left out  aperture: the picture was found to be in focus"),
+        ({"tolerance": 900}, OPENER, "left out  aperture: the blur that opening adds (up to 3.5 "),
+        ({"aperture_blur": None}, CLEANER, "left out  defocus: the scene is taken as far"),
+        ({}, CLEANER, "left out  defocus: none is given for the whole frame: each pixel's was"),
+        ({"defocus": 1e-4}, CLEANER, "left out  defocus: the defocus disc is 5e-05 pixel wide, "),
+        ({}, CLEANER, "left out  motion_blur: the image does not move"),
+        ({"image_speed": 1e-6}, CLEANER, "left out  motion_blur: the image moves by 4e-06 pixel "),
+        ({}, SOURCE, "left out  noise: no pixel lacks noise: the source has the target's already"),
+        ({"noise": False}, SOURCE, "left out  noise: only the light is asked for"),
+        ({"noise": False}, SOURCE, "left out  clip_and_quantise: only the light is asked for"),
+        ({}, CLEANER, "needed    noise_reduction: the source is noisier than the target; leaving"),
+        ({"tolerance": 0}, OPENER, "needed    noise_reduction: tolerance 0 takes no noisy pixel"),
+        ({"noise": False}, CLEANER, "needed    noise_reduction: no noise of the target's is there"),
+        ({}, OPENER, "needed    aperture: the aperture opens and adds blur (up to 3.5 pixel); lea"),
+        ({"defocus": 3}, CLEANER, "needed    defocus: the defocus disc is 1.5 pixel wide; leaving"),
+        (
+            {"image_speed": 0.25, "tolerance": 0},
+            CLEANER,
+            "needed    motion_blur: the image moves by 1 pixel during the exposure",
+        ),
     ],
 )
-def test_reasons(changes: dict, settings: CameraSettings, step: str, reason: str) -> None:
-    plan = prepared(**changes).plan(settings)
-    assert reason in plan.left_out[step]
-    assert f"left out  {step}: {plan.left_out[step]}" in str(plan)
+def test_reasons(changes: dict, settings: CameraSettings, line: str) -> None:
+    scene = {name: value for name, value in changes.items() if name != "noise"}
+    text = str(prepared(**scene).plan(settings, noise=changes.get("noise", True)))
+    assert f"\n  {line}" in text
+    assert all(name in text for name in STEPS)
+    assert max(map(len, text.splitlines())) < 140
 
 
 def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
@@ -142,10 +170,13 @@ def test_blur_of_the_aperture_lowers_the_predicted_excess() -> None:
 
 
 def test_operations_by_hand() -> None:
-    """Per sample: 2 + 1 + 4 + 2 (1 + 2^2) + 6 + 14 + 6, for a disc of 2.5 pixel."""
-    everything = prepared(tolerance=0.0, image_speed=0.2, defocus=2.5)
+    """Per sample: 2 + 1 + 4 + 2 (1 + 3^2) + 6 + 14 + 6, for a disc of 3.5 pixel."""
+    everything = prepared(tolerance=0.0, image_speed=0.2, defocus=3.5)
     plan = everything.plan(CameraSettings(6400, 1 / 64, 4))
-    assert [step.operations / (4 * 16 * 20) for step in plan.steps] == [2, 1, 4, 10, 6, 14, 6]
+    assert [step.operations / (4 * 16 * 20) for step in plan.steps] == [2, 1, 4, 20, 6, 14, 6]
+    assert "  cost      0.1 million operations" in plan.explain()
+    large = PreparedScene(torch.full((4, 500, 1000), 0.1), SOURCE, Z6, ZERO).plan(SOURCE)
+    assert large.explain().endswith("  cost      44.0 million operations")
 
 
 # Deciding on numbers alone
@@ -224,14 +255,17 @@ def test_tolerance_0_leaves_nothing_out() -> None:
 
 def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
     """The paper's aperture module needs the denoised light; its own blur is not known before."""
-    situation = Situation(
-        1.0, Z6.nlf(6400), Z6.nlf(100), 0.1, True, Statistics(5.0), lambda: pytest.fail("it ran")
-    )
-    made = decide(situation._replace(aperture_px=math.inf, opens=True, opens_denoised=True))
+    nlf, found = (Z6.nlf(6400), Z6.nlf(100)), Statistics(5.0, disc=0.01)
+    situation = Situation(1.0, *nlf, 0.1, True, found, lambda: pytest.fail("it ran"))
+    opens = situation._replace(aperture_px=math.inf, opens=True, opens_denoised=True)
+    made = decide(opens)
     assert [step.runs for step in made] == [True, True, False, False]
     assert "works on the noise-reduced light only" in made[0].reason
     assert made[1].reason == "the aperture opens and adds blur"
+    assert made[1].error == math.inf
     assert decide(situation)[0].runs
+    asked = opens._replace(defocus_px=2.0, denoised=lambda: Statistics(disc=0.02))
+    assert decide(asked)[2].error == pytest.approx(0.08)  # of the light that is blurred
 
 
 def test_tolerances() -> None:
@@ -247,27 +281,17 @@ def test_tolerances() -> None:
 # Steps and errors
 
 
-@pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER, CameraSettings(6400, 1, 4)])
-@pytest.mark.parametrize("tolerance", [0.0, 0.1, 5.0])
-def test_old_fields_follow_from_the_steps(settings: CameraSettings, tolerance: float) -> None:
-    plan = prepared(tolerance=tolerance, image_speed=1e-3).plan(settings)
-    assert plan.tolerance == tolerance
-    assert plan.modules == tuple(s.name for s in plan.steps if s.runs)
-    assert plan.left_out == {s.name: s.reason for s in plan.steps if not s.runs}
-    assert plan.operations == sum(s.operations for s in plan.steps)
-    assert plan.predicted_error == pytest.approx(math.sqrt(sum(s.error**2 for s in plan.steps)))
-    assert plan.predicted_error <= plan.tolerance
-    assert plan.predicted_difference >= plan.predicted_error
-    assert all(s.error == 0 for s in plan.steps if s.runs)
-    assert all(s.operations == 0 for s in plan.steps if not s.runs)
-
-
-def test_tolerance_nought_predicts_rounding_alone() -> None:
-    for settings in (SOURCE, CLEANER, OPENER):
-        plan = prepared(tolerance=0.0, image_speed=1e-3, defocus=0.1).plan(settings)
-        assert {"noise_reduction", "defocus", "motion_blur"} <= set(plan.modules)
-        assert plan.predicted_error == 0.0
-        assert plan.predicted_difference < 1e-3
+@pytest.mark.parametrize("settings", [SOURCE, CLEANER, OPENER])
+def test_tolerance_nought_predicts_rounding_alone(settings: CameraSettings) -> None:
+    """A millionth of the light, in units of the noise."""
+    source = prepared(tolerance=0.0, image_speed=1e-3, defocus=0.1)
+    plan, nlf = source.plan(settings), Z6.nlf(settings.iso)
+    assert {"noise_reduction", "defocus", "motion_blur"} <= set(plan.modules)
+    assert plan.predicted_error == 0.0
+    shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
+    signal = source.light.numpy() * exposure_ratio(SOURCE, settings)
+    level = math.sqrt((signal**2 / (read + shot * signal)).mean())
+    assert plan.predicted_difference == pytest.approx(level / 2**20, rel=0.02)
 
 
 def test_each_decision_says_what_it_costs() -> None:
@@ -287,33 +311,15 @@ def test_each_decision_says_what_it_costs() -> None:
     assert (
         "0.25 of the target's noise is due to what is left out (tolerance 0.3)" in loose.explain()
     )
-    # The network that did not run would itself have erred: by BIAS of 5e-3, and GAMMA of 0.2.
-    own = math.hypot(BIAS * 5e-3, GAMMA * 0.2) / 4e-3
+    # The network that did not run would itself have erred, by shares of noise and light.
+    own = math.hypot(0.35 * 5e-3, 0.015 * 0.2) / 4e-3
     assert loose.predicted_difference == pytest.approx(math.hypot(0.25, own), rel=1e-3)
     assert replace(made, denoised=None).plan(settings).predicted_error == pytest.approx(0.25)
 
 
-def test_the_light_alone_takes_neither_noise_nor_clip() -> None:
-    plan = prepared().plan(CLEANER, noise=False)
-    assert plan.modules == ("exposure", "noise_reduction")
-    for step in ("noise", "clip_and_quantise"):
-        assert plan.left_out[step] == "only the light is asked for"
-    assert plan.operations < prepared().plan(CLEANER).operations
-
-
-def test_the_text_names_every_step() -> None:
-    plan = prepared(tolerance=0.0, image_speed=1e-3).plan(OPENER)
-    text = plan.explain()
-    assert text == str(plan)
-    assert "needed    noise_reduction: tolerance 0" in text
-    assert "needed    aperture: the aperture opens and adds blur (up to 3.5 pixel)" in text
-    assert all(step in text for step in STEPS)
-    assert max(len(line) for line in text.splitlines()) < 140
-
-
 def test_regions_that_needed_no_network_count_against_the_full_run() -> None:
-    """A quarter of the frame is saturated and was left as it is: the full run errs by GAMMA of it,
-    and BIAS of the noise that it takes it to have."""
+    """A quarter of the frame is saturated and was left as it is: the full run errs by shares of it,
+    and of the noise that it takes it to have."""
     light = 0.2 + 0.01 * torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0))
     light[:, :16, :16] = 1.0
     denoised = torch.where(light == 1.0, 1.0, 0.19)
@@ -324,7 +330,7 @@ def test_regions_that_needed_no_network_count_against_the_full_run() -> None:
     given, wanted = (
         torch.tensor(n.read) + torch.tensor(n.shot) for n in (Z6.nlf(1600), Z6.nlf(100))
     )
-    square = (BIAS**2 * given + GAMMA**2) / wanted
+    square = (0.35**2 * given + 0.015**2) / wanted
     expected = math.sqrt(float(square.mean()) / 4)
     assert plan.predicted_difference == pytest.approx(expected, rel=1e-3)
     assert replace(made, tolerance=0.0).plan(CLEANER).predicted_difference < 1e-3
