@@ -29,44 +29,30 @@ def aperture_blur(diameter: float = 2.0 / math.sqrt(3)) -> MapApertureBlur:
     return MapApertureBlur(light(0), Denoised(light(1)), torch.full((24, 24), diameter), 8.0)
 
 
-def test_each_light_is_blurred_by_its_own_bank() -> None:
-    made = aperture_blur()
+def test_each_light_is_blurred_by_its_own_bank_and_cached() -> None:
+    made, kernel = aperture_blur(), torch.zeros(9, 9)
     for denoised in (False, True):
         result = made.opened(4.0, denoised=denoised)
         expected = disc_blur(light(int(denoised)), 2.0)
         torch.testing.assert_close(result, expected, atol=1e-5, rtol=0)
-
-
-def test_results_are_kept_by_f_number_and_light() -> None:
-    made = aperture_blur()
-    first = made.opened(4.0, denoised=False)
-    assert made.opened(4.0, denoised=False) is first
-    assert not torch.equal(made.opened(4.0, denoised=True), first)
-    assert not torch.equal(made.opened(5.6, denoised=False), first)
-
-
-def test_remaining_is_the_energy_of_the_added_blur() -> None:
-    kernel = torch.zeros(9, 9)
+        assert made.opened(4.0, denoised=denoised) is result
+        assert not torch.equal(made.opened(5.6, denoised=denoised), result)
     kernel[4, 4] = 1.0
-    energy = float(disc_blur(kernel, 2.0).square().sum())
-    remaining = aperture_blur().remaining_variance(4.0)
-    assert remaining.shape == (24, 24)
-    torch.testing.assert_close(remaining, torch.full((24, 24), energy), rtol=1e-5, atol=0)
+    energy = disc_blur(kernel, 2.0).square().sum()
+    remaining = made.remaining_variance(4.0)
+    torch.testing.assert_close(remaining, energy.expand(24, 24), rtol=1e-5, atol=0)
 
 
 def test_a_lamp_of_any_brightness_stays_finite() -> None:
-    bright = light()
-    bright[:, 12, 12] = 1e30
-    made = MapApertureBlur(bright, Denoised(bright), torch.full((24, 24), 3.0), 8.0)
-    result = made.opened(4.0, denoised=False)
-    assert bool(result.isfinite().all())
+    opened = []
+    for lamp in (0.0, 1e30):
+        scene = light()
+        scene[:, 12, 12] = lamp
+        made = MapApertureBlur(scene, Denoised(scene), torch.full((24, 24), 3.0), 8.0)
+        opened.append(made.opened(4.0, denoised=False))
+    assert bool(opened[1].isfinite().all())
     # A disc's 6 px away nothing of the lamp arrives, and nothing of the shadows is lost.
-    torch.testing.assert_close(
-        result[:, 3, 3],
-        MapApertureBlur(light(), Denoised(light()), torch.full((24, 24), 3.0), 8.0).opened(
-            4.0, denoised=False
-        )[:, 3, 3],
-    )
+    torch.testing.assert_close(opened[1][:, 3, 3], opened[0][:, 3, 3])
 
 
 def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> None:
@@ -87,13 +73,8 @@ def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> No
     assert not torch.equal(result, light())
 
 
-def whole(light: Tensor, diameter: Tensor, f_number: float) -> Tensor:
-    """The bank of discs on the whole frame at once."""
-    return DiscBank(light).blurred(added_blur(diameter, 8.0, f_number))
-
-
-@pytest.mark.parametrize("size", [(16, 16), (1, 40), (40, 1), (35, 91), (150, 133)])
-@pytest.mark.parametrize("tile", [16, 32, 768])
+@pytest.mark.parametrize("size", [(1, 40), (40, 1), (35, 91), (150, 133)])
+@pytest.mark.parametrize("tile", [32, 768])
 def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
     size: tuple[int, int], tile: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,7 +88,8 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
     made = MapApertureBlur(image, Denoised(image), diameter, 8.0)
     for f_number in (5.6, 2.8):
         result = made.opened(f_number, denoised=True)
-        torch.testing.assert_close(result, whole(image, diameter, f_number), rtol=0, atol=3e-6)
+        whole = DiscBank(image).blurred(added_blur(diameter, 8.0, f_number))
+        torch.testing.assert_close(result, whole, rtol=0, atol=3e-6)
         assert torch.equal(result[:, diameter == 0], image[:, diameter == 0])
         assert not torch.equal(result, image) or min(size) == 1
 

@@ -39,17 +39,14 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
     return calls
 
 
-def test_what_needs_no_blur_is_not_copied() -> None:
-    blurred_light = BlurredLight(LIGHT, CLEAN, None)
-    assert blurred_light.blurred(STILL) is LIGHT
-    assert blurred_light.blurred(replace(STILL, denoised=True)) is CLEAN.light
-
-
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
-    exposure = replace(STILL, defocus_px=2.0, motion_px=3.0, denoised=denoised)
-    expected = motion_blur(disc_blur(CLEAN.light if denoised else LIGHT, 2.0), 3.0)
-    assert torch.equal(BlurredLight(LIGHT, CLEAN, None).blurred(exposure), expected)
+    source, blurred_light = CLEAN.light if denoised else LIGHT, BlurredLight(LIGHT, CLEAN, None)
+    exposure = replace(STILL, denoised=denoised)
+    assert blurred_light.blurred(exposure) is source  # what needs no blur is not copied
+    exposure = replace(exposure, defocus_px=2.0, motion_px=3.0)
+    expected = motion_blur(disc_blur(source, 2.0), 3.0)
+    assert torch.equal(blurred_light.blurred(exposure), expected)
 
 
 def test_each_blur_is_made_once(made: list[tuple[str, float]]) -> None:
@@ -87,23 +84,16 @@ def test_the_opened_aperture_comes_first() -> None:
     assert not torch.equal(expected, motion_blur(CLEAN.light, 2.0))
 
 
-def test_blur_that_opening_adds() -> None:
+def test_blur_that_opening_adds_and_noise_that_it_leaves() -> None:
     """Squared diameters add: 2 pixels at f/8 take sqrt(16 - 4) more at f/4."""
-    blurred_light = BlurredLight(
-        LIGHT, None, MapApertureBlur(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
-    )
+    aperture_blur = MapApertureBlur(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
+    blurred_light, none = BlurredLight(LIGHT, None, aperture_blur), BlurredLight(LIGHT, None, None)
     assert blurred_light.added_blur(4.0) == pytest.approx(12**0.5)
     assert blurred_light.added_blur(8.0) == blurred_light.added_blur(16.0) == 0.0
-    assert BlurredLight(LIGHT, None, None).added_blur(1.4) == 0.0
-
-
-def test_noise_that_opening_leaves() -> None:
-    aperture_blur = MapApertureBlur(LIGHT, Denoised(LIGHT), torch.full((24, 20), 2.0), 8.0)
-    blurred_light = BlurredLight(LIGHT, None, aperture_blur)
+    assert none.added_blur(1.4) == 0.0
+    assert none.remaining_variance(4.0, 1.0) is None
     alone = aperture_blur.remaining_variance(4.0)
     assert torch.equal(blurred_light.remaining_variance(4.0, 1.0), alone)
-    torch.testing.assert_close(
-        blurred_light.remaining_variance(4.0, 0.5), (2 * alone).clamp(max=1.0)
-    )
-    assert blurred_light.remaining_variance(4.0, 0.5) is blurred_light.remaining_variance(4.0, 0.5)
-    assert BlurredLight(LIGHT, None, None).remaining_variance(4.0, 1.0) is None
+    half = blurred_light.remaining_variance(4.0, 0.5)
+    torch.testing.assert_close(half, (2 * alone).clamp(max=1.0))
+    assert blurred_light.remaining_variance(4.0, 0.5) is half

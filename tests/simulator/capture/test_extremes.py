@@ -19,18 +19,12 @@ STATES = [CameraSettings(100.0 * 2 ** (s / 2), 2 ** (s / 2), 4.0) for s in STOPS
 SHAPE = (4, 48, 48)
 
 
-def hot_pixel() -> torch.Tensor:
-    light = torch.zeros(SHAPE)
-    light[:, 24, 24] = 1e6
-    return light
-
-
 SIGNALS = {
     "zero": torch.zeros(SHAPE),
     "one digital number": torch.ones(SHAPE) / torch.tensor(CAMERA.span)[:, None, None],
     "as dark as black goes": -torch.tensor(CAMERA.pedestal)[:, None, None].expand(SHAPE),
     "white": torch.ones(SHAPE),
-    "hot pixel": hot_pixel(),
+    "hot pixels": (torch.arange(48) == 24).float().expand(SHAPE) * 1e6,
     "checkerboard": (torch.arange(48)[:, None] + torch.arange(48)).remainder(2).expand(SHAPE),
     "30 stops": torch.from_numpy(2.0 ** np.random.default_rng(0).uniform(-30, 0, SHAPE)),
     "light of 1e6": torch.full(SHAPE, 1e6),

@@ -13,7 +13,6 @@ from simulator.capture.light_statistics import SAMPLES, LightStatistics
 from simulator.optics.blur import disc_blur, motion_blur
 
 Z6 = get_camera("nikon_z6")
-ISOS = (100, 800, 6400)
 
 
 def natural(height: int = 96, width: int = 128, seed: int = 0) -> np.ndarray:
@@ -54,10 +53,12 @@ LIGHTS = {
 
 
 def exact(light: np.ndarray, ratio: float, dm: np.ndarray, ds: np.ndarray, iso: float) -> float:
-    target = Z6.nlf(iso)
-    shot, read = (np.array(v)[:, None, None] for v in (target.shot, target.read))
-    wanted = read + shot * ratio * np.maximum(light, 0.0)
-    return math.sqrt(((dm**2 + ds**2) / wanted).mean())
+    return math.sqrt(((dm**2 + ds**2) / variance(ratio * light, iso)).mean())
+
+
+def variance(signal: np.ndarray, iso: float) -> np.ndarray:
+    shot, read = (np.array(v)[:, None, None] for v in (Z6.nlf(iso).shot, Z6.nlf(iso).read))
+    return read + shot * np.maximum(signal, 0.0)
 
 
 def blur_error(
@@ -86,11 +87,7 @@ def test_excess_bounds_that_of_all_pixels_closely(name: str, ratio: float) -> No
     statistics = LightStatistics(tensor(light))
     for source, target in [(6400, 100), (400, 100), (100, 100), (100, 1600)]:
         first, second = Z6.nlf(source), Z6.nlf(target)
-        shot1, read1, shot2, read2 = (
-            np.array(v)[:, None, None] for v in (first.shot, first.read, second.shot, second.read)
-        )
-        given = ratio**2 * read1 + ratio**2 * shot1 * light
-        wanted = read2 + ratio * shot2 * light
+        given, wanted = ratio**2 * variance(light, source), variance(ratio * light, target)
         spread = np.maximum(np.sqrt(given) - np.sqrt(wanted), 0.0)
         expected = exact(light, ratio, np.zeros_like(light), spread, target)
         stated = statistics.excess_error(ratio, first, second)
@@ -116,20 +113,27 @@ def test_levels_in_units_of_the_noise() -> None:
     assert statistics.relative_level(3.0, Z6.nlf(400)) == pytest.approx(
         exact(light, 3.0, 3.0 * light, zero, 400), rel=0.01
     )
-    source = Z6.nlf(1600)
-    shot, read = (np.array(v)[:, None, None] for v in (source.shot, source.read))
-    deviation = 3.0 * np.sqrt(read + shot * light)
-    assert statistics.relative_noise(3.0, source, Z6.nlf(400)) == pytest.approx(
+    deviation = 3.0 * np.sqrt(variance(light, 1600))
+    assert statistics.relative_noise(3.0, Z6.nlf(1600), Z6.nlf(400)) == pytest.approx(
         exact(light, 3.0, zero, deviation, 400), rel=0.01
     )
 
 
+@pytest.mark.parametrize("ratio", [0.5, 3.0])
+def test_excess_variance_over_all_pixels(ratio: float) -> None:
+    """Of a source that is on the target's scale."""
+    light = LIGHTS["natural"]
+    expected = np.maximum(variance(ratio * light, 1600) / variance(ratio * light, 400) - 1.0, 0.0)
+    stated = LightStatistics(tensor(light)).relative_excess_variance(
+        ratio, Z6.nlf(1600), Z6.nlf(400)
+    )
+    assert stated == pytest.approx(expected.mean(), rel=0.01)
+
+
 def test_median_of_each_plane() -> None:
     light = LIGHTS["natural"] * np.array([1.0, 2.0, 3.0, -1.0])[:, None, None]
-    median = LightStatistics(tensor(light)).median
-    np.testing.assert_allclose(
-        median[:3], np.median(light[:3], axis=(1, 2)), rtol=0.03
-    )  # of a sample
+    median = LightStatistics(tensor(light)).median  # of a sample
+    np.testing.assert_allclose(median[:3], np.median(light[:3], axis=(1, 2)), rtol=0.03)
     assert median[3] == 0.0
 
 
@@ -144,24 +148,20 @@ def test_median_of_columns_that_repeat() -> None:
 
 
 @pytest.mark.parametrize("name", list(LIGHTS))
-@pytest.mark.parametrize("iso", ISOS)
+@pytest.mark.parametrize("iso", [100, 6400])
 def test_no_blur_moves_the_light_by_more_than_its_bound(name: str, iso: float) -> None:
     light = tensor(LIGHTS[name])
     statistics, target = LightStatistics(light), Z6.nlf(iso)
     still = light.double().numpy()
-    for extent in (0.05, 0.3, 1.0, 1.7, 2.5, 4.0, 9.0):
+    for extent in (0.05, 1.0, 2.5, 9.0):
         for ratio in (0.25, 4.0):
             for blurred, bound in (
                 (disc_blur(light, extent), blur_error(statistics, ratio, target, disc=extent)),
                 (motion_blur(light, extent), blur_error(statistics, ratio, target, extent)),
             ):
                 moved = blurred.double().numpy()
-                variances = [
-                    np.array(target.read)[:, None, None]
-                    + np.array(target.shot)[:, None, None] * np.maximum(ratio * x, 0.0)
-                    for x in (still, moved)
-                ]
-                ds = np.sqrt(variances[0]) - np.sqrt(variances[1])
+                before, after = variance(ratio * still, iso), variance(ratio * moved, iso)
+                ds = np.sqrt(before) - np.sqrt(after)
                 error = exact(still, ratio, ratio * (moved - still), ds, iso)
                 assert error <= bound * 1.001 + 1e-5, (extent, ratio)
 
@@ -189,11 +189,17 @@ def test_the_bound_is_close_for_small_blurs_of_smooth_light() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (3, 5)])
-def test_any_size(shape: tuple[int, int]) -> None:
+@pytest.mark.parametrize("extreme", [False, True])
+def test_any_size_and_light(shape: tuple[int, int], extreme: bool) -> None:
     light = np.random.default_rng(0).random((4, *shape))
+    if extreme:
+        light.reshape(4, -1)[:, :3] = np.array([3e38, -3e38, -0.07])[: light[0].size]
     statistics = LightStatistics(tensor(light))
-    assert statistics.excess_error(1.0, Z6.nlf(6400), Z6.nlf(100)) > 1.0
-    assert math.isfinite(float(blur_error(statistics, 1.0, Z6.nlf(100), 1.0, 1.0)))
+    for ratio in (1e-12, 1.0, 1e12):
+        error = statistics.excess_error(ratio, Z6.nlf(6400), Z6.nlf(100))
+        assert math.isfinite(error)
+        assert error > 1.0 or ratio < 1.0
+        assert 0.0 <= blur_error(statistics, ratio, Z6.nlf(100), 1.0, 1.0) < math.inf
 
 
 @pytest.mark.parametrize("shape", [(1024, 1024), (3, 4 * SAMPLES), (4 * SAMPLES, 3)])
@@ -209,15 +215,6 @@ def test_large_frames_are_sampled(shape: tuple[int, int]) -> None:
     expected = math.sqrt((laplacian**2).mean() / 1e-6) / 32
     # Of three rows only one is looked at, or of three columns two at the border.
     assert blur_error(statistics, 1.0, flat, 0.0, 1.0) == pytest.approx(expected, rel=0.25)
-
-
-def test_negative_and_enormous_light() -> None:
-    light = torch.zeros(4, 8, 8)
-    light[:, 0], light[:, 1], light[:, 2] = 3e38, -3e38, -0.07
-    statistics = LightStatistics(light)
-    for ratio in (1e-12, 1.0, 1e12):
-        assert math.isfinite(statistics.excess_error(ratio, Z6.nlf(6400), Z6.nlf(100)))
-        assert math.isfinite(float(blur_error(statistics, ratio, Z6.nlf(100), 1.0, 1.0)))
 
 
 def test_a_target_without_noise_sees_everything() -> None:
