@@ -1,17 +1,18 @@
-"""Noise of frames: keys, the bank, exact draws; against closed forms and published vectors.
+"""Noise of frames: keys, the bank, exact draws; against published vectors and Python's integers.
 
 Every bound is a sampling error of white noise.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-import subprocess
-import sys
+import struct
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
@@ -35,37 +36,38 @@ from simulator.settings import CameraSettings
 
 SHAPE = (4, 128, 128)
 PIXELS = math.prod(SHAPE)
+STEP, MASK = 0x9E3779B97F4A7C15, 2**64 - 1
 
 both = pytest.mark.parametrize("kind", ["exact", "bank"])
 
 
-def frames(kind: Noise, count: int, seed: int = 1) -> np.ndarray:
+def mixed(word: int) -> int:
+    """The finaliser of splitmix64."""
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & MASK
+    word = (word ^ word >> 27) * 0x94D049BB133111EB & MASK
+    return word ^ word >> 31
+
+
+def bits(number: float) -> int:
+    return int(struct.unpack("<Q", struct.pack("<d", number))[0])
+
+
+def key_of(seed: int, *numbers: float) -> int:
+    key = mixed(seed + STEP & MASK)
+    for number in numbers:
+        key = mixed((key ^ bits(number)) + STEP & MASK)
+    return key
+
+
+def frames(kind: Noise, count: int) -> np.ndarray:
     """(count, 4, 128, 128) noise of one rollout."""
-    return np.stack([normals(k, kind) for k in noise_keys(seed, np.arange(count))])
-
-
-def normals(key: int, kind: Noise, shape: tuple[int, int, int] = SHAPE) -> np.ndarray:
-    """Of one frame."""
-    return frame_normals(int(key), shape, kind)
-
-
-@both
-def test_a_frame_is_a_function_of_its_key_in_every_process(kind: Noise) -> None:
-    key = int(noise_keys(5, 2)[0])
-    np.testing.assert_array_equal(normals(key, kind), normals(key, kind))
-    assert (normals(key, kind) != normals(key + 1, kind)).mean() > 0.99
-    code = (
-        "from simulator.noise.generator import frame_normals, noise_keys\n"
-        f"noise = frame_normals(int(noise_keys(5, 2)[0]), (4, 16, 16), {kind!r})\n"
-        "print(noise.tobytes().hex())"
-    )
-    other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert bytes.fromhex(other.stdout.strip()) == normals(key, kind, (4, 16, 16)).tobytes()
+    keys = noise_keys(1, np.arange(count))
+    return np.stack([frame_normals(int(k), SHAPE, kind) for k in keys]).astype(np.float64)
 
 
 @both
 def test_frames_have_the_moments_of_a_normal(kind: Noise) -> None:
-    noise = frames(kind, 100).astype(np.float64)
+    noise = frames(kind, 50)
     n = noise.size
     assert abs(noise.mean()) < 5.0 / math.sqrt(n)
     # Standard errors of the k-th moment: sqrt(E x^2k - (E x^k)^2), 15 = E x^6 and so on.
@@ -74,125 +76,112 @@ def test_frames_have_the_moments_of_a_normal(kind: Noise) -> None:
     assert abs((noise**4).mean() - 3.0) < 5.0 * math.sqrt(96.0 / n)
 
 
-@both
-def test_one_frame_is_normally_distributed(kind: Noise) -> None:
-    """Distance of the distribution functions of a frame: 1.95 / sqrt(n) is its 99.9 % bound."""
-    for key in noise_keys(9, np.arange(5)):
-        distance = stats.kstest(normals(key, kind).ravel(), "norm").statistic
-        assert distance < 1.95 / math.sqrt(PIXELS)
-
-
-@both
-def test_frames_are_white_in_space(kind: Noise) -> None:
-    noise = frames(kind, 50).astype(np.float64)
+def test_the_bank_makes_frames_white_in_space_in_time_and_over_planes() -> None:
+    noise = frames("bank", 50)
+    pairs = [(noise[lag:], noise[:-lag]) for lag in (1, 2, 7)] + [(noise[:, 1:], noise[:, :-1])]
     for rows, columns in [(0, 1), (0, 2), (0, 16), (1, 0), (1, 1), (2, 0), (2, 3), (4, 0), (64, 0)]:
-        first = noise[..., rows:, columns:]
-        second = noise[..., : 128 - rows, : 128 - columns]
+        pairs.append((noise[..., rows:, columns:], noise[..., : 128 - rows, : 128 - columns]))
+    for first, second in pairs:
         assert abs((first * second).mean()) < 5.0 / math.sqrt(first.size)
 
 
-@both
-def test_frames_are_white_in_time_and_over_planes(kind: Noise) -> None:
-    noise = frames(kind, 100).astype(np.float64)
-    for lag in (1, 2, 7):
-        pairs = noise[lag:] * noise[:-lag]
-        assert abs(pairs.mean()) < 5.0 / math.sqrt(pairs.size)
-    across = noise[:, 1:] * noise[:, :-1]
-    assert abs(across.mean()) < 5.0 / math.sqrt(across.size)
-
-
-@both
-def test_no_shift_makes_two_frames_alike(kind: Noise) -> None:
+def test_no_shift_makes_two_frames_of_the_bank_alike() -> None:
     """Largest correlation of two frames over all 65,536 shifts, against that of white noise.
 
     The largest of n standard normals is near sqrt(2 ln n) = 4.7. A pair of blocks that share
     their samples adds 256 to a sum whose standard deviation is sqrt(65,536) = 256: one unit more.
     """
-    noise = frames(kind, 20).astype(np.float64).reshape(20, -1)
-    spectra = np.fft.rfft(noise)
-    for i in range(19):
-        correlation = np.fft.irfft(spectra[i].conj() * spectra[i + 1], n=PIXELS)
+    spectra = np.fft.rfft(frames("bank", 20).reshape(20, -1))
+    for first, second in itertools.pairwise(spectra):
+        correlation = np.fft.irfft(first.conj() * second, n=PIXELS)
         peak = np.abs(correlation).max() / math.sqrt(PIXELS)
         assert peak < math.sqrt(2.0 * math.log(PIXELS)) + 2.0
 
 
-# -- keys of sweeps -------------------------------------------------------------------------------
+# -- keys ------------------------------------------------------------------------------------------
+
+
+def test_keys_are_those_of_splitmix64() -> None:
+    """The first two outputs that its authors publish for the seed 1234567."""
+    keys = noise_keys(np.array([1234567, 1234567 + STEP], np.uint64))
+    assert keys.tolist() == [6457827717110365317, 3203168211198807973]
+
+
+@given(st.integers(0, MASK), st.lists(st.floats(allow_nan=False), max_size=4), st.integers(2, 40))
+def test_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: int) -> None:
+    expected = key_of(seed, *numbers)
+    batch = noise_keys(np.full(n, seed, np.uint64), *(np.full(n, v) for v in numbers))
+    assert batch.dtype == np.uint64
+    assert batch.tolist() == [expected] * n
+    last = np.arange(float(n))
+    assert noise_keys(seed, *numbers, last).tolist() == [key_of(seed, *numbers, x) for x in last]
 
 
 def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
-    base = CameraSettings(100, 1 / 64, 4.0)
-    others = [CameraSettings(200, 1 / 64, 4.0), CameraSettings(100, 1 / 32, 4.0)]
-    others.append(CameraSettings(100, 1 / 64, 5.6))
-    keys = [*sweep_keys(7, [base, *others]), *sweep_keys(8, [base, *others])]
-    assert len(set(keys)) == 8
-    assert sweep_keys(np.int64(7), [others[1]])[0] == keys[2]
-    assert sweep_keys(2**64 - 1, [base]).dtype == np.uint64
+    given = [(100, 1 / 64, 4.0), (200, 1 / 64, 4.0), (100, 1 / 32, 4.0), (100, 1 / 64, 5.6)]
+    states = [CameraSettings(*values) for values in given]
+    for seed in (7, np.int64(8), MASK):
+        keys = sweep_keys(seed, states)  # type: ignore[arg-type]
+        assert keys.tolist() == [key_of(int(seed), *values) for values in given]
     assert len(sweep_keys(7, [])) == 0
 
 
-@pytest.mark.parametrize("seed", [-1, 1.5, "1", None, True, 2**64])
-def test_bad_seeds_are_named(seed: object) -> None:
-    with pytest.raises(ValueError, match="`seed`"):
-        sweep_keys(seed, [CameraSettings(100, 1 / 64, 4.0)])  # type: ignore[arg-type]
+def keys_of_no_state(seed: Any) -> np.ndarray:
+    return sweep_keys(seed, [])
 
 
-def test_a_key_is_a_function_of_its_numbers() -> None:
-    keys = noise_keys(np.array([3, 4, 3]), np.array([0, 0, 1]))
-    assert keys.dtype == np.uint64
-    assert len(set(keys.tolist())) == 3
-    assert keys[0] == noise_keys(3, 0)[0] == noise_keys(np.int64(3), 0.0)[0]
-    assert noise_keys(7, 100.0, 1 / 64, 4.0) != noise_keys(7, 100.0, 4.0, 1 / 64)
-    many = noise_keys(np.arange(1000).repeat(50), np.tile(np.arange(50), 1000))
-    assert len(np.unique(many)) == 50_000
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, "a"])
-def test_seeds_are_checked(seed: object) -> None:
-    with pytest.raises(ValueError, match="`seeds`"):
-        noise_keys(seed, 0)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("make", "seed"),
+    [
+        *itertools.product((keys_of_no_state, noise_generator, noise_keys), (-1, 1.5, "1", None)),
+        *itertools.product((keys_of_no_state, noise_generator), [True]),
+        (keys_of_no_state, 2**64),
+    ],
+)
+def test_bad_seeds_are_named(make: Callable[[Any], object], seed: object) -> None:
+    with pytest.raises(ValueError, match=r"`seeds?`"):
+        make(seed)
 
 
 # -- the bank itself ------------------------------------------------------------------------------
 
 
-def test_bank_holds_every_quantile_once() -> None:
+def test_the_bank_is_every_quantile_once_in_a_fixed_order() -> None:
     bank = noise_bank()
-    assert bank.shape == (BANK_SIZE + BLOCK,)
-    assert bank.dtype == np.float32
-    assert not bank.flags.writeable
-    np.testing.assert_array_equal(bank[BANK_SIZE:], bank[:BLOCK])
-    # The inverse of the distribution function, from another library, at a few of its quantiles.
-    ordered, at = np.sort(bank[:BANK_SIZE]), [0, 1, 1000, BANK_SIZE // 2, BANK_SIZE - 1]
-    quantiles = stats.norm.isf((np.array(at) + 0.5) / BANK_SIZE)[::-1]
-    np.testing.assert_allclose(ordered[BANK_SIZE - 1 - np.array(at)][::-1], quantiles, rtol=1e-6)
+    assert (bank.shape, bank.dtype, bank.flags.writeable) == ((2**20 + 256,), np.float32, False)
+    np.testing.assert_array_equal(bank[2**20 :], bank[:256])
+    quantiles = stats.norm.ppf((np.arange(2**20) + 0.5) / 2**20)
+    np.random.default_rng(20210616).shuffle(quantiles)
+    np.testing.assert_allclose(bank[: 2**20], quantiles, rtol=1e-6)
 
 
-# -- repetition ------------------------------------------------------------------------------------
+@pytest.mark.parametrize("shape", [(2, 3, 200), (4, 1, 1)])
+def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, int]) -> None:
+    key, bank = key_of(5, 2.0), noise_bank()
+    size, turn = shape[1] * shape[2], 0
+    for plane in bank_normals(key, shape).reshape(shape[0], size):
+        for start in range(0, size, 256):
+            turn += 1
+            word = mixed(key + turn * STEP & MASK)
+            values = bank[word % 2**16 * 16 :][: min(256, size - start)]
+            np.testing.assert_array_equal(plane[start : start + 256], values * (-1) ** (word >> 63))
+    words = [mixed((key ^ 0x5851F42D4C957F2D) + turn * STEP & MASK) for turn in (1, 2, 3)]
+    expected = [float(bank[word % 2**20]) * (-1) ** (word >> 63) for word in words]
+    assert single_normals(np.array([key], np.uint64), 3).tolist() == [expected]
 
 
 def test_blocks_repeat_as_often_as_chance_has_it() -> None:
     """Pairs of blocks with the same start: n (n - 1) / 2 pairs, 65,536 starts."""
     count = 40
     blocks = frames("bank", count).reshape(count * PIXELS // BLOCK, BLOCK)
-    firsts = np.abs(blocks[:, :4]).astype(np.float64) @ [1.0, 1e3, 1e6, 1e9]
+    firsts = np.abs(blocks[:, :4]) @ [1.0, 1e3, 1e6, 1e9]
     _, times = np.unique(firsts, return_counts=True)
     pairs = (times * (times - 1) // 2).sum()
     expected = len(blocks) * (len(blocks) - 1) / 2 / (BANK_SIZE // STRIDE)
     assert pairs == pytest.approx(expected, abs=5.0 * math.sqrt(expected))
 
 
-# -- single normals -------------------------------------------------------------------------------
-
-
-def test_single_normals_are_normal_and_apart_from_the_frames() -> None:
-    keys = noise_keys(4, np.arange(20_000))
-    values = single_normals(keys, 2)
-    assert values.shape == (20_000, 2)
-    np.testing.assert_array_equal(values[7], single_normals(keys[7:8], 2)[0])
-    assert stats.kstest(values.ravel(), "norm").statistic < 1.95 / math.sqrt(values.size)
-    assert abs((values[:, 0] * values[:, 1]).mean()) < 5.0 / math.sqrt(len(values))
-    firsts = np.array([bank_normals(int(k), (1, 1, 1)).item() for k in keys[:4000]])
-    assert abs((firsts * values[:4000, 0]).mean()) < 5.0 / math.sqrt(4000)
+# -- exact draws -----------------------------------------------------------------------------------
 
 
 # From the test vectors that come with Random123 (Salmon et al. 2011).
@@ -253,70 +242,12 @@ def test_frames_end_inside_a_block() -> None:
     np.testing.assert_array_equal(part, whole[..., : 2 * BLOCK - 37])
 
 
-def test_tails_are_those_of_a_normal() -> None:
-    """Samples beyond 3, 4 and 5 standard deviations: their number is Poisson distributed."""
-    normals = np.abs(drawn_normals(2, (4, 2048, 2048)))
-    for limit, share in ((3.0, 2.6998e-3), (4.0, 6.3342e-5), (5.0, 5.7330e-7)):
-        expected = share * normals.size
-        assert (normals > limit).sum() == pytest.approx(expected, abs=5.0 * expected**0.5)
-
-
 # -- generators of torch ---------------------------------------------------------------------
 
 
-def test_the_same_key_gives_the_same_draws() -> None:
-    first, second = noise_generator(7, 100.0, 1 / 64), noise_generator(7, 100.0, 1 / 64)
-    assert torch.equal(torch.randn(100, generator=first), torch.randn(100, generator=second))
-
-
-@pytest.mark.parametrize(
-    ("first", "second"),
-    [
-        ((7,), (8,)),
-        ((7, 100.0, 200.0), (7, 200.0, 100.0)),
-        ((7, 1.0), (7, math.nextafter(1.0, 2.0))),
-        ((7, 0.0), (7, -0.0)),
-    ],
-)
-def test_different_keys_give_independent_draws(
-    first: tuple[int, ...], second: tuple[int, ...]
-) -> None:
-    n = 10_000
-    a = torch.randn(n, generator=noise_generator(*first), dtype=torch.float64)
-    b = torch.randn(n, generator=noise_generator(*second), dtype=torch.float64)
-    assert abs(float((a * b).mean())) < 5 / math.sqrt(n)
-
-
-def test_numpy_integers_are_seeds() -> None:
-    assert noise_generator(np.int64(5)).initial_seed() == noise_generator(5).initial_seed()
-    assert all(noise_generator(seed).initial_seed() < 2**63 for seed in range(8))
-
-
-@pytest.mark.parametrize("seed", [-1, 1.5, "1", None, True])
-def test_bad_seeds_of_generators_are_named(seed: object) -> None:
-    with pytest.raises(ValueError, match="`seed`"):
-        noise_generator(seed)  # type: ignore[arg-type]
-
-
-# -- for any input --------------------------------------------------------------------
-
-
-@given(
-    st.integers(0, 2**64 - 1),
-    st.lists(st.floats(allow_nan=False), max_size=4),
-    st.integers(2, 40),
-)
-def test_noise_keys_are_of_seed_and_numbers_alone(seed: int, numbers: list[float], n: int) -> None:
-    (key,) = noise_keys(seed, *numbers)
-    batch = noise_keys(np.full(n, seed, np.uint64), *(np.full(n, v) for v in numbers))
-    assert bool((batch == key).all())
-    others = np.arange(n, dtype=np.uint64) ^ np.uint64(seed)
-    keys = noise_keys(others, *numbers)
-    assert len(set(keys.tolist())) == n
-    assert keys[0] == key
-    if numbers:  # another last number, another key
-        last = np.arange(float(n))
-        assert len(set(noise_keys(seed, *numbers[:-1], last).tolist())) == n
-        assert noise_keys(seed, *numbers[:-1])[0] != key
-    planes = bank_normals(int(key), (4, 1, n))
-    assert np.array_equal(planes[:, 0, :1], bank_normals(int(key), (4, 1, 1))[:, 0])
+@pytest.mark.parametrize("key", [(), (100.0, 1 / 64), (1 / 64, 100.0), (0.0,), (-0.0,)])
+@pytest.mark.parametrize("seed", [0, 7, np.int64(7)])
+def test_generators_are_seeded_by_numpys_mixture_of_the_key(seed: int, key: tuple) -> None:
+    words = [int(seed), *map(bits, key)]
+    (state,) = np.random.SeedSequence(words).generate_state(1, np.uint64)
+    assert noise_generator(seed, *key).initial_seed() == int(state) // 2
