@@ -81,15 +81,6 @@ def test_adaptive_normalisation() -> None:
     torch.testing.assert_close(norm(x), 0.3 * x + 2.0 * (x - 0.5) / 2.0)
 
 
-def test_context_network_starts_as_the_identity() -> None:
-    net, image = ParameterConcatenation(width=12).eval(), normal(1, 4, 9, 7).abs()
-    last = net.body[-1]
-    assert isinstance(last, nn.Conv2d)
-    nn.init.dirac_(last.weight)
-    nn.init.zeros_(last.bias)  # type: ignore[arg-type]
-    torch.testing.assert_close(net(image, PARAMETERS[:1]), image)
-
-
 def test_receptive_field_of_the_published_table() -> None:
     """513 pixels (Chen et al. 2017, table 1)."""
     net = ParameterConcatenation(width=1).eval()

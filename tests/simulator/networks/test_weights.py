@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,27 +35,18 @@ def beside(path: Path, suffix: str) -> Path:
     return path.with_name(path.name + suffix)
 
 
-def rewrite(path: Path, change: Callable[[dict[str, torch.Tensor]], object]) -> None:
-    """Other tensors under a card whose hash is right again."""
-    file, card = beside(path, ".safetensors"), beside(path, ".json")
-    tensors = load_file(file)
-    change(tensors)
-    save_file(tensors, file)
-    digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    card.write_text(json.dumps({**json.loads(card.read_text()), "sha256": digest}))
-
-
-@pytest.mark.parametrize("ending", ["", ".safetensors", ".json"])
-def test_round_trip(saved: Path, modules: nn.ModuleDict, ending: str) -> None:
-    loaded, card = load_modules(beside(saved, ending))
+def test_round_trip(saved: Path, modules: nn.ModuleDict) -> None:
     assert sorted(p.name for p in saved.parent.iterdir()) == ["net-0.5.json", "net-0.5.safetensors"]
     expected = modules.state_dict()
-    assert list(loaded.state_dict()) == list(expected)
-    assert all(torch.equal(value, expected[name]) for name, value in loaded.state_dict().items())
-    assert not loaded.training
-    assert not any(p.requires_grad for p in loaded.parameters())
-    assert (card["preset"], card["note"]) == ("compact", "for a test")
-    assert card["parameters"] == sum(p.numel() for p in modules.parameters())
+    for ending in ("", ".safetensors", ".json"):
+        loaded, card = load_modules(beside(saved, ending))
+        state = loaded.state_dict()
+        assert list(state) == list(expected)
+        assert all(torch.equal(value, expected[name]) for name, value in state.items())
+        assert not loaded.training
+        assert not any(p.requires_grad for p in loaded.parameters())
+        assert (card["preset"], card["note"]) == ("compact", "for a test")
+        assert card["parameters"] == sum(p.numel() for p in modules.parameters())
 
 
 @pytest.mark.parametrize("position", [20, -1])
@@ -71,22 +61,18 @@ def test_one_changed_byte_is_noticed(saved: Path, position: int) -> None:
         load_modules(saved)
 
 
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [
-        (lambda tensors: tensors.update({"exposure.b": torch.zeros(3)}), "exposure.b"),
-        (lambda tensors: tensors.pop("exposure.w"), "exposure.w"),
-        (lambda tensors: tensors.update(surplus=torch.zeros(1)), "surplus"),
-    ],
-)
-def test_tensors_of_other_networks_are_refused(
-    saved: Path, change: Callable[[dict[str, torch.Tensor]], object], name: str
-) -> None:
-    rewrite(saved, change)
-    with pytest.raises(ValueError, match="do not fit the networks") as caught:
+@pytest.mark.parametrize("name", ["exposure.b", "exposure.w", "surplus"])
+def test_tensors_of_other_networks_are_refused(saved: Path, name: str) -> None:
+    """Under a card whose hash is right."""
+    file, card = beside(saved, ".safetensors"), beside(saved, ".json")
+    tensors = load_file(file)
+    if tensors.pop(name, None) is None or name == "exposure.b":
+        tensors[name] = torch.zeros(3)
+    save_file(tensors, file)
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    card.write_text(json.dumps({**json.loads(card.read_text()), "sha256": digest}))
+    with pytest.raises(ValueError, match=f"do not fit the networks.*{name}"):
         load_modules(saved)
-    assert name in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -110,18 +96,13 @@ def test_damaged_cards(saved: Path, card: str | dict[str, Any], message: str) ->
 
 
 @pytest.mark.parametrize("ending", [".json", ".safetensors"])
-def test_files_that_are_not_there_or_may_not_be_read(
-    saved: Path, monkeypatch: pytest.MonkeyPatch, ending: str
-) -> None:
-    def denied(self: Path) -> bytes:
-        raise PermissionError(13, "Permission denied", str(self))
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "read_bytes", denied)
-        with pytest.raises(ValueError, match=r"net-0.5'\) cannot be read: .*net-0.5.safetensors"):
-            load_modules(saved)
-    beside(saved, ending).unlink()
-    with pytest.raises(ValueError, match=re.escape(f"there is no {beside(saved, ending)}")):
+def test_files_that_are_not_there_or_cannot_be_read(saved: Path, ending: str) -> None:
+    file = beside(saved, ending)
+    file.unlink()
+    with pytest.raises(ValueError, match=re.escape(f"there is no {file}")):
+        load_modules(saved)
+    file.mkdir()
+    with pytest.raises(ValueError, match=r"there is no|cannot be read"):
         load_modules(saved)
 
 
