@@ -11,42 +11,28 @@ from hypothesis import strategies as st
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from tests.strategies import (
-    log_uniform,
+from tests.simulator.z6_noise import z6_noise
+from tests.strategies import log_uniform
+
+
+@pytest.mark.parametrize(
+    ("iso", "base", "extrapolated"),
+    [
+        *((iso, iso, False) for iso in (100, 400, 800, 1600, 6400)),
+        # The Z6 switches gain at ISO 800, where read noise falls: nothing is interpolated across.
+        *((iso, 400, False) for iso in (600, 799.99)),
+        *((iso, 100, True) for iso in (25, 50)),
+        *((iso, 6400, True) for iso in (12800, 409600)),
+    ],
 )
-
-# Retyped from the published table (shot and read of R, G, B): the Z6's DNG NoiseProfile tags.
-Z6 = {
-    100: (
-        (7.88891432059205e-06, 7.47234302281224e-06, 7.31670099946593e-06),
-        (5.71150998895191e-09, 5.73712214136873e-09, 5.59509111432998e-09),
-    ),
-    400: (
-        (3.25795376516365e-05, 3.09620813305867e-05, 2.95490959029526e-05),
-        (5.23908219573611e-08, 5.22487909303224e-08, 4.85513274723299e-08),
-    ),
-    800: (
-        (6.47394522011139e-05, 6.19623102159152e-05, 5.78805218585489e-05),
-        (2.34025221765005e-08, 2.22569604502207e-08, 1.94326385518926e-08),
-    ),
-    6400: (
-        (0.000536276798657206, 0.000529454489967193, 0.000460526436255436),
-        (6.94797157253651e-07, 7.25184811907467e-07, 7.1397833103636e-07),
-    ),
-}
-
-
-def planes(red_green_blue: tuple[float, float, float]) -> tuple[float, ...]:
-    red, green, blue = red_green_blue
-    return (red, green, green, blue)
-
-
-@pytest.mark.parametrize("iso", sorted(Z6))
-def test_z6_calibrated_isos_are_the_table(iso: int) -> None:
-    nlf = get_camera("nikon_z6").nlf(iso)
-    assert nlf.shot == pytest.approx(planes(Z6[iso][0]), rel=1e-12)
-    assert nlf.read == pytest.approx(planes(Z6[iso][1]), rel=1e-12)
-    assert not nlf.extrapolated
+def test_z6_is_the_table_and_scales_where_it_has_no_neighbours(
+    iso: float, base: int, extrapolated: bool
+) -> None:
+    """Shot noise scales with the ISO, read noise with its square."""
+    nlf, (shot, read) = get_camera("nikon_z6").nlf(iso), z6_noise(base)
+    assert nlf.shot == pytest.approx(iso / base * shot, rel=1e-12)
+    assert nlf.read == pytest.approx((iso / base) ** 2 * read, rel=1e-12)
+    assert nlf.extrapolated is extrapolated
 
 
 @pytest.mark.parametrize("iso", [100, 200, 400, 800, 1600, 3200, 6400])
@@ -72,34 +58,11 @@ def test_interpolation_is_log_log_inside_a_segment() -> None:
     assert nlf.shot[0] == pytest.approx(red, rel=1e-9)
 
 
-def test_interpolation_never_crosses_the_conversion_gain_step() -> None:
-    # The Z6 switches gain at ISO 800, where read noise falls. 600 is 1.5 times 400: shot noise
-    # scales with the ratio, read noise with its square.
-    nlf = get_camera("nikon_z6").nlf(600)
-    assert nlf.shot == pytest.approx([1.5 * v for v in planes(Z6[400][0])], rel=1e-12)
-    assert nlf.read == pytest.approx([2.25 * v for v in planes(Z6[400][1])], rel=1e-12)
-    assert not nlf.extrapolated  # inside the table's range
-    just_below = get_camera("nikon_z6").nlf(799.99)
-    assert just_below.read[1] == pytest.approx(4 * 5.22487909303224e-08, rel=1e-4)
-    assert get_camera("nikon_z6").nlf(800).read[1] == pytest.approx(2.22569604502207e-08)
-
-
 def test_a_segment_begins_at_its_iso_not_at_its_first_calibration() -> None:
     camera = replace(get_camera("nikon_z6"), segments=(700.0,))
     assert camera.nlf(699).read[1] == pytest.approx((699 / 400) ** 2 * 5.22487909303224e-08)
     assert camera.nlf(750).read[1] == pytest.approx((750 / 800) ** 2 * 2.22569604502207e-08)
     assert camera.nlf(750).shot[1] == pytest.approx(750 / 800 * 6.19623102159152e-05)
-
-
-@pytest.mark.parametrize(
-    ("iso", "base", "factor"),
-    [(25, 100, 0.25), (50, 100, 0.5), (12800, 6400, 2), (409600, 6400, 64)],
-)
-def test_extrapolation_is_flagged(iso: float, base: int, factor: float) -> None:
-    nlf = get_camera("nikon_z6").nlf(iso)
-    assert nlf.extrapolated
-    assert nlf.shot == pytest.approx([factor * v for v in planes(Z6[base][0])], rel=1e-12)
-    assert nlf.read == pytest.approx([factor**2 * v for v in planes(Z6[base][1])], rel=1e-12)
 
 
 def test_one_measurement_calibrates_a_camera() -> None:

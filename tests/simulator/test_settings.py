@@ -17,9 +17,7 @@ from simulator.settings import (
     sensor_signal,
     snap_exposure_time,
 )
-from tests.strategies import (
-    settings_within,
-)
+from tests.strategies import settings_within
 
 
 @pytest.mark.parametrize(

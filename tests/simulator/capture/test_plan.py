@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from simulator import (
     CameraSettings,
@@ -18,29 +16,15 @@ from simulator import (
     exposure_ratio,
     get_camera,
 )
-from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import Denoised
-from simulator.capture.exposure import Exposure, Step
+from simulator.capture.exposure import Step
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.plan import (
     DEFAULT_TOLERANCE,
     Situation,
     check_tolerance,
     decide,
-)
-from simulator.capture.sensor import Transitions, record_stepwise, sensor_light
-from simulator.noise.generator import sweep_keys
-from simulator.raw.image import unpack_mosaic
-from tests.strategies import (
-    SEEDS,
-    USUAL_SETTINGS,
-    cameras,
-    lights,
-    settings_within,
-)
-from tests.strategies import (
-    prepared as any_prepared,
 )
 
 Z6 = get_camera("nikon_z6")
@@ -334,59 +318,3 @@ def test_regions_that_needed_no_network_count_against_the_full_run() -> None:
     expected = math.sqrt(float(square.mean()) / 4)
     assert plan.predicted_difference == pytest.approx(expected, rel=1e-3)
     assert replace(made, tolerance=0.0).plan(CLEANER).predicted_difference < 1e-3
-
-
-SETTINGS = settings_within()
-
-
-# -- for any input --------------------------------------------------------------------
-
-
-@given(
-    lights(st.floats(-0.0625, 4.0, width=32)),
-    cameras(),
-    SETTINGS,
-    st.one_of(SETTINGS, USUAL_SETTINGS),
-    st.booleans(),
-    st.sampled_from([0.0, 0.3]),
-    st.sampled_from([0.0, 3.0]),
-    SEEDS,
-)
-def test_tolerance_0_leaves_out_only_what_changes_no_pixel(
-    light: torch.Tensor,
-    camera: CameraProfile,
-    reference: CameraSettings,
-    settings: CameraSettings,
-    is_noisy: bool,
-    image_speed: float,
-    defocus: float,
-    seed: int,
-) -> None:
-    """Against every step run one by one; the numbers of a plan are finite at any tolerance."""
-    nlf = camera.nlf(reference.iso) if is_noisy else NoiseLevelFunction.zero()
-    fields = {"image_speed": image_speed, "defocus": defocus}
-    source = any_prepared(light, reference, camera, nlf, **fields, tolerance=0.0)
-    for tolerance in (0.0, 0.1):
-        plan = replace(source, tolerance=tolerance).plan(settings)
-        assert math.isfinite(plan.predicted_error)
-        assert math.isfinite(plan.predicted_difference)
-        assert math.isfinite(plan.predicted_rmse)
-        assert math.isfinite(plan.excess_noise)
-        assert plan.excess_noise >= 0.0
-        assert {*plan.modules, *plan.left_out} >= {"exposure", "defocus", "motion_blur", "noise"}
-    everything = Exposure(
-        exposure_ratio(reference, settings),
-        nlf,
-        camera.nlf(settings.iso),
-        motion_px=image_speed * settings.exposure_time * light.shape[1],
-        defocus_px=defocus * 4.0 / settings.effective_f_number,
-    )
-    # The blurred light has its ratio already: the exposure that is left is 1.
-    at_target = replace(everything, ratio=1.0, source=everything.source.exposed(everything.ratio))
-    frame, keys = torch.empty(1, *light.shape), sweep_keys(seed, [settings])
-    blurred = sensor_light(light, everything)
-    record_stepwise(Transitions.of([blurred], [at_target]), camera, keys, "exact", frame)
-    wanted = unpack_mosaic(frame[0], camera)
-    found = unpack_mosaic(source.capture(settings, seed)[0], camera)
-    steps = np.abs(found.astype(np.int64) - wanted)
-    assert steps.max() <= 1  # a sum in another order may round to the next number

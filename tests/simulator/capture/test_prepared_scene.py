@@ -29,16 +29,8 @@ from simulator.capture.exposure import Exposure
 from simulator.networks.aperture_module import ApertureModule
 from simulator.noise.generator import Noise
 from simulator.raw.image import unpack_mosaic
-from tests.strategies import (
-    SEEDS,
-    USUAL_SETTINGS,
-    cameras,
-    lights,
-    settings_within,
-)
-from tests.strategies import (
-    prepared as any_prepared,
-)
+from tests.strategies import SEEDS, USUAL_SETTINGS, cameras, lights, settings_within
+from tests.strategies import prepared as any_prepared
 
 Z6 = get_camera("nikon_z6")
 LOW, HIGH = CameraSettings(100, 1 / 64, 8), CameraSettings(6400, 1 / 64, 8)
@@ -469,3 +461,8 @@ def test_a_frame_is_the_same_alone_in_a_sweep_and_in_any_order(
         assert torch.equal(again, frame)
         assert 0.0 <= excess < math.inf
         assert torch.equal(in_stream, frame)
+        plan = fresh.plan(state)
+        assert 0.0 <= plan.excess_noise < math.inf
+        assert 0.0 <= plan.predicted_rmse < math.inf
+        assert plan.predicted_error >= 0.0  # no NaN
+        assert plan.predicted_difference >= 0.0

@@ -28,6 +28,7 @@ from simulator.capture.sensor import (
 )
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
+from tests.simulator.z6_noise import z6_noise
 
 STATES = [
     CameraSettings(iso, exposure_time, f_number)
@@ -38,32 +39,7 @@ STATES = [
 AREA = {4: 1 / 16, 5.6: 1 / 32, 8: 1 / 64, 11: 1 / 128}  # exact stops of the marked f-numbers
 Z6 = get_camera("nikon_z6")
 BLACK, WHITE, SPAN = 1008.0, 15520.0, 14512.0
-# Shot and read noise of R, G, B at each ISO, retyped from the published table.
-Z6_NOISE = {
-    100: (
-        (7.88891432059205e-06, 7.47234302281224e-06, 7.31670099946593e-06),
-        (5.71150998895191e-09, 5.73712214136873e-09, 5.59509111432998e-09),
-    ),
-    400: (
-        (3.25795376516365e-05, 3.09620813305867e-05, 2.95490959029526e-05),
-        (5.23908219573611e-08, 5.22487909303224e-08, 4.85513274723299e-08),
-    ),
-    1600: (
-        (0.000138265049210346, 0.00013417868314641, 0.000116127260242618),
-        (5.69427999550786e-08, 5.73036984664066e-08, 5.99138096354303e-08),
-    ),
-    6400: (
-        (0.000536276798657206, 0.000529454489967193, 0.000460526436255436),
-        (6.94797157253651e-07, 7.25184811907467e-07, 7.1397833103636e-07),
-    ),
-}
 ROWS, COLUMNS = 32, 128  # pixels of one flat patch
-
-
-def table(iso: float) -> tuple[np.ndarray, np.ndarray]:
-    """(shot, read), each (4, 1) over R, G1, G2, B."""
-    shot, read = Z6_NOISE[int(iso)]
-    return np.array(shot)[[0, 1, 1, 2], None], np.array(read)[[0, 1, 1, 2], None]
 
 
 def exposure_of(settings: CameraSettings) -> float:
@@ -132,7 +108,7 @@ def test_noise_free_source_over_all_states() -> None:
         capture, excess = prepared.capture(state, seed=1)
         assert excess == 0.0
         samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
-        shot, read = table(state.iso)
+        shot, read = z6_noise(state.iso)[..., None]
         variance = read + shot * levels
         expected += [
             recorded_moments(level, v)
@@ -140,56 +116,6 @@ def test_noise_free_source_over_all_states() -> None:
             for level, v in zip(levels, row, strict=True)
         ]
     assert_moments(np.concatenate(samples), expected)
-
-
-def test_noisy_source_over_all_states() -> None:
-    """Where the source is cleaner, mean and variance are the target's; elsewhere the declared
-    excess says how much larger the variance is: target * (1 + excess)."""
-    reference, generator = CameraSettings(400, 1 / 125, 5.6), np.random.default_rng(0)
-    levels = np.array([0.15, 0.4])
-    grid = np.linspace(-8.0, 8.0, 4001)
-    density = norm.pdf(grid) / norm.pdf(grid).sum()
-    clean, noisier = ([], []), ([], [])
-    for state in STATES:
-        ratio = exposure_of(state) / exposure_of(reference)
-        shot1, read1 = table(400)
-        light = patches(levels / ratio).double().numpy()
-        light += np.sqrt(read1[..., None] + shot1[..., None] * light) * generator.normal(
-            size=light.shape
-        )
-        source = NoiseLevelFunction(tuple(shot1[:, 0]), tuple(read1[:, 0]))  # type: ignore[arg-type]
-        prepared = PreparedScene(torch.from_numpy(light).float(), reference, Z6, source)
-        capture, declared = prepared.capture(state, seed=3)
-        numbers = numbers_of(capture, 2)
-        shot2, read2 = table(state.iso)
-        exposed = ratio**2 * read1 + ratio * shot1 * levels  # (4, 2), as it reaches the sensor
-        target = read2 + shot2 * levels
-        spread = 7 * np.sqrt(exposed)  # the top-up reads the noisy signal, not the true one
-        ends = [np.maximum(levels + sign * spread, 0.0) for sign in (-1, 1)]
-        missing = [read2 - ratio**2 * read1 + (shot2 - ratio * shot1) * x for x in ends]
-        for plane, level in itertools.product(range(4), range(2)):
-            cell = numbers[plane, level]
-            if min(m[plane, level] for m in missing) > 0:
-                clean[0].append(cell)
-                clean[1].append(recorded_moments(levels[level], target[plane, level]))
-            elif max(m[plane, level] for m in missing) < 0:
-                excess = exposed[plane, level] / target[plane, level] - 1
-                noisier[0].append(cell)
-                noisier[1].append(
-                    recorded_moments(levels[level], target[plane, level] * (1 + excess))
-                )
-        # the declared excess: mean over the pixels of the source's share beyond the target's
-        x = np.maximum(levels[None, :, None] + np.sqrt(exposed)[:, :, None] * grid, 0.0)
-        before = ratio**2 * read1[:, :, None] + ratio * shot1[:, :, None] * x
-        relative = np.maximum(before / (read2[:, :, None] + shot2[:, :, None] * x) - 1, 0.0)
-        mean = relative @ density
-        error = np.sqrt(np.maximum(relative**2 @ density - mean**2, 0.0).mean() / light.size)
-        assert declared == pytest.approx(mean.mean(), abs=5 * error + 1e-6 * mean.mean() + 1e-9)
-        assert prepared.plan(state).excess_noise == pytest.approx(declared, rel=1e-4, abs=1e-9)
-    assert len(clean[0]) >= 64  # an eighth of the 512 cells at least, of either kind
-    assert len(noisier[0]) >= 64
-    assert_moments(np.array(clean[0]), clean[1])
-    assert_moments(np.array(noisier[0]), noisier[1])
 
 
 def test_digital_numbers_are_rounded_once() -> None:
