@@ -82,10 +82,11 @@ def test_speeds_far_from_a_nominal_stop_are_kept(exposure_time: float) -> None:
     assert CameraSettings.from_exif(100, exposure_time, 4).exposure_time == exposure_time
 
 
-def test_direct_settings_are_taken_as_they_are() -> None:
-    assert CameraSettings(100, 1 / 60, 4).exposure_time == 1 / 60
-    assert CameraSettings.from_exif(100, 1 / 60, 4) == CameraSettings(100, 1 / 64, 4)
-    assert CameraSettings.from_exif(100, 0.01667, 4) == CameraSettings(100, 1 / 64, 4)
+@pytest.mark.parametrize(("recorded", "exact"), [(1 / 60, 1 / 64), (0.01667, 1 / 64), (6.0, 6.35)])
+def test_recorded_speeds_snap_and_given_ones_stay(recorded: float, exact: float) -> None:
+    assert CameraSettings(100, recorded, 4).exposure_time == recorded
+    snapped = CameraSettings.from_exif(100, recorded, 4)
+    assert snapped.exposure_time == pytest.approx(exact, rel=1e-4)
 
 
 @pytest.mark.parametrize(

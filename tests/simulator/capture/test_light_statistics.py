@@ -166,25 +166,6 @@ def test_no_blur_moves_the_light_by_more_than_its_bound(name: str, iso: float) -
                 assert error <= bound * 1.001 + 1e-5, (extent, ratio)
 
 
-def test_the_bound_is_close_for_small_blurs_of_smooth_light() -> None:
-    """1 - cos(t) is t^2 / 2 to first order: a wave of 32 pixels that the
-    borders continue, behind a disc of half a pixel."""
-    wave = 0.3 + 0.1 * np.cos((np.arange(256) + 0.5) * 2 * np.pi / 32)
-    light = np.broadcast_to(wave, (4, 64, 256))
-    statistics = LightStatistics(tensor(light))
-    # Its Laplacian is -(2 - 2 cos(2 pi / 32)) of the wave; second moments d^2 / 16 and e^2 / 12.
-    laplacian = (2 - 2 * math.cos(2 * math.pi / 32)) * (wave - 0.3)
-    flat = NoiseLevelFunction((0.0,) * 4, (1e-6,) * 4)
-    root = math.sqrt((laplacian**2).mean() / 1e-6)
-    disc, streak = (blur_error(statistics, 2.0, flat, *e) for e in ((0.0, 0.5), (0.5, 0.0)))
-    assert disc == pytest.approx(2.0 * 0.25 / 16 / 2 * root, rel=0.02)
-    assert streak == pytest.approx(2.0 * 0.25 / 12 / 2 * root, rel=0.02)
-    difference = (motion_blur(tensor(light), 0.5) - tensor(light)).double()
-    assert 2.0 * math.sqrt(float(difference.square().mean()) / 1e-6) == pytest.approx(
-        streak, rel=0.02
-    )
-
-
 # Sizes and extremes
 
 

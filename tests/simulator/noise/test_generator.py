@@ -18,9 +18,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from simulator.noise.generator import (
-    BANK_SIZE,
     BLOCK,
-    STRIDE,
     Noise,
     bank_normals,
     drawn_normals,
@@ -168,17 +166,6 @@ def test_frames_and_single_normals_are_looked_up_in_it(shape: tuple[int, int, in
     words = [mixed((key ^ 0x5851F42D4C957F2D) + turn * STEP & MASK) for turn in (1, 2, 3)]
     expected = [float(bank[word % 2**20]) * (-1) ** (word >> 63) for word in words]
     assert single_normals(np.array([key], np.uint64), 3).tolist() == [expected]
-
-
-def test_blocks_repeat_as_often_as_chance_has_it() -> None:
-    """Pairs of blocks with the same start: n (n - 1) / 2 pairs, 65,536 starts."""
-    count = 40
-    blocks = frames("bank", count).reshape(count * PIXELS // BLOCK, BLOCK)
-    firsts = np.abs(blocks[:, :4]) @ [1.0, 1e3, 1e6, 1e9]
-    _, times = np.unique(firsts, return_counts=True)
-    pairs = (times * (times - 1) // 2).sum()
-    expected = len(blocks) * (len(blocks) - 1) / 2 / (BANK_SIZE // STRIDE)
-    assert pairs == pytest.approx(expected, abs=5.0 * math.sqrt(expected))
 
 
 # -- exact draws -----------------------------------------------------------------------------------

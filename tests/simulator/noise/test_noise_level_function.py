@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import FrozenInstanceError
 
 import numpy as np
 import pytest
@@ -42,9 +43,13 @@ def test_noise_level_function_arithmetic() -> None:
     assert nlf.exposed(8).shot == pytest.approx((32e-5, 24e-5, 24e-5, 16e-5))
     assert nlf.exposed(8).read == pytest.approx((256e-8, 192e-8, 192e-8, 128e-8))
     assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
+    assert nlf.scaled(1 / 16).read == pytest.approx((2.5e-9, 1.875e-9, 1.875e-9, 1.25e-9))
     assert NoiseLevelFunction.zero().is_zero
+    assert nlf.zero().is_zero
     assert not nlf.is_zero
     assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
+    with pytest.raises(FrozenInstanceError):
+        nlf.source = "other"  # type: ignore[misc]
     most = NoiseLevelFunction((1.0,) * 4, (1.0,) * 4).exposed(1e30)
     assert (most.shot, most.read) == ((1e24,) * 4, (1e24,) * 4)
     larger = nlf.at_least(NoiseLevelFunction((3e-5,) * 4, (1e-8, 4e-8, 3e-8, 3e-8)))
