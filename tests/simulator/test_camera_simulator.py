@@ -77,7 +77,7 @@ def test_simulating_is_preparing_and_capturing(simulator: CameraSimulator, scene
 def test_simulate_keeps_what_is_known(simulator: CameraSimulator) -> None:
     data = picture(10, 10, 0.5)
     data[2, :3, 1:] = 1.0
-    known = {"white_balance": (2.0, 1.0, 1.5), "box_factor": 2}
+    known = {"white_balance": (2.0, 1.0, 1.5), "box_factor": 3}
     raw = RawImage(data, BASE, Z6, **known, metadata={"path": "a.nef"})  # type: ignore[arg-type]
     prepared = simulator.prepare(raw)
     assert torch.equal(prepared.light, data)
@@ -88,7 +88,7 @@ def test_simulate_keeps_what_is_known(simulator: CameraSimulator) -> None:
     assert (out.settings, out.camera) == (TARGET, Z6)
     for made in (prepared, out):
         assert {name: getattr(made, name) for name in known} == known
-    assert out.noise.shot[1] == pytest.approx(3.09620813305867e-05 / 4)
+    assert out.noise.shot[1] == pytest.approx(3.09620813305867e-05 / 9)
     assert out.metadata == {
         "path": "a.nef",
         "simulated_from": "ISO 100, 1/64 s, f/4",
@@ -193,6 +193,10 @@ def test_the_longest_streak_takes_no_memory_of_its_length(nlf: NoiseLevelFunctio
         (
             lambda s, raw: s.simulate(raw, CameraSettings(100, 1, 1), defocus=200.0),
             "`defocus` .* a disc of 800 pixel at f/1: .* as wide as the frame",
+        ),
+        (
+            lambda s, raw: PreparedScene(torch.ones(4, 1, 600), BASE, Z6, ZERO, defocus=601.0),
+            "at most 600 pixel wide",
         ),
         (lambda s, raw: PreparedScene(raw.data[:3], BASE, Z6, ZERO), "`light`"),
         (lambda s, raw: PreparedScene(raw.data * math.nan, BASE, Z6, ZERO), "`light`"),
