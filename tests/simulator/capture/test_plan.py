@@ -9,23 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from simulator import (
-    CameraSettings,
-    NoiseLevelFunction,
-    PreparedScene,
-    exposure_ratio,
-    get_camera,
-)
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import Denoised
 from simulator.capture.exposure import Step
 from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.plan import (
-    DEFAULT_TOLERANCE,
-    Situation,
-    check_tolerance,
-    decide,
-)
+from simulator.capture.plan import DEFAULT_TOLERANCE, Situation, check_tolerance, decide
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)

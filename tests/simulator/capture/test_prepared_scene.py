@@ -15,12 +15,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from simulator import (
-    CameraSettings,
-    NoiseLevelFunction,
-    PreparedScene,
-    get_camera,
-)
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.camera import CameraProfile
 from simulator.capture import prepared_scene
 from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
