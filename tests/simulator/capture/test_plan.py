@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
@@ -20,15 +20,7 @@ Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)
 CLEANER = CameraSettings(100, 1 / 4, 8)
 OPENER = CameraSettings(1600, 1 / 256, 4)
-STEPS = [
-    "exposure",
-    "noise_reduction",
-    "aperture",
-    "defocus",
-    "motion_blur",
-    "noise",
-    "clip_and_quantise",
-]
+STEPS = "exposure noise_reduction aperture defocus motion_blur noise clip_and_quantise"
 ZERO = NoiseLevelFunction.zero()
 
 
@@ -49,7 +41,7 @@ def test_every_step_runs_or_has_a_reason(
     settings: CameraSettings, networks: bool, tolerance: float
 ) -> None:
     plan = prepared(networks=networks, tolerance=tolerance, image_speed=1e-3).plan(settings)
-    assert [step.name for step in plan.steps] == STEPS
+    assert " ".join(step.name for step in plan.steps) == STEPS
     assert plan.modules == tuple(s.name for s in plan.steps if s.runs)
     assert plan.left_out == {s.name: s.reason for s in plan.steps if not s.runs}
     assert all(plan.left_out.values())
@@ -116,7 +108,7 @@ def test_reasons(changes: dict, settings: CameraSettings, line: str) -> None:
     scene = {name: value for name, value in changes.items() if name != "noise"}
     text = str(prepared(**scene).plan(settings, noise=changes.get("noise", True)))
     assert f"\n  {line}" in text
-    assert all(name in text for name in STEPS)
+    assert all(name in text for name in STEPS.split())
     assert max(map(len, text.splitlines())) < 140
 
 
@@ -133,21 +125,13 @@ def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
     assert without.predicted_rmse == pytest.approx(float((given - wanted).mean()) ** 0.5)
 
 
-def test_blur_of_the_aperture_lowers_the_predicted_excess() -> None:
-    """f/8 to f/4 at a fifth of a stop more light: blur removes more noise than that is too much."""
-    settings = replace(OPENER, exposure_time=OPENER.exposure_time * 2**0.2)
-    opened = prepared(denoised=None).plan(settings)
-    assert prepared(networks=False).plan(settings).excess_noise > 0.1
-    assert opened.excess_noise == 0.0
-    assert "noise" in opened.modules
-
-
 def test_operations_by_hand() -> None:
     """Per sample: 2 + 1 + 4 + 2 (1 + 3^2) + 6 + 14 + 6, for a disc of 3.5 pixel."""
     everything = prepared(tolerance=0.0, image_speed=0.2, defocus=3.5)
     plan = everything.plan(CameraSettings(6400, 1 / 64, 4))
     assert [step.operations / (4 * 16 * 20) for step in plan.steps] == [2, 1, 4, 20, 6, 14, 6]
-    assert "  cost      0.1 million operations" in plan.explain()
+    with pytest.raises(FrozenInstanceError):
+        plan.tolerance = 1.0  # type: ignore[misc]
     large = PreparedScene(torch.full((4, 500, 1000), 0.1), SOURCE, Z6, ZERO).plan(SOURCE)
     assert large.explain().endswith("  cost      44.0 million operations")
 

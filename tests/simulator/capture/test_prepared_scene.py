@@ -103,14 +103,6 @@ def test_light_without_noise_takes_none_of_the_sources(tolerance: float, denoise
     assert plan.predicted_error == pytest.approx(0.0 if denoised else 1 / 8)
 
 
-def test_a_source_with_next_to_no_noise_keeps_it() -> None:
-    """ISO 100 at half of white: sigma is sqrt(7.5e-6 * 0.5) = 0.2 %, 0.4 % of the light."""
-    bright = prepared(0.5, LOW).exposure(CameraSettings(100, 1 / 16, 8))
-    dark = prepared(0.01, LOW).exposure(CameraSettings(100, 1 / 16, 8))  # 3 % of the light
-    assert (bright.denoised, dark.denoised) == (False, True)
-    assert bright.source_noise.shot == pytest.approx([4 * s for s in Z6.nlf(100).shot])
-
-
 def test_noise_is_compared_with_the_averaged_sensors() -> None:
     """A box-averaged source has the target's noise divided by k^2 as well: nothing to remove."""
     nlf = Z6.nlf(6400).scaled(1 / 16)

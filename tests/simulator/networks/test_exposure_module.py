@@ -14,17 +14,6 @@ from simulator.settings import exposure_ratio
 from simulator.training.data import ReferencePairs
 from simulator.training.losses import ExposureLoss
 
-W, B = 1.03, (0.002, -0.001, 0.003, -0.004)
-
-
-def synthetic(count: int = 3, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Captures that follow the model exactly; a part of the targets is over-exposed."""
-    rng = np.random.default_rng(seed)
-    source = torch.from_numpy(rng.random((count, 4, 12, 10), dtype=np.float32))
-    ratio = torch.tensor([0.25, 1.7, 0.6])[:count]
-    scale = (W * ratio)[:, None, None, None]
-    return source, scale * (source + torch.tensor(B)[:, None, None]), ratio
-
 
 def test_it_starts_as_the_plain_ratio() -> None:
     raw = torch.rand(2, 4, 3, 5, generator=torch.Generator().manual_seed(0)) * 3 - 0.1
@@ -39,18 +28,17 @@ def test_it_starts_as_the_plain_ratio() -> None:
 
 
 def test_the_fit_is_numpys_least_squares_on_noisy_captures_and_adds_up() -> None:
-    source, target, ratio = synthetic()
-    target = target + 0.02 * torch.randn(target.shape, generator=torch.Generator().manual_seed(1))
+    """Captures that follow the model w = 1.03; a part of the targets is over-exposed."""
+    rng = np.random.default_rng(0)
+    source, ratio = rng.random((3, 4, 12, 10)), np.array([0.25, 1.7, 0.6])[:, None, None, None]
+    b = np.array([0.002, -0.001, 0.003, -0.004])[:, None, None]
+    target = 1.03 * ratio * (source + b) + rng.normal(0.0, 0.02, source.shape)
     used = (source <= OVER_EXPOSED) & (target <= OVER_EXPOSED)
-    assert 0.7 < used.float().mean() < 0.95  # both kinds are there
-    rows, wanted = [], []
-    for item, plane, row, column in zip(*np.nonzero(used.numpy()), strict=True):
-        line = np.zeros(5)
-        line[0] = ratio[item] * source[item, plane, row, column]
-        line[1 + plane] = ratio[item]
-        rows.append(line)
-        wanted.append(float(target[item, plane, row, column]))
-    (w, *v), *_ = np.linalg.lstsq(np.array(rows), np.array(wanted), rcond=None)
+    assert 0.7 < used.mean() < 0.95  # both kinds are there
+    shifts = [np.eye(4)[plane][:, None, None] * np.ones_like(source) for plane in range(4)]
+    columns = [(ratio * column)[used] for column in (source, *shifts)]
+    (w, *v), *_ = np.linalg.lstsq(np.stack(columns, axis=1), target[used], rcond=None)
+    source, target, ratio = map(torch.from_numpy, (source, target, ratio[:, 0, 0, 0]))
     fit = LinearFit()
     fit.add(source[:2], target[:2], ratio[:2])
     fit.add(source[2:], target[2:], ratio[2:])

@@ -5,6 +5,7 @@ Every bound is a sampling error of white noise.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import struct
@@ -55,6 +56,9 @@ def key_of(seed: int, *numbers: float) -> int:
     for number in numbers:
         key = mixed((key ^ bits(number)) + STEP & MASK)
     return key
+
+
+of_sweep = functools.partial(sweep_keys, states=[])
 
 
 def frames(kind: Noise, count: int) -> np.ndarray:
@@ -124,16 +128,12 @@ def test_frames_of_a_sweep_differ_by_each_setting_and_the_seed() -> None:
     assert len(sweep_keys(7, [])) == 0
 
 
-def keys_of_no_state(seed: Any) -> np.ndarray:
-    return sweep_keys(seed, [])
-
-
 @pytest.mark.parametrize(
     ("make", "seed"),
     [
-        *itertools.product((keys_of_no_state, noise_generator, noise_keys), (-1, 1.5, "1", None)),
-        *itertools.product((keys_of_no_state, noise_generator), [True]),
-        (keys_of_no_state, 2**64),
+        *itertools.product((of_sweep, noise_generator, noise_keys), (-1, 1.5, "1", None)),
+        *itertools.product((of_sweep, noise_generator), [True]),
+        (of_sweep, 2**64),
     ],
 )
 def test_bad_seeds_are_named(make: Callable[[Any], object], seed: object) -> None:
