@@ -40,8 +40,21 @@ def prepared(index: int) -> PreparedScene:
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 
 
-def made(noise: Noise | None = "bank", *, cache_light: bool = True) -> CaptureBatch:
-    return CaptureBatch(prepared, 5, STATES, Z6, noise=noise, cache_light=cache_light)
+class Counted:
+    """Scenes of a batch, and which of them were asked for."""
+
+    def __init__(self) -> None:
+        self.calls: list[int] = []
+
+    def __call__(self, index: int) -> PreparedScene:
+        self.calls.append(index)
+        return prepared(index)
+
+
+def made(
+    noise: Noise | None = "bank", *, cache_light: bool = True, scenes: Any = prepared
+) -> CaptureBatch:
+    return CaptureBatch(scenes, 5, STATES, Z6, noise=noise, cache_light=cache_light)
 
 
 def photographed(
@@ -65,7 +78,8 @@ def alone(index: int, state: int, gain: float, key: int | None, noise: Noise = "
 @pytest.mark.parametrize("noise", ["bank", "exact", None])
 @pytest.mark.parametrize("cache_light", [True, False])
 def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: bool) -> None:
-    batch, rng, seen = made(noise, cache_light=cache_light), np.random.default_rng(0), set()
+    scenes, rng, seen = Counted(), np.random.default_rng(0), set()
+    batch = made(noise, cache_light=cache_light, scenes=scenes)
     for _ in range(12):
         states, gains = rng.integers(len(STATES), size=5), rng.choice([0.25, 1.0, 3.0], 5)
         frames, found = photographed(batch, states, gains)
@@ -86,6 +100,7 @@ def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: 
             assert found.excess_variance[i] == pytest.approx(excess, rel=0.05, abs=1e-9)
             seen |= {"excess"} if excess > 0.1 and exposure.opened_to else set()
     assert seen >= {"aperture", "defocus", "motion_blur"}
+    assert (sorted(scenes.calls) == [0, 1, 2, 3, 4]) is cache_light  # else opened light is dropped
     assert noise is None or seen >= {"noise", "excess"}
 
 
@@ -105,15 +120,8 @@ def test_rows_have_the_light_that_is_given() -> None:
 
 
 def test_forgotten_scenes_are_asked_for_again_and_their_memory_is_used_again() -> None:
-    calls: list[int] = []
-    batch = CaptureBatch(
-        lambda i: calls.append(i) or prepared(i),  # type: ignore[func-returns-value]
-        5,
-        STATES,
-        Z6,
-        noise="bank",
-        cache_light=True,
-    )
+    scenes = Counted()
+    batch, calls = made(scenes=scenes), scenes.calls
     first, again, _ = photographed(batch, 1)[0], photographed(batch, 1)[0], photographed(batch, 4)
     assert sorted(calls) == [0, 1, 2, 3, 4]
     assert not batch._free

@@ -244,6 +244,7 @@ def test_copies_share_what_is_known_of_the_light() -> None:
     assert brighter.statistics.light is brighter.light
     assert brighter.blurred_light is not source.blurred_light
     assert len({source, brighter}) == 2  # by identity
+    assert "blurred_light" not in repr(source)
 
 
 # Sweeps

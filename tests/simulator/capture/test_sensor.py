@@ -39,6 +39,7 @@ STATES = [
 AREA = {4: 1 / 16, 5.6: 1 / 32, 8: 1 / 64, 11: 1 / 128}  # exact stops of the marked f-numbers
 Z6 = get_camera("nikon_z6")
 BLACK, WHITE, SPAN = 1008.0, 15520.0, 14512.0
+ZERO = NoiseLevelFunction.zero()
 ROWS, COLUMNS = 32, 128  # pixels of one flat patch
 
 
@@ -104,7 +105,7 @@ def test_noise_free_source_over_all_states() -> None:
     for state in STATES:
         ratio = exposure_of(state) / exposure_of(reference)
         light = patches(levels / ratio)
-        prepared = PreparedScene(light, reference, Z6, NoiseLevelFunction.zero())
+        prepared = PreparedScene(light, reference, Z6, ZERO)
         capture, excess = prepared.capture(state, seed=1)
         assert excess == 0.0
         samples.append(numbers_of(capture, len(levels)).reshape(-1, ROWS * COLUMNS))
@@ -135,13 +136,13 @@ def test_digital_numbers_are_rounded_once() -> None:
 
 
 def test_limits_of_light_and_signal() -> None:
-    zero = NoiseLevelFunction.zero()
     light = torch.tensor([3e6, -3e6, 3e9, -3e9]).expand(4, 1, 4).contiguous()
-    assert sensor_light(light, Exposure(1.0, zero, zero))[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
-    blurred = sensor_light(light, Exposure(1e-6, zero, zero, motion_px=1e-3))
-    expected = [3.0, -3.0, 1e3, -1e3]  # white at every exposure
-    np.testing.assert_allclose(blurred[0, 0].numpy(), expected, rtol=1e-4, atol=1e-3)
-    prepared = PreparedScene(light, CameraSettings(100, 1, 4), Z6, zero, gain=1e39)
+    assert sensor_light(light, Exposure(1.0, ZERO, ZERO))[0, 0].tolist() == [1e6, -1e6, 1e6, -1e6]
+    for blur, limit in (({}, 3e3), ({"motion_px": 1e-3}, 1e3), ({"defocus_px": 1e-3}, 1e3)):
+        dark = sensor_light(light, Exposure(1e-6, ZERO, ZERO, **blur))[0, 0]
+        expected = [3.0, -3.0, limit, -limit]  # white at every exposure
+        np.testing.assert_allclose(dark.numpy(), expected, rtol=1e-4, atol=1e-3)
+    prepared = PreparedScene(light, CameraSettings(100, 1, 4), Z6, ZERO, gain=1e39)
     assert prepared.exposure(CameraSettings(100, 1, 4)).ratio == 2.0**107
 
 
@@ -150,7 +151,7 @@ def test_motion_blur_comes_before_the_clip() -> None:
     10 / 5 = 2. Clipped first it would come out at 0.2."""
     light = torch.zeros(4, 5, 31)
     light[:, 2, 15] = 10.0
-    exposure = Exposure(1.0, NoiseLevelFunction.zero(), NoiseLevelFunction.zero(), motion_px=5.0)
+    exposure = Exposure(1.0, ZERO, ZERO, motion_px=5.0)
     smeared = sensor_light(light, exposure)
     np.testing.assert_allclose(smeared[:, 2, 14:17].numpy(), 2.0, rtol=0.05)
     recorded = clip_and_quantise(smeared, Z6)
@@ -187,16 +188,14 @@ def test_bands_come_before_the_noise() -> None:
     assert banded.light[0][:, :, 0].tolist() == [[pytest.approx(0.15), pytest.approx(0.45)]] * 4
     assert banded.shares()[0][:, 0].tolist() == [0.5, 1.5]
     frame = torch.empty(1, 4, 2, 5000)
-    counts = record(transitions, Z6, keys=keys, row_gain=rows, signals=frame)
-    assert counts.tolist() == [[0, 0]]  # nobody asked for them
-    assert record(Transitions([], exposure_table([])), Z6).shape == (0, 2)
+    record(transitions, Z6, keys=keys, row_gain=rows, signals=frame)
     target, source = Z6.nlf(6400), Z6.nlf(400)
     for row, gain in enumerate(rows[0]):
         wanted = target.read[1] + target.shot[1] * 0.3 * gain
         taken = gain * (source.read[1] + source.shot[1] * 0.3 * gain)
         measured = float(frame[0, 1, row].double().var())
         assert measured == pytest.approx(wanted - taken, rel=5 * math.sqrt(2 / 5000))
-    plain = Transitions.of([light], [Exposure(1.0, NoiseLevelFunction.zero(), target)])
+    plain = Transitions.of([light], [Exposure(1.0, ZERO, target)])
     assert plain.in_bands(rows).shares() == [None]
     share = torch.full((2, 5000), 0.5)
     blurred = replace(exposure, remaining_variance=share)
@@ -236,13 +235,21 @@ def test_balance_of_noise_pixel_by_pixel(target: NoiseLevelFunction, blurred_noi
     assert balance.lacks_noise == bool((wanted > given).any())
 
 
+def test_recording_nothing_and_on_other_devices() -> None:
+    assert record(Transitions([], exposure_table([])), Z6).shape == (0, 2)
+    light, table = torch.empty(4, 2, 3, device="meta"), exposure_table([Exposure(1, ZERO, ZERO)])
+    signals, keys = torch.empty(1, 4, 2, 3, device="meta"), np.zeros(1, np.uint64)
+    counts = record(Transitions([light], table), Z6, keys=keys, signals=signals)
+    assert counts.tolist() == [[0, 0]]
+
+
 def test_balance_where_there_is_no_noise() -> None:
     """A clean source lacks all of it; over a target without any, the excess is finite."""
-    zero, light = NoiseLevelFunction.zero(), torch.full((4, 4, 4), 0.5)
-    assert noise_balance(light, Exposure(1.0, zero, Z6.nlf(100))) == NoiseBalance(0.0, 0.0, True)
-    assert noise_balance(light, Exposure(1.0, zero, zero)) == NoiseBalance(0.0, 0.0, False)
+    light = torch.full((4, 4, 4), 0.5)
+    assert noise_balance(light, Exposure(1.0, ZERO, Z6.nlf(100))) == NoiseBalance(0.0, 0.0, True)
+    assert noise_balance(light, Exposure(1.0, ZERO, ZERO)) == NoiseBalance(0.0, 0.0, False)
     light[:, 0], shot = 0.0, NoiseLevelFunction((1e-4,) * 4, (0.0,) * 4)  # rows of 0 / 0
-    balance = noise_balance(light, Exposure(1.0, shot, zero))
+    balance = noise_balance(light, Exposure(1.0, shot, ZERO))
     assert balance == NoiseBalance(1e24, pytest.approx(0.75 * 0.5e-4), False)
     with pytest.raises(dataclasses.FrozenInstanceError):
         balance.lacks_noise = True  # type: ignore[misc]
