@@ -87,19 +87,6 @@ def test_the_bank_makes_frames_white_in_space_in_time_and_over_planes() -> None:
         assert abs((first * second).mean()) < 5.0 / math.sqrt(first.size)
 
 
-def test_no_shift_makes_two_frames_of_the_bank_alike() -> None:
-    """Largest correlation of two frames over all 65,536 shifts, against that of white noise.
-
-    The largest of n standard normals is near sqrt(2 ln n) = 4.7. A pair of blocks that share
-    their samples adds 256 to a sum whose standard deviation is sqrt(65,536) = 256: one unit more.
-    """
-    spectra = np.fft.rfft(frames("bank", 20).reshape(20, -1))
-    for first, second in itertools.pairwise(spectra):
-        correlation = np.fft.irfft(first.conj() * second, n=PIXELS)
-        peak = np.abs(correlation).max() / math.sqrt(PIXELS)
-        assert peak < math.sqrt(2.0 * math.log(PIXELS)) + 2.0
-
-
 # -- keys ------------------------------------------------------------------------------------------
 
 
