@@ -80,11 +80,7 @@ def test_the_networks_run_where_they_are_needed() -> None:
             CameraSettings(100, 4, 8),
             "left out  noise_reduction: the source has so little noise that the network's own",
         ),
-        (
-            {"networks": False},
-            OPENER,
-            "left out  aperture: the scene is taken as in focus: `depth`",
-        ),
+        ({"networks": False}, OPENER, "left out  aperture: the scene is taken as in focus: `dep"),
         ({}, CLEANER, "left out  aperture: the aperture does not open"),
         ({"diameter": 0.0}, OPENER, "left out  aperture: the picture was found to be in focus"),
         ({"tolerance": 900}, OPENER, "left out  aperture: the blur that opening adds (up to 3.5 "),
