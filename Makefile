@@ -37,7 +37,7 @@ bench: $(STAMP)
 
 $(VENV): $(STAMP)
 
-# Made anew when it is missing or older than what it is made from.
+# Made again when it is missing or older than what it is made from.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("ae-env needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -119,7 +119,8 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | f-number | 4, 5.6, 8, 11 |
 
     `action_masks()` gives the states that the current scene allows: all of them, unless the scene
-    is a recorded grid with holes (`Scene.allowed`). Wrappers in `ae_env.wrappers` offer the
+    is a recorded grid with holes (`Scene.allowed`). Another state is photographed all the same, but
+    the oracle does not count it, so its regret may be negative. Wrappers in `ae_env.wrappers` offer the
     controls one by one, relative steps, and continuous APEX values.
 
     ## Observation Space

@@ -220,9 +220,7 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
     ('ppo:runs/mine', {})
     """
     if not isinstance(name, str):
-        raise ValueError(
-            f"`policy` (={name!r}) must be a name, such as 'matrix:P', not a {type(name).__name__}"
-        )
+        raise ValueError(f"`policy` (={name!r}) must be a name, such as 'matrix:P'")
     # A folder may have a question mark in its name, a class may not.
     mark = _OPTIONS.search(name, max(name.find(".py:"), 0))
     if mark is None:
@@ -355,7 +353,7 @@ def _construct(
 ) -> Policy:
     """A `cls` with `options` of the caller's and those that the name has `fixed`."""
     if not inspect.isclass(cls):
-        raise ValueError(f"`policy` (={name!r}) must name a class, not a {type(cls).__name__}")
+        raise ValueError(f"`policy` (={name!r}) must name a class")
     missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
     if not missing and issubclass(cls, Policy) and cls.act is Policy.act:
         missing = ["act"]

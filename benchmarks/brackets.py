@@ -258,6 +258,7 @@ def measure(scene: str, repeats: int, seed: int) -> dict[str, Any]:
 
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each scene; only the static one, each simulation timed once, if `quick`."""
+    data_folder("boreal_brackets")  # raises before any work
     repeats = 1 if quick else REPEATS
     return [
         Part(scene, measure, {"scene": scene, "repeats": repeats, "seed": seed}, threads=1)

@@ -242,6 +242,7 @@ def measure_file(file: str) -> dict[str, Any]:
 
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each raw; only the first if `quick`."""
+    data_folder("canon_crw_cc0")  # raises before any work
     files = list(FILES)[: 1 if quick else None]
     return [Part(file, measure_file, {"file": file}) for file in files]
 

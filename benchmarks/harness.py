@@ -237,7 +237,8 @@ def data_folder(name: str) -> Path:
     root = data_root()
     if root is None or not (root / name).is_dir():
         raise FileNotFoundError(
-            f"there is no folder {name!r} of real files: set AE_ENV_DATA to the one that holds it"
+            f"there is no folder {name!r} of real files in {root or 'AE_ENV_DATA'}: set "
+            "AE_ENV_DATA to the folder that holds it"
         )
     return root / name
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ae_env.lighting.base import MAX_STOPS, Lighting, RollingShutter
 from ae_env.utils.checks import check_number
-from simulator.optics.lamps import Lamp, MainsLamp, PulsedLamp
+from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 
 #: Depth of a lamp on the mains, where none is given.
 MAINS_DEPTH = 0.8
@@ -34,8 +34,9 @@ _RANGES = {
 class FlickerLighting(Lighting):
     """Light that flickers much faster than frames follow each other, around the scene's own.
 
-    It is integrated in closed form over the exposure time of each row (`simulator.optics.lamps`).
-    Rows begin one after the other, so unless the exposure lasts whole periods, the frame has bands.
+    It is integrated in closed form over the exposure time of each row
+    (`simulator.optics.flicker_integral`). Rows begin one after the other, so unless the
+    exposure lasts whole periods, the frame has bands.
 
     Args:
         frequency: Of the light [Hz]: twice that of the mains, or of the pulses. 0.001 to 1e6.

@@ -221,10 +221,11 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         and not any(part.startswith(".") for part in p.relative_to(base).parts)
     ]
     if not files:
-        endings = sorted({p.suffix.lower() or "(none)" for p in found})
+        endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         raise ValueError(
-            f"`scenes` (={str(spec)!r}, files ending in {endings}) must hold raws "
-            f"({_RAW_ENDINGS}) or radiance maps ({', '.join(RADIANCE_SUFFIXES)})"
+            f"`scenes` (={str(spec)!r}) must hold raws ({_RAW_ENDINGS}) or radiance maps "
+            f"({', '.join(RADIANCE_SUFFIXES)}); its files end in: "
+            f"{endings or 'there are none, or the folder cannot be read'}"
         )
     return base, sorted(files, key=_natural)
 

@@ -38,10 +38,10 @@ def bench(
     """
     name = name.replace("-", "_")
     check_word("name", name, BENCHMARKS)
-    if against is not None and (name != "throughput" or not against.is_dir()):
-        raise ValueError(
-            f"`against` (={str(against)!r}) must be a checkout's folder, of throughput"
-        )
+    if against is not None and name != "throughput":
+        raise ValueError(f"`against` (={str(against)!r}) is an option of throughput only")
+    if against is not None and not (against / "simulator" / "__init__.py").is_file():
+        raise ValueError(f"`against` (={str(against)!r}) must be a checkout of this project")
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
         raise ValueError(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "

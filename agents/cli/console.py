@@ -20,7 +20,9 @@ console = Console()
 
 MAX_SEED = 2**63 - 1
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
-OwnSeed = Annotated[int | None, typer.Option(help="Not the YAML's.", min=0, max=MAX_SEED)]
+OwnSeed = Annotated[
+    int | None, typer.Option(help="Seed instead of the one in the YAML.", min=0, max=MAX_SEED)
+]
 Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
 
 

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: A state counts as right if its q is this near to the best.
-SCORE_TOLERANCE = 0.01
+NEAR_BEST = 0.01
 #: A third of a stop, with room for the rounding of f-numbers.
 THIRD_EV = 1.0 / 3.0 + 1e-6
 #: Light that rests for fewer frames at the end of an episode is not waited for.
@@ -80,7 +80,7 @@ def ev_error(scores: Floats, states: Ints, ev100: Floats, allowed: NDArray[np.bo
 
     Zero wherever the brightness is right, however it is split.
     """
-    good = (scores >= oracle_score(scores, allowed)[..., None] - SCORE_TOLERANCE) & allowed
+    good = (scores >= oracle_score(scores, allowed)[..., None] - NEAR_BEST) & allowed
     distance = np.abs(ev100 - ev100[states][..., None])
     error: Floats = np.where(good, distance, np.inf).min(axis=-1)
     return error

@@ -15,7 +15,7 @@ from benchmarks.harness import Row
 from benchmarks.isolated import median_seconds
 from benchmarks.stability.case import row
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
-from simulator.optics.lamps import Lamp, MainsLamp, PulsedLamp
+from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
 
 #: Rounding of a float32 and of a float64.
 EPS32, EPS64 = 2.0**-24, 2.0**-53

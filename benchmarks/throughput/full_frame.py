@@ -57,11 +57,10 @@ def rows(results: dict[str, Any]) -> list[Row]:
     """One row per file and case."""
     found = []
     for label, row in results.items():
-        kind, name, *case = label.split("|")
-        if kind == "frame":
+        if label.startswith("frame|"):
+            _, name, case = label.split("|")
             file = "synthetic DNG" if name.startswith("frame") else name
-            beside = {"libraw": results[f"libraw|{name}"]}
-            found.append({"case": case[0], "file": file, **row, **beside})
+            found.append({"case": case, "file": file, **row, "libraw": results[f"libraw|{name}"]})
     return found
 
 

@@ -194,8 +194,8 @@ class PreparedScene:
         if diameter > most:
             raise ValueError(
                 f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel "
-                f"at f/{f_number:.3g}: it must be at most {most:g} pixel wide, as wide as the "
-                f"frame or {MAX_DISC_PX:g} pixel"
+                f"at f/{f_number:.3g}: it must be at most {most:g} pixel, as wide as the frame "
+                f"({MAX_DISC_PX:g} on smaller ones)"
             )
         return diameter
 

@@ -76,7 +76,7 @@ class Checkpoint:
     Args:
         path: The file; None writes and reads nothing.
         identity: JSON value that says what is trained and how. A checkpoint of another training, or
-            of another version of this package, is not resumed.
+            of another version of this package, is not resumed but kept under another name.
         state: Called for the state to write; see `save_checkpoint`.
         writes: False in the processes of a distributed training that only read.
     """
@@ -101,10 +101,15 @@ class Checkpoint:
         if stored is None:
             return None
         if stored.get("identity") != self.identity:
+            assert self.path is not None
+            other = self.path.with_name(f"{self.path.name}.other")
+            if self.writes:
+                self.path.replace(other)
             _LOGGER.warning(
-                "checkpoint %s is of a training with other settings or of another version, "
-                "training restarts",
+                "checkpoint %s is of a training with other settings or of another version: it is "
+                "kept as %s, and training restarts",
                 self.path,
+                other.name,
             )
             return None
         return dict(stored["state"])

@@ -52,7 +52,7 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
     if not isinstance(content, dict):
         found = "is empty" if content is None else f"holds {_short.repr(content)}"
         known = ", ".join(model.model_fields)
-        raise ValueError(f"{name} {found}: it must have entries, of {known}")
+        raise ValueError(f"{name} {found}: it must map entries to values; known entries: {known}")
     try:
         return model.model_validate(content)
     except ValidationError as error:
@@ -164,7 +164,7 @@ def _check_node(node: yaml.Node, entries: dict[int, int], depth: int = 0) -> int
             _check_keys([key for key, _ in node.value])
         entries[id(node)] = 1 + sum(_check_node(child, entries, depth + 1) for child in children)
     if entries[id(node)] > MAX_ENTRIES:
-        raise ValueError(f"there must be at most {MAX_ENTRIES} entries, aliases written out")
+        raise ValueError(f"there must be at most {MAX_ENTRIES} entries, aliases expanded")
     return entries[id(node)]
 
 

@@ -35,7 +35,7 @@ def test_every_listed_name_makes_a_policy(context):
         ("oracle:P", r"must be one of"),
         ("no_such_pkg.mod:Class", r"no module 'no_such_pkg'"),
         ("agents.baselines:Rundom", r"no class 'Rundom' there; found .*Random, BestFixed, Oracle"),
-        ("agents.evaluation.metrics:flicker", r"must name a class, not a function"),
+        ("agents.evaluation.metrics:flicker", r"must name a class"),
         ("agents.evaluation.intervals:Interval", r"not a policy, it has no `reset` and `act`"),
         ("mine.py", r"must name a class of the file"),
         ("spot?compensatio=1", r"'spot\?compensatio=1'\): .*the option 'compensatio'.*mean 'comp"),

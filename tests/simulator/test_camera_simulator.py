@@ -180,7 +180,7 @@ def test_the_longest_streak_takes_no_memory_of_its_length(nlf: NoiseLevelFunctio
         (lambda s, raw: s.simulate(raw, 3), r"`settings` \(=3\) must be CameraSettings"),
         (
             lambda s, raw: s.prepare(raw, defocus=513.0),
-            r"`defocus` \(=513.0 pixel at f/4\) makes a disc of 513 .* 512 pixel wide",
+            r"`defocus` \(=513.0 pixel at f/4\) makes a disc of 513 .* 512 pixel",
         ),
         (
             lambda s, raw: s.simulate(raw, CameraSettings(100, 1, 1), defocus=200.0),
@@ -188,7 +188,7 @@ def test_the_longest_streak_takes_no_memory_of_its_length(nlf: NoiseLevelFunctio
         ),
         (
             lambda s, raw: PreparedScene(torch.ones(4, 1, 600), BASE, Z6, ZERO, defocus=601.0),
-            "at most 600 pixel wide",
+            "at most 600 pixel, as wide as the frame",
         ),
         (lambda s, raw: PreparedScene(raw.data[:3], BASE, Z6, ZERO), "`light`"),
         (lambda s, raw: PreparedScene(raw.data * math.nan, BASE, Z6, ZERO), "`light`"),

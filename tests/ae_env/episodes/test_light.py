@@ -8,7 +8,7 @@ import pytest
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
-from simulator.optics.lamps import MainsLamp, PulsedLamp
+from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 from tests.ae_env.environments import make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, make_scene

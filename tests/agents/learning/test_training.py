@@ -49,7 +49,7 @@ def test_shipped_configs(path: Path) -> None:
     [
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
         ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression' or 'ppo'"),
-        ("", r"is empty: it must have entries"),
+        ("", r"is empty: it must map entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\): unknown.*mean `n_steps`"),
         ("agent: ppo\ntraining: {gamma: 2}", r"training.gamma \(=2\): .*less than or equal to 1"),

@@ -11,7 +11,7 @@ import torch
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.lamps import PulsedLamp
+from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
 from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
 from simulator.settings import CameraSettings

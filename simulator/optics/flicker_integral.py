@@ -1,4 +1,4 @@
-"""Light that changes while the shutter is open: mains, pulse-width modulation, strobes, lightning.
+"""Flickering light integrated over an exposure: mains, modulated pulses, strobes, lightning.
 
 Each lamp gives its mean light over an exposure in closed form, relative to its long-term mean, so
 that the cost does not depend on how many periods the exposure lasts and no pulse, however short, is

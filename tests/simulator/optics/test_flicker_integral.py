@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from simulator.optics.lamps import Flash, Lamp, MainsLamp, PulsedLamp
+from simulator.optics.flicker_integral import Flash, Lamp, MainsLamp, PulsedLamp
 from tests.strategies import log_uniform
 
 TIMES = (1 / 8000, 1 / 1000, 1 / 120, 0.01, 1 / 60, 0.35)
