@@ -242,6 +242,9 @@ class CaptureBatch:
 
 
 def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, int]]) -> None:
+    if not planned:
+        return
+
     def run(first: int, last: int) -> None:
         for index, row in planned[first:last]:
             task(index, row)

@@ -190,8 +190,8 @@ class PreparedScene:
     def _disc(self, f_number: float) -> float:
         """Diameter of the defocus disc at `f_number` [pixel]."""
         diameter = self.defocus * 4.0 / f_number
-        most = max(*self.light.shape[-2:], MAX_DISC_PX)
-        if diameter > most:
+        if diameter > MAX_DISC_PX and diameter > max(self.light.shape[-2:]):
+            most = max(*self.light.shape[-2:], MAX_DISC_PX)
             raise ValueError(
                 f"`defocus` (={self.defocus!r} pixel at f/4) makes a disc of {diameter:.4g} pixel "
                 f"at f/{f_number:.3g}: it must be at most {most:g} pixel, as wide as the frame "
