@@ -79,7 +79,8 @@ def available() -> tuple[dict[str, CompositeScorer], dict[str, str]]:
         try:
             made[name] = make_scorer(name)
         except (ValueError, ImportError, OSError) as error:
-            missing[name] = " ".join(str(error).split())
+            # What follows is where files of this machine lie.
+            missing[name] = " ".join(str(error).partition(":")[0].split())
     return made, missing
 
 
