@@ -88,6 +88,14 @@ def parse_seconds(text: str) -> float:
         raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
 
 
+def parse_f_number(text: str) -> float:
+    """F-number from ``"4"`` or ``"f/4"``."""
+    try:
+        return float(text.lower().removeprefix("f").removeprefix("/"))
+    except ValueError:
+        raise ValueError(f"`aperture` (={text!r}) must be an f-number, such as 4 or f/4") from None
+
+
 def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> None:
     """Makes a folder for results, before any work is done.
 

@@ -13,6 +13,7 @@ from agents.cli.console import (
     Seed,
     console,
     make_folder,
+    parse_f_number,
     parse_seconds,
     print_files,
     save_picture,
@@ -23,6 +24,10 @@ from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 if TYPE_CHECKING:
     from simulator.camera_simulator import CameraSimulator
     from simulator.raw.image import RawImage
+    from simulator.settings import CameraSettings
+
+#: Quarter turns to the left that turn a picture upright, by LibRaw's code.
+_TURNS = {3: 2, 5: 1, 6: -1}
 
 Weights = Annotated[
     str, typer.Option(help="Networks: compact, a file of weights, or none to only add noise.")
@@ -41,13 +46,23 @@ Noise = Annotated[
 ]
 
 
+SourceIso = Annotated[
+    float | None, typer.Option(help="ISO speed of RAW, where the file does not say its settings.")
+]
+SourceShutter = Annotated[str | None, typer.Option(help="Exposure time of RAW [s].")]
+SourceAperture = Annotated[str | None, typer.Option(help="F-number of RAW.")]
+
+
 def simulate(
     raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
     iso: Annotated[float, typer.Option(help="Target ISO speed.")],
     shutter: Annotated[str, typer.Option(help="Target exposure time, such as 1/60 or 0.5 [s].")],
-    aperture: Annotated[float, typer.Option(help="Target f-number.")],
+    aperture: Annotated[str, typer.Option(help="Target f-number, such as 4 or f/4.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="DNG to write.")] = Path("out.dng"),
     png: Annotated[Path | None, typer.Option(help="Also write the developed picture here.")] = None,
+    source_iso: SourceIso = None,
+    source_shutter: SourceShutter = None,
+    source_aperture: SourceAperture = None,
     seed: Seed = 0,
     weights: Weights = "compact",
     depth: Depth = "far",
@@ -65,13 +80,13 @@ def simulate(
 
     check_noise(noise)
     check_tolerance(tolerance)
-    settings = CameraSettings(iso, parse_seconds(shutter), aperture)
+    settings = CameraSettings(iso, parse_seconds(shutter), parse_f_number(aperture))
     device = torch_device(device)
     for name, path in (("out", out), ("png", png)):
         suffix = ".dng" if name == "out" else ".png"
         if path is not None and path.suffix.lower() != suffix:
             raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
-    source = read_raw(raw)
+    source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     for name, path in (("out", out), ("png", png)):
         if path is not None:
             make_folder(path.parent, name=name, file=path)
@@ -98,10 +113,27 @@ def make_simulator(weights: str, device: str, cache: bool) -> CameraSimulator:
     return CameraSimulator.from_pretrained(weights, device=device, cache=where)
 
 
+def source_settings(
+    iso: float | None, shutter: str | None, aperture: str | None
+) -> CameraSettings | None:
+    """Settings of the source that the options give; None for those of the file."""
+    from simulator import CameraSettings
+
+    if iso is None and shutter is None and aperture is None:
+        return None
+    if iso is None or shutter is None or aperture is None:
+        raise ValueError(
+            "give all of --source-iso, --source-shutter and --source-aperture, or none"
+        )
+    return CameraSettings(iso, parse_seconds(shutter), parse_f_number(aperture))
+
+
 def _write_png(path: Path, raw: RawImage) -> Path:
+    import numpy as np
     from PIL import Image
 
     from simulator import render_srgb
 
     picture = render_srgb(raw).permute(1, 2, 0).cpu().numpy()
-    return save_picture(path, Image.fromarray(picture))
+    upright = np.rot90(picture, _TURNS.get(raw.metadata.get("flip", 0), 0))
+    return save_picture(path, Image.fromarray(np.ascontiguousarray(upright)))

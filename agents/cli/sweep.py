@@ -16,7 +16,16 @@ from agents.cli.console import (
     save_picture,
     torch_device,
 )
-from agents.cli.simulate import Cache, Depth, Weights, make_simulator
+from agents.cli.simulate import (
+    Cache,
+    Depth,
+    SourceAperture,
+    SourceIso,
+    SourceShutter,
+    Weights,
+    make_simulator,
+    source_settings,
+)
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 
 if TYPE_CHECKING:
@@ -30,6 +39,9 @@ def sweep(
     raw: Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")],
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("sweep"),
     dngs: Annotated[bool, typer.Option(help="Also write the 64 DNGs, full size.")] = False,
+    source_iso: SourceIso = None,
+    source_shutter: SourceShutter = None,
+    source_aperture: SourceAperture = None,
     seed: Seed = 0,
     weights: Weights = "compact",
     depth: Depth = "far",
@@ -51,7 +63,7 @@ def sweep(
     _check_depth(depth, weights)
     check_tolerance(tolerance)
     device = torch_device(device)
-    source = read_raw(raw)
+    source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     make_folder(out)
     scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth, cache)
     sheet = out / "contact_sheet.png"

@@ -17,6 +17,8 @@ import rawpy
 from simulator.camera import BayerPattern
 from simulator.raw.dng import ORIENTATIONS, OwnRecord
 from simulator.raw.metadata import (
+    TIFF_FILE,
+    UNKNOWN_FILE,
     Directory,
     first,
     first_numbers,
@@ -31,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 #: PhotometricInterpretation of a raw, and of a DNG that is demosaicked already.
 COLOUR_FILTER_ARRAY, LINEAR_RAW = 32803, 34892
+#: Compression of DNGs that LibRaw decodes: none, lossless JPEG, deflate; and GoPro's.
+_COMPRESSIONS, _VC5 = (1, 7, 8), 9
 _LETTERS = {0: "R", 1: "G", 2: "B"}
 _DNG_MATRIX = "XYZ to camera RGB, ColorMatrix of the file"
 
@@ -102,7 +106,7 @@ def decode_own_dng(path: Path, directories: Sequence[Directory], own: OwnRecord)
         mosaic=mosaic,
         cfa=BayerPattern(letters),
         black_level=black,
-        white_level=_white_level(path, white, black, directories),
+        white_level=_white_level(path, white, black, directories, mosaic),
         white_balance=(green / red, 1.0, green / blue),
         white_balance_source="camera" if known else "none",
         colour_matrix=read_colour_matrix(directories),
@@ -156,14 +160,25 @@ def decode_with_libraw(
         if bomb:
             raise RawFileError.of(path, f"({words}) {bomb}")
         return _from_libraw(path, raw, words, directories)
-    except rawpy.LibRawFileUnsupportedError:
-        text = f"must be a camera raw that LibRaw reads, but is {words}, or is truncated"
-        raise RawFileError.of(path, text) from None
     except (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError) as error:
-        reason = error.args[0] if error.args else error
-        reason = reason.decode() if isinstance(reason, bytes) else reason
-        text = f"must be a whole raw file, but LibRaw says {reason}: {words}, truncated or damaged"
-        raise RawFileError.of(path, text) from None
+        raise RawFileError.of(path, _reason(error, words, directories)) from None
+
+
+def _reason(error: Exception, words: str, directories: Sequence[Directory]) -> str:
+    """Why LibRaw cannot read a file that its directory does not call cut short."""
+    compression = next(iter(_mosaic_directory(directories).get("Compression", ())), 1)
+    if "WhiteLevel" in _mosaic_directory(directories) and compression not in _COMPRESSIONS:
+        kind = " (VC-5, GoPro's)" if compression == _VC5 else ""
+        return (
+            f"cannot be decoded: LibRaw lacks its compression, {compression}{kind}; convert it to "
+            "an uncompressed DNG"
+        )
+    if isinstance(error, rawpy.LibRawFileUnsupportedError):
+        cut = ", or is truncated" if words in (TIFF_FILE, UNKNOWN_FILE) else ""
+        return f"must be a camera raw that LibRaw reads, but is {words}{cut}"
+    reason = error.args[0] if error.args else error
+    reason = reason.decode() if isinstance(reason, bytes) else reason
+    return f"must be a whole raw file, but LibRaw says {reason}: {words}, truncated or damaged"
 
 
 def _from_libraw(
@@ -196,7 +211,7 @@ def _from_libraw(
         mosaic=mosaic,
         cfa=cfa,
         black_level=tuple(black),  # type: ignore[arg-type]
-        white_level=_white_level(path, float(raw.white_level), black, directories),
+        white_level=_white_level(path, float(raw.white_level), black, directories, mosaic),
         white_balance=white_balance,
         white_balance_source=source,
         colour_matrix=matrix,
@@ -266,17 +281,24 @@ def _mosaic_directory(directories: Sequence[Directory]) -> Directory:
 
 
 def _white_level(
-    path: Path, white: float, black: Sequence[float], directories: Sequence[Directory]
+    path: Path,
+    white: float,
+    black: Sequence[float],
+    directories: Sequence[Directory],
+    mosaic: np.ndarray,
 ) -> float:
     """`white`, or the largest digital number where the file's WhiteLevel cannot be right.
 
-    That is 0, or beyond what the bits of a sample can hold (but for tables of larger values).
+    That is 0, or in a DNG beyond what the bits of a sample can hold. Elsewhere the bits are those
+    of the compressed samples (Sony's ARW says 12 of 14), and LibRaw knows the camera's white.
     """
     tags = _mosaic_directory(directories)
     stated = next(iter(numbers(tags, "WhiteLevel")), white)
     bits = next(iter(numbers(tags, "BitsPerSample")), 16)
-    fits = 8 <= bits <= 16 and "LinearizationTable" not in tags
+    fits = 8 <= bits <= 16 and "WhiteLevel" in tags and "LinearizationTable" not in tags
     largest = 2 ** (int(bits) if fits else 16) - 1
+    if largest < stated < 2**16 and int(mosaic.max()) > largest:  # samples hold more than the bits
+        largest = 2**16 - 1
     if not 0 < stated <= largest:
         text = f"its white level (={stated:.10g}) must be in [1, {largest}]; {largest} is used"
         logger.warning("%s: %s", path.name, text)

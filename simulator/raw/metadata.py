@@ -175,6 +175,7 @@ def missing_bytes(directories: Sequence[Directory], size: int) -> int:
 # -- the kind of file and its camera --------------------------------------------------------------
 
 UNKNOWN_FILE, CANON_CRW = "a file of unknown type", "a Canon CRW file"
+TIFF_FILE = "a TIFF-structured file"
 _SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"\xff\xd8\xff", "a JPEG file"),
     (b"\x89PNG\r\n", "a PNG file"),
@@ -211,7 +212,7 @@ def describe_file(head: bytes) -> str:
     if head[6:14] == b"HEAPCCDR":
         return CANON_CRW
     if head[:2] in (b"II", b"MM"):
-        return "a TIFF-structured file"
+        return TIFF_FILE
     if b"\0" not in head and all(b >= 32 or b in b"\t\n\r\f" for b in head):
         return "a text file"
     return UNKNOWN_FILE

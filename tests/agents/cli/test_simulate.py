@@ -51,6 +51,25 @@ def test_a_raw_at_other_settings(ae_env, raw: RawImage, dng: Path, tmp_path: Pat
     assert not read_raw(out).data.equal(back.data)
 
 
+def test_settings_of_a_source_that_has_none_and_a_picture_turned_upright(ae_env, tmp_path: Path):
+    data = np.full((4, 20, 30), 0.1, np.float32)
+    data[:, :10] = 0.4  # the upper half is bright
+    settings, metadata = CameraSettings(100, 1 / 64, 8), {"flip": 6}  # upright after a turn right
+    raw = RawImage(data, settings, get_camera("nikon_z6"), metadata=metadata)
+    write_dng(tmp_path / "a.dng", raw)
+    out, png = tmp_path / "out.dng", tmp_path / "a.png"
+    command = ("simulate", tmp_path / "a.dng", "--iso", 100, "--shutter", "1/64", "--aperture")
+    given = ("--source-iso", 400, "--source-shutter", "1/64")
+    code, text, _ = ae_env(*command, "f/8", "-o", out, "--png", png, *given, "--source-aperture", 8)
+    assert (code, "source ISO 400, 1/64 s, f/8" in text) == (0, True)
+    assert read_raw(out).data.mean() == pytest.approx(0.25 / 4, rel=0.02)  # at ISO 400 it was
+    picture = np.asarray(Image.open(png)).astype(float).mean(axis=-1)
+    assert picture.shape == (60, 40)
+    assert picture[:, 25:].mean() > 1.5 * picture[:, :15].mean()  # the top came to the right
+    code, _, error = ae_env(*command, 8, "-o", out, *given)
+    assert (code, "--source-aperture, or none" in error) == (2, True)
+
+
 def test_all_states_of_a_raw(ae_env, dng: Path, tmp_path: Path) -> None:
     code, text, _ = ae_env("sweep", dng, "--out", tmp_path / "sweep", "--dngs")
     assert code == 0

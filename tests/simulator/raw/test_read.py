@@ -26,6 +26,7 @@ from simulator import (
     write_dng,
 )
 from simulator.camera import BayerPattern
+from simulator.raw import decoding
 from simulator.raw import read as read_module
 from simulator.raw.metadata import read_own_record
 
@@ -362,6 +363,8 @@ LARGEST = ("white_level", 65535)
         ("CFAPattern", "4B", (9, 1, 1, 2), r"CFAPattern is \(9, 1, 1, 2\)"),
         ("CFAPattern", "4B", (0, 0, 0, 0), "CFAPattern"),
         ("BlackLevel", "I", (70_000,), "white level above its black levels"),
+        # GoPro's, which LibRaw lacks: the file is whole all the same.
+        ("Compression", "H", (9,), r"LibRaw lacks its compression, 9 \(VC-5.*convert"),
         # Also in a DNG of another program:
         *(("WhiteLevel", "I", (white,), LARGEST) for white in (0, 65536, 2**32 - 1)),
         ("WhiteLevel", "I", (64,), "above its black levels, .* white 64"),
@@ -370,7 +373,8 @@ LARGEST = ("white_level", 65535)
     ],
 )
 def test_what_a_dng_lost_falls_back_or_is_named(own_dng, path, caplog, name, form, values, changed):
-    for file in (own_dng, path) if name in ("WhiteLevel", "Sides") else (own_dng,):
+    files = {"WhiteLevel": (own_dng, path), "Sides": (own_dng, path), "Compression": (path,)}
+    for file in files.get(name, (own_dng,)):
         given = {} if file is own_dng else {"settings": SETTINGS, "nlf": NLF}
         for each in ("ImageWidth", "ImageLength") if name == "Sides" else (name,):
             patch(file, each, form, *values)
@@ -404,3 +408,31 @@ def test_damaged_files_are_read_or_refused(path, own_dng, name):
         else:
             assert bool(torch.isfinite(raw.data).all())
     assert 15 < refused < 150
+
+
+@pytest.mark.parametrize(
+    ("tags", "white", "brightest", "wanted"),
+    [
+        ({"BitsPerSample": (12,)}, 15360.0, 900, 15360.0),  # Sony's ARW: 14 bits compressed to 12
+        ({"BitsPerSample": (12,), "WhiteLevel": (15360,)}, 15360.0, 14000, 15360.0),
+        ({"BitsPerSample": (12,), "WhiteLevel": (15360,)}, 15360.0, 900, 4095.0),  # damaged
+    ],
+)
+def test_white_beyond_the_bits_of_a_sample(tags, white, brightest, wanted):
+    directory = {"PhotometricInterpretation": (32803,), **tags}
+    mosaic = np.full((2, 2), brightest, np.uint16)
+    found = decoding._white_level(Path("a.arw"), white, [512.0] * 4, [directory], mosaic)
+    assert found == wanted
+
+
+def test_a_camera_given_for_a_file_whose_white_level_is_wrong(tmp_path):
+    """Its brightest sample is four times that level; darker files do not show that it is wrong."""
+    camera = CameraProfile("sensor", BayerPattern.RGGB, (64.0,) * 4, 4095, 12)
+    given = {"settings": SETTINGS, "nlf": NLF, "camera": camera}
+    path = write_sample_dng(tmp_path / "a.dng", WhiteLevel=("I", (1000,)))
+    raw = read_raw(path, **given)
+    assert raw.camera.white_level == 4095
+    np.testing.assert_array_equal(raw.to_mosaic(), MOSAIC)
+    dark = write_sample_dng(tmp_path / "b.dng", MOSAIC // 5, WhiteLevel=("I", (1000,)))
+    with pytest.raises(ValueError, match=r"white level 4095.* must have the levels of .b\.dng"):
+        read_raw(dark, **given)
