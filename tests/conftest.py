@@ -4,7 +4,9 @@ import logging
 import multiprocessing
 import multiprocessing.forkserver
 import os
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +74,18 @@ def forkserver() -> Any:
 def quick_spawn(forkserver: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Processes that the package spawns come from `forkserver`: importing torch takes seconds."""
     monkeypatch.setattr(multiprocessing, "get_context", {"spawn": forkserver}.__getitem__)
+
+
+@pytest.fixture
+def compiled_and_loaded(tmp_path: Path) -> Callable[[str], list[list[str]]]:
+    """Words that a program prints which compiles its kernels, and then one that loads them."""
+
+    def run(code: str) -> list[list[str]]:
+        command, given = [sys.executable, "-c", code], {"NUMBA_CACHE_DIR": str(tmp_path)}
+        outputs = (subprocess.check_output(command, env=os.environ | given) for _ in range(2))
+        return [output.decode().split() for output in outputs]
+
+    return run
 
 
 @pytest.fixture

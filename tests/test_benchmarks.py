@@ -10,6 +10,7 @@ import pytest
 from agents.cli.bench import BENCHMARKS
 from benchmarks import harness
 from benchmarks.harness import Benchmark, FinishedParts, Part, Report, cell, pivot, rounded, table
+from benchmarks.throughput import full_frame
 from benchmarks.work_precision.precision import pareto_front
 
 
@@ -22,6 +23,13 @@ def test_cells_of_missing_values_are_empty_and_pipes_escaped() -> None:
     assert cell(row, "{deep[a][0]}") == "3"
     text = table([row], {"name": "{name}", "empty": "{none}", "ms": lambda r: 2 * r["ms"]})
     assert text.splitlines() == ["| name | ms |", "|---|--:|", "| a\\|b | 2.468 |"]
+
+
+def test_frames_of_a_throughput_run_with_all_its_parts() -> None:
+    """A part of another kind has no file in its name."""
+    results = {"paired 1": [], "libraw|a.dng": {"s": 1}, "frame|a.dng|full": {"s": 2}}
+    wanted = {"case": "full", "file": "a.dng", "s": 2, "libraw": {"s": 1}}
+    assert full_frame.rows(results) == [wanted]
 
 
 def test_a_pivot_has_a_line_for_each_value_and_gaps_where_there_is_no_row() -> None:

@@ -140,14 +140,13 @@ def _run(
 
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
-    make_folder(out)
-
     with StoredRun(plan, out / "parts", scenes, device=device) as run:
         ranked = run.ranked_policies  # raises before any work where a policy is unknown
         if append is not None and plan.policies:
             check_append(append, plan, ranked, author=author)
             for name in (p for p in plan.policies if p not in ranked):
                 logger.warning("%s gets no row in %s: it is told the best states", name, append)
+        make_folder(out)
         with progress_bars() as progress, progress("evaluation") as task:
             results = run.run(workers=workers, progress=task)
     files = write_report(results, out, command=command_line())

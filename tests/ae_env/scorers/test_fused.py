@@ -1,9 +1,5 @@
 """Closed forms by a fused kernel, against the scorers that are written in torch."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,7 +81,7 @@ def test_static_and_changing_light_are_scored_by_the_same_kernel(
         np.testing.assert_allclose(found.mean, 0.8 * other.mean + 0.2 * other.parts["noise"])
 
 
-def test_compiled_and_loaded_kernels_agree_to_the_last_bit(tmp_path: Path) -> None:
+def test_compiled_and_loaded_kernels_agree_to_the_last_bit(compiled_and_loaded: Any) -> None:
     """The first process of a fresh installation compiles; all others load what it cached."""
     code = (
         "import sys, numpy as np; from ae_env.scorers.fused import fused_means\n"
@@ -97,8 +93,6 @@ def test_compiled_and_loaded_kernels_agree_to_the_last_bit(tmp_path: Path) -> No
         "fused_means(0, 3, light, dark, *fixed, *noise, means)\n"
         "print(*fused_means.stats.cache_hits.values(), means.tobytes().hex())\n"
     )
-    command, given = [sys.executable, "-c", code], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    outputs = [subprocess.check_output(command, env=given, text=True).split() for _ in range(2)]
-    (compiled,), (hits, loaded) = outputs
+    (compiled,), (hits, loaded) = compiled_and_loaded(code)
     assert (hits, len(loaded)) == ("1", 2 * 72)
     assert loaded == compiled

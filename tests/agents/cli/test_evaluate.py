@@ -64,6 +64,7 @@ def test_an_environment_is_the_base(tmp_path):
         (("--preset", "ae_bench_v1", "--frames", 3), "is a fixed benchmark: it does not take --fr"),
         (("--preset", "mine.yaml", "--append", "x.csv"), "takes the results of a benchmark only"),
         (("--policy", "random", "--scorer", "nois"), "did you mean 'noise'"),
+        (("--policy", "matix:P", "--scenes", "bundled:small"), "did you mean 'matrix"),
         (("--preset", "broken.yaml"), "starts"),
         (("--policy", "random", "--author", "me"), "give --append too"),
         (("--preset", "ae_bench_v1", "--append", "."), "must be a file, but it is a folder"),
@@ -72,8 +73,8 @@ def test_an_environment_is_the_base(tmp_path):
 def test_mistakes_are_one_line(ae_env, tmp_path, arguments, message):
     (tmp_path / "mine.yaml").write_text(BASE)
     (tmp_path / "broken.yaml").write_text(BASE.replace("dark", "drak"))
-    code, _, error = ae_env("evaluate", *arguments)
-    assert (code, error.strip().count("\n")) == (2, 0), error
+    code, text, error = ae_env("evaluate", *arguments)
+    assert (code, text, error.strip().count("\n")) == (2, "", 0), error
     assert message in error
     assert not (tmp_path / "evaluation").exists()
 
@@ -82,6 +83,7 @@ def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):
     code, text, _ = ae_env("evaluate", "--preset", preset, "--out", "first")
     assert code == 0
     assert "over 4 conditions" in text
+    assert text.startswith("evaluation ...\n")  # a line where no bar can be drawn
     folder = tmp_path / "first"
     content = json.loads((folder / "results.json").read_text())
     rows, meta = content["rows"], content["meta"]

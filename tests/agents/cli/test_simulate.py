@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, read_raw, write_dng
 from simulator.networks.weights import build_modules, save_modules
@@ -51,10 +51,16 @@ def test_a_raw_at_other_settings(ae_env, raw: RawImage, dng: Path, tmp_path: Pat
     assert not read_raw(out).data.equal(back.data)
 
 
-def test_settings_of_a_source_that_has_none_and_a_picture_turned_upright(ae_env, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("flip", "orientation"),
+    [(3, 3), (5, 8), (6, 6)],  # LibRaw's code and that of EXIF
+)
+def test_settings_of_a_source_that_has_none_and_a_picture_turned_upright(
+    ae_env, tmp_path: Path, flip: int, orientation: int
+) -> None:
     data = np.full((4, 20, 30), 0.1, np.float32)
     data[:, :10] = 0.4  # the upper half is bright
-    settings, metadata = CameraSettings(100, 1 / 64, 8), {"flip": 6}  # upright after a turn right
+    settings, metadata = CameraSettings(100, 1 / 64, 8), {"flip": flip}
     raw = RawImage(data, settings, get_camera("nikon_z6"), metadata=metadata)
     write_dng(tmp_path / "a.dng", raw)
     out, png = tmp_path / "out.dng", tmp_path / "a.png"
@@ -64,8 +70,11 @@ def test_settings_of_a_source_that_has_none_and_a_picture_turned_upright(ae_env,
     assert (code, "source ISO 400, 1/64 s, f/8" in text) == (0, True)
     assert read_raw(out).data.mean() == pytest.approx(0.25 / 4, rel=0.02)  # at ISO 400 it was
     picture = np.asarray(Image.open(png)).astype(float).mean(axis=-1)
-    assert picture.shape == (60, 40)
-    assert picture[:, 25:].mean() > 1.5 * picture[:, :15].mean()  # the top came to the right
+    bright = Image.fromarray(np.repeat([255, 0], 20).astype(np.uint8)[:, None].repeat(60, axis=1))
+    bright.getexif()[0x0112] = orientation
+    wanted = np.asarray(ImageOps.exif_transpose(bright)) > 0
+    assert picture.shape == wanted.shape
+    assert picture[wanted].mean() > 1.5 * picture[~wanted].mean()
     code, _, error = ae_env(*command, 8, "-o", out, *given)
     assert (code, "--source-aperture, or none" in error) == (2, True)
 

@@ -1,9 +1,6 @@
 """Row-by-row blur against the definitions in `simulator.optics.blur`, and brute force."""
 
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -114,7 +111,7 @@ def test_wide_discs_in_the_fourier_domain_are_those_of_the_sum(monkeypatch, exte
         torch.testing.assert_close(fourier, direct, rtol=1e-4, atol=1e-5)
 
 
-def test_a_streak_is_the_same_compiled_and_loaded(tmp_path):
+def test_a_streak_is_the_same_compiled_and_loaded(compiled_and_loaded):
     """A sum of two products may be fused either way, and was: each process chose its own."""
     code = (
         "import torch; from simulator.optics.blur_kernels import _moved, streak\n"
@@ -122,7 +119,5 @@ def test_a_streak_is_the_same_compiled_and_loaded(tmp_path):
         "blurred = [streak(light, extent) for extent in (1.3, 5.5, 11.2)]\n"
         "print(*_moved.stats.cache_hits.values(), torch.stack(blurred).numpy().tobytes().hex())\n"
     )
-    command, given = [sys.executable, "-c", code], os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    outputs = [subprocess.check_output(command, env=given, text=True).split() for _ in range(2)]
-    (compiled,), (hits, loaded) = outputs
+    (compiled,), (hits, loaded) = compiled_and_loaded(code)
     assert (hits, loaded) == ("1", compiled)
