@@ -29,6 +29,7 @@ bench: $(STAMP)
 	$(BIN)/ae-env bench scorers
 	$(BIN)/ae-env bench defects
 	$(BIN)/ae-env bench convergence
+	$(BIN)/ae-env bench ptc
 	$(BIN)/ae-env bench throughput
 	$(BIN)/ae-env bench stability
 	@echo "error against time (about 20 minutes, and an hour once for the networks to compare with): $(BIN)/ae-env bench work-precision"

@@ -36,7 +36,7 @@ COSTS = ("flicker", "switch")
 ObservationKind = Literal["uint8", "linear", "dn"]
 Motion = Literal["random", "none"]
 Depth = Literal["random", "far", "unknown"]
-Noise = Literal["bank", "exact"]
+Noise = Literal["bank", "exact", "sensor"]
 Reward = Literal["capture", "expected"]
 #: Longest delay [frame].
 MAX_DELAY = 16
@@ -140,7 +140,11 @@ class EnvOptions:
 
     def make_camera(self) -> CameraProfile:
         """The camera body."""
-        return self.camera if isinstance(self.camera, CameraProfile) else get_camera(self.camera)
+        given = self.camera
+        camera = given if isinstance(given, CameraProfile) else get_camera(given)
+        if self.noise == "sensor":
+            camera.read_noise(100.0)  # raises where there is no such calibration
+        return camera
 
     def make_scorer(self) -> CompositeScorer:
         """The scorer."""

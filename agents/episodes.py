@@ -14,6 +14,7 @@ from agents.policy import Observations
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
+    from ae_env.scenes.loading import SceneSpec
 
 ENV_ID = "ae_env/AutoExposure-v0"
 #: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
@@ -41,7 +42,7 @@ def make_envs(
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
 
 
-def training_scenes(scenes: str, resolution: int = 64) -> tuple[str, bool]:
+def training_scenes(scenes: SceneSpec, resolution: int = 64) -> tuple[SceneSpec, bool]:
     """Scenes to train on for an evaluation on `scenes`, and whether they are others.
 
     The others are the bundled ones, where `scenes` has too few source groups for a training split.
@@ -49,7 +50,7 @@ def training_scenes(scenes: str, resolution: int = 64) -> tuple[str, bool]:
     from ae_env.options import EnvOptions
     from ae_env.scenes.loading import BUNDLED
 
-    if scenes not in BUNDLED:
+    if not isinstance(scenes, str) or scenes not in BUNDLED:
         options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
         groups = {scene.group for scene in options.load_scenes()}
         if len(groups) < MIN_TRAINING_GROUPS:

@@ -35,11 +35,12 @@ def recorded(signal: Tensor, camera: CameraProfile) -> Tensor:
 
 
 def cropped(scene: ReferenceScene, height: int, width: int) -> ReferenceScene:
-    """The middle `height` x `width` pixels of a scene, or all of one that is smaller."""
-    top, left = (
-        max(0, n - size) // 2
-        for n, size in zip(scene.light.shape[1:], (height, width), strict=True)
+    """The middle `height` x `width` packed pixels of a scene, or all of one that is smaller."""
+    top, left = (max(0, n - size) // 2 for n, size in zip(scene.size, (height, width), strict=True))
+    rows, columns = (
+        slice(scene.pitch * first, scene.pitch * (first + n))
+        for first, n in ((top, height), (left, width))
     )
-    window = (..., slice(top, top + height), slice(left, left + width))
+    window = (..., rows, columns)
     depth = None if scene.depth is None else scene.depth[window]
     return replace(scene, light=scene.light[window].contiguous(), depth=depth)

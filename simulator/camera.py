@@ -11,8 +11,12 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib import resources
 from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.noise.read_noise import ReadNoise
 
 
 class BayerPattern(StrEnum):
@@ -49,6 +53,8 @@ class CameraProfile:
         white_level: Digital number at which the sensor saturates, whole.
         bit_depth: Bits per sample of its raw files.
         nlf_by_iso: Calibrated noise level function by ISO; empty if unknown.
+        read_noise_by_iso: Rows and tails of the read noise by ISO, for ``noise="sensor"``; empty if
+            unknown.
         segments: ISO at which a new conversion-gain segment begins; interpolation never crosses it.
         colour_matrix: XYZ (D65) to camera RGB, row by row (3 x 3); None if unknown.
         colour_matrix_source: Where the matrix comes from.
@@ -65,6 +71,7 @@ class CameraProfile:
     make: str = "unknown"
     model: str = "unknown"
     nlf_by_iso: Mapping[float, NoiseLevelFunction] = field(default_factory=dict)
+    read_noise_by_iso: Mapping[float, ReadNoise] = field(default_factory=dict)
     segments: tuple[float, ...] = ()
     colour_matrix: tuple[tuple[float, float, float], ...] | None = None
     colour_matrix_source: str = ""
@@ -115,9 +122,10 @@ class CameraProfile:
     def nlf(self, iso: float) -> NoiseLevelFunction:
         """Noise level function at `iso`.
 
-        Log-log interpolation between calibrated ISOs, inside a conversion-gain segment; outside
-        the table shot noise scales with ISO and read noise with its square, flagged as
-        extrapolated.
+        Log-log interpolation between calibrated ISOs, inside a conversion-gain segment. Outside,
+        shot noise scales with ISO and read noise with its square, but for the rounding to digital
+        numbers (1/12 DN^2), which is the same at each ISO; beyond the table
+        `NoiseLevelFunction.extrapolation` says how far.
 
         Raises:
             ValueError: If the profile has no noise calibration or `iso` is not positive.
@@ -127,9 +135,49 @@ class CameraProfile:
                 f"camera {self.name!r} has no noise calibration; give `nlf`, or estimate one with "
                 "simulator.estimate_nlf"
             )
-        if not (isinstance(iso, Real) and math.isfinite(iso) and iso > 0):
-            raise ValueError(f"`iso` (={iso!r}) must be positive and finite")
+        _check_iso(iso)
         return _interpolate_nlf(self, float(iso))
+
+    def read_noise(self, iso: float, box_factor: int = 1) -> ReadNoise:
+        """Rows and tails of the read noise at `iso`, of averages of `box_factor` squared pixels.
+
+        Interpolated over log ISO inside a conversion-gain segment; that of the nearest ISO outside
+        the table.
+
+        Raises:
+            ValueError: If the profile has no such calibration or `iso` is not positive.
+        """
+        if not self.read_noise_by_iso:
+            raise ValueError(
+                f"camera {self.name!r} has no calibration of row noise and of the read noise's "
+                "shape: `noise` must be 'exact' or 'bank', or give `read_noise_by_iso`"
+            )
+        _check_iso(iso)
+        table = self.read_noise_by_iso
+        isos = _segment(self, table, iso)
+        row, shape = (
+            float(np.interp(math.log(iso), np.log(isos), [getattr(table[i], name) for i in isos]))
+            for name in ("row", "shape")
+        )
+        return ReadNoise(row, shape, box_factor)
+
+    def with_levels(
+        self, black_level: Sequence[float], white_level: float, bit_depth: int
+    ) -> CameraProfile:
+        """This camera with the levels of a file, and its noise on the scale that they make.
+
+        The same digital numbers, as shares of the converter's range, are more or less of the way to
+        white; the noise of a plane goes with them.
+        """
+        levels: dict[str, Any] = {"black_level": black_level, "white_level": white_level}
+        other = replace(self, **levels, bit_depth=bit_depth)
+        own, new = (
+            [span / 2.0**depth for span in spans]
+            for spans, depth in ((self.span, self.bit_depth), (other.span, bit_depth))
+        )
+        factor = sum(own) / sum(new)
+        table = {iso: nlf.exposed(factor) for iso, nlf in self.nlf_by_iso.items()}
+        return replace(other, nlf_by_iso=table)
 
     def with_nlf(self, iso: float, nlf: NoiseLevelFunction) -> CameraProfile:
         """This camera with its noise calibrated by one measurement at `iso`."""
@@ -139,17 +187,26 @@ class CameraProfile:
         return hash((self.name, self.cfa, self.black_level, self.white_level))
 
 
+def _check_iso(iso: float) -> None:
+    if not (isinstance(iso, Real) and math.isfinite(iso) and iso > 0):
+        raise ValueError(f"`iso` (={iso!r}) must be positive and finite")
+
+
+def _segment(camera: CameraProfile, table: Mapping[float, object], iso: float) -> list[float]:
+    """The ISOs of `table` in the conversion-gain segment of `iso`; all where it has none."""
+    bounds = [0.0, *camera.segments, math.inf]
+    index = sum(iso >= b for b in bounds) - 1
+    return sorted(i for i in table if bounds[index] <= i < bounds[index + 1]) or sorted(table)
+
+
 def _interpolate_nlf(camera: CameraProfile, iso: float) -> NoiseLevelFunction:
     table = camera.nlf_by_iso
     if iso in table:
         return table[iso]
-    bounds = [0.0, *camera.segments, math.inf]
-    index = sum(iso >= b for b in bounds) - 1
-    isos = sorted(i for i in table if bounds[index] <= i < bounds[index + 1]) or sorted(table)
+    isos = _segment(camera, table, iso)
     if not isos[0] < iso < isos[-1]:
         nearest = min(isos, key=lambda i: abs(math.log(iso / i)))
-        nlf = table[nearest].exposed(iso / nearest)
-        return replace(nlf, extrapolated=not min(table) <= iso <= max(table))
+        return _amplified(camera, table[nearest], iso / nearest, _stops_beyond(table, iso))
     high = next(i for i in isos if i > iso)
     low = isos[isos.index(high) - 1]
     t = math.log(iso / low) / math.log(high / low)
@@ -165,18 +222,37 @@ def _interpolate_nlf(camera: CameraProfile, iso: float) -> NoiseLevelFunction:
     )
 
 
+def _stops_beyond(table: Mapping[float, NoiseLevelFunction], iso: float) -> float:
+    """Stops by which `iso` is above the table (negative: below); 0 inside."""
+    return math.log2(iso / min(max(iso, min(table)), max(table)))
+
+
+def _amplified(
+    camera: CameraProfile, nlf: NoiseLevelFunction, gain: float, stops: float
+) -> NoiseLevelFunction:
+    """`nlf` after `gain` in front of the rounding, whose variance is therefore not multiplied."""
+    rounding = [min(v, 1 / 12 / s**2) for v, s in zip(nlf.read, camera.span, strict=True)]
+    before = replace(nlf, read=[v - r for v, r in zip(nlf.read, rounding, strict=True)])  # type: ignore[arg-type]
+    after = before.exposed(gain)
+    read = [v + r for v, r in zip(after.read, rounding, strict=True)]
+    return replace(after, read=read, extrapolation=stops)  # type: ignore[arg-type]
+
+
 @functools.cache
 def _built_in() -> dict[str, CameraProfile]:
     text = resources.files("simulator").joinpath("cameras.json").read_text(encoding="utf-8")
     cameras = {}
     for name, entry in json.loads(text).items():
-        nlf_by_iso = {}
+        nlf_by_iso, read_noise_by_iso = {}, {}
         for iso, values in entry.pop("nlf_by_iso").items():
             shot, read = ([v[0], v[1], v[1], v[2]] for v in (values["shot"], values["read"]))
             nlf_by_iso[float(iso)] = NoiseLevelFunction(shot, read, source=entry["source"])  # type: ignore[arg-type]
+            if "row" in values:
+                read_noise_by_iso[float(iso)] = ReadNoise(values["row"], values["shape"])
         entry["colour_matrix"] = tuple(tuple(row) for row in entry["colour_matrix"])
         entry["segments"] = tuple(entry["segments"])
-        cameras[name] = CameraProfile(name=name, nlf_by_iso=nlf_by_iso, **entry)
+        entry |= {"nlf_by_iso": nlf_by_iso, "read_noise_by_iso": read_noise_by_iso}
+        cameras[name] = CameraProfile(name=name, **entry)
     return cameras
 
 

@@ -7,6 +7,7 @@ is then a few element-wise steps.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,15 +18,18 @@ import torch
 from torch import nn
 
 from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.blurred_light import ApertureBlur, Denoised
+from simulator.capture.blurred_light import ApertureBlur
+from simulator.capture.denoised import Denoised
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
+from simulator.networks.denoiser import SIZES, Denoiser
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.full_run import FullRun, Stages
 from simulator.networks.network_cache import NetworkCache, Where
 from simulator.networks.noise_module import NoiseModule, Preset, smoothed, variance_map
 from simulator.noise.generator import Noise, check_noise
+from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.tiles import in_tiles, varying
@@ -34,8 +38,10 @@ from simulator.utils.tiles import in_tiles, varying
 Depth = Literal["far", "unknown"]
 #: Sources of a simulation.
 Source = RawImage | PreparedScene | HasPrepared
-#: Reach of the compact networks around a pixel [pixel]; tiles overlap by it.
-_NOISE_HALO, _MAP_HALO = 36, 56
+#: Reach of the family's networks around a pixel [pixel], a multiple of 8; tiles overlap by it.
+_NOISE_HALO, _MAP_HALO = 80, 56
+#: Size of the raw that a network's time is measured on [packed pixel].
+_TIMED = 128
 #: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
 _DISC_REACH = 16
 
@@ -57,9 +63,11 @@ def prepared_of(source: Source, device: torch.device) -> PreparedScene:
     if isinstance(source, PreparedScene):
         if source.light.device == device:
             return source
-        given = {name: getattr(source, name) for name in ("light", "denoised", "saturated")}
-        moved = {name: part.to(device) for name, part in given.items() if part is not None}
-        return replace(source, **moved)
+        saturated = None if source.saturated is None else source.saturated.to(device)
+        denoised = tuple(d.to(device) for d in source.denoised)
+        return replace(
+            source, light=source.light.to(device), denoised=denoised, saturated=saturated
+        )
     if hasattr(source, "prepared"):
         return prepared_of(source.prepared, device)
     raise ValueError(
@@ -72,7 +80,7 @@ def _recorded(raw: RawImage, device: torch.device) -> PreparedScene:
     if raw.nlf is not None and not camera.nlf_by_iso:
         camera = camera.with_nlf(raw.settings.iso, raw.nlf)
     return PreparedScene(
-        light=raw.data.to(device),
+        light=neutral_highlights(raw, saturated).to(device),
         reference=raw.settings,
         camera=camera,
         nlf=raw.noise,
@@ -86,9 +94,9 @@ class CameraSimulator:
     """Simulates what a camera would have recorded at other settings.
 
     Args:
-        preset: Networks with random weights to train or to time, ``"compact"`` or ``"paper"``; see
-            `from_pretrained` for trained ones. None has none: noise is only added, and every scene
-            is taken as far.
+        preset: Networks with random weights to train or to time, ``"nano"``, ``"compact"``,
+            ``"large"`` or ``"paper"``; see `from_pretrained` for trained ones. None has none: noise
+            is only added, and every scene is taken as far.
         device: ``"auto"`` (CUDA where there is one), or any torch device.
         precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32.
         cache: Where `prepare` stores the networks' results about a source, for the next time that
@@ -125,8 +133,17 @@ class CameraSimulator:
         self.precision = precision
         self._results = NetworkCache(cache)
         self.exposure = ExposureModule().requires_grad_(False).to(self.device)
-        self.noise = None if preset is None else self._ready(NoiseModule(preset))
-        self.aperture = None if preset is None else self._ready(ApertureModule(preset))
+        self.noises: tuple[NoiseModule, ...] = ()
+        self.aperture: ApertureModule | None = None
+        self._seconds: dict[str, float] = {}
+        if preset is not None:
+            self.noises = (self._ready(NoiseModule(preset)),)
+            self.aperture = self._ready(ApertureModule("paper" if preset == "paper" else "compact"))
+
+    @property
+    def noise(self) -> NoiseModule | None:
+        """The best of its noise modules, `noises`, which are in the order of their cost."""
+        return self.noises[-1] if self.noises else None
 
     @classmethod
     def from_pretrained(
@@ -141,7 +158,9 @@ class CameraSimulator:
         """A simulator with trained networks.
 
         Args:
-            name: ``"compact"``, or the path of weights that `ae-env train-simulator` wrote.
+            name: Largest noise module that may run, ``"nano"``, ``"compact"`` or ``"large"``; which
+                one up to it does, `tolerance` decides. Or the path of weights that
+                `ae-env train-simulator` wrote, whose noise module is the only one then.
             device: See `CameraSimulator`.
             precision: See `CameraSimulator`.
             cache: See `CameraSimulator`.
@@ -153,14 +172,22 @@ class CameraSimulator:
         """
         from simulator.networks.weights import load_modules
 
-        modules, card = load_modules(name)
-        if card["preset"] not in get_args(Preset):
-            raise ValueError(f"`name` (={str(name)!r}) holds the baseline {card['preset']!r}")
+        sizes = list(SIZES)
+        names = sizes[: sizes.index(str(name)) + 1] if str(name) in sizes else [name]
+        loaded = {n: load_modules(n) for n in names}
+        whole = next((m for m, _ in loaded.values() if "aperture" in m), None)
+        if whole is None:  # a noise module alone
+            whole = load_modules("compact")[0]
+        for modules, own in loaded.values():
+            if "noise" not in modules:
+                raise ValueError(f"`name` (={str(name)!r}) holds the baseline {own['preset']!r}")
         simulator = cls(device=device, precision=precision, cache=cache)
-        simulator.noise = simulator._ready(cast(NoiseModule, modules["noise"]))
-        simulator.aperture = simulator._ready(cast(ApertureModule, modules["aperture"]))
+        simulator.noises = tuple(
+            simulator._ready(cast(NoiseModule, modules["noise"])) for modules, _ in loaded.values()
+        )
+        simulator.aperture = simulator._ready(cast(ApertureModule, whole["aperture"]))
         if body_correction:
-            simulator.exposure = cast(ExposureModule, modules["exposure"]).to(simulator.device)
+            simulator.exposure = cast(ExposureModule, whole["exposure"]).to(simulator.device)
         return simulator
 
     def _ready(self, module: Any) -> Any:
@@ -188,9 +215,9 @@ class CameraSimulator:
                 takes the scene as far or in focus throughout, where every aperture is exact.
             depth: ``"unknown"`` lets the aperture module find what is out of focus, and blur that
                 more where the aperture opens; ``"far"`` takes the scene as in focus throughout.
-            tolerance: How far the distribution of a capture may move by what is left out, in units
-                of the target's noise; 0 leaves out only what changes nothing. By default what the
-                source was prepared with, `DEFAULT_TOLERANCE` for a raw or a scene.
+            tolerance: Error that a capture may have, in units of the target's noise: the cheapest
+                steps that keep it are taken, or else, as at 0, those with the least error. By
+                default what the source was prepared with, `DEFAULT_TOLERANCE` for a raw or a scene.
 
         Raises:
             ValueError: If an argument is out of range, or `depth` needs networks that are not here.
@@ -214,12 +241,14 @@ class CameraSimulator:
             prepared = replace(prepared, light=self.exposure(prepared.light, 1.0), nlf=noise)
         whole = prepared.tolerance == 0.0  # what was found with another one may leave parts out
         known, aperture_blur = prepared.denoised, prepared.aperture_blur
-        if self.noise is not None and not prepared.nlf.is_zero and _lacks(known, whole):
-            every = whole or self.noise.preset == "paper"
-            light = partial(self._denoised, replace(prepared, denoised=None))
-            prepared = replace(prepared, denoised=Denoised(light, everywhere=every))
+        lacks = not known or (whole and not all(d.everywhere for d in known))
+        if self.noises and not prepared.nlf.is_zero and lacks:
+            bare = replace(prepared, denoised=())
+            prepared = replace(
+                prepared, denoised=tuple(self._denoised(m, bare) for m in self.noises)
+            )
         if depth == "unknown" or (
-            aperture_blur is not None and self.aperture and _lacks(aperture_blur, whole)
+            aperture_blur is not None and self.aperture and whole and not aperture_blur.everywhere
         ):
             prepared = replace(prepared, aperture_blur=self._aperture_blur(prepared))
         return prepared
@@ -234,28 +263,39 @@ class CameraSimulator:
         return prepared if defocus is None else replace(prepared, defocus=defocus)
 
     @torch.no_grad()
-    def denoise(self, prepared: PreparedScene) -> torch.Tensor:
+    def denoise(self, prepared: PreparedScene, noise: NoiseModule | None = None) -> torch.Tensor:
         """The prepared scene's light (4, H, W) with little noise.
 
-        The result serves every exposure: the compact network commutes with exposure. The paper's
+        The result serves every exposure: the family commutes with exposure. The paper's network
         does not; it is run at the exposure of the source.
+
+        Args:
+            prepared: The scene.
+            noise: The noise module; by default the best.
 
         Raises:
             ValueError: If this simulator has no noise module.
         """
-        if self.noise is None:
+        noise = self.noise if noise is None else noise
+        if noise is None:
             raise ValueError("there is no noise module: use CameraSimulator.from_pretrained")
         image, (shot, read) = prepared.light[None], self._noise_of(prepared)
-        noise = self.noise
-
-        def network(part: torch.Tensor) -> torch.Tensor:
+        if not noise.commutes:
             with self._autocast():
-                return noise(part, shot, read)
+                return noise(image, shot, read)[0]
+        network = cast(Denoiser, noise.network)
 
-        if noise.preset == "compact":
-            needed = varying(prepared.light) if prepared.tolerance > 0 else None
-            return in_tiles(network, image, halo=_NOISE_HALO, needed=needed, fallback=image)[0]
-        return network(image)[0]
+        def uncorrected(part: torch.Tensor, far: torch.Tensor) -> torch.Tensor:
+            with self._autocast():
+                return network.uncorrected(part, far, shot, read)
+
+        needed = varying(prepared.light) if prepared.tolerance > 0 else None
+        around = network.surroundings(image, shot, read)
+        clean = in_tiles(
+            uncorrected, image, around, halo=_NOISE_HALO, needed=needed, fallback=image
+        )
+        clean = network.corrected(clean, image, shot, read)[0]
+        return clean if needed is None else torch.where(needed, clean, prepared.light)
 
     @torch.no_grad()
     def estimate_defocus(self, prepared: PreparedScene) -> torch.Tensor:
@@ -269,7 +309,7 @@ class CameraSimulator:
         aperture = self.aperture
         shot, read = self._noise_of(prepared)
         light = prepared.light[None]
-        image = light if prepared.denoised is None else prepared.denoised.light[None]
+        image = prepared.denoised[-1].light[None] if prepared.denoised else light
 
         def network(part: torch.Tensor, noisy: torch.Tensor) -> torch.Tensor:
             deviation = variance_map(smoothed(noisy), shot, read).sqrt()
@@ -285,18 +325,39 @@ class CameraSimulator:
     def _aperture_blur(self, prepared: PreparedScene) -> ApertureBlur:
         assert self.aperture is not None
         f_number = prepared.reference.effective_f_number
-        denoised = prepared.denoised or Denoised(prepared.light)
         if self.aperture.preset == "paper":
+            denoised = prepared.denoised[-1] if prepared.denoised else Denoised(prepared.light)
             opened = partial(self._results.called, "opened", self.aperture)
             return NetworkApertureBlur(denoised, opened, f_number)
         estimate, everywhere = partial(self._defocus_map, prepared), prepared.tolerance == 0.0
-        return MapApertureBlur(prepared.light, denoised, estimate, f_number, everywhere=everywhere)
+        return MapApertureBlur(prepared.light, estimate, f_number, everywhere=everywhere)
 
-    def _denoised(self, prepared: PreparedScene) -> torch.Tensor:
-        """`denoise`, cached."""
-        assert self.noise is not None
-        make = partial(self.denoise, prepared)
-        return self._cached("denoised", self.noise, prepared, make, prepared.light.shape)
+    def _denoised(self, noise: NoiseModule, prepared: PreparedScene) -> Denoised:
+        """`denoise` when it is first needed, cached."""
+        pixels, make = prepared.light[0].numel(), partial(self.denoise, prepared, noise)
+        return Denoised(
+            lambda: self._cached("denoised", noise, prepared, make, prepared.light.shape),
+            name=noise.preset,
+            residual=noise.residual,
+            operations=noise.operations * pixels,
+            seconds=lambda: self._seconds_of(noise) * pixels,
+            everywhere=prepared.tolerance == 0.0 or not noise.commutes,
+        )
+
+    @torch.no_grad()
+    def _seconds_of(self, noise: NoiseModule) -> float:
+        """Time that a noise module takes for a packed pixel on this machine [s], measured once."""
+        if noise.preset not in self._seconds:
+            image = torch.zeros(1, 4, _TIMED, _TIMED, device=self.device)
+            variance = torch.full((1, 4), 1e-4, device=self.device)
+            times = []
+            for _ in range(2):
+                start = time.perf_counter()
+                with self._autocast():
+                    noise(image, variance, variance).sum().item()
+                times.append(time.perf_counter() - start)
+            self._seconds[noise.preset] = min(times) / _TIMED**2
+        return self._seconds[noise.preset]
 
     def _defocus_map(self, prepared: PreparedScene) -> torch.Tensor:
         """`estimate_defocus`, cached."""
@@ -314,7 +375,7 @@ class CameraSimulator:
         shape: Sequence[int],
     ) -> torch.Tensor:
         """The result of `make`, or that of an earlier call where everything was the same."""
-        denoised = None if prepared.denoised is None else prepared.denoised.light
+        denoised = prepared.denoised[-1].light if prepared.denoised else None
         inputs = {"light": prepared.light, "denoised": denoised, "saturated": prepared.saturated}
         return self._results.result(
             kind,
@@ -419,8 +480,8 @@ class CameraSimulator:
             source: A raw, a prepared scene, or a scene.
             settings: Target ISO, exposure time and f-number.
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
-            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster (see
-                `PreparedScene.capture`); the full run draws it.
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster, ``"sensor"`` draws it with
+                row noise and tails (see `PreparedScene.capture`); the full run knows ``"exact"``.
             image_speed: See `prepare`.
             defocus: See `prepare`.
             depth: See `prepare`.
@@ -433,12 +494,14 @@ class CameraSimulator:
         """
         check_noise(noise)
         if tolerance is None and self.noise is not None:
+            if noise == "sensor":
+                raise ValueError("`noise` (='sensor') needs a `tolerance`: not in the full run")
             stages = self.stages(
                 source, settings, seed=seed, image_speed=image_speed, defocus=defocus, depth=depth
             )
             data, excess_noise = stages.capture, 0.0
             prepared = prepared_of(source, self.device)
-            clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=None, aperture_blur=None)
+            clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=(), aperture_blur=None)
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
             prepared = self.prepare(
@@ -466,8 +529,3 @@ class CameraSimulator:
             box_factor=prepared.box_factor,
             metadata=metadata,
         )
-
-
-def _lacks(known: Denoised | ApertureBlur | None, whole: bool) -> bool:
-    """Whether there is none, or one that leaves out parts of the frame where it must not."""
-    return known is None or (whole and not known.everywhere)

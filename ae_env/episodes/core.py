@@ -41,6 +41,7 @@ _NOISES: dict[bool | str, Noise | None] = {
     True: "bank",
     "bank": "bank",
     "exact": "exact",
+    "sensor": "sensor",
 }
 #: Name of each kind of observation in `CaptureBatch.record`.
 _OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}

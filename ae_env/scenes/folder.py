@@ -40,7 +40,7 @@ OnError = Literal["stop", "skip"]
 _PROGRESS_SECONDS = 10.0
 #: Most file names in a log line about files that were skipped.
 _MOST_NAMES = 5
-_HOW_TO_SKIP = "; in Python or YAML, {'path': ..., 'on_error': 'skip'} leaves it out"
+_HOW_TO_SKIP = "; --on-error skip, or {'path': ..., 'on_error': 'skip'}, leaves it out"
 _RAW_ENDINGS = f"{', '.join(RAW_SUFFIXES[:8])} ..."
 
 

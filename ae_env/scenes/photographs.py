@@ -71,7 +71,7 @@ def photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator
     picture, the others are cut and mirrored at random (by a seed that depends on the name alone).
     """
     rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
-    light = unprocess(_read(photograph.file), rng)
+    light = unprocess(read_photograph(photograph.file), rng)
     height, width = light.shape[1:]
     for index in range(SCENES_PER_PHOTOGRAPH):
         top, left = (height - NATIVE_SIZE) // 2, (width - NATIVE_SIZE) // 2
@@ -125,7 +125,8 @@ def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.asarray((linear * np.exp2(blown * rng.uniform(0.0, 2.5))).astype(np.float32))
 
 
-def _read(name: str) -> np.ndarray:
+def read_photograph(name: str) -> np.ndarray:
+    """The pixels of a photograph of `PHOTOGRAPHS`, by its file name: uint8, (H, W, 3) or (H, W)."""
     file = resources.files("skimage.data").joinpath(name)
     if not file.is_file():
         raise FileNotFoundError(

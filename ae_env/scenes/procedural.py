@@ -9,7 +9,7 @@ docstring of each kind says where that is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,13 +42,16 @@ class Drawing:
     illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
-def draw(kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE) -> Drawing:
+def draw(
+    kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE, *, lens: bool = True
+) -> Drawing:
     """A picture of `kind`.
 
     Args:
         kind: One of `list_kinds()`.
         rng: Source of all randomness; the same state gives the same picture.
-        size: Height and width [packed pixels].
+        size: Height and width [pixels].
+        lens: Whether it has the softness of a lens; without, it is for a camera that has its own.
 
     Raises:
         ValueError: If there is no such kind; the message proposes the nearest name.
@@ -57,7 +60,7 @@ def draw(kind: str, rng: np.random.Generator, size: int = NATIVE_SIZE) -> Drawin
         hint = did_you_mean(kind, _KINDS)
         raise ValueError(f"`kind` (={kind!r}) must be one of {list_kinds()}{hint}")
     drawing = _KINDS[kind](rng, size)
-    return Drawing(_lens(drawing.light), drawing.illuminance, drawing.illuminant)
+    return replace(drawing, light=_lens(drawing.light)) if lens else drawing
 
 
 def list_kinds() -> list[str]:

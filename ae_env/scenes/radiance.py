@@ -83,8 +83,11 @@ def radiance_scenes(
     """The scenes of one radiance map, all in one source group.
 
     A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
-    with a field of view of 60 degrees; any other gives its central square. Both are sampled to
-    about 256 packed pixels a side, as the bundled scenes have, before `Scene.resized`.
+    with a field of view of 60 degrees; any other gives its central square. Both have about 256
+    packed pixels a side, as the bundled scenes have, before `Scene.resized`. A map with at least as
+    many pixels there as photosites (512 x 512) is sampled through the colour filter array, so is a
+    coarser one with ``crop="native"`` if it has those of the crop; of others the planes share their
+    places, and the log says so (`Scene.sampled`).
 
     Args:
         path: The file.
@@ -104,11 +107,19 @@ def radiance_scenes(
         fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
     fields.setdefault("source", Path(path).name)
     if abs(width / height - 2.0) <= 0.01:
-        size = native_size(request.resolution)
+        available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
+        size, sampled = _view_size(request, native_size(request.resolution), available)
         views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
     else:
-        size = native_size(request.resolution, min(height, width))
+        available = min(height, width)
+        size = native_size(request.resolution, available)
+        size, sampled = _view_size(request, size, available)
         views = [(name, _central_square(image, size, Path(path).name))]
+    if not sampled:
+        logger.info(
+            "radiance map %s: %d pixels a view, fewer than photosites: planes share their places",
+            *(Path(path).name, available),
+        )
     try:
         levels = [_log2_level(view, request.camera) for _, view in views]
     except ValueError as error:
@@ -118,11 +129,20 @@ def radiance_scenes(
             fields["ev100"] = ev100 + level - float(np.mean(levels))
         try:
             scene = Scene.from_radiance(
-                view, request.camera, scene_id=scene_id, group=group, **fields
+                view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
             )
         except ValueError as error:
             raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
         yield request.sized(scene)
+
+
+def _view_size(request: SceneRequest, size: int, available: int) -> tuple[int, bool]:
+    """Pixels a side of a view of `size` packed pixels, and whether they are photosites."""
+    if available >= 2 * size:
+        return 2 * size, True
+    if request.crop == "native" and request.resolution and available >= 2 * request.resolution:
+        return available // 2 * 2, True
+    return size, False
 
 
 def _near_one(image: np.ndarray) -> np.ndarray:

@@ -1,7 +1,11 @@
 """Scenes for the reference camera, on which the simulator is trained, validated and tested.
 
+All of them are light at the pitch of the photosites, for the camera to sample: procedural scenes
+are drawn there, pictures are cut out at it and never enlarged.
+
 The split by source group is fixed: procedural groups by their index, photographs and radiance maps
-by name. A group has all its views in one split, and the scenes of a split stay when `number` grows.
+by name (`ae_env.scenes.detail.detail_split`). A group has all its views in one split, and the
+scenes of a split stay when `number` grows.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import tifffile
@@ -21,30 +25,28 @@ import torch
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
+from ae_env.scenes.colour import temperature_tint
 from ae_env.scenes.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
-from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes, unprocess
-from ae_env.scenes.procedural import draw, list_kinds
-from ae_env.scenes.radiance import (
-    AZIMUTHS,
-    EV100_RANGE,
-    RADIANCE_SUFFIXES,
-    assumed_ev100,
-    perspective,
-    read_radiance,
+from ae_env.scenes.detail import (
+    FIRST_INDEX,
+    Split,
+    photograph_pictures,
+    radiance_files,
+    recorded_mosaics,
 )
-from ae_env.scenes.scene import Scene, reference_settings
+from ae_env.scenes.photographs import PHOTOGRAPHS, read_photograph, unprocess
+from ae_env.scenes.procedural import draw, list_kinds
+from ae_env.scenes.radiance import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
+from ae_env.scenes.scene import Scene, mean_anchor, reference_settings
 from ae_env.utils.checks import check_integer, check_word
 from simulator.camera import CameraProfile
 from simulator.optics.thin_lens import Lens
-from simulator.reference.reference_camera import DRAPED, ReferenceScene
+from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.settings import incident_ev100
 
 logger = logging.getLogger(__name__)
 
-Split = Literal["train", "validation", "test"]
-
-#: Index of the first procedural group of each split; no split may have more groups than the gap.
-FIRST_INDEX = {"train": 0, "validation": 100_000, "test": 200_000}
+#: Most procedural groups of a split, the gap between the first indices of two.
 MOST_GROUPS = 100_000
 #: Every fourth procedural group has no depth: one of the bundled kinds, for noise and exposure.
 _FLAT_EVERY = 4
@@ -56,16 +58,22 @@ FOCUS_CYCLE = (
 )
 #: The photograph of the bundled training split that validates.
 VALIDATION_PHOTOGRAPH = "coffee"
-#: Radiance maps by file stem: 4 train, 2 validate, 7 test.
-RADIANCE_MAPS: dict[str, tuple[str, ...]] = {
-    "train": ("bridge", "dawn", "forest", "lobby"),
-    "validation": ("StillLife", "city"),
-    "test": ("Desk", "apartment", "lab", "park", "sunset", "venice", "warehouse"),
+#: Pictures that give fewer packed pixels a side than this are left out, unless smaller scenes are
+#: asked for.
+LEAST_VIEW = 128
+#: Photographs (by file) with a blur of their own, by depth of field or motion.
+_BLURRED = {
+    *("buddiesofbudgie_budgie-branch", "buddiesofbudgie_fragrant-chamomile"),
+    *("buddiesofbudgie_kitten-on-lawn", "buddiesofbudgie_motherboard-circuits"),
+    *("buddiesofbudgie_noche-bogota", "buddiesofbudgie_oakland-zoo-otters"),
+    *("buddiesofbudgie_solaris-grapes", "buddiesofbudgie_the-spices-of-life"),
+    *("elementary_Jonas_Nilsson_Lee", "elementary_Pablo_Garcia_Saldana"),
+    *("elementary_photo-1452953008873-ae5837174535", "elementary_victor-svistunov-233897-KB"),
+    *("getsolus_Twigonometry", "nextcloud_Frog", "nextcloud_Gorilla", "nextcloud_Vineyard"),
+    "solus-project_HermiteCrab2560x1600",
 }
-#: Field of view of the panoramas' views [degrees]; 256 pixels of it are native at 1024 wide.
-FIELD_OF_VIEW = 90.0
-#: Packed pixels a side of photographs and of views into radiance maps, at most.
-LARGEST_VIEW = 256
+#: See `_edge_ratio`: that of edges averaged over square pixels is 0.4.
+_SHARP = 0.36
 #: Illuminance of reference scenes [lux] (paper, section 4.1); brighter scenes are put at the end.
 ILLUMINANCE = (1.0, 20_000.0)
 #: Largest circle of confusion of the photographs with depth at f/11 [packed pixels].
@@ -78,7 +86,7 @@ def reference_scenes(
     *,
     number: int = 48,
     size: int = 256,
-    radiance: Path | None = None,
+    data: Path | None = None,
     seed: int = 0,
 ) -> list[ReferenceScene]:
     """The scenes of `split`: procedural ones, photographs, and views into radiance maps.
@@ -91,12 +99,14 @@ def reference_scenes(
         camera: Camera in whose colours light is stated, and in whose pixels blur is.
         number: Procedural groups, one scene each, at most `MOST_GROUPS`; the first are the same
             whatever `number` is.
-        size: Height and width [packed pixels]; photographs and views have at most 256.
-        radiance: Folder under which the maps of `RADIANCE_MAPS` lie; those missing are left out,
-            which is logged. None leaves all out.
+        size: Height and width [packed pixels], half as many as photosites; pictures that are
+            smaller keep their size, and are left out below 128 and below `size`, which is logged.
+        data: Folder of real files (see docs/simulator-training.md), for radiance maps and further
+            photographs; None leaves them out.
         seed: Seed of the procedural groups; part of their names.
 
     Raises:
+        FileNotFoundError: If there is no folder `data`.
         ValueError: If an argument is invalid.
     """
     check_word("split", split, tuple(FIRST_INDEX))
@@ -104,29 +114,9 @@ def reference_scenes(
     check_integer("size", size, 16, more=" packed pixels")
     check_integer("seed", seed, 0)
     scenes = [_procedural(camera, FIRST_INDEX[split], i, size, seed) for i in range(number)]
-    for photograph in PHOTOGRAPHS:
-        validates = photograph.name == VALIDATION_PHOTOGRAPH
-        if split == ("validation" if validates else photograph.split):
-            for scene in photograph_scenes(photograph, camera):
-                scenes.append(_from_scene(scene.resized(min(size, LARGEST_VIEW), "native")))
-    if radiance is not None:
-        for path in _maps(Path(radiance), RADIANCE_MAPS[split]):
-            scenes += _radiance_views(path, camera, min(size, LARGEST_VIEW))
-    if split != "test":
-        return scenes
-    return [sharpened(s) if s.depth is None and s.kind != "photograph" else s for s in scenes]
-
-
-def sharpened(scene: ReferenceScene) -> ReferenceScene:
-    """A scene without depth at half its size, box-averaged: sharp to the pixel.
-
-    Radiance maps and the bundled kinds are softer than a lens in focus. Wherever defocus matters,
-    in the test split and in `draped_scenes`, "in focus" must mean sharp; elsewhere all pixels are
-    used.
-    """
-    height, width = (n // 2 * 2 for n in scene.light.shape[1:])
-    tiles = scene.light[:, :height, :width].reshape(4, height // 2, 2, width // 2, 2)
-    return replace(scene, light=tiles.mean(dim=(2, 4)))
+    for picture in (*_bundled_photographs(split), *_real_pictures(data, split)):
+        scenes += _cut_out(picture, camera, size)
+    return scenes
 
 
 def _procedural(
@@ -140,10 +130,10 @@ def _procedural(
     rng = np.random.default_rng([zlib.crc32(b"reference"), seed, first + position])
     depth, lens = None, Lens()
     if flat:
-        drawing = draw(kind, rng, 2 * size)  # halved below: as sharp as the scenes with depth
+        drawing = draw(kind, rng, 2 * size, lens=False)
     else:
         focus = FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
-        drawn = draw_depth(rng, size, focus)
+        drawn = draw_depth(rng, 2 * size, focus)
         drawing = drawn.drawing
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
         depth, lens = torch.from_numpy(depths), Lens(FOCAL_LENGTH, distance)
@@ -158,16 +148,11 @@ def _procedural(
         kind=kind,
         source="procedural, ae-env (MIT)",
     )
-    return _from_scene(scene.resized(size, "box"), depth, lens)
+    return _from_scene(scene, depth=depth, lens=lens)
 
 
-def _from_scene(
-    scene: Scene,
-    depth: torch.Tensor | None = None,
-    lens: Lens | None = None,
-    illuminance: float | None = None,
-) -> ReferenceScene:
-    """`scene` for the reference camera, its light moved into the range of `ILLUMINANCE`.
+def _from_scene(scene: Scene, *, illuminance: float | None = None, **fields: Any) -> ReferenceScene:
+    """A scene of one pixel to a photosite for the camera, its light moved into `ILLUMINANCE`.
 
     Light is relative to the reference settings: under less of it they expose longer, and `light`
     stays as it is.
@@ -184,13 +169,12 @@ def _from_scene(
         scene_id=scene.scene_id,
         group=scene.group,
         kind=scene.kind,
-        light=scene.light,
+        light=scene.light[[0, 1, 3]],
         reference=reference,
-        depth=depth,
-        lens=Lens() if lens is None else lens,
         illuminance=known,
         white_balance=scene.white_balance,
         source=scene.source,
+        **fields,
     )
 
 
@@ -207,7 +191,177 @@ def packed_pitch(camera: CameraProfile) -> float:
     return 2e-6 * camera.pixel_pitch_um
 
 
-# -- pictures draped over depth -------------------------------------------------------------------
+# -- pictures without depth -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """Linear light (3, H, W), its pixels as sharp as photosites see.
+
+    Args:
+        views: By scene id; the parts of it that become scenes.
+        illuminance, tint: The light, where it is known.
+    """
+
+    group: str
+    kind: str
+    views: dict[str, np.ndarray]
+    source: str
+    illuminance: float | None = None
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    in_focus: bool = True
+
+
+def _bundled_photographs(split: Split) -> Iterator[_Picture]:
+    """scikit-image's photographs, of which nobody knows what was in focus."""
+    for photograph in PHOTOGRAPHS:
+        validates = photograph.name == VALIDATION_PHOTOGRAPH
+        if split != ("validation" if validates else photograph.split):
+            continue
+        rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
+        light = unprocess(read_photograph(photograph.file), rng)
+        low, high = (math.log(v) for v in photograph.illuminance)
+        yield _Picture(
+            photograph.name,
+            "photograph",
+            {photograph.name: light},
+            f"scikit-image {photograph.file}: {photograph.credit}",
+            illuminance=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
+            tint=temperature_tint(rng.uniform(*photograph.tint)),
+            in_focus=False,
+        )
+
+
+def _real_pictures(data: Path | None, split: Split) -> Iterator[_Picture]:
+    """Radiance maps and photographs of a folder of real files."""
+    if data is None:
+        return
+    if not Path(data).is_dir():
+        raise FileNotFoundError(f"`data` (={str(data)!r}) must be an existing folder")
+    for path, group in radiance_files(Path(data), split):
+        image = read_radiance(path)
+        yield _Picture(group, "radiance", _views(path.stem, image), path.name)
+    for photograph in photograph_pictures(Path(data), split):
+        yield _Picture(
+            photograph.group,
+            "photograph",
+            {photograph.name: _sharpened(photograph.light.numpy())},
+            f"photo_pool {photograph.name}",
+            in_focus=photograph.name not in _BLURRED,
+        )
+
+
+def _views(name: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    """Four square cuts out of a panorama's band of 45 degrees around the horizon; other pictures as
+    they are.
+
+    A perspective view has its edges enlarged; the band is stretched by 1.41 at most, sideways.
+    """
+    height, width = image.shape[1:]
+    if abs(width / height - 2.0) > 0.01:
+        return {name: _sharpened(image)}
+    side = width // 8 * 2
+    top = (height - side) // 2
+    views = {}
+    for azimuth in AZIMUTHS:
+        left = round((azimuth / 360.0 + 0.5) * width) - side // 2
+        columns = np.arange(left, left + side) % width
+        views[f"{name}-{azimuth:03.0f}"] = image[:, top : top + side, columns]
+    return views
+
+
+def _sharpened(light: np.ndarray) -> np.ndarray:
+    """`light`, or its means over 2 x 2 pixels where it is softer than edges that pixels average."""
+    return _tile_means(light) if _edge_ratio(light[1]) < _SHARP else light
+
+
+def _edge_ratio(values: np.ndarray) -> float:
+    """Mean square difference of the logarithm of neighbours, relative to that of second neighbours.
+
+    An edge that falls anywhere in a square pixel gives (2/3) / (5/3) = 0.4; soft pictures tend to
+    1/4, white noise to 1.
+    """
+    logs = np.log(values + 0.02 * np.median(values) + 1e-9)
+    near, far = (np.square(logs[:, n:] - logs[:, :-n]).mean() for n in (1, 2))
+    return float(near / max(far, 1e-12))
+
+
+def _tile_means(light: np.ndarray) -> np.ndarray:
+    height, width = (n // 2 for n in light.shape[1:])
+    tiles = light[:, : 2 * height, : 2 * width].reshape(3, height, 2, width, 2)
+    return np.asarray(tiles.mean(axis=(2, 4)))
+
+
+def _cut_out(picture: _Picture, camera: CameraProfile, size: int) -> Iterator[ReferenceScene]:
+    """The middle of each view, at most 2 x `size` photosites a side."""
+    for name, view in picture.views.items():
+        side = min(2 * size, *(n // 2 * 2 for n in view.shape[1:]))
+        if side < 2 * min(size, LEAST_VIEW):
+            logger.info("%s: too coarse (%d photosites a side), left out", name, side)
+            continue
+        top, left = ((n - side) // 2 for n in view.shape[1:])
+        lux, source = picture.illuminance, picture.source
+        if lux is None:
+            lux = assumed_illuminance(name)
+            source += f"; light of unknown scale, {lux:g} lux assumed"
+        scene = Scene.from_radiance(
+            view[:, top : top + side, left : left + side],
+            camera,
+            scene_id=name,
+            group=picture.group,
+            illuminance=picture.illuminance,
+            ev100=incident_ev100(lux),
+            illuminant=picture.tint,
+            kind=picture.kind,
+            source=source,
+        )
+        yield _from_scene(scene, illuminance=lux, in_focus=picture.in_focus)
+
+
+def mosaic_scenes(
+    split: Split, camera: CameraProfile, data: Path, *, size: int = 256
+) -> Iterator[ReferenceScene]:
+    """The middle of real raws at low ISO: flat art and far views, in focus throughout.
+
+    For the aperture: their noise is small, but it is there, so they are no truth to denoise. They
+    cannot be defocused, as each plane has but a quarter of the photosites.
+
+    Args:
+        split: See `reference_scenes`; groups are split by `ae_env.scenes.detail`.
+        camera: Camera that photographs them; their colours are left as they were recorded.
+        data: Folder of real files.
+        size: Height and width [packed pixels], at most.
+    """
+    for picture in recorded_mosaics(data, split):
+        height, width = picture.light.shape[1:]
+        side = min(size, height, width)
+        top, left = (height - side) // 2, (width - side) // 2
+        light = picture.light[:, top : top + side, left : left + side].clamp(min=0.0)
+        lux = assumed_illuminance(picture.name)
+        yield ReferenceScene(
+            scene_id=picture.name,
+            group=picture.group,
+            kind=MOSAIC,
+            light=light * mean_anchor(light[1:3]),
+            reference=reference_settings(incident_ev100(lux)),
+            illuminance=lux,
+            source=f"raw {picture.name}; light of unknown scale, {lux:g} lux assumed",
+            sampled=True,
+        )
+
+
+def assumed_illuminance(name: str) -> float:
+    """Light [lux] assumed for a picture of unknown scale, in `ILLUMINANCE`, by a hash of its name.
+
+    The assumption is log-uniform, and drawn for each view, so that a few maps cover the range.
+
+    >>> assumed_illuminance("lab-090") == assumed_illuminance("lab-090")
+    True
+    """
+    low, high = EV100_RANGE
+    fraction = (assumed_ev100(name) - low) / (high - low)
+    darkest, brightest = ILLUMINANCE
+    return float(f"{darkest * (brightest / darkest) ** fraction:.4g}")
 
 
 def draped_scenes(
@@ -218,19 +372,19 @@ def draped_scenes(
     Dead leaves have texture everywhere; real pictures also have smooth surfaces with sharp edges,
     and a network that learns the map of defocus from leaves alone takes the smooth ones for
     blurred. A picture that is in focus throughout, laid over depth, shows what defocus does to such
-    surfaces. Photographs are left out, because they have an unknown defocus already.
+    surfaces.
 
     Args:
-        scenes: Scenes to drape; those with depth, and photographs, are passed over.
+        scenes: Scenes to drape; passed over are those with depth, those with a blur of their own,
+            and those that are not at the pitch of the photosites.
         camera: Camera in whose pixels blur is stated.
         copies: Depths per scene; every third has everything in focus.
         seed: Seed of the depths.
     """
     number = 0
-    for given in scenes:
-        if given.depth is not None or given.kind == "photograph":
+    for scene in scenes:
+        if scene.depth is not None or not scene.in_focus or scene.pitch == 1:
             continue
-        scene = sharpened(given)
         for copy in range(copies):
             focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
             number += 1
@@ -246,61 +400,6 @@ def draped_scenes(
                 depth=torch.from_numpy(depth),
                 lens=Lens(FOCAL_LENGTH, distance),
             )
-
-
-# -- radiance maps --------------------------------------------------------------------------------
-
-
-def assumed_illuminance(name: str) -> float:
-    """Light [lux] assumed for a view into a radiance map, in `ILLUMINANCE`, by a hash of its name.
-
-    A radiance map is relative: nothing in it says how bright the place was. The assumption is
-    log-uniform, and drawn for each view, so that a few maps cover the range.
-
-    >>> assumed_illuminance("lab-090") == assumed_illuminance("lab-090")
-    True
-    """
-    low, high = EV100_RANGE
-    fraction = (assumed_ev100(name) - low) / (high - low)
-    darkest, brightest = ILLUMINANCE
-    return float(f"{darkest * (brightest / darkest) ** fraction:.4g}")
-
-
-def _maps(folder: Path, stems: tuple[str, ...]) -> Iterator[Path]:
-    if not folder.is_dir():
-        raise FileNotFoundError(f"`radiance` (={str(folder)!r}) must be an existing folder")
-    files = {p.stem: p for p in sorted(folder.rglob("*")) if p.suffix in RADIANCE_SUFFIXES}
-    for stem in stems:
-        if stem in files:
-            yield files[stem]
-        else:
-            logger.warning("no radiance map %r under %s: its scenes are left out", stem, folder)
-
-
-def _radiance_views(path: Path, camera: CameraProfile, size: int) -> Iterator[ReferenceScene]:
-    """Four views of a panorama, or the middle of a picture, all in focus, all in one group."""
-    image = read_radiance(path)
-    height, width = image.shape[1:]
-    if abs(width / height - 2.0) <= 0.01:
-        views = {
-            f"{path.stem}-{a:03.0f}": perspective(image, a, LARGEST_VIEW, FIELD_OF_VIEW)
-            for a in AZIMUTHS
-        }
-    else:
-        views = {path.stem: image}
-    for name, view in views.items():
-        lux = assumed_illuminance(name)
-        scene = Scene.from_radiance(
-            view,
-            camera,
-            scene_id=name,
-            group=path.stem,
-            ev100=incident_ev100(lux),
-            kind="radiance",
-            source=f"{path.name}; light of unknown scale, {lux:g} lux assumed",
-        )
-        native = scene.resized(LARGEST_VIEW, "box").resized(size, "native")
-        yield _from_scene(native, illuminance=lux)
 
 
 # -- photographs with depth -----------------------------------------------------------------------
@@ -322,9 +421,8 @@ class _DepthPhotograph:
 def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> list[ReferenceScene]:
     """Photographs with measured depth, for testing only, each with two settings of the focus.
 
-    Pixels are box-averaged 2 x 2, depth takes the lower median of the four: a mean of two depths
-    would put an edge where nothing is. Where no disparity was measured it is that of the nearest
-    pixel that has one. The lens is focused on the front (95 % of the picture are farther) or on
+    A pixel counts as a photosite. Where no disparity was measured it is that of the nearest pixel
+    that has one. The lens is focused on the front (95 % of the picture are farther) or on
     the median depth, and its focal length chosen such that the circle of confusion at f/11 reaches
     6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is the larger).
 
@@ -376,13 +474,13 @@ def _cones(folder: Path) -> _DepthPhotograph:
 
 def _focused(photograph: _DepthPhotograph, camera: CameraProfile) -> Iterator[ReferenceScene]:
     rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
-    light = _tiles(unprocess(photograph.image, rng)).mean(axis=-1)
-    filled = fill_from_nearest(photograph.disparity)
-    disparity = np.sort(_tiles(filled), axis=-1)[..., 1]  # the lower median of four
+    height, width = (n // 2 * 2 for n in photograph.disparity.shape)
+    light = unprocess(photograph.image, rng)[:, :height, :width]
+    disparity = fill_from_nearest(photograph.disparity)[:height, :width]
     inverse = (disparity + photograph.offset) * photograph.dioptres_per_pixel
     far, middle, front, near = np.quantile(inverse, [0.02, 0.5, 0.95, 0.98])
     scene = Scene.from_radiance(
-        light.astype(np.float32),
+        light,
         camera,
         scene_id=photograph.name,
         group=photograph.name,
@@ -397,7 +495,8 @@ def _focused(photograph: _DepthPhotograph, camera: CameraProfile) -> Iterator[Re
         area = _PHOTOGRAPH_BLUR * packed_pitch(camera) * F_NUMBER / spread
         focal_length = 0.5 * (math.sqrt((area * focus) ** 2 + 4.0 * area) - area * focus)
         lens = Lens(float(focal_length), float(1.0 / focus))
-        yield replace(_from_scene(scene, depth, lens), scene_id=f"{photograph.name}-{name}")
+        made = _from_scene(scene, depth=depth, lens=lens)
+        yield replace(made, scene_id=f"{photograph.name}-{name}")
 
 
 def fill_from_nearest(values: np.ndarray) -> np.ndarray:
@@ -413,10 +512,3 @@ def fill_from_nearest(values: np.ndarray) -> np.ndarray:
         raise ValueError("`values` must have a finite value")
     indices = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return np.asarray(values[tuple(indices)])
-
-
-def _tiles(values: np.ndarray) -> np.ndarray:
-    """(..., H, W) as (..., H // 2, W // 2, 4), the pixels of each 2 x 2 tile."""
-    height, width = (n // 2 for n in values.shape[-2:])
-    tiles = values[..., : 2 * height, : 2 * width].reshape(*values.shape[:-2], height, 2, width, 2)
-    return np.moveaxis(tiles, -3, -2).reshape(*values.shape[:-2], height, width, 4)

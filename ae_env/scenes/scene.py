@@ -14,11 +14,14 @@ import torch
 from ae_env.scenes.colour import camera_from_srgb, check_rgb
 from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.blurred_light import BlurredLight, Denoised
+from simulator.capture.blurred_light import BlurredLight
+from simulator.capture.denoised import Denoised
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
+from simulator.reference.sampling import lens_blur, sample_mosaic
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
 
@@ -103,6 +106,9 @@ class Scene:
             no noise, or no such module.
         defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
             scene whose own defocus is to grow as the aperture opens; None where all is far.
+        sampled: Whether each plane was sampled at its own place, as a sensor does. False: the four
+            share their places, G1 equals G2, as in every bundled scene; averaged by a large
+            `box_factor` there is hardly a difference.
         allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
             them; None for every state of any grid.
 
@@ -126,6 +132,7 @@ class Scene:
     saturated: torch.Tensor | None = None
     denoised: torch.Tensor | None = None
     defocus_map: torch.Tensor | None = None
+    sampled: bool = False
     allowed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -196,10 +203,11 @@ class Scene:
     @property
     def prepared(self) -> PreparedScene:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        denoised, aperture_blur = None if self.denoised is None else Denoised(self.denoised), None
+        denoised = () if self.denoised is None else (Denoised(self.denoised),)
+        aperture_blur = None
         if self.defocus_map is not None:
-            clean, f_number = denoised or Denoised(self.light), self.reference.effective_f_number
-            aperture_blur = MapApertureBlur(self.light, clean, self.defocus_map, f_number)
+            f_number = self.reference.effective_f_number
+            aperture_blur = MapApertureBlur(self.light, self.defocus_map, f_number)
         return PreparedScene(
             light=self.light,
             reference=self.reference,
@@ -210,7 +218,9 @@ class Scene:
             box_factor=self.box_factor,
             denoised=denoised,
             aperture_blur=aperture_blur,
-            blurred_light=BlurredLight(self.light, denoised, aperture_blur, self._statistics),
+            blurred_light=BlurredLight(
+                self.light, denoised, self.nlf, aperture_blur, self._statistics
+            ),
         )
 
     @cached_property
@@ -307,6 +317,9 @@ class Scene:
     ) -> Scene:
         """A scene from a raw photograph: its light, its noise, its saturated pixels.
 
+        Saturated pixels are neutral (`simulator.raw.highlights`), so that they stay so when they
+        are darkened.
+
         Args:
             raw: The photograph; its settings become the reference.
             scene_id: Unique name.
@@ -318,8 +331,9 @@ class Scene:
         Raises:
             ValueError: If neither the raw nor its camera knows the noise.
         """
+        saturated = raw.saturated
         return cls.from_array(
-            raw.data,
+            neutral_highlights(raw, saturated),
             raw.settings,
             raw.camera,
             scene_id=scene_id,
@@ -329,7 +343,8 @@ class Scene:
             white_balance=raw.white_balance,
             kind=kind,
             box_factor=raw.box_factor,
-            saturated=raw.saturated,
+            saturated=saturated,
+            sampled=True,
             **fields,
         )
 
@@ -345,6 +360,7 @@ class Scene:
         ev100: float = DEFAULT_EV100,
         illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
         kind: str = "radiance",
+        sampled: bool = False,
         **fields: Any,
     ) -> Scene:
         """A noise-free scene from linear light, taken into the camera's colours.
@@ -362,19 +378,22 @@ class Scene:
             illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`; decides the white
                 balance.
             kind: Sort of scene.
+            sampled: Whether the pixels of `rgb`, (3, 2H, 2W), are photosites: they go through a
+                lens that is sharp to about a pixel and the camera's colour filter array. Otherwise
+                each becomes a packed pixel, all four planes of it at one place.
             **fields: Further fields of `Scene`.
         """
         image = check_rgb(rgb)
         matrix, white = camera_from_srgb(camera, illuminant)
         planes = torch.from_numpy(matrix).float() @ image.reshape(3, -1)
         planes = planes.clamp_(min=0.0).reshape(image.shape)
-        light = planes[[0, 1, 1, 2]]
+        light = sample_mosaic(lens_blur(planes), camera.cfa) if sampled else planes[[0, 1, 1, 2]]
         if illuminance is not None:
             reference = reference_settings(incident_ev100(illuminance))
             light *= WHITE_SIGNAL
         else:
             reference = reference_settings(ev100)
-            light *= mean_anchor(light[1])
+            light *= mean_anchor(light[1:3] if sampled else light[1])
         return cls.from_array(
             light,
             reference,
@@ -384,6 +403,7 @@ class Scene:
             illuminance=illuminance,
             white_balance=(white[1] / white[0], 1.0, white[1] / white[2]),
             kind=kind,
+            sampled=sampled,
             **fields,
         )
 

@@ -191,6 +191,12 @@ def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[S
     parts = split_groups([scene.group for scene in scenes])
     if split == "train" and "train" not in parts.values():
         raise too_few_groups(spec, str(len(parts)))
+    left_out = sum(part != split for part in parts.values())
+    if left_out:
+        logger.warning(
+            f"{spec}: split {split!r} leaves out {left_out} of {len(parts)} source groups, those "
+            "of the other split; split='all' (--split all) takes every one"
+        )
     return [scene for scene in scenes if parts[scene.group] == split]
 
 

@@ -23,6 +23,9 @@ Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max
 OwnSeed = Annotated[
     int | None, typer.Option(help="Seed instead of the one in the YAML.", min=0, max=MAX_SEED)
 ]
+OnError = Annotated[
+    str, typer.Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
+]
 Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
 
 
@@ -94,6 +97,14 @@ def parse_f_number(text: str) -> float:
         return float(text.lower().removeprefix("f").removeprefix("/"))
     except ValueError:
         raise ValueError(f"`aperture` (={text!r}) must be an f-number, such as 4 or f/4") from None
+
+
+def scene_files(scenes: Any, on_error: str) -> Any:
+    """The environment's `scenes` for the options `--scenes` and `--on-error`."""
+    if on_error == "stop":
+        return scenes
+    given = scenes if isinstance(scenes, Mapping) else {"path": scenes}
+    return {**given, "on_error": on_error}
 
 
 def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> None:

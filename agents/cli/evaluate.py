@@ -12,11 +12,13 @@ import typer
 from agents.cli.console import (
     MAX_SEED,
     Device,
+    OnError,
     command_line,
     console,
     make_folder,
     print_files,
     progress_bars,
+    scene_files,
     torch_device,
 )
 
@@ -73,6 +75,7 @@ def evaluate(
     preset: Preset = None,
     env: Environment = None,
     scenes: Scenes = None,
+    on_error: OnError = "stop",
     split: Split = None,
     grid: Grid = None,
     scorer: Scorer = None,
@@ -110,6 +113,12 @@ def evaluate(
         "seed": seed,
     }
     given = {name: value for name, value in options.items() if value is not None}
+    if scenes is not None:
+        given["scenes"] = scene_files(scenes, on_error)
+    elif on_error != "stop":
+        raise ValueError(
+            f"`on-error` (={on_error!r}) is about the files of --scenes: give that, too"
+        )
     device = torch_device(device)
     plan = _plan(preset, env, list(policy or ()), given)
     if append is not None and plan.hash is None:
@@ -208,8 +217,10 @@ def _plain(
     environment.setdefault("scenes", "bundled")
     environment.setdefault("resolution", 64)
     first = given.get("seed", 0)
+    scenes = environment["scenes"]
+    name = scenes.get("path", scenes) if isinstance(scenes, Mapping) else scenes
     return {
-        "name": f"{environment['scenes']}, {environment.get('split', 'test')} split",
+        "name": f"{name}, {environment.get('split', 'test')} split",
         "conditions": _one_condition(condition),
         "starts": ["random"],
         "frames": given.get("frames", 8),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import sys
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -51,11 +52,9 @@ def main() -> None:
     An error becomes one line, and exit status 2 where it is about what the user gave (options,
     files), 1 where something failed while running; Ctrl-C gives 130, SIGTERM 143.
     """
-    logging.basicConfig(
-        level=logging.WARNING,
-        format="%(message)s",
-        handlers=[RichHandler(console=Console(stderr=True), show_time=False, show_path=False)],
-    )
+    handler = RichHandler(console=Console(stderr=True), show_time=False, show_path=False)
+    handler.addFilter(_first_time())
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
     signal.signal(signal.SIGTERM, _terminate)
     try:
         app(prog_name="ae-env")
@@ -71,6 +70,17 @@ def main() -> None:
             more = "; run the same command again to continue" if resumes else ""
             Console(stderr=True).print(f"\nstopped{more}")
         raise
+
+
+def _first_time() -> Callable[[logging.LogRecord], bool]:
+    """A filter of log lines: scenes that are loaded again have the same to say."""
+    seen = set[str]()
+
+    def is_new(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        return not (text in seen or seen.add(text))  # type: ignore[func-returns-value]
+
+    return is_new
 
 
 def _terminate(*_: Any) -> None:

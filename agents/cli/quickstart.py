@@ -13,6 +13,7 @@ import typer
 
 from agents.cli.console import (
     Device,
+    OnError,
     Seed,
     command_line,
     console,
@@ -20,6 +21,7 @@ from agents.cli.console import (
     print_files,
     print_line,
     progress_bars,
+    scene_files,
     torch_device,
 )
 from agents.cli.evaluate import print_scores
@@ -50,6 +52,7 @@ Scenes = Annotated[
 def quickstart(
     scenes: Scenes = "bundled",
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("quickstart"),
+    on_error: OnError = "stop",
     seed: Seed = 0,
     device: Device = "cpu",
 ) -> None:
@@ -61,14 +64,20 @@ def quickstart(
     device = torch_device(device)
     with progress_bars() as progress:
         done = run_quickstart(
-            scenes, out, seed=seed, progress=progress, command=command_line(), device=device
+            scenes,
+            out,
+            seed=seed,
+            progress=progress,
+            command=command_line(),
+            device=device,
+            on_error=on_error,
         )
     if done.zero_shot:
         print_line(f"fewer than 15 source groups in {scenes}: agents trained on bundled scenes")
     print_scores(done.result)
     print_files(done.files)
     console.print("\nTry next:")
-    for line in next_commands(scenes, out, done.agents):
+    for line in next_commands(scenes, out, done.agents, on_error):
         print_line(f"  {line}")
 
 
@@ -91,7 +100,14 @@ class QuickstartResult:
 
 
 def run_quickstart(
-    scenes: str, out: Path, *, seed: int, progress: Progress, command: str, device: str = "cpu"
+    scenes: str,
+    out: Path,
+    *,
+    seed: int,
+    progress: Progress,
+    command: str,
+    device: str = "cpu",
+    on_error: str = "stop",
 ) -> QuickstartResult:
     """Score tables, trainings, evaluation, report; a second run resumes the first.
 
@@ -102,6 +118,7 @@ def run_quickstart(
         progress: Opens progress bars.
         command: The command line, for the report.
         device: Torch device of the agents' networks.
+        on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
     from ae_env.utils.checks import check_integer
     from agents.episodes import training_scenes
@@ -111,25 +128,26 @@ def run_quickstart(
     from agents.report.evaluation_report import write_report
 
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
-    source, zero_shot = training_scenes(scenes)
+    files = scene_files(scenes, on_error)
+    source, zero_shot = training_scenes(files)
     environment = {"scenes": source, "split": "train", "resolution": 64}
     with progress("scenes and score tables") as task:
         cache_score_tables(environment, task)
     agents = _train(environment, out, seed, progress, device)
-    unseen = {"scenes": scenes, "split": "test", "resolution": 64}
+    unseen = {"scenes": files, "split": "test", "resolution": 64}
     policies = _policies(unseen, agents, device)
     with progress("light meters learn their programs") as task:
         fit_policies(policies, environment, seed=seed, progress=task)
     with progress("evaluation on unseen scenes") as task:
         result = evaluate(policies, unseen, episodes_per_scene=EPISODES, seed=seed, progress=task)
-    files = write_report(
+    written = write_report(
         result,
         out,
         command=command,
-        next_commands=next_commands(scenes, out, agents),
+        next_commands=next_commands(scenes, out, agents, on_error),
         extra_meta={"trained_on": source, "zero_shot": zero_shot},
     )
-    return QuickstartResult(result, files, agents, zero_shot)
+    return QuickstartResult(result, written, agents, zero_shot)
 
 
 def _train(
@@ -176,9 +194,12 @@ def _policies(
     return {name: make_policy(own, context, device=device) for name, own in names.items()}
 
 
-def next_commands(scenes: str, out: Path, agents: Mapping[str, Path]) -> Sequence[str]:
+def next_commands(
+    scenes: str, out: Path, agents: Mapping[str, Path], on_error: str = "stop"
+) -> Sequence[str]:
     """Command lines to try after a quickstart."""
     own = [] if scenes == "bundled" else ["--scenes", scenes]
+    own += [] if on_error == "stop" else ["--on-error", on_error]
     evaluation = ["ae-env", "evaluate", "--policy", f"ppo:{agents['ppo']}"]
     evaluation += ["--policy", "matrix:tuned", *own, "--out", f"{out}/meters"]
     return (

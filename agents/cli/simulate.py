@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -16,6 +17,7 @@ from agents.cli.console import (
     parse_f_number,
     parse_seconds,
     print_files,
+    print_line,
     save_picture,
     torch_device,
 )
@@ -30,7 +32,11 @@ if TYPE_CHECKING:
 _TURNS = {3: 2, 5: 1, 6: -1}
 
 Weights = Annotated[
-    str, typer.Option(help="Networks: compact, a file of weights, or none to only add noise.")
+    str,
+    typer.Option(
+        help="Largest network that may run: nano, compact, large; a file of weights; or none to "
+        "only add noise."
+    ),
 ]
 Depth = Annotated[
     str,
@@ -39,10 +45,17 @@ Depth = Annotated[
 Cache = Annotated[bool, typer.Option(help="Cache the outputs of the networks between runs.")]
 Tolerance = Annotated[
     float,
-    typer.Option(help="Error to accept for speed, in units of the target's noise; 0 for none."),
+    typer.Option(
+        help="Error that a capture may have, in units of the target's noise: the cheapest way "
+        "within it is taken, or else the best; 0 for the best."
+    ),
 ]
 Noise = Annotated[
-    str, typer.Option(help="exact: drawn; or bank: looked up in a bank of normals, faster.")
+    str,
+    typer.Option(
+        help="exact: drawn; bank: looked up in a bank of normals, faster; or sensor: drawn with "
+        "the row noise and the tails of a calibrated camera's read noise."
+    ),
 ]
 
 
@@ -70,6 +83,9 @@ def simulate(
     noise: Noise = "exact",
     device: Device = "auto",
     cache: Cache = True,
+    details: Annotated[
+        bool, typer.Option("--details", help="Also print why each step runs or is left out.")
+    ] = False,
 ) -> None:
     """Simulate one raw at other settings and write it as a DNG; prints the plan.
 
@@ -93,14 +109,35 @@ def simulate(
     simulator = make_simulator(weights, device, cache)
     prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
-    console.print(str(prepared.plan(settings)), highlight=False, soft_wrap=True)
+    plan = prepared.plan(settings)
+    for text in (plan.explain(), *([plan.details()] if details else [])):
+        console.print(text, highlight=False, soft_wrap=True)
     result = simulator.simulate(prepared, settings, seed=seed, noise=noise)  # type: ignore[arg-type]
     result = replace(result, metadata={**source.metadata, **result.metadata})
+    for line in _remarks(source, result):
+        print_line(line)
     write_dng(out, result)
     files = {"DNG": out}
     if png is not None:
         files["PNG"] = _write_png(png, result)
     print_files(files)
+
+
+def _remarks(source: RawImage, result: RawImage) -> Iterator[str]:
+    """Lines about what the result hides at the ends of its range, and what had to be guessed."""
+    from simulator import exposure_ratio
+
+    numbers, white = result.to_mosaic(), result.camera.white_level
+    ends = [(numbers == end).mean() for end in (0, white)]
+    yield f"recorded: {ends[0]:.2%} of the samples at black, {ends[1]:.2%} at white"
+    stops = result.camera.nlf(result.settings.iso).extrapolation
+    if stops:
+        where = "above" if stops > 0 else "below"
+        iso, camera = f"{result.settings.iso:g}", result.camera.name
+        yield f"noise: ISO {iso} is {abs(stops):.1f} stops {where} the calibration of {camera}"
+    hidden = result.metadata["clipped_source"]
+    if hidden and exposure_ratio(source.settings, result.settings) < 1.0:
+        yield f"highlights: {hidden:.2%} of the source is saturated: neutral, as bright as is known"
 
 
 def make_simulator(weights: str, device: str, cache: bool) -> CameraSimulator:
@@ -134,6 +171,14 @@ def _write_png(path: Path, raw: RawImage) -> Path:
 
     from simulator import render_srgb
 
-    picture = render_srgb(raw).permute(1, 2, 0).cpu().numpy()
-    upright = np.rot90(picture, _TURNS.get(raw.metadata.get("flip", 0), 0))
+    picture = Image.fromarray(render_srgb(raw).permute(1, 2, 0).cpu().numpy())
+    aspect = raw.metadata.get("pixel_aspect", 1.0)
+    if aspect != 1.0:  # no pixel is left out: the picture grows along the pixels' longer side
+        width, height = (
+            round(picture.width * max(aspect, 1)),
+            round(picture.height / min(aspect, 1)),
+        )
+        print_line(f"pixels are {aspect:g} times as wide as high: the PNG is stretched")
+        picture = picture.resize((width, height), Image.Resampling.BICUBIC)
+    upright = np.rot90(np.asarray(picture), _TURNS.get(raw.metadata.get("flip", 0), 0))
     return save_picture(path, Image.fromarray(np.ascontiguousarray(upright)))

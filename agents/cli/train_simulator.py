@@ -26,6 +26,7 @@ from agents.cli.console import (
 if TYPE_CHECKING:
     from simulator.reference.reference_camera import ReferenceScene
     from simulator.training.config import SimulatorConfig
+    from simulator.training.detail import DetailPicture
 
 #: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
@@ -67,6 +68,7 @@ def train_simulator(
             weights = train_and_save(
                 training,
                 reference_scenes_of,
+                detail_pictures_of,
                 folder / training.preset,
                 command=command_line(),
                 device=device,
@@ -81,7 +83,7 @@ def train_simulator(
 
 def reference_scenes_of(config: SimulatorConfig, split: str) -> Sequence[ReferenceScene]:
     """The scenes of a split that a training's configuration names."""
-    from ae_env.scenes.reference_scenes import draped_scenes, reference_scenes
+    from ae_env.scenes.reference_scenes import draped_scenes, mosaic_scenes, reference_scenes
     from simulator import get_camera
     from simulator.utils.files import DATA_VARIABLE, data_folder
 
@@ -92,13 +94,24 @@ def reference_scenes_of(config: SimulatorConfig, split: str) -> Sequence[Referen
     if config.scenes.radiance and ("$" in radiance or not radiance):  # unset, or empty
         console.print(f"{config.scenes.radiance} is not set: training without radiance maps")
         radiance = ""
+    data = Path(radiance) if radiance else None
     camera = get_camera(config.camera)
     scenes = reference_scenes(
         split,  # type: ignore[arg-type]
         camera,
         number=config.scenes.procedural if split == "train" else _VALIDATION_SCENES,
         size=config.scenes.size,
-        radiance=Path(radiance) if radiance else None,
+        data=data,
         seed=config.seed,
     )
+    if data is not None:
+        scenes += mosaic_scenes(split, camera, data, size=config.scenes.size)  # type: ignore[arg-type]
     return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
+
+
+def detail_pictures_of(config: SimulatorConfig, split: str) -> Sequence[DetailPicture]:
+    """The pictures of a split that the noise stage is trained on."""
+    from ae_env.scenes.detail import detail_pictures
+    from simulator.utils.files import data_folder
+
+    return detail_pictures(split, data=data_folder(), seed=config.seed)  # type: ignore[arg-type]

@@ -101,9 +101,12 @@ def settling(scores: Floats) -> Ints:
 
     >>> settling(np.array([[[1.0], [1.0], [2.0], [2.0], [2.0], [2.0], [2.0]]])).tolist()
     [3]
+    >>> settling(np.ones((1, 1, 64))).tolist()
+    [0]
     """
     frames = scores.shape[1]
-    changed = np.any(scores[:, 1:] != scores[:, :-1], axis=-1)  # (E, T - 1)
+    before = np.concatenate([scores[:, :1], scores[:, :-1]], axis=1)
+    changed = np.any(scores != before, axis=-1)  # (E, T)
     last = np.where(changed.any(-1), frames - 1 - np.argmax(changed[:, ::-1], axis=-1), -1)
     since = last + 1
     return np.where(frames - since >= MIN_REST, since, 0).astype(np.int64)

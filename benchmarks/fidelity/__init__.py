@@ -13,14 +13,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.fidelity import defocus, denoising, pairs, pictures
+from benchmarks.fidelity import defocus, pairs, pictures
 from benchmarks.fidelity.models import checksums, load_models, train_missing
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, table
 
 #: In the order of the report: module and heading.
 SECTIONS: dict[str, tuple[Any, str]] = {
     "pairs": (pairs, "The paper's table"),
-    "denoising": (denoising, "Denoising: ISO 6400 to ISO 100"),
     "defocus": (defocus, "Defocus: f/11 to f/4"),
     "pictures": (pictures, "Pictures"),
 }
@@ -36,9 +35,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
         for camera in pairs.CAMERAS
         for mix in pairs.PAIRS
     ]
-    for camera in denoising.CAMERAS:
-        own = {"camera": camera, **arguments}
-        found.append(Part(f"denoising {camera}", denoising.measure, own))
     found.append(Part("defocus", defocus.measure, arguments))
     found.append(Part("pictures", pictures.measure, arguments))
     weights = checksums()

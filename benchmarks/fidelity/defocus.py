@@ -69,7 +69,7 @@ class View:
 def measure(seed: int, quick: bool) -> list[Row]:
     """One row per set of scenes, ISO and class."""
     camera, (groups, size) = get_camera(CAMERA), QUICK if quick else FULL
-    scenes = reference_scenes("test", camera, number=groups, size=size, radiance=None)
+    scenes = reference_scenes("test", camera, number=groups, size=size)
     scenes = [scene for scene in scenes if scene.kind == "depth"]
     photographs = depth_photographs(camera, data=data_root())
     chosen = [*scenes[::4], *photographs[::2]] if quick else [*scenes, *photographs]

@@ -15,14 +15,16 @@ from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.harness import data_root
 from benchmarks.isolated import ROOT
 from simulator import CameraSimulator, get_camera
+from simulator.networks.denoiser import SIZES
+from simulator.networks.noise_module import NoiseModule
 from simulator.networks.weights import load_modules
 from simulator.reference.reference_camera import ReferenceScene
 
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
 FOLDER, CONFIGS = ROOT / "runs" / "simulator", ROOT / "configs" / "simulator"
 PRESETS, BASELINES = ("compact", "paper"), ("pc", "dl")
-#: Procedural groups of the test split, size of its scenes and of crops of them [packed pixel];
-#: scenes without depth, photographs apart, are half the size.
+#: Procedural groups of the test split, largest size of its scenes and of crops of them [packed
+#: pixel]; views into panoramas are 128 x 128.
 FULL, QUICK = (64, 256, 128), (6, 128, 64)
 
 
@@ -46,7 +48,7 @@ class Models:
 
 def weights(name: str) -> str | Path | None:
     """Name or path of a model for `load_modules`; None if it was not trained."""
-    if name == "compact":  # comes with the package
+    if name in SIZES:  # comes with the package
         return name
     path = FOLDER / name / f"{name}.safetensors"
     return path if path.is_file() else None
@@ -84,9 +86,15 @@ def load_models() -> Models:
     return Models(own, corrected, baselines, {name: card for name, (_, card) in loaded.items()})
 
 
+def trained_noise_modules() -> dict[str, NoiseModule]:
+    """The noise modules that come with the package, and the paper's where it was trained."""
+    names = {n: n for n in SIZES} | ({"paper": w} if (w := weights("paper")) else {})
+    return {n: load_modules(w)[0]["noise"] for n, w in names.items()}  # type: ignore[misc]
+
+
 @functools.cache
 def held_out_scenes(camera: str, quick: bool) -> tuple[ReferenceScene, ...]:
     """The test split: procedural groups, photographs and, where present, radiance maps."""
     number, size, _ = QUICK if quick else FULL
     profile, folder = get_camera(camera), data_root()
-    return tuple(reference_scenes("test", profile, number=number, size=size, radiance=folder))
+    return tuple(reference_scenes("test", profile, number=number, size=size, data=folder))

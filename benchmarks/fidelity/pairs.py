@@ -156,7 +156,7 @@ def _photographed(
         for old in [key for key in blurred if key[0] != pair.sequence]:
             del blurred[old]  # pairs come in order of their sequence
         rng = np.random.default_rng([seed, number, pair.sequence, pair.source, pair.target])
-        top, left = (int(rng.integers(n - crop + 1)) for n in scene.light.shape[1:])
+        top, left = (int(rng.integers(n - crop + 1)) for n in scene.size)
         window = (..., slice(top, top + crop), slice(left, left + crop))
         captures = []
         for settings in (sequence.settings[pair.source], sequence.settings[pair.target]):

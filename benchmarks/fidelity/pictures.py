@@ -34,12 +34,12 @@ COLUMNS = ("whole picture", "input", "EXP", "NS", "Full", "ground truth")
 #: light [EV] of input and target. Times are rounded to whole stops.
 CASES: dict[str, tuple[dict[str, tuple[float, float]], Any, Any]] = {
     "low light": (
-        {"Desk": (0.75, 0.45), "chelsea-0": (0.4, 0.5)},
+        {"Desk": (0.75, 0.45), "chelsea": (0.4, 0.5)},
         (6400, 4, -1.5),
         (800, 4, 1.5),
     ),
     "high light": (
-        {"warehouse-090": (0.35, 0.7), "grass-0": (0.5, 0.5)},
+        {"warehouse-090": (0.35, 0.7), "grass": (0.5, 0.5)},
         (1600, 8, -2.0),
         (100, 4, 0.0),
     ),
@@ -53,7 +53,7 @@ def measure(seed: int, quick: bool) -> list[Row]:
     scenes = {
         scene.scene_id: scene
         for scene in (
-            *reference_scenes("test", profile, number=0, radiance=data_root()),
+            *reference_scenes("test", profile, number=0, data=data_root()),
             *depth_photographs(profile, data=None),
         )
     }
@@ -94,8 +94,7 @@ def _settings(scene: ReferenceScene, iso: float, f_number: float, ev: float) -> 
 
 def _developed(data: torch.Tensor, like: RawImage) -> np.ndarray:
     raw = RawImage(data, like.settings, like.camera, white_balance=like.white_balance)
-    # Light that lies at one place for all four planes: interpolation would colour its edges.
-    return render_srgb(raw, demosaic="half").permute(1, 2, 0).numpy()
+    return render_srgb(raw, demosaic="half").permute(1, 2, 0).numpy()  # a pixel a packed pixel
 
 
 def _draw(axes: Any, row: Row, pictures: list[np.ndarray], middle: tuple[float, float]) -> None:

@@ -41,7 +41,9 @@ def level_functions(seed: int, quick: bool) -> list[Row]:
             logs = np.log([[(*n.shot, *n.read)] for n in map(camera.nlf, own)])[:, 0]  # (K, 8)
             wanted = np.exp([np.interp(math.log(iso), np.log(own), column) for column in logs.T])
             beyond = iso / min(max(iso, own[0]), own[-1])
-            wanted *= np.repeat([beyond, beyond**2], 4)  # shot goes with the ISO, read its square
+            # Shot noise goes with the ISO, read noise before it is rounded with its square.
+            rounding = np.repeat([0.0, 1.0], 4) / 12 / camera.span[0] ** 2
+            wanted = (wanted - rounding) * np.repeat([beyond, beyond**2], 4) + rounding
             found = camera.nlf(iso)
             errors.append(float(np.abs([*found.shot, *found.read] / wanted - 1.0).max()))
             flagged &= found.extrapolated or known[0] <= iso <= known[-1]

@@ -6,7 +6,7 @@ expose the result as often as asked. *Transition* methods begin with the raw for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.captures import recorded
-from benchmarks.fidelity.denoising import behind_anscombe, non_local_means
+from benchmarks.denoising import behind_anscombe, non_local_means
 from benchmarks.fidelity.models import load_models, weights
 from simulator import (
     CameraSettings,
@@ -24,13 +24,16 @@ from simulator import (
     RawImage,
     exposure_ratio,
 )
+from simulator.capture.plan import DEFAULT_TOLERANCE
 from simulator.training.data import settings_parameters
 
 Dtype = Literal["float32", "bfloat16"]
 
-TOLERANCES = (0.0, 0.03, 0.1, 0.3, 1.0)
+TOLERANCES = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
 #: The one that bfloat16 and single transitions are measured with.
-DEFAULT = 0.1
+DEFAULT = DEFAULT_TOLERANCE
+#: Networks that may run, the least and the most accurate.
+FAMILY = ("nano", "compact", "large")
 
 
 class Prepared(Protocol):
@@ -84,14 +87,15 @@ def all_methods() -> list[Method]:
     ]
     dtypes: tuple[Dtype, ...] = ("float32", "bfloat16")
     for dtype in dtypes:
-        compact = simulator("compact", dtype)
-        tolerances: Sequence[float] = TOLERANCES if dtype == "float32" else (0.0, DEFAULT)
-        methods += [planned(compact, tolerance, dtype) for tolerance in tolerances]
+        for name in FAMILY:
+            tolerances = TOLERANCES if name == "large" and dtype == "float32" else (DEFAULT,)
+            methods += [planned(name, tolerance, dtype) for tolerance in tolerances]
         if dtype == "float32":
-            methods.append(_planned_transition(compact, DEFAULT))
-        methods.append(full("compact", compact, dtype))
+            methods.append(_planned_transition(simulator("compact", dtype), DEFAULT))
+        methods.append(full("large", simulator("large", dtype), dtype))
         if "paper" in models.simulators:
-            methods.append(full("paper", simulator("paper", dtype), dtype))
+            paper = simulator("paper", dtype)
+            methods += [full("paper", paper, dtype), _without_repetition(paper, dtype)]
         methods += [_baseline(name, net, dtype) for name, net in models.baselines.items()]
     return methods
 
@@ -127,18 +131,68 @@ def _with_non_local_means(bare: CameraSimulator) -> Method:
 
     def prepare(raw: RawImage) -> Prepared:
         prepared = bare.prepare(raw)
-        return replace(prepared, light=denoise(prepared), nlf=NoiseLevelFunction.zero())
+        return replace(
+            prepared, light=denoise(prepared.light, prepared.nlf), nlf=NoiseLevelFunction.zero()
+        )
 
     return Method("non-local means", prepare=prepare)
 
 
-def planned(own: CameraSimulator, tolerance: float, dtype: Dtype = "float32") -> Method:
-    """`own`, prepared once, leaving out what `tolerance` allows; it finds the defocus itself."""
+def planned(name: str, tolerance: float, dtype: Dtype = "float32") -> Method:
+    """Networks up to `name`, prepared once, within `tolerance`; they find defocus themselves."""
+    own = simulator(name, dtype)
 
     def prepare(raw: RawImage) -> Prepared:
         return own.prepare(raw, depth="unknown", tolerance=tolerance)
 
-    return Method(f"compact {tolerance:g}", dtype, tolerance, prepare=prepare)
+    return Method(f"{name} {tolerance:g}", dtype, tolerance, prepare=prepare)
+
+
+class _PaperSweep:
+    """The paper's networks as a sensible user would sweep with them.
+
+    States of equal exposure ratio share a run of the noise module, and those of equal f-number,
+    too, one of the aperture module, which runs only where the aperture opens.
+    """
+
+    def __init__(self, own: CameraSimulator, raw: RawImage) -> None:
+        self._own, self._raw = own, raw
+        self._opened: dict[tuple[float, float], Tensor] = {}
+        self._denoised: dict[float, Tensor] = {}
+
+    def expose(
+        self, states: Iterable[CameraSettings], *, seed: int = 0, out: Tensor | None = None
+    ) -> Tensor:
+        clean = (
+            PreparedScene(self.expected(s), s, self._raw.camera, NoiseLevelFunction.zero())
+            for s in states
+        )
+        return torch.stack([c.expose([c.reference], seed=seed)[0] for c in clean], out=out)
+
+    @torch.no_grad()
+    def expected(self, settings: CameraSettings) -> Tensor:
+        raw, ratio = self._raw, exposure_ratio(self._raw.settings, settings)
+        own, source = self._own, self._raw.settings.effective_f_number
+        assert own.noise is not None
+        assert own.aperture is not None
+        with torch.autocast("cpu", torch.bfloat16, enabled=own.precision == "bfloat16"):
+            if ratio not in self._denoised:
+                exposed = own.exposure(raw.data[None], ratio).clamp(0.0, 1.0)
+                noise = raw.noise.exposed(ratio)
+                numbers = (torch.tensor([v]) for v in (noise.shot, noise.read))
+                self._denoised[ratio] = own.noise(exposed, *numbers)
+            denoised, target = self._denoised[ratio], settings.effective_f_number
+            if target >= source:
+                return denoised[0]
+            if (ratio, target) not in self._opened:
+                f_numbers = (torch.tensor([n]) for n in (source, target))
+                zero = torch.zeros_like(denoised)
+                self._opened[ratio, target] = own.aperture(denoised, zero, *f_numbers)[0].float()
+            return self._opened[ratio, target]
+
+
+def _without_repetition(own: CameraSimulator, dtype: Dtype) -> Method:
+    return Method("paper, no repetition", dtype, prepare=lambda raw: _PaperSweep(own, raw))
 
 
 # -- transitions ----------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.captures import cropped
 from benchmarks.harness import data_root
 from simulator import CameraSettings, RawImage, get_camera, incident_ev100
+from simulator.camera_simulator import Depth
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 #: Height and width [packed pixel].
@@ -55,6 +56,11 @@ class Trial:
     scene: ReferenceScene
     source: CameraSettings
     camera: ReferenceCamera
+
+    @property
+    def depth(self) -> Depth:
+        """What the simulator is told: all is in focus, or nothing is known."""
+        return "far" if self.scene.depth is None else "unknown"
 
     def raw(self, seed: int) -> RawImage:
         """A noisy capture of the scene with the source's settings."""
@@ -125,12 +131,12 @@ def _in_turn(kinds: dict[str, list[ReferenceScene]], counts: dict[str, int]) -> 
 def _scenes(size: Size, groups: int, drawn: int) -> dict[str, list[ReferenceScene]]:
     """Scenes of exactly `size` by kind."""
     profile = get_camera(CAMERA)
-    found = reference_scenes("test", profile, number=groups, size=drawn, radiance=data_root())
+    found = reference_scenes("test", profile, number=groups, size=drawn, data=data_root())
     kinds: dict[str, list[ReferenceScene]] = {
         kind: [] for kind in ("depth", "flat", "photograph", "radiance")
     }
     for scene in found:
-        if min(scene.light.shape[1:]) >= min(size) and max(scene.light.shape[1:]) >= max(size):
+        if min(scene.size) >= min(size) and max(scene.size) >= max(size):
             known = scene.kind if scene.kind in kinds else "flat"
             kinds[known].append(cropped(scene, *size))
     kinds["radiance"] = list({s.group: s for s in kinds["radiance"]}.values())  # one view each

@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from simulator.capture.blurred_light import Denoised
+from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import LIGHT_LIMIT
 from simulator.optics.disc_bank import HALO, DiscBank, added_blur, remaining_variance
 from simulator.utils.cache import LruCache
@@ -25,7 +25,6 @@ class MapApertureBlur:
 
     Args:
         light: (4, H, W) as recorded.
-        denoised: The same with little noise.
         diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or a function that
             estimates it, called when an aperture first opens.
         f_number: Effective f-number of the light.
@@ -37,15 +36,14 @@ class MapApertureBlur:
     def __init__(
         self,
         light: Tensor,
-        denoised: Denoised,
         diameter: Tensor | Callable[[], Tensor],
         f_number: float,
         *,
         everywhere: bool = True,
     ) -> None:
         self.f_number, self._diameter, self.everywhere = f_number, diameter, everywhere
-        self._recorded, self._denoised = light, denoised
-        self._banks: dict[tuple[Tile, bool], DiscBank] = {}
+        self._recorded = light
+        self._banks: dict[tuple[Tile, Denoised | None], DiscBank] = {}
         self._cache: LruCache[Tensor] = LruCache(CACHE_BYTES)
 
     @cached_property
@@ -59,12 +57,12 @@ class MapApertureBlur:
             return 0.0
         return float(added_blur(self._largest, self.f_number, f_number))
 
-    def opened(self, f_number: float, *, denoised: bool) -> Tensor:
+    def opened(self, f_number: float, denoised: Denoised | None) -> Tensor:
         """See `ApertureBlur`."""
         key = (f_number, denoised)
         result = self._cache.get(key)
         if result is None:
-            light = self._denoised.light if denoised else self._recorded
+            light = self._recorded if denoised is None else denoised.light
             result = self._blurred(light, denoised, f_number)
             self._cache.put(key, result, result.nbytes)
         return result
@@ -72,6 +70,11 @@ class MapApertureBlur:
     def remaining_variance(self, f_number: float) -> Tensor:
         """See `ApertureBlur`."""
         return remaining_variance(added_blur(self.diameter, self.f_number, f_number))
+
+    @cached_property
+    def mean_square_diameter(self) -> float:
+        """See `ApertureBlur`."""
+        return float(self.diameter.square().mean())
 
     @cached_property
     def _largest(self) -> Tensor:
@@ -82,7 +85,7 @@ class MapApertureBlur:
         """The parts of the frame that are out of focus."""
         return make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
 
-    def _blurred(self, light: Tensor, denoised: bool, f_number: float) -> Tensor:
+    def _blurred(self, light: Tensor, denoised: Denoised | None, f_number: float) -> Tensor:
         def blurred(tile: Tile) -> Tensor:
             added = added_blur(self.diameter[tile.outer], self.f_number, f_number)
             return self._bank(light, denoised, tile).blurred(added)[tile.core]
@@ -95,7 +98,7 @@ class MapApertureBlur:
             result[tile.inner] = blurred(tile)
         return result
 
-    def _bank(self, light: Tensor, denoised: bool, tile: Tile) -> DiscBank:
+    def _bank(self, light: Tensor, denoised: Denoised | None, tile: Tile) -> DiscBank:
         """The discs of a tile, cached on small frames: close f-numbers share most of them."""
         bank = self._banks.get((tile, denoised))
         if bank is None:
@@ -117,6 +120,7 @@ class NetworkApertureBlur:
 
     needs_denoised = True
     everywhere = True
+    mean_square_diameter = 0.0  # its network gives none
 
     def __init__(
         self,
@@ -132,7 +136,7 @@ class NetworkApertureBlur:
         return float("inf") if f_number < self.f_number else 0.0
 
     @torch.no_grad()
-    def opened(self, f_number: float, *, denoised: bool = True) -> Tensor:
+    def opened(self, f_number: float, denoised: Denoised | None = None) -> Tensor:
         """See `ApertureBlur`."""
         result = self._cache.get(f_number)
         if result is None:

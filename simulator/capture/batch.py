@@ -155,11 +155,16 @@ class CaptureBatch:
         light, remaining = columns.light[rows], None
         if columns.any_blurs:  # else all of the source's variance remains
             remaining = columns.remaining_variance[rows]
+        read_noise = None
+        if self.noise == "sensor":
+            pairs = zip(indices.tolist(), states.tolist(), strict=True)
+            read_noise = [self._light(i).prepared.read_noise(self.states[s]) for i, s in pairs]
         counts = record(
             Transitions(light, columns.table[rows], remaining),
             self.camera,
             keys=None if self.noise is None else keys,
             noise=self.noise or "bank",
+            read_noise=read_noise,
             row_gain=row_gain,
             codes=codes,
             numbers=numbers,

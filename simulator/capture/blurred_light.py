@@ -2,74 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from functools import cached_property
 from typing import Protocol
 
 import torch
 
+from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import Exposure
 from simulator.capture.light_statistics import LightStatistics
+from simulator.capture.residual import ResidualStatistics
 from simulator.capture.sensor import defocused_light
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.blur import motion_blur
-from simulator.raw.image import check_packed
 from simulator.utils.cache import LruCache
 
 #: Memory that the cached blurred light of one scene may take [byte].
 CACHE_BYTES = 512 * 2**20
-
-
-class Denoised:
-    """Light with its noise removed by a noise module.
-
-    A network is the most expensive step there is, and many transitions need none: it runs when
-    `light` is first read, and only then.
-
-    Args:
-        light: (4, H, W) float32, or a function that works it out.
-        everywhere: Whether the noise is also removed where a positive tolerance needs no network.
-    """
-
-    def __init__(
-        self, light: torch.Tensor | Callable[[], torch.Tensor], *, everywhere: bool = True
-    ) -> None:
-        if isinstance(light, torch.Tensor):
-            light = check_packed("denoised", light)
-        self._light, self.everywhere = light, everywhere
-        self._lock = threading.RLock()
-
-    def __reduce__(self) -> tuple[Callable[..., Denoised], tuple[torch.Tensor, bool]]:
-        return _restored, (self.light, self.everywhere)
-
-    @property
-    def light(self) -> torch.Tensor:
-        """(4, H, W) at the exposure of the source."""
-        with self._lock:
-            if not isinstance(self._light, torch.Tensor):
-                self._light = self._light()
-            return self._light
-
-    @property
-    def shape(self) -> torch.Size | None:
-        """Shape of `light`, where it is known already."""
-        return self._light.shape if isinstance(self._light, torch.Tensor) else None
-
-    @cached_property
-    def statistics(self) -> LightStatistics:
-        """Statistics of `light`."""
-        return LightStatistics(self.light)
-
-    def to(self, device: torch.device) -> Denoised:
-        """The same on `device`; itself where it is there already."""
-        light = self._light
-        if isinstance(light, torch.Tensor) and light.device == device:
-            return self
-        return Denoised(lambda: self.light.to(device), everywhere=self.everywhere)
-
-
-def _restored(light: torch.Tensor, everywhere: bool) -> Denoised:
-    return Denoised(light, everywhere=everywhere)
 
 
 class ApertureBlur(Protocol):
@@ -87,15 +35,19 @@ class ApertureBlur(Protocol):
     everywhere: bool
     """Whether it opens also where a positive tolerance needs no network."""
 
+    @property
+    def mean_square_diameter(self) -> float:
+        """Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown."""
+
     def extent(self, f_number: float) -> float:
         """Largest diameter of the blur that opening to `f_number` adds [pixel]."""
 
-    def opened(self, f_number: float, *, denoised: bool) -> torch.Tensor:
+    def opened(self, f_number: float, denoised: Denoised | None) -> torch.Tensor:
         """Light (4, H, W) at the wider aperture, at unchanged exposure.
 
         Args:
             f_number: Effective f-number wanted, smaller than the source's.
-            denoised: Whether the noise-reduced light is opened, or the light as it was recorded.
+            denoised: The noise-reduced light that is opened; None for the light as recorded.
         """
 
     def remaining_variance(self, f_number: float) -> torch.Tensor | None:
@@ -110,7 +62,8 @@ class BlurredLight:
 
     Args:
         light: (4, H, W) as recorded.
-        denoised: The same with little noise, or None.
+        denoised: The same with little noise, by each network.
+        nlf: Noise of `light`.
         aperture_blur: Blur that wider apertures add, or None.
         statistics: Statistics of `light`, where they are at hand.
         cache_bytes: Memory of the cache; the light that was used longest ago goes first.
@@ -119,23 +72,30 @@ class BlurredLight:
     def __init__(
         self,
         light: torch.Tensor,
-        denoised: Denoised | None,
+        denoised: tuple[Denoised, ...],
+        nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
         cache_bytes: int = CACHE_BYTES,
     ) -> None:
         self.light, self.denoised, self.aperture_blur = light, denoised, aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
+        self.residuals = ResidualStatistics(light, nlf)
         self._added: dict[float, float] = {}
         self._cache: LruCache[torch.Tensor] = LruCache(cache_bytes)
 
     def is_of(
-        self, light: torch.Tensor, denoised: Denoised | None, aperture_blur: ApertureBlur | None
+        self,
+        light: torch.Tensor,
+        denoised: tuple[Denoised, ...],
+        nlf: NoiseLevelFunction,
+        aperture_blur: ApertureBlur | None,
     ) -> bool:
         """Whether it was made for exactly these objects."""
         return (
             self.light is light
-            and self.denoised is denoised
+            and self.denoised == denoised
+            and self.residuals.nlf == nlf
             and self.aperture_blur is aperture_blur
         )
 
@@ -164,8 +124,8 @@ class BlurredLight:
     def source(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from: as recorded, denoised or opened."""
         if exposure.opened_to is not None and self.aperture_blur is not None:
-            return self.aperture_blur.opened(exposure.opened_to, denoised=exposure.denoised)
-        return self.denoised.light if exposure.denoised and self.denoised else self.light
+            return self.aperture_blur.opened(exposure.opened_to, exposure.denoised)
+        return self.light if exposure.denoised is None else exposure.denoised.light
 
     def blurred(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from simulator.capture.denoised import Denoised
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.noise.top_up import top_up_table
 from simulator.optics.shapes import kernel_energy
@@ -35,6 +36,8 @@ class Step(NamedTuple):
         reason: Why it does, or does not; ``{extent}`` and ``{error}`` stand for the numbers.
         error: Error of leaving it out, in units of the target's noise.
         extent: Extent of its blur [pixel], where it is one.
+        residual: Error that it makes itself where it runs, as far as that is known.
+        network: The network that it runs, if any.
     """
 
     name: str
@@ -42,6 +45,8 @@ class Step(NamedTuple):
     reason: str
     error: float = 0.0
     extent: float = 0.0
+    residual: float = 0.0
+    network: Denoised | None = None
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,8 @@ class Exposure:
         target: Noise of the camera at the capture's settings.
         motion_px: How far the image moves while the shutter is open [pixel].
         defocus_px: Diameter of the defocus disc [pixel].
-        denoised: Whether it starts from the noise-reduced light; `source` is zero then.
+        denoised: The noise-reduced light that it starts from; `source` is zero then. None for the
+            light as it was recorded.
         opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
             None where it does not.
         remaining_variance: (H, W) share that this blur leaves of the noise variance which the other
@@ -67,7 +73,7 @@ class Exposure:
     target: NoiseLevelFunction
     motion_px: float = 0.0
     defocus_px: float = 0.0
-    denoised: bool = False
+    denoised: Denoised | None = None
     opened_to: float | None = None
     remaining_variance: torch.Tensor | None = None
     steps: tuple[Step, ...] = field(default=(), compare=False)
@@ -82,12 +88,12 @@ class Exposure:
         )
 
     @property
-    def lens_blur(self) -> tuple[bool, float | None, float]:
+    def lens_blur(self) -> tuple[Denoised | None, float | None, float]:
         """Key of the light behind the lens, before motion and exposure."""
         return self.denoised, self.opened_to, self.defocus_px
 
     @property
-    def blur(self) -> tuple[bool, float | None, float, float]:
+    def blur(self) -> tuple[Denoised | None, float | None, float, float]:
         """Key of the light on the sensor, before exposure."""
         return self.denoised, self.opened_to, self.defocus_px, self.motion_px
 

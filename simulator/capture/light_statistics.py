@@ -20,6 +20,8 @@ SAMPLES = 65_536
 _SORTED = 4096
 #: Pixels from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
+#: Variance of the Laplacian of noise of variance 1: 4^2 + 4.
+_LAPLACIAN = 20.0
 _FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
 
 
@@ -229,6 +231,22 @@ class LightStatistics:
         squares = bins.edges[0], bins.disc, bins.row
         disc, row = _curvature(bins.share, *squares, float(ratio), _numbers(target), _FLOOR)
         return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
+
+    def blur_change(
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+    ) -> float:
+        """What a disc of one pixel changes, in units of the target's noise; other than in
+        `curvature` estimated, not bounded: the noise of the light itself is taken out.
+
+        Args:
+            ratio: Exposure ratio from the light to the target.
+            source: Noise of the light, at its own exposure.
+            target: Noise that the capture should have.
+        """
+        bins = self._bins
+        wanted = np.maximum(_variance(bins.light * ratio, target), _FLOOR)
+        detail = np.maximum(bins.disc - _LAPLACIAN * _variance(bins.light, source), 0.0)
+        return abs(ratio) / 32.0 * _root_mean(bins.share, detail / wanted)
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""

@@ -6,7 +6,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from numbers import Real
@@ -15,30 +17,38 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from simulator.camera import get_camera
+from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import Exposure, Step
 from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.sensor import NoiseBalance
+from simulator.capture.residual import ResidualStatistics
+from simulator.capture.sensor import NoiseBalance, Transitions, record
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.tiles import varying
 
-#: How much of a transition may be left out, in units of the target's noise: by default the
-#: distribution of a pixel may move by a tenth of its noise's standard deviation.
+#: Error that a capture may have, in units of the target's noise: by default the distribution of a
+#: pixel may move by a tenth of its noise's standard deviation.
 DEFAULT_TOLERANCE = 0.1
-#: Noise below this share of the light is not worth denoising: the networks' own error is as large.
-WORTH_DENOISING = 0.006
-#: Error of the compact noise module itself: a share of the standard deviation of the noise that
-#: it removes, and a share of the light. Calibrated on 41 scenes of the validation split
-#: (procedural, photographs, radiance maps, draped ones) at ISO 100 to 6400, 8 noisy captures each:
-#: with these, `SimulationPlan.predicted_difference` bounds 98 % of 261 measured distances between
-#: the full run and plans without noise reduction, and is two to three times the median one.
-BIAS, GAMMA = 0.35, 0.015
 #: Rounding error of float32 in a transition, as a share of the light.
 ROUNDING = 2.0**-20
+#: Errors of the estimated map of defocus: the share of the blur that it adds by which it errs, the
+#: blur that it cannot see [pixel of diameter], and by how much what a blurred picture changes when
+#: it is blurred again understates what it would change if it were sharpened.
+DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
+#: Root mean square light hidden by white, over what a density that falls with the square of the
+#: light would have.
+HIDDEN_LIGHT = 0.3
+#: Relative error of the noise's standard deviation for each stop of ISO beyond the calibration:
+#: without their last ISOs the Z6's table is off by 0.03 to 0.05, the 70D's by 0.17 to 0.25.
+EXTRAPOLATION_ERROR = 0.1
+#: Factors on errors that depend on what nothing shows, below which 90 % of the measured ones are.
+_BOUND = {"left out": 1.2, "clipped highlights": 1.6, "unknown depth": 2.0, "ISO": 2.5}
+#: Below this are 90 % of the errors where no part is predicted: single noisy samples that were
+#: clipped or rounded in the source.
+_LEAST_BOUND = 0.03
 #: Arithmetic operations per sample of the steps whose cost does not depend on anything.
 _OPERATIONS = {
     "exposure": 2,
-    "noise_reduction": 1,
     "aperture": 4,
     "motion_blur": 6,
     "noise": 14,
@@ -71,13 +81,13 @@ class Situation(NamedTuple):
         ratio: Exposure ratio from the source to the target.
         source: Noise of the source, at its own exposure.
         target: Noise that the capture should have.
-        tolerance: Bound on the root of the sum of squares of the errors of all that is left out.
-            0 leaves out nothing that changes a pixel.
+        tolerance: Error that the capture may have: the cheapest way within it is taken, or else
+            the one with the least error. At 0 that is always the one with the least.
         noise: Whether a capture is wanted; else the light without noise, in which noise of the
             source cannot count as part of the target's.
         statistics: Of the light as it was recorded.
-        denoised: Function that returns the statistics of the noise-reduced light; None without a
-            noise module.
+        residuals: Errors of networks on that light.
+        networks: The noise modules that there are, the cheapest first.
         defocus_px: Diameter of the defocus disc [pixel].
         motion_px: Length of the streak of motion [pixel].
         aperture_px: Largest diameter of the blur that the opening aperture adds [pixel], inf where
@@ -92,7 +102,8 @@ class Situation(NamedTuple):
     tolerance: float
     noise: bool
     statistics: LightStatistics
-    denoised: Callable[[], LightStatistics] | None = None
+    residuals: ResidualStatistics
+    networks: tuple[Denoised, ...] = ()
     defocus_px: float = 0.0
     motion_px: float = 0.0
     aperture_px: float | None = None
@@ -110,10 +121,11 @@ def decide(given: Situation) -> tuple[Step, Step, Step, Step]:
     noise_reduction = _decide_noise_reduction(given)
     if not (given.aperture_px or given.defocus_px or given.motion_px):
         return noise_reduction, _no_aperture(given), _no_defocus(given), _NO_MOTION
-    missing_noise = missing_blur = 0.0
-    if given.denoised is not None and not noise_reduction.runs:
-        missing_noise = noise_reduction.error
-    disc, row = _curvature(given, noise_reduction.runs)
+    missing_blur = 0.0
+    missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
+    if missing_noise > given.tolerance:  # beyond anybody's reach: blur has the tolerance to itself
+        missing_noise = 0.0
+    disc, row = _curvature(given, noise_reduction.network)
 
     def blur(name: str, extent: float, curvature: float) -> Step:
         nonlocal missing_blur
@@ -137,54 +149,55 @@ def decide(given: Situation) -> tuple[Step, Step, Step, Step]:
     )
 
 
-def _curvature(given: Situation, denoised: bool) -> tuple[float, float]:
+def _curvature(given: Situation, network: Denoised | None) -> tuple[float, float]:
     """`LightStatistics.curvature` of the light that is blurred."""
     if given.tolerance == 0.0:  # no blur is left out, however small
         return math.inf, math.inf
     if not (given.defocus_px or given.motion_px or given.aperture_px != math.inf):
         return math.inf, math.inf  # nobody asks: the network need not run for it
-    light = given.statistics
-    if denoised and given.denoised is not None:
-        light = given.denoised()
+    light = given.statistics if network is None else network.statistics
     return light.curvature(given.ratio, given.target)
 
 
 def _decide_noise_reduction(given: Situation) -> Step:
+    """The cheapest of all ways within the tolerance, or else the one with the least error."""
     if given.source.is_zero:
         return _CLEAN_SOURCE
-    if given.denoised is None:  # its error need not be known to decide: `make_plan` works it out
+    if not given.networks:  # its error need not be known to decide: `make_plan` works it out
         return _NO_NOISE_MODULE
     name, error = "noise_reduction", _noise_error(given)
-    # Blur averages noise, too. That is not counted on: it may be left out itself.
-    if given.opens_denoised and given.aperture_px:
-        reason = "the aperture module works on the noise-reduced light only"
-        return Step(name, True, reason + _WITHOUT, error)
-    if given.tolerance > 0.0:
-        if error <= given.tolerance:
-            return Step(name, False, _small_noise(given, error), error)
-        if not _worth_denoising(given):
-            reason = "the source has so little noise that the network's own error is as large"
-            return Step(name, False, reason, error)
+    if given.opens_denoised and given.aperture_px:  # blur averages noise, too: not counted on
+        reason = "the aperture module works on the noise-reduced light only" + _WITHOUT
+        network = given.networks[-1]
+        return Step(name, True, reason, error, 0.0, _own_error(given, network), network)
+    if error <= given.tolerance:
+        return Step(name, False, _small_noise(given, error), error)
+    best, least = given.networks[0], math.inf
+    for network in given.networks:
+        residual = _own_error(given, network)
+        if residual < least:
+            best, least = network, residual
+        if residual <= given.tolerance:
+            break
+    if error <= least:
+        return Step(name, False, "no network would err less than the noise", error)
+    reason = "the source is noisier than the target"
     if not given.noise:
         reason = "no noise of the target's is there to take the source's up"
-    elif error == 0.0:
-        reason = "tolerance 0 takes no noisy pixel for its mean"
-    else:
-        reason = "the source is noisier than the target"
-    return Step(name, True, reason + _WITHOUT, error)
+    return Step(name, True, reason + _WITHOUT, error, 0.0, least, best)
+
+
+def _own_error(given: Situation, network: Denoised) -> float:
+    """Error of a network itself, in units of the target's noise; 0 where it was not measured."""
+    if network.residual is None:
+        return 0.0
+    return given.residuals.error(network.residual, given.ratio, given.target, noise=given.noise)
 
 
 def _noise_error(given: Situation) -> float:
     """Error of leaving the source's noise in, in units of the target's."""
     error_of = given.statistics.excess_error if given.noise else given.statistics.relative_noise
     return error_of(given.ratio, given.source, given.target)
-
-
-def _worth_denoising(given: Situation) -> bool:
-    """Whether the noise is more than `WORTH_DENOISING` of the light, at its median level."""
-    signal = given.statistics.median
-    deviation = np.sqrt(np.array(given.source.read) + np.array(given.source.shot) * signal)
-    return bool((deviation > WORTH_DENOISING * signal).any())
 
 
 def _small_noise(given: Situation, error: float) -> str:
@@ -249,7 +262,8 @@ class PlannedStep:
         runs: Whether it runs.
         reason: Why it does, or does not.
         error: Error of leaving it out, in units of the target's noise; 0 if it runs.
-        operations: Arithmetic operations that it takes, all pixels together.
+        operations: Arithmetic operations that it takes, all pixels together; those of a network
+            once for all settings.
     """
 
     name: str
@@ -263,34 +277,39 @@ class PlannedStep:
 class SimulationPlan:
     """Steps of a change of settings, with their cost in error and in work.
 
-    Predicted errors are distances between the distributions of a pixel, root mean square over the
-    pixels: ``sqrt(mean((dm^2 + ds^2) / s^2))`` where the mean moves by dm, the standard deviation
-    by ds, and s is the standard deviation that the target's noise should have.
+    Errors are distances between the distributions of a pixel, as they are and as a camera's would
+    be, over the noise of the source and of the capture: root mean square over the pixels of
+    ``sqrt(dm^2 + ds^2) / s``, where the mean moves by dm, the standard deviation by ds, and s is
+    the standard deviation that the target's noise should have.
 
     Args:
         settings: Settings to simulate.
         exposure_ratio: How much brighter than the source the result is.
         steps: Every step in order, with the reason why it runs or not.
-        tolerance: Bound that `predicted_error` was planned for.
+        tolerance: Error that was asked for.
+        network: Name of the noise module that runs; None for none.
+        errors: The parts of the error by what they come from; ``"left out"``, ``"network"``,
+            ``"clipped highlights"``, ``"unknown depth"``, ``"ISO"``, ``"rounding"``.
+        error_bound: Bound below which the error is in 90 % of all cases.
         excess_noise: Variance that the source brings beyond the target's, relative to the target's,
             mean over the pixels. 0 means that the noise is exact.
         clipped_source: Share of the pixels that are saturated in the source: what they would show
             at a darker exposure is unknown.
-        extrapolated_noise: Whether the target's ISO lies outside the camera's calibration.
-        predicted_rmse: Root mean square of the excess noise, 1 is sensor white.
-        predicted_difference: Bound on the distance to the full run (`CameraSimulator.simulate` with
-            ``tolerance=None``), including the errors of the networks that it runs.
+        extrapolated: Stops by which the target's ISO lies outside the camera's calibration.
+        network_seconds: Estimated time of the network on this machine [s].
     """
 
     settings: CameraSettings
     exposure_ratio: float
     steps: tuple[PlannedStep, ...]
     tolerance: float
+    network: str | None
+    errors: Mapping[str, float]
+    error_bound: float
     excess_noise: float
     clipped_source: float
-    extrapolated_noise: bool
-    predicted_rmse: float
-    predicted_difference: float
+    extrapolated: float
+    network_seconds: Callable[[], float]
 
     @property
     def modules(self) -> tuple[str, ...]:
@@ -304,54 +323,83 @@ class SimulationPlan:
 
     @property
     def operations(self) -> int:
-        """Arithmetic operations that the steps need, all pixels together.
-
-        What `CameraSimulator.prepare` does once per scene, such as denoising, is not counted.
-        """
+        """Arithmetic operations that the steps need, all pixels together, the networks included."""
         return sum(step.operations for step in self.steps)
 
     @property
     def predicted_error(self) -> float:
-        """Distance to a camera that does every step perfectly: root of the sum of squares."""
-        return math.hypot(*(step.error for step in self.steps))
+        """Distance to what the camera would have recorded: root of the sum of squares."""
+        return math.hypot(*self.errors.values())
+
+    @property
+    def milliseconds(self) -> tuple[float, float]:
+        """Estimated time on this machine [ms]: of this capture, and once for all settings."""
+        own = sum(s.operations for s in self.steps if s.name != "noise_reduction")
+        shared = 0.0 if self.network is None else self.network_seconds()
+        return 1e3 * own * seconds_per_operation(), 1e3 * shared
 
     def explain(self) -> str:
-        """The plan as text: what runs, what does not, why, and what that costs."""
-        lines = [
-            f"{self.settings}: {self.exposure_ratio:.4g} x the light of the source",
-            f"  runs      {' -> '.join(self.modules)}",
+        """The plan in three lines: what runs, what it errs by, what it costs."""
+        runs = [
+            f"{name} ({self.network})" if name == "noise_reduction" else name
+            for name in self.modules
         ]
+        parts = [f"{name} {error:.2g}" for name, error in self.errors.items() if error >= 0.005]
+        avoidable = math.hypot(self.errors["left out"], self.errors["network"])
+        within = "kept" if avoidable <= self.tolerance else "out of reach, this is the least error"
+        capture, shared = self.milliseconds
+        once = f" and {shared:.3g} ms once for all settings" if shared else ""
+        return (
+            f"{self.settings}: {self.exposure_ratio:.4g} x the light; {' -> '.join(runs)}\n"
+            f"error {self.predicted_error:.2g} of the target's noise, 90 % bound "
+            f"{self.error_bound:.2g}{': ' * bool(parts)}{', '.join(parts)} "
+            f"(tolerance {self.tolerance:g}: {within})\n"
+            f"cost {_counted(self.operations)} operations, about {capture:.2g} ms a capture{once}"
+        )
+
+    def details(self) -> str:
+        """Why each step runs or does not, and what cannot be made exact."""
+        lines = []
         for step in self.steps:
-            if step.runs and step.reason:
-                lines.append(f"  needed    {step.name}: {step.reason}")
-        for step in self.steps:
-            if not step.runs:
+            if step.reason:
                 error = f" (error {step.error:.2g})" if step.error else ""
-                lines.append(f"  left out  {step.name}: {step.reason}{error}")
-        if "noise_reduction" in self.modules or "aperture" in self.modules:
-            lines.append(
-                "  networks  ran once for all settings; their error: docs/results/simulator.md"
-            )
-        lines.append(
-            f"  error     {self.predicted_error:.2g} of the target's noise is due to what is left "
-            f"out (tolerance {self.tolerance:g})"
-        )
-        lines.append(
-            f"            at most {self.predicted_difference:.2g} of the target's noise away from "
-            "the full run of this simulator"
-        )
-        lines.append(
-            f"            noise variance {self.excess_noise:.1%} above the target's "
-            f"(RMSE {self.predicted_rmse:.2e} of white); "
-            f"{self.clipped_source:.2%} of the source is saturated"
-        )
-        if self.extrapolated_noise:
-            lines.append("  warning   the ISO is outside the camera's noise calibration")
-        lines.append(f"  cost      {self.operations / 1e6:.1f} million operations")
+                lines.append(
+                    f"{'runs' if step.runs else 'left out'} {step.name}: {step.reason}{error}"
+                )
+        if self.excess_noise:
+            lines.append(f"noise variance {self.excess_noise:.1%} above the target's")
+        if self.clipped_source:
+            lines.append(f"{self.clipped_source:.2%} of the source is saturated")
+        if self.extrapolated:
+            lines.append(f"the ISO is {self.extrapolated:.2g} stops beyond the noise calibration")
         return "\n".join(lines)
 
     def __str__(self) -> str:
         return self.explain()
+
+
+def _counted(number: int) -> str:
+    for unit, name in ((1e9, "billion"), (1e6, "million")):
+        if number >= unit:
+            return f"{number / unit:.2g} {name}"
+    return str(number)
+
+
+@functools.cache
+def seconds_per_operation() -> float:
+    """Time of one of the operations that `SimulationPlan` counts, measured on this machine [s]."""
+    light = torch.zeros(4, 128, 128)
+    exposure = Exposure(
+        1.0, NoiseLevelFunction.zero(), NoiseLevelFunction((1e-4,) * 4, (1e-7,) * 4)
+    )
+    transition, camera = Transitions.of([light], [exposure]), get_camera("nikon_z6")
+    signals, keys, times = torch.empty(1, 4, 128, 128), np.ones(1, np.uint64), []
+    for _ in range(5):
+        start = time.perf_counter()
+        record(transition, camera, keys=keys, signals=signals)
+        times.append(time.perf_counter() - start)
+    each = sum(_OPERATIONS[name] for name in ("exposure", "noise", "clip_and_quantise"))
+    return min(times) / (each * light.numel())
 
 
 def make_plan(
@@ -359,8 +407,8 @@ def make_plan(
     exposure: Exposure,
     given: Situation,
     balance: NoiseBalance,
-    light: torch.Tensor,
     clipped_source: float,
+    depth_error: float,
 ) -> SimulationPlan:
     """Steps, reasons, predicted error and cost of a capture, or of the light without noise.
 
@@ -369,10 +417,10 @@ def make_plan(
         exposure: The exposure that was decided for them.
         given: The numbers that it was decided on.
         balance: The source's noise against the target's.
-        light: (4, H, W) as it was recorded.
         clipped_source: See `SimulationPlan`.
+        depth_error: Error due to a depth that is not known, in units of the target's noise.
     """
-    samples = light.numel()
+    samples = given.statistics.light.numel()
     noise_reduction, *blurs = exposure.steps
     if noise_reduction is _NO_NOISE_MODULE:
         noise_reduction = noise_reduction._replace(error=_noise_error(given))
@@ -383,6 +431,18 @@ def make_plan(
         reason = "no pixel lacks noise: the source has the target's already, or more"
         noise = Step("noise", False, reason)
     clip = Step("clip_and_quantise", wanted, "" if wanted else "only the light is asked for")
+    network = noise_reduction.network
+    extrapolated = abs(exposure.target.extrapolation) if given.noise else 0.0
+    errors = {
+        "left out": math.hypot(*(step.error for step in optional)),
+        "network": noise_reduction.residual,
+        "clipped highlights": _hidden_highlights(given, clipped_source),
+        "unknown depth": depth_error,
+        "ISO": EXTRAPOLATION_ERROR * extrapolated,
+        "rounding": ROUNDING * given.statistics.relative_level(given.ratio, given.target),
+    }
+    spread = network.residual.spread if network and network.residual else 1.0
+    factors = {"network": spread, **_BOUND}
     return SimulationPlan(
         settings=settings,
         exposure_ratio=exposure.ratio,
@@ -393,48 +453,37 @@ def make_plan(
             _planned(clip, samples),
         ),
         tolerance=given.tolerance,
+        network=None if network is None else network.name,
+        errors=errors,
+        error_bound=math.hypot(
+            _LEAST_BOUND, *(factors.get(name, 1.0) * error for name, error in errors.items())
+        ),
         excess_noise=balance.relative_excess_variance,
         clipped_source=clipped_source,
-        extrapolated_noise=exposure.target.extrapolated,
-        predicted_rmse=balance.excess_variance**0.5,
-        predicted_difference=_difference(exposure, given, optional, light),
+        extrapolated=extrapolated,
+        network_seconds=float if network is None else network.seconds,
     )
+
+
+def _hidden_highlights(given: Situation, share: float) -> float:
+    """Error of what a `share` of the pixels, saturated in the source, would show when darker.
+
+    Light above white is taken to be distributed as natural highlights are, with a density that
+    falls with its square: what is white stands for light of at least that.
+    """
+    ratio = given.ratio
+    if not share or ratio >= 1.0 or ratio <= 0.0:
+        return 0.0
+    square = 2.0 * ratio * (1.0 - ratio + ratio * math.log(ratio))
+    variance = sum(s * ratio + r for s, r in zip(given.target.shot, given.target.read, strict=True))
+    return HIDDEN_LIGHT * math.sqrt(share * square / max(variance / 4.0, 1e-30))
 
 
 def _planned(step: Step, samples: int) -> PlannedStep:
     reason = step.reason.format(extent=step.extent, error=step.error)
     if not step.runs:
         return PlannedStep(step.name, False, reason, step.error, 0)
+    if step.network is not None:
+        return PlannedStep(step.name, True, reason, 0.0, step.network.operations)
     per_sample = _OPERATIONS.get(step.name) or 2 * (1 + int(step.extent) ** 2)  # taps of a disc
     return PlannedStep(step.name, True, reason, 0.0, per_sample * samples)
-
-
-def _difference(
-    exposure: Exposure, given: Situation, steps: tuple[PlannedStep, ...], light: torch.Tensor
-) -> float:
-    """See `SimulationPlan.predicted_difference`."""
-    excess, *errors = (step.error for step in steps)  # noise reduction is the first
-    level = given.statistics.relative_level(given.ratio, given.target)
-    moved = math.hypot(*errors) + ROUNDING * level
-    if given.denoised is None:  # the full run does not reduce the noise either
-        return moved
-    if exposure.denoised:
-        noise, level = (0.0, 0.0) if given.tolerance == 0.0 else _untouched(given, light)
-    else:
-        noise = given.statistics.relative_noise(given.ratio, given.source, given.target)
-    if not given.source.is_zero:
-        moved += math.hypot(BIAS * noise, GAMMA * level)
-    return math.hypot(0.0 if exposure.denoised else excess, moved)
-
-
-def _untouched(given: Situation, light: torch.Tensor) -> tuple[float, float]:
-    """Noise and level, in units of the target's noise, of the regions that needed no network."""
-    noise, level = 0.0, 0.0
-    brought, target = given.source.exposed(given.ratio), given.target
-    constant = ~varying(light)
-    for plane in range(4):
-        signal = (light[plane][constant] * given.ratio).clamp_(min=0.0).double()
-        wanted = (signal * target.shot[plane] + target.read[plane]).clamp_(min=1e-30)
-        level += float((signal**2 / wanted).sum())
-        noise += float(((signal * brought.shot[plane] + brought.read[plane]) / wanted).sum())
-    return math.sqrt(noise / light.numel()), math.sqrt(level / light.numel())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
@@ -12,11 +13,15 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.blurred_light import ApertureBlur, BlurredLight, Denoised
+from simulator.capture.blurred_light import ApertureBlur, BlurredLight
+from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import RATIO_LIMIT, Exposure
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.plan import (
     DEFAULT_TOLERANCE,
+    DEPTH_ERROR,
+    KEPT_BLUR_ERROR,
+    MISSED_BLUR,
     SimulationPlan,
     Situation,
     check_tolerance,
@@ -25,7 +30,8 @@ from simulator.capture.plan import (
 )
 from simulator.capture.sensor import Transitions, exposed_light, noise_balance, record
 from simulator.noise.generator import Noise, check_noise, sweep_keys
-from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
+from simulator.noise.read_noise import ReadNoise
 from simulator.optics.shapes import kernel_energy
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
@@ -63,12 +69,12 @@ class PreparedScene:
         defocus: Diameter of the defocus disc at f/4 [pixel of `light`]; 0 for a scene that is far
             or in focus throughout. No disc may be wider than both the frame and 512 pixel.
         gain: Light relative to `light`, where it changes over time.
-        denoised: `light` with its noise removed by a noise module, for targets that are cleaner
-            than the source; None where there is no such module or no noise.
+        denoised: `light` with its noise removed by each noise module, the cheapest first, for
+            targets that are cleaner than the source; none where there is no module or no noise.
         aperture_blur: Adds the blur of apertures wider than the reference's to a scene whose depth
             is not known; None takes it as far.
-        tolerance: How far the distribution of a capture may move by what is left out, in units of
-            the target's noise; 0 leaves out only what changes nothing.
+        tolerance: Error that a capture may have, in units of the target's noise: the cheapest
+            steps that keep it are taken, or else, as at 0, those with the least error.
         blurred_light: Blurs the light and caches what it has blurred. It is made here, and copies
             with the same light (`dataclasses.replace`) share it.
     """
@@ -83,20 +89,24 @@ class PreparedScene:
     image_speed: float = 0.0
     defocus: float = 0.0
     gain: float = 1.0
-    denoised: Denoised | None = None
+    denoised: tuple[Denoised, ...] = ()
     aperture_blur: ApertureBlur | None = None
     tolerance: float = DEFAULT_TOLERANCE
     blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
-        if cached is None or not cached.is_of(self.light, self.denoised, self.aperture_blur):
+        if cached is None or not cached.is_of(
+            self.light, self.denoised, self.nlf, self.aperture_blur
+        ):
             same_light = cached is not None and cached.light is self.light
             if not same_light:  # a copy's light was checked before
                 object.__setattr__(self, "light", check_packed("light", self.light))
             self._check_denoised()
             statistics = cached.statistics if cached is not None and same_light else None
-            lights = BlurredLight(self.light, self.denoised, self.aperture_blur, statistics)
+            lights = BlurredLight(
+                self.light, self.denoised, self.nlf, self.aperture_blur, statistics
+            )
             object.__setattr__(self, "blurred_light", lights)
         for name in ("image_speed", "defocus", "gain"):
             value = getattr(self, name)
@@ -115,16 +125,14 @@ class PreparedScene:
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
 
     def _check_denoised(self) -> None:
-        denoised = self.denoised
-        if denoised is None:
-            return
-        if not isinstance(denoised, Denoised):
-            raise ValueError(f"`denoised` (={type(denoised).__name__}) must be Denoised or None")
-        if denoised.shape not in (None, self.light.shape):
-            raise ValueError(
-                f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
-                f"{tuple(self.light.shape)}"
-            )
+        for denoised in self.denoised:
+            if not isinstance(denoised, Denoised):
+                raise ValueError(f"`denoised` (={type(denoised).__name__}) must be Denoised")
+            if denoised.shape not in (None, self.light.shape):
+                raise ValueError(
+                    f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
+                    f"{tuple(self.light.shape)}"
+                )
 
     def __repr__(self) -> str:
         _, height, width = self.light.shape
@@ -161,7 +169,7 @@ class PreparedScene:
     def _situation(self, settings: CameraSettings, noise: bool, gain: float) -> Situation:
         if not isinstance(settings, CameraSettings):
             raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
-        f_number, denoised = settings.effective_f_number, self.denoised
+        f_number = settings.effective_f_number
         defocus_px = motion_px = 0.0  # where there is none, this is called in sweeps for each state
         if self.defocus:
             defocus_px = self._disc(f_number)
@@ -179,7 +187,8 @@ class PreparedScene:
             self.tolerance,
             noise,
             self.blurred_light.statistics,
-            None if denoised is None else lambda: denoised.statistics,
+            self.blurred_light.residuals,
+            self.denoised,
             defocus_px,
             motion_px,
             aperture_px,
@@ -204,15 +213,15 @@ class PreparedScene:
         defocus_px = defocus.extent if defocus.runs else 0.0
         motion_px = motion_blur.extent if motion_blur.runs else 0.0
         opened_to = settings.effective_f_number if aperture.runs else None
-        denoised, remaining_variance = noise_reduction.runs, None
-        if opened_to is not None and not denoised and not self.nlf.is_zero:
+        denoised, remaining_variance = noise_reduction.network, None
+        if opened_to is not None and denoised is None and not self.nlf.is_zero:
             # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
             # it further. Both together leave about what the larger leaves alone.
             energy = kernel_energy(motion_px, defocus_px)
             remaining_variance = self.blurred_light.remaining_variance(opened_to, energy)
         return Exposure(
             ratio=given.ratio,
-            source=NoiseLevelFunction.zero() if denoised else self.nlf,
+            source=self.nlf if denoised is None else NoiseLevelFunction.zero(),
             target=given.target,
             motion_px=motion_px,
             defocus_px=defocus_px,
@@ -234,7 +243,29 @@ class PreparedScene:
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.source_light(exposure)
         balance = noise_balance(light, exposure)
-        return make_plan(settings, exposure, given, balance, self.light, self.saturated_share)
+        depth = self._depth_error(settings, exposure)
+        return make_plan(settings, exposure, given, balance, self.saturated_share, depth)
+
+    def _depth_error(self, settings: CameraSettings, exposure: Exposure) -> float:
+        """Error due to a depth that is not known, in units of the target's noise."""
+        blur = self.aperture_blur
+        if blur is None or settings.effective_f_number == blur.f_number:  # no map is needed
+            return 0.0
+        wider = (blur.f_number / settings.effective_f_number) ** 2
+        disc = self.statistics.blur_change(exposure.ratio, self.nlf, exposure.target)
+        if wider <= 1.0:  # what a smaller aperture would sharpen stays blurred
+            return KEPT_BLUR_ERROR * disc * blur.mean_square_diameter * (1.0 - wider)
+        missed = disc * MISSED_BLUR**2 * (wider - 1.0)
+        return math.hypot(missed, DEPTH_ERROR * self._added_blur(exposure))
+
+    def _added_blur(self, exposure: Exposure) -> float:
+        """What the blur of the opening aperture changes, in units of the target's noise."""
+        if exposure.opened_to is None:
+            return 0.0
+        sharp = self.light if exposure.denoised is None else exposure.denoised.light
+        change = (self.source_light(exposure) - sharp).mul_(exposure.ratio).square_()
+        wanted = noise_variance(sharp * exposure.ratio, exposure.target).clamp_(min=1e-30)
+        return float((change / wanted).double().mean().sqrt())
 
     def source_light(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
@@ -249,6 +280,14 @@ class PreparedScene:
         exposure = self.exposure(settings)
         source = exposure.source_noise.scaled(float(self.box_factor**2))
         return self.camera.nlf(settings.iso).at_least(source)
+
+    def read_noise(self, settings: CameraSettings) -> ReadNoise:
+        """Rows and tails of the read noise of a capture.
+
+        Raises:
+            ValueError: If the camera has no calibration of them.
+        """
+        return self.camera.read_noise(settings.iso, self.box_factor)
 
     # -- captures -----------------------------------------------------------------------------
 
@@ -288,7 +327,9 @@ class PreparedScene:
         Args:
             settings: Settings to simulate.
             seed: Seed of the noise, >= 0.
-            noise: ``"exact"`` draws it, ``"bank"`` looks it up (`simulator.noise.generator`).
+            noise: ``"exact"`` draws it, ``"bank"`` looks it up (`simulator.noise.generator`),
+                ``"sensor"`` draws it with the camera's row noise and the tails of its read noise
+                (`CameraProfile.read_noise`).
 
         Returns:
             (4, H, W) float32 in [-pedestal, 1], and its excess noise (see `SimulationPlan`).
@@ -328,6 +369,7 @@ class PreparedScene:
             raise ValueError(f"`states` (={states!r}) must be several CameraSettings")
         frames = self._frames(len(states), out)
         keys = sweep_keys(seed, states)  # a bad seed raises before any work
+        read_noise = [self.read_noise(s) for s in states] if noise == "sensor" else None
         gains = np.ones(len(states)) if gain is None else gain
         exposures = [self.exposure(s, gain=g) for s, g in zip(states, gains.tolist(), strict=True)]
         groups: dict[tuple[object, ...], list[int]] = {}
@@ -345,6 +387,7 @@ class PreparedScene:
                 self.camera,
                 keys=keys[some] if transitions.lacks_noise else None,
                 noise=noise,
+                read_noise=None if read_noise is None else read_noise[some],
                 row_gain=None if row_gain is None else row_gain[some],
                 signals=frames[some],
             )

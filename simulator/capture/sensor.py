@@ -6,13 +6,14 @@ quantise, each of the last two once. (Exposure and blur are linear and change pl
 then serves many exposures.)
 
 `record` is the one way from light to frames: sweeps, the full run and the environment all take it.
-On the CPU it is one fused kernel (`simulator.capture.kernels`), elsewhere the steps one by one.
+On the CPU it is one fused kernel (`simulator.capture.kernels`), elsewhere, and where the read noise
+has rows and tails, the steps one by one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -20,8 +21,9 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import LIGHT_LIMIT, SIGNAL_LIMIT, Exposure, exposure_table
 from simulator.capture.kernels import record_frames
-from simulator.noise.generator import Noise, frame_normals
-from simulator.noise.noise_level_function import VARIANCE_LIMIT
+from simulator.noise.generator import Noise, frame_normals, noise_keys
+from simulator.noise.noise_level_function import VARIANCE_LIMIT, plane_tensor
+from simulator.noise.read_noise import ReadNoise
 from simulator.noise.top_up import missing_variance, top_up_table
 from simulator.optics.blur import disc_blur, motion_blur
 from simulator.utils.threads import in_shares
@@ -84,6 +86,15 @@ class Transitions:
                 shares[i] = (share if known is None else share * known).contiguous()
         return Transitions(lights, self.table, shares)
 
+    def before_rounding(self, camera: CameraProfile) -> Transitions:
+        """The same without the variance that rounding to whole digital numbers will add, 1/12.
+
+        It is part of the calibrated read noise: the rest of that is what has to be drawn.
+        """
+        table = self.table.copy()
+        table[:, 2] -= 1.0 / (12.0 * np.square(np.array(camera.span, np.float32)))
+        return replace(self, table=table)
+
     def shares(self) -> list[torch.Tensor | None]:
         """`remaining_variance` as a list, one entry for each frame."""
         known = self.remaining_variance
@@ -103,6 +114,7 @@ def record(
     *,
     keys: np.ndarray | None = None,
     noise: Noise = "exact",
+    read_noise: Sequence[ReadNoise] | None = None,
     row_gain: np.ndarray | None = None,
     signals: torch.Tensor | None = None,
     codes: np.ndarray | None = None,
@@ -118,6 +130,7 @@ def record(
         camera: The body.
         keys: (B,) uint64 of the noise; None for none.
         noise: How the keys become noise.
+        read_noise: Rows and tails of each frame's read noise, for the noise ``"sensor"``.
         row_gain: See `Transitions.in_bands`; None where all rows have the frame's light.
         signals: (B, 4, H, W) contiguous float32 in [-pedestal, 1], where white is 1.
         codes: (B, 4, H, W) uint8, companded.
@@ -131,10 +144,22 @@ def record(
         return np.zeros((0, 2), np.int64)
     if row_gain is not None:
         transitions = transitions.in_bands(row_gain)
-    if transitions.light[0].is_cpu:
+    transitions = transitions.before_rounding(camera)
+    table, on_cpu = transitions.table, transitions.light[0].is_cpu
+    if read_noise is not None and keys is not None:
+        if signals is None:
+            signals = torch.empty(len(table), *transitions.light[0].shape)
+        record_stepwise(transitions, camera, keys, "exact", signals, read_noise)
+        if not on_cpu or (codes is None and numbers is None and not count):
+            return np.zeros((len(table), 2), np.int64)
+        # What is recorded already passes the fused kernel unchanged, which fills the rest.
+        table, keys = np.zeros_like(table), None
+        table[:, 0] = 1.0
+        transitions, signals = Transitions(list(signals), table), None
+    if on_cpu:
         return record_frames(
             transitions.light,
-            transitions.table,
+            table,
             camera,
             keys=keys,
             noise=noise,
@@ -184,6 +209,7 @@ def record_stepwise(
     keys: np.ndarray | None,
     noise: Noise,
     signals: torch.Tensor,
+    read_noise: Sequence[ReadNoise] | None = None,
 ) -> None:
     """`record` on any device: what the fused kernel is held against. Fills `signals`."""
     for i, (light, table) in enumerate(zip(transitions.light, transitions.table, strict=True)):
@@ -192,8 +218,35 @@ def record_stepwise(
             missing = missing_variance(signal, table[1:], transitions.shares()[i])
             normals = frame_normals(int(keys[i]), tuple(light.shape), noise)
             drawn = torch.from_numpy(normals).to(signal.device)
-            signal = missing.clamp_(min=0.0).sqrt_().mul_(drawn).add_(signal)
+            missing.clamp_(min=0.0)
+            if read_noise is not None:
+                share, own = transitions.shares()[i], read_noise[i]
+                signal = signal + _read_part(missing, table, share, int(keys[i]), own)
+            signal = missing.sqrt_().mul_(drawn).add_(signal)
         signals[i] = clip_and_quantise(signal, camera)
+
+
+def _read_part(
+    missing: torch.Tensor,
+    table: np.ndarray,
+    remaining_variance: torch.Tensor | None,
+    key: int,
+    read_noise: ReadNoise,
+) -> torch.Tensor:
+    """Read noise with rows and tails; its variance is taken out of `missing` (4, H, W), in place.
+
+    A source's read noise counts as having rows and tails of the same kind.
+    """
+    planes, height, width = missing.shape
+    dark = missing_variance(missing.new_zeros(planes, 1, 1), table[1:], remaining_variance)
+    read = torch.minimum(dark.clamp(min=0.0), missing)
+    missing -= read
+    row_key, pixel_key = (int(noise_keys(np.array([key], np.uint64), n)[0]) for n in (1, 2))
+    rows = torch.from_numpy(frame_normals(row_key, (1, 2, height))[0]).to(missing)
+    pixels = torch.from_numpy(frame_normals(pixel_key, (planes, height, width))).to(missing)
+    shared = plane_tensor(table[2].clip(min=0.0), missing.device)
+    own = read_noise.pixel_part((1.0 - read_noise.row**2) * read, pixels)
+    return read_noise.row_part(shared, rows) + own
 
 
 def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tensor:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import itertools
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.networks.noise_module import Preset, ResidualBlock, check_preset
+from simulator.networks.denoiser import ResidualBlock
 from simulator.networks.unet import AttentionUNet
 from simulator.optics.blur import box_mean, disc_blur
 from simulator.optics.disc_bank import DiscBank, added_blur
 
+AperturePreset = Literal["compact", "paper"]
 #: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
 DEAD_ZONE = 1.0
 #: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
@@ -43,9 +45,12 @@ class ApertureModule(nn.Module):
             3.3, run for every pair of f-numbers.
     """
 
-    def __init__(self, preset: Preset = "compact") -> None:
+    def __init__(self, preset: AperturePreset = "compact") -> None:
         super().__init__()
-        check_preset(preset)
+        if preset not in get_args(AperturePreset):
+            raise ValueError(
+                f"`preset` (={preset!r}) must be one of {list(get_args(AperturePreset))}"
+            )
         self.preset = preset
         self.network: nn.Module = DefocusMap() if preset == "compact" else AttentionUNet()
 

@@ -65,7 +65,7 @@ class FullRun:
             seed: Seed of the output's noise.
         """
         keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
-        bare = replace(prepared, denoised=None, aperture_blur=None, tolerance=0.0)
+        bare = replace(prepared, denoised=(), aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = self.exposure(prepared.light[None], exposure.ratio)
         if self.noise.preset == "paper":

@@ -15,16 +15,18 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from simulator.capture.residual import Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule
 from simulator.networks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator.utils.files import sibling, write_atomically
 
-#: Everything that can be trained: the two presets of the simulator, and the paper's two baselines.
-PRESETS = ("compact", "paper", "pc", "dl")
+#: Everything that can be trained: the simulator's networks in three sizes (nano and large are noise
+#: modules alone), the paper's, and the paper's two baselines.
+PRESETS = ("nano", "compact", "large", "paper", "pc", "dl")
 #: Increased when the networks change such that older weights no longer fit.
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 def build_modules(preset: str) -> nn.ModuleDict:
@@ -33,6 +35,8 @@ def build_modules(preset: str) -> nn.ModuleDict:
         return nn.ModuleDict({"baseline": ParameterConcatenation()})
     if preset == "dl":
         return nn.ModuleDict({"baseline": DecoupledNet()})
+    if preset in ("nano", "large"):
+        return nn.ModuleDict({"noise": NoiseModule(preset)})  # type: ignore[arg-type]
     return nn.ModuleDict(
         {
             "exposure": ExposureModule(),
@@ -168,6 +172,8 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     except RuntimeError as error:
         text = " ".join(str(error).split())
         raise ValueError(f"`weights` (={str(name)!r}) do not fit the networks: {text}") from error
+    if "noise" in modules and card.get("residual") is not None:
+        modules["noise"].residual = Residual.from_card(card["residual"])  # type: ignore[assignment]
     modules.eval().requires_grad_(False)
     return modules.to(memory_format=torch.channels_last), card  # type: ignore[call-overload]
 

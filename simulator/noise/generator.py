@@ -24,8 +24,9 @@ from simulator.settings import CameraSettings
 from simulator.utils.jit import kernel
 from simulator.utils.threads import in_shares
 
-#: How the noise of a frame is made: drawn, or looked up in a bank of normals.
-Noise = Literal["exact", "bank"]
+#: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
+#: and tails of the camera's read noise (`simulator.noise.read_noise`).
+Noise = Literal["exact", "bank", "sensor"]
 
 
 def check_noise(noise: str) -> None:

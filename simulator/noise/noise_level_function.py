@@ -22,7 +22,8 @@ class NoiseLevelFunction:
     Args:
         shot: Slope per plane R, G1, G2, B, on the scale where sensor white is 1.
         read: Variance at zero signal per plane.
-        extrapolated: Whether the ISO lies outside the calibrated table.
+        extrapolation: Stops by which the ISO lies above the calibrated table, negative where it
+            lies below; 0 inside.
         source: Where the numbers come from.
 
     Raises:
@@ -31,7 +32,7 @@ class NoiseLevelFunction:
 
     shot: tuple[float, float, float, float]
     read: tuple[float, float, float, float]
-    extrapolated: bool = False
+    extrapolation: float = 0.0
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -48,6 +49,11 @@ class NoiseLevelFunction:
     def is_zero(self) -> bool:
         """Whether there is no noise at all."""
         return max(*self.shot, *self.read) == 0.0
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether the ISO lies outside the calibrated table."""
+        return self.extrapolation != 0.0
 
     def scaled(self, factor: float) -> NoiseLevelFunction:
         """Variance times `factor`: averaging ``k * k`` pixels multiplies it by ``1 / k**2``."""
@@ -68,7 +74,7 @@ class NoiseLevelFunction:
         )
 
     def _with(self, shot: Any, read: Any) -> NoiseLevelFunction:
-        return NoiseLevelFunction(shot, read, self.extrapolated, self.source)
+        return NoiseLevelFunction(shot, read, self.extrapolation, self.source)
 
 
 def _four_variances(name: str, given: Any) -> tuple[float, ...]:

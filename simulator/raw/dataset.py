@@ -15,7 +15,7 @@ import io
 import logging
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import overload
@@ -251,13 +251,7 @@ def packed_camera(name: str) -> CameraProfile:
         raise ValueError(f"`camera` (={name!r}) must be one of {', '.join(LEVELS)}")
     camera = get_camera(name)
     black, white = LEVELS[name]
-    factor = camera.span[0] / (white - black)  # the same digital numbers on the new scale
-    return replace(
-        camera,
-        black_level=(black,) * 4,
-        white_level=white,
-        nlf_by_iso={iso: nlf.exposed(factor) for iso, nlf in camera.nlf_by_iso.items()},
-    )
+    return camera.with_levels((black,) * 4, white, camera.bit_depth)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import rawpy
 from simulator.camera import BayerPattern
 from simulator.raw.dng import ORIENTATIONS, OwnRecord
 from simulator.raw.metadata import (
+    NO_RAWS,
     TIFF_FILE,
     UNKNOWN_FILE,
     Directory,
@@ -102,6 +103,8 @@ def decode_own_dng(path: Path, directories: Sequence[Directory], own: OwnRecord)
     focal_length = next(iter(first_numbers(directories, "FocalLength")), 0.0)
     if focal_length > 0:
         extra["focal_length"] = float(focal_length)
+    scale = first_numbers(directories, "DefaultScale")
+    extra |= _pixel_aspect(scale[0] / scale[1] if len(scale) == 2 and scale[1] > 0 else 1.0)
     return Decoded(
         mosaic=mosaic,
         cfa=BayerPattern(letters),
@@ -173,7 +176,7 @@ def _reason(error: Exception, words: str, directories: Sequence[Directory]) -> s
             f"cannot be decoded: LibRaw lacks its compression, {compression}{kind}; convert it to "
             "an uncompressed DNG"
         )
-    if isinstance(error, rawpy.LibRawFileUnsupportedError):
+    if isinstance(error, rawpy.LibRawFileUnsupportedError) or words in NO_RAWS:
         cut = ", or is truncated" if words in (TIFF_FILE, UNKNOWN_FILE) else ""
         return f"must be a camera raw that LibRaw reads, but is {words}{cut}"
     reason = error.args[0] if error.args else error
@@ -207,6 +210,7 @@ def _from_libraw(
         extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
     if np.isfinite(other.focal_length) and other.focal_length > 0:
         extra["focal_length"] = float(other.focal_length)
+    extra |= _pixel_aspect(sizes.pixel_aspect)
     return Decoded(
         mosaic=mosaic,
         cfa=cfa,
@@ -271,6 +275,11 @@ def _colour_matrix(
 
 
 # -- both -----------------------------------------------------------------------------------------
+
+
+def _pixel_aspect(aspect: float) -> dict[str, float]:
+    """Entry of the metadata for pixels that are not square; 8 to 1 and beyond is damage."""
+    return {"pixel_aspect": float(aspect)} if aspect != 1.0 and 0.125 < aspect < 8.0 else {}
 
 
 def _mosaic_directory(directories: Sequence[Directory]) -> Directory:

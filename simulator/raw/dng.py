@@ -145,6 +145,7 @@ def _image_tags(raw: RawImage) -> dict[str, Tag]:
         "AsShotNeutral": Tag(TiffType.RATIONAL, [_neutral(g) for g in raw.white_balance]),
         "BaselineExposure": Tag(TiffType.SRATIONAL, [0.0]),
         **_black_tags(raw),
+        **_scale_tags(raw),
         **_noise_tags(raw),
     }
 
@@ -165,6 +166,11 @@ def _black_tags(raw: RawImage) -> dict[str, Tag]:
     for value, (row, column) in zip(values, raw.camera.cfa.offsets, strict=True):
         tile[2 * row + column] = value
     return {"BlackLevelRepeatDim": Tag(TiffType.SHORT, [2, 2]), "BlackLevel": Tag(kind, tile)}
+
+
+def _scale_tags(raw: RawImage) -> dict[str, Tag]:
+    aspect = raw.metadata.get("pixel_aspect", 1.0)
+    return {} if aspect == 1.0 else {"DefaultScale": Tag(TiffType.RATIONAL, [aspect, 1])}
 
 
 def _noise_tags(raw: RawImage) -> dict[str, Tag]:

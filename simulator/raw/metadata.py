@@ -42,7 +42,13 @@ _NAMES = (
     *("ColorMatrix1", "CameraCalibration1", "CalibrationIlluminant1", "AnalogBalance"),
     *("ColorMatrix2", "CameraCalibration2", "CalibrationIlluminant2", "AsShotNeutral"),
     *("NoiseProfile", "ExposureTime", "FNumber", "RecommendedExposureIndex", "ISOSpeed"),
-    *("StandardOutputSensitivity", "DateTimeOriginal", "FocalLength", "UserComment"),
+    *(
+        "StandardOutputSensitivity",
+        "DateTimeOriginal",
+        "FocalLength",
+        "UserComment",
+        "DefaultScale",
+    ),
 )
 _NAME_OF_CODE = {int(tifffile.TIFF.EXIF_TAGS[name]): name for name in _NAMES}
 _SUB_DIRECTORIES, _EXIF = (int(tifffile.TIFF.EXIF_TAGS[name]) for name in ("SubIFDs", "ExifTag"))
@@ -175,8 +181,8 @@ def missing_bytes(directories: Sequence[Directory], size: int) -> int:
 # -- the kind of file and its camera --------------------------------------------------------------
 
 UNKNOWN_FILE, CANON_CRW = "a file of unknown type", "a Canon CRW file"
-TIFF_FILE = "a TIFF-structured file"
-_SIGNATURES: tuple[tuple[bytes, str], ...] = (
+TIFF_FILE, TEXT_FILE = "a TIFF-structured file", "a text file"
+_OTHER_SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"\xff\xd8\xff", "a JPEG file"),
     (b"\x89PNG\r\n", "a PNG file"),
     (b"GIF8", "a GIF file"),
@@ -188,12 +194,16 @@ _SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"PK\x03\x04", "a ZIP archive"),
     (b"\x1f\x8b", "a gzip archive"),
     (b"\x93NUMPY", "a NumPy array"),
+)
+_RAW_SIGNATURES: tuple[tuple[bytes, str], ...] = (
     (b"\0MRM", "a Minolta MRW file"),
     (b"ARRI", "an ARRIRAW file"),
     (b"NOKIARAW", "a Nokia raw file"),
     (b"FUJIFILM", "a Fujifilm RAF file"),
     (b"FOVb", "a Sigma X3F file (Foveon: three colours at every pixel)"),
 )
+#: Kinds of files that are no raws, whole or not.
+NO_RAWS = {TEXT_FILE, *(words for _, words in _OTHER_SIGNATURES)}
 #: Record type of make and model in Canon's CIFF, and of the heaps that hold further records.
 _CIFF_MAKE_MODEL, _CIFF_HEAPS = 0x080A, (0x2800, 0x3000)
 #: A Canon CRW has less than ten heaps of less than a hundred records.
@@ -202,7 +212,7 @@ _CIFF_MAX_HEAPS, _CIFF_MAX_RECORDS = 64, 1024
 
 def describe_file(head: bytes) -> str:
     """Kind of a file in words for an error message, from its first 4096 bytes."""
-    for signature, words in _SIGNATURES:
+    for signature, words in (*_OTHER_SIGNATURES, *_RAW_SIGNATURES):
         if head.startswith(signature):
             return words
     if not head:
@@ -214,7 +224,7 @@ def describe_file(head: bytes) -> str:
     if head[:2] in (b"II", b"MM"):
         return TIFF_FILE
     if b"\0" not in head and all(b >= 32 or b in b"\t\n\r\f" for b in head):
-        return "a text file"
+        return TEXT_FILE
     return UNKNOWN_FILE
 
 

@@ -78,8 +78,9 @@ def read_raw(
     Returns:
         The raw, with ``metadata`` keys ``path`` (file name), ``make``, ``model``, ``flip``
         (LibRaw's code of how to turn it upright: 0, 3, 5 or 6), ``nlf_source``,
-        ``white_balance_source`` and, where known, ``datetime`` (ISO 8601) and
-        ``focal_length`` [mm].
+        ``white_balance_source`` and, where known, ``datetime`` (ISO 8601), ``focal_length`` [mm]
+        and, of pixels that are not square, ``pixel_aspect`` (width / height): the data have the
+        sensor's pixels.
 
     Raises:
         FileNotFoundError: If there is no such file.
@@ -200,7 +201,8 @@ def _settings(path: Path, exposure: Sequence[float], own: OwnRecord | None) -> C
     if missing:
         raise ValueError(
             f"`settings` (=None) must be given: {path.name!r} does not say its "
-            f"{', '.join(missing)}; pass settings=CameraSettings(iso, exposure_time, f_number)"
+            f"{', '.join(missing)}; pass settings=CameraSettings(iso, exposure_time, f_number), or "
+            "--source-iso, --source-shutter and --source-aperture to `ae-env simulate` and `sweep`"
         )
     # LibRaw hands on float32; 7 digits are what it holds.
     rounded = {k: float(f"{v:.7g}") for k, v in values.items()}
@@ -241,23 +243,25 @@ def _profile(
         matrix = matrix if source else None
     if matrix is None and base is not None:
         matrix, source = base.colour_matrix, base.colour_matrix_source
-    levels: dict[str, Any] = {
+    depth = max(1, int(decoded.white_level).bit_length())
+    colours: dict[str, Any] = {
         "cfa": decoded.cfa,
-        "black_level": decoded.black_level,
-        "white_level": decoded.white_level,
-        "bit_depth": max(1, int(decoded.white_level).bit_length()),
         "colour_matrix": matrix,
         "colour_matrix_source": source if matrix is not None else "",
     }
     if base is not None:
-        return replace(base, **levels)
+        found = base.with_levels(decoded.black_level, decoded.white_level, depth)
+        return replace(found, **colours)
     repeated = make == "unknown" or model.lower().startswith(make.lower())
     name = model if repeated else f"{make} {model}".strip()
     return CameraProfile(
         name="_".join(name.lower().split()) or "unknown",
         make=make or "unknown",
         model=model or "unknown",
-        **levels,
+        black_level=decoded.black_level,
+        white_level=decoded.white_level,
+        bit_depth=depth,
+        **colours,
     )
 
 

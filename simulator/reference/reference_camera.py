@@ -1,9 +1,10 @@
 """The reference camera: the ground truth that the simulator's error is measured against.
 
 From noise-free light and depth to digital numbers, each step as the physics has it: thin-lens
-defocus with occlusion, the light of the true exposure time and aperture, motion blur, photon noise
-in electrons, full well, read noise, black level, clip, whole digital numbers. Each body has a small
-hidden error of shutter, aperture and black level, as real ones do.
+defocus with occlusion, the softness of a lens in focus, the colour filter array, the light of the
+true exposure time and aperture, motion blur, photon noise in electrons, full well, read noise,
+black level, clip, whole digital numbers, and only then an average of neighbours. Each body has a
+small hidden error of shutter, aperture and black level, as real ones do.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from simulator.camera import CameraProfile
 from simulator.capture.exposure import SIGNAL_LIMIT
@@ -23,6 +25,7 @@ from simulator.optics.blur import motion_blur
 from simulator.optics.flicker_integral import Lamp
 from simulator.optics.thin_lens import Lens, defocus
 from simulator.raw.image import check_packed
+from simulator.reference.sampling import average_planes, lens_blur, sample_mosaic
 from simulator.settings import CameraSettings, exposure_ratio
 
 #: A well holds this much more than white at the base ISO: makers set the white level just below it,
@@ -32,6 +35,8 @@ WELL_MARGIN = 0.004
 _STOPS = range(37)
 #: Kind of a scene whose picture is also there without the depth that it was given.
 DRAPED = "draped"
+#: Kind of a scene that a real sensor recorded, with a little noise left.
+MOSAIC = "mosaic"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +47,22 @@ class ReferenceScene:
         scene_id: Unique name.
         group: Source group, the unit of splitting (photograph, panorama, physical subject).
         kind: Kind of source, such as ``"procedural"``.
-        light: (4, H, W) float32 >= 0, linear, in camera colours, at `reference`; 1.0 is sensor
-            white, not clipped.
+        light: Float32 >= 0, linear, in camera colours, at `reference`; 1.0 is sensor white, not
+            clipped. (3, 2H, 2W): red, green and blue at the pitch of the photosites, which the
+            camera samples. (4, H, W): planes that are recorded as they are, those of a real mosaic
+            or of a scene too coarse to be sampled.
         reference: Settings at which `light` is on that scale.
-        depth: (H, W) float32, distance from the lens [m], above its focal length, inf allowed;
-            None if all is in focus.
+        depth: Distance from the lens [m] at each pixel of `light`, float32, above its focal length,
+            inf allowed; None if all is in focus.
         lens: The lens that it is photographed with.
         illuminance: Incident light [lux], if known.
         white_balance: Gains of R, G, B of the scene's light.
         source: Where the light comes from.
+        sampled: Whether it has the detail of a sensor, each plane at its own place. Always so where
+            `light` is at the pitch of the photosites; planes that share their places, G1 equal to
+            G2, say nothing about detail.
+        in_focus: Whether `light` itself is sharp throughout. A photograph with a blur of its own
+            says nothing about what a wider aperture does.
 
     Raises:
         ValueError: If light or depth has the wrong shape or values out of range.
@@ -66,9 +78,19 @@ class ReferenceScene:
     illuminance: float | None = None
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     source: str = ""
+    sampled: bool = False
+    in_focus: bool = True
 
     def __post_init__(self) -> None:
-        light = check_packed("light", self.light)
+        light = self.light
+        if light.ndim == 3 and light.shape[0] == 3:
+            if light.shape[1] % 2 or light.shape[2] % 2:
+                raise ValueError(f"`light` (shape {tuple(light.shape)}) must have even sides")
+            # The green twice, to be checked like planes.
+            light = check_packed("light", light[[0, 1, 1, 2]])[[0, 1, 3]]
+            object.__setattr__(self, "sampled", True)
+        else:
+            light = check_packed("light", light)
         if bool((light < 0).any()):
             raise ValueError(f"`light` (minimum {float(light.min()):g}) must be >= 0")
         object.__setattr__(self, "light", light)
@@ -86,6 +108,17 @@ class ReferenceScene:
                 f"({nearest:g} m)"
             )
         object.__setattr__(self, "depth", self.depth.to(torch.float32))
+
+    @property
+    def pitch(self) -> int:
+        """Pixels of `light` a side in a packed pixel: 2 where they are photosites, else 1."""
+        return 2 if self.light.shape[0] == 3 else 1
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width [packed pixel]."""
+        height, width = self.light.shape[1:]
+        return height // self.pitch, width // self.pitch
 
 
 @dataclass(frozen=True)
@@ -157,7 +190,7 @@ class ReferenceCapture:
 
     Args:
         mean: (4, H, W) without noise, clipped as the capture is, not quantised.
-        sample: (4, H, W) with noise, clipped, whole digital numbers.
+        sample: (4, H, W) with noise, clipped, whole digital numbers (or averages of them).
         settings: Nominal settings, as the file would state them.
     """
 
@@ -172,14 +205,23 @@ class ReferenceCamera:
     Args:
         camera: Sensor, with a noise calibration and, for scenes with depth, a pixel pitch.
         body: Hidden error of this body.
-        box_factor: Sensor pixels averaged per side and plane into one pixel of a scene's light.
+        box_factor: Samples k that are averaged per side and plane after they were recorded, each
+            with noise of its own: captures then have H // k x W // k pixels, their values whole
+            multiples of 1/k^2 digital numbers.
+        sensor_noise: Whether the read noise has the camera's rows and tails
+            (`CameraProfile.read_noise`); else it is normal and independent.
 
     Raises:
-        ValueError: If the camera has no noise calibration or `box_factor` is below 1.
+        ValueError: If the camera has no such noise calibration or `box_factor` is below 1.
     """
 
     def __init__(
-        self, camera: CameraProfile, *, body: BodyError | None = None, box_factor: int = 1
+        self,
+        camera: CameraProfile,
+        *,
+        body: BodyError | None = None,
+        box_factor: int = 1,
+        sensor_noise: bool = False,
     ) -> None:
         if not camera.nlf_by_iso:
             raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
@@ -188,34 +230,50 @@ class ReferenceCamera:
         self.camera = camera
         self.body = BodyError.none() if body is None else body
         self.box_factor = box_factor
+        self.sensor_noise = sensor_noise
+        if sensor_noise:
+            camera.read_noise(min(camera.nlf_by_iso))  # raises where there is none
 
     def blur_diameter(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
-        """Diameter of the circle of confusion, (H, W), in pixels of ``scene.light``, >= 0.
+        """Diameter of the circle of confusion in the pixels of a capture, >= 0.
+
+        Where depth is finer than that it is the root of the mean square, as second moments add.
 
         Args:
             scene: The scene to photograph.
             f_number: As marked on the lens; the blur is that of the stop that it stands for.
+
+        Returns:
+            (H // k, W // k) for a scene of H x W packed pixels and `box_factor` k.
         """
-        return self._signed_diameter(scene, f_number).abs().to(torch.float32)
+        diameter, pixels = self._signed_diameter(scene, f_number), scene.pitch * self.box_factor
+        if pixels == 1:
+            return diameter.abs().to(torch.float32)
+        squares = F.avg_pool2d(diameter.square()[None], pixels)[0]
+        return (squares.sqrt() / pixels).to(torch.float32)
 
     def _signed_diameter(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+        """The same with its sign, at and in the pixels of ``scene.light``."""
         if scene.depth is None:
             return torch.zeros_like(scene.light[0], dtype=torch.float64)
         if self.camera.pixel_pitch_um is None:
             raise ValueError(f"`camera` (={self.camera.name!r}) must have a pixel pitch")
         exact = CameraSettings(100.0, 1.0, f_number).effective_f_number
-        pitch = 2e-6 * self.camera.pixel_pitch_um * self.box_factor  # two sensor pixels a plane's
+        pitch = 2e-6 * self.camera.pixel_pitch_um / scene.pitch
         return scene.lens.circle_of_confusion(scene.depth.double(), exact) / pitch
 
     def blurred_light(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
-        """Light on the sensor behind the aperture `f_number`, (4, H, W): defocus alone.
+        """Light on the photosites behind the aperture `f_number`, (4, H, W).
 
-        It is still at the exposure of ``scene.reference``, unclipped and without noise: one result
-        serves every ISO and exposure time.
+        Defocus at the pitch of ``scene.light``; light at the pitch of the photosites then goes
+        through a lens that is sharp to about a pixel and through the colour filter array. It is
+        still at the exposure of ``scene.reference``, unclipped, without noise and not averaged: one
+        result serves every ISO and exposure time.
         """
-        if scene.depth is None:
-            return scene.light
-        return defocus(scene.light, self._signed_diameter(scene, f_number))
+        light = scene.light
+        if scene.depth is not None:
+            light = defocus(light, self._signed_diameter(scene, f_number))
+        return sample_mosaic(lens_blur(light), self.camera.cfa) if scene.pitch == 2 else light
 
     def expose(
         self,
@@ -244,9 +302,7 @@ class ReferenceCamera:
         time = self.body.exposure_time(settings.exposure_time)
         moved = motion_blur(light, image_speed * time * light.shape[-2])
         if lamp is not None:
-            bands = lamp.row_light(
-                start, time, light.shape[-2], self.camera.row_time, 2 * self.box_factor
-            )
+            bands = lamp.row_light(start, time, light.shape[-2], self.camera.row_time, 2)
             moved = moved * torch.from_numpy(bands).to(moved)[:, None]
         return moved * ratio + self._black_offset(light)
 
@@ -256,15 +312,16 @@ class ReferenceCamera:
     def record(self, signal: torch.Tensor, iso: float, generator: torch.Generator) -> torch.Tensor:
         """Digital numbers of `signal`, on the scale where sensor white is 1.
 
-        The variance is that of the camera's noise level function: the noise of the rounding to
-        whole numbers is part of the calibrated read noise, and is not counted twice.
+        The variance of a sample is that of the camera's noise level function: the noise of the
+        rounding to whole numbers is part of the calibrated read noise, and is not counted twice.
+        `box_factor` squared samples are averaged after that.
 
         Args:
             signal: (..., 4, H, W), from `expose`.
             iso: ISO speed.
             generator: Source of the noise, on the device of `signal`.
         """
-        shot, read = nlf_tensors(self.camera.nlf(iso).scaled(1 / self.box_factor**2), signal.device)
+        shot, read = nlf_tensors(self.camera.nlf(iso), signal.device)
         black, well = self._black_offset(signal), self._well(signal, iso)
         # Light far above a full well fills it in any case; its photon count would overflow.
         light = torch.minimum((signal - black).clamp(min=0.0), 2.0 * well)
@@ -272,9 +329,18 @@ class ReferenceCamera:
         counted = torch.poisson(light * electrons, generator=generator) / electrons
         collected = torch.minimum(torch.where(shot > 0, counted, light), well)
         span = torch.tensor(self.camera.span).to(signal)[:, None, None]
-        sigma = (read - 1.0 / (12.0 * span**2)).clamp(min=0.0).sqrt()
+        rounding = 1.0 / (12.0 * span**2)
         normal = torch.empty_like(collected).normal_(generator=generator)
-        return clip_and_quantise(collected + sigma * normal + black, self.camera)
+        if self.sensor_noise:
+            given = self.camera.read_noise(iso)
+            rows = signal.new_empty(*signal.shape[:-3], 2, signal.shape[-2])
+            left = ((1.0 - given.row**2) * read - rounding).clamp(min=0.0)
+            noise = given.row_part(read, rows.normal_(generator=generator))
+            noise = noise + given.pixel_part(left, normal)
+        else:
+            noise = (read - rounding).clamp(min=0.0).sqrt() * normal
+        recorded = clip_and_quantise(collected + noise + black, self.camera)
+        return average_planes(recorded, self.box_factor)
 
     def _well(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
         """Signal of a full well, (4, 1, 1): just above white at the base ISO, more beyond it."""
@@ -286,11 +352,13 @@ class ReferenceCamera:
         return torch.tensor(wells).to(signal)[:, None, None]
 
     def clip(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
-        """Clip `signal` (..., 4, H, W) to what a capture at `iso` can show: [-pedestal, 1]."""
+        """The mean of a capture of `signal` (..., 4, H, W) at `iso`: clipped to [-pedestal, 1],
+        then averaged as `record` does.
+        """
         black = self._black_offset(signal)
         held = torch.minimum(signal, self._well(signal, iso) + black)
         pedestal = torch.tensor(self.camera.pedestal).to(signal)[:, None, None]
-        return torch.maximum(held, -pedestal).clamp(max=1.0)
+        return average_planes(torch.maximum(held, -pedestal).clamp(max=1.0), self.box_factor)
 
     def capture(
         self,

@@ -10,7 +10,9 @@ from pydantic import Field, model_validator
 from simulator.camera import get_camera
 from simulator.utils.config_file import Configuration, load_yaml
 
-_STAGES = ("exposure", "noise", "aperture", "baseline")
+_STAGES = ("noise", "exposure", "aperture", "baseline")
+#: Stages of the presets that are not whole simulators.
+_STAGES_OF = {"nano": ("noise",), "large": ("noise",), "pc": ("baseline",), "dl": ("baseline",)}
 
 
 class StageConfig(Configuration):
@@ -23,6 +25,8 @@ class StageConfig(Configuration):
         batch: Pairs per step and process.
         crop: Height and width of the crops [packed pixel].
         learning_rate: Peak of a one-cycle schedule (rise over 5 %, cosine fall to 0).
+        average: Decay of the running average of the weights that is kept in the end; 0 keeps the
+            last ones.
     """
 
     steps: int | None = Field(default=None, ge=1, le=10_000_000)
@@ -30,6 +34,7 @@ class StageConfig(Configuration):
     batch: int = Field(default=8, ge=1, le=4096)
     crop: int = Field(default=64, ge=16, le=4096)
     learning_rate: float = Field(default=1e-3, gt=0, le=1.0)
+    average: float = Field(default=0.0, ge=0, lt=1)
 
     @model_validator(mode="after")
     def _one_budget(self) -> StageConfig:
@@ -56,18 +61,20 @@ class SimulatorConfig(Configuration):
     """A training of the three modules, or of a baseline.
 
     Args:
-        preset: ``"compact"`` or ``"paper"``; ``"pc"`` (parameter concatenation) and ``"dl"``
-            (decoupled learning) are the paper's baselines, one network trained in one stage.
-        camera: Built-in camera that records the sequences.
+        preset: ``"compact"`` or ``"paper"``; ``"nano"`` and ``"large"`` are noise modules alone;
+            ``"pc"`` (parameter concatenation) and ``"dl"`` (decoupled learning) are the paper's
+            baselines, one network trained in one stage.
+        camera: Built-in camera that records the sequences. The noise stage adds the noise of every
+            built-in camera.
         body: Seed of the hidden error of its body.
         seed: Seed of everything that is random.
         precision: Of the networks; weights, optimiser and losses stay float32.
         scenes: Scenes of the sequences.
-        exposure, noise, aperture: The three stages of a preset.
+        exposure, noise, aperture: The three stages of a simulator.
         baseline: The stage of ``"pc"`` and ``"dl"``.
     """
 
-    preset: Literal["compact", "paper", "pc", "dl"]
+    preset: Literal["nano", "compact", "large", "paper", "pc", "dl"]
     camera: str = "nikon_z6"
     body: int = Field(default=1, ge=0)
     seed: int = Field(default=0, ge=0)
@@ -81,8 +88,9 @@ class SimulatorConfig(Configuration):
     @model_validator(mode="after")
     def _check(self) -> SimulatorConfig:
         get_camera(self.camera)
+        stages = _STAGES_OF.get(self.preset, ("exposure", "noise", "aperture"))
         for name in _STAGES:
-            wanted = (name == "baseline") == (self.preset in ("pc", "dl"))
+            wanted = name in stages
             if wanted != (getattr(self, name) is not None):
                 rule = "must be given" if wanted else "must be left out"
                 raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
@@ -99,8 +107,13 @@ class SimulatorConfig(Configuration):
         return {name: getattr(self, name) for name in _STAGES if getattr(self, name) is not None}
 
     def card(self, last_stage: str | None = None) -> dict[str, Any]:
-        """JSON values that identify the training, without the stages after `last_stage`."""
+        """JSON values that identify the training, without the stages after `last_stage`.
+
+        The noise stage has pictures of its own: nothing but its budget and the seed changes it.
+        """
         values = self.model_dump(mode="json", exclude_none=True)
+        if last_stage == "noise":
+            return {name: values[name] for name in ("preset", "seed", "precision", "noise")}
         names = list(self.stages())
         later = [] if last_stage is None else names[names.index(last_stage) + 1 :]
         return {name: value for name, value in values.items() if name not in later}

@@ -137,10 +137,10 @@ class ReferencePairs:
             if progress is not None:
                 progress(done, len(wanted))
             scene = self.sequences[index].scene
-            for stop, chosen in by_stop.items():
-                if (scene.scene_id, stop) not in self._blurred_light:
-                    light = self.camera.blurred_light(scene, chosen.f_number)
-                    self._blurred_light[scene.scene_id, stop] = light
+            for chosen in by_stop.values():
+                key = _light_key(scene, chosen)
+                if key not in self._blurred_light:
+                    self._blurred_light[key] = self.camera.blurred_light(scene, chosen.f_number)
         if progress is not None:
             progress(len(wanted), len(wanted))
 
@@ -150,7 +150,8 @@ class ReferencePairs:
         sequence = self.sequences[pair.sequence]
         scene = sequence.scene
         source, target = sequence.settings[pair.source], sequence.settings[pair.target]
-        height, width = scene.light.shape[1:]
+        k = self.camera.box_factor
+        height, width = (n // k for n in scene.size)
         if crop > min(height, width):
             raise ValueError(
                 f"`crop` (={crop}) must not exceed the {height} x {width} pixels of scene "
@@ -158,21 +159,24 @@ class ReferencePairs:
             )
         top = int(rng.integers(height - crop + 1))
         left = int(rng.integers(width - crop + 1))
-        flips = [axis for axis in (-2, -1) if rng.random() < 0.5]
+        # The one symmetry of a mosaic: transposed, G1 and G2 change places. Mirrored, its planes
+        # would lie where no photosites are.
         transposed = rng.random() < 0.5
 
-        def cut(image: Tensor) -> Tensor:
-            part = image[..., top : top + crop, left : left + crop].flip(flips)
+        def cut(image: Tensor, scale: int = 1) -> Tensor:
+            rows, columns = (slice(scale * n, scale * (n + crop)) for n in (top, left))
+            part = image[..., rows, columns]
             return (part.transpose(-2, -1) if transposed else part).contiguous()
 
         def record(settings: CameraSettings) -> tuple[Tensor, Tensor]:
-            light = cut(self._blurred_light[scene.scene_id, settings.aperture_stop])
+            light = cut(self._blurred_light[_light_key(scene, settings)], k)
+            light = light[[0, 2, 1, 3]] if transposed else light
             signal = self.camera.expose(light, scene.reference, settings)
             return signal, self.camera.record(signal, settings.iso, generator)
 
         _, noisy = record(source)
         signal, sample = record(target)
-        nlf = self.camera.camera.nlf(source.iso).scaled(1.0 / self.camera.box_factor**2)
+        nlf = self.camera.camera.nlf(source.iso).scaled(1.0 / k**2)
         return {
             "source": noisy,
             "target": self.camera.clip(signal, target.iso),
@@ -194,6 +198,11 @@ class ReferencePairs:
         if key not in self._defocus:
             self._defocus[key] = self.camera.blur_diameter(scene, settings.effective_f_number)
         return self._defocus[key]
+
+
+def _light_key(scene: ReferenceScene, settings: CameraSettings) -> tuple[str, int]:
+    """Without depth, light is the same behind every aperture, and rendered once."""
+    return scene.scene_id, 0 if scene.depth is None else settings.aperture_stop
 
 
 def settings_parameters(settings: CameraSettings) -> tuple[float, float, float]:

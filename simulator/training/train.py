@@ -12,17 +12,28 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from torch import nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from simulator.camera import get_camera
+from simulator.camera import get_camera, list_cameras
+from simulator.networks.noise_module import NoiseModule
 from simulator.networks.weights import build_modules, save_modules
-from simulator.reference.reference_camera import DRAPED, BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import (
+    DRAPED,
+    MOSAIC,
+    BodyError,
+    ReferenceCamera,
+    ReferenceScene,
+)
+from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
+from simulator.training.calibration import calibrate
 from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
+from simulator.training.detail import DetailCrops, DetailPicture
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.files import sibling
@@ -34,6 +45,8 @@ if TYPE_CHECKING:
 #: Makes the scenes of a split, ``"train"`` or ``"validation"``, such as
 #: `ae_env.scenes.reference_scenes` does.
 SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
+#: Gives the pictures of a split for the noise stage, such as `ae_env.scenes.detail` does.
+PictureMaker = Callable[[SimulatorConfig, str], Sequence[DetailPicture]]
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]
 #: Fixed batches that a trained stage is validated on.
@@ -41,7 +54,6 @@ _VALIDATION_STEPS, _VALIDATION_BATCH = 8, 8
 #: Pairs that each stage is trained on, see `simulator.reference.sequences.select_pairs`.
 _PAIRS: dict[str, Stage] = {
     "exposure": "exposure",
-    "noise": "noise",
     "aperture": "aperture",
     "baseline": "all",
 }
@@ -56,6 +68,7 @@ _LOG_EVERY, _SMOOTHING = 20, 0.98
 def train_and_save(
     config: SimulatorConfig,
     make_scenes: SceneMaker,
+    make_pictures: PictureMaker,
     path: Path,
     *,
     command: str,
@@ -69,7 +82,8 @@ def train_and_save(
 
     Args:
         config: The training.
-        make_scenes: Gives the scenes of a split.
+        make_scenes: Gives the scenes of a split; not called for a noise module alone.
+        make_pictures: Gives the pictures of a split for the noise stage.
         path: File name of the weights; checkpoints and logs go into its folder.
         command: The command line that does it again, for the card.
         device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
@@ -84,7 +98,10 @@ def train_and_save(
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.default_generator.manual_seed(config.seed)
         modules = build_modules(config.preset)
-    sources = {split: _Source(config, make_scenes, split) for split in ("train", "validation")}
+    sources = {
+        split: _Source(config, make_scenes, make_pictures, split)
+        for split in ("train", "validation")
+    }
     if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
         progress = None
     stages: dict[str, dict[str, Any]] = {}
@@ -112,11 +129,16 @@ def train_and_save(
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
+        residual = None
+        if "noise" in modules:
+            module = cast(NoiseModule, modules["noise"].to("cpu").eval())
+            residual = calibrate(module, sources["validation"].crops).to_card()
         meta = result_meta(command, config.seed)
         card = {
             "training": config.card(),
-            "scenes": dict(Counter(s.scene.kind for s in sources["train"].sequences)),
+            "scenes": sources["train"].kinds,
             "stages": stages,
+            "residual": residual,
             **{k: meta[k] for k in ("command", "commit", "date", "machine", "versions")},
         }
         save_modules(path, modules.to("cpu").eval(), config.preset, card)
@@ -150,23 +172,52 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
 
 
 class _Source:
-    """Pairs of one split. Light that is rendered for a stage serves the next."""
+    """Scenes, pictures and pairs of one split, made when a stage asks for them.
 
-    def __init__(self, config: SimulatorConfig, make_scenes: SceneMaker, split: str) -> None:
-        camera = get_camera(config.camera)
-        self.camera = ReferenceCamera(camera, body=BodyError.draw(camera, config.body))
-        self.seed = config.seed
-        self.sequences = draw_sequences(make_scenes(config, split), camera, config.seed)
+    Light that is rendered for a stage serves the next.
+    """
+
+    def __init__(
+        self,
+        config: SimulatorConfig,
+        make_scenes: SceneMaker,
+        make_pictures: PictureMaker,
+        split: str,
+    ) -> None:
+        self.config, self.split = config, split
+        self._make_scenes, self._make_pictures = make_scenes, make_pictures
         self._blurred_light: dict[tuple[str, int], torch.Tensor] = {}
+        self.kinds: Counter[str] = Counter()
 
-    def pairs(self, stage: str, progress: Callable[[int, int], None] | None) -> ReferencePairs:
+    @functools.cached_property
+    def _sequences(self) -> tuple[ReferenceCamera, list[CaptureSequence]]:
+        camera = get_camera(self.config.camera)
+        body = ReferenceCamera(camera, body=BodyError.draw(camera, self.config.body))
+        scenes = self._make_scenes(self.config, self.split)
+        self.kinds.update(scene.kind for scene in scenes)
+        return body, draw_sequences(scenes, camera, self.config.seed)
+
+    @functools.cached_property
+    def crops(self) -> DetailCrops:
+        """Crops of the noise stage."""
+        pictures = self._make_pictures(self.config, self.split)
+        self.kinds.update(picture.kind for picture in pictures)
+        return DetailCrops(
+            pictures, [get_camera(name) for name in list_cameras()], self.config.seed
+        )
+
+    def pairs(
+        self, stage: str, progress: Callable[[int, int], None] | None
+    ) -> ReferencePairs | DetailCrops:
         """The pairs that `stage` is trained or validated on."""
-        used = [s for s in self.sequences if _teaches(s.scene, stage)]
+        if stage == "noise":
+            return self.crops
+        camera, sequences = self._sequences
         return ReferencePairs(
-            used,
-            self.camera,
+            [s for s in sequences if _teaches(s.scene, stage)],
+            camera,
             _PAIRS[stage],
-            seed=self.seed,
+            seed=self.config.seed,
             blurred_light=self._blurred_light,
             progress=progress,
         )
@@ -175,10 +226,13 @@ class _Source:
 def _teaches(scene: ReferenceScene, stage: str) -> bool:
     """Whether a stage is trained on `scene`.
 
-    Only a scene of known depth tells what a wider aperture does to it. The other stages have seen
-    the picture that a draped scene shows.
+    The aperture is learnt from scenes of known depth and from those in focus throughout, in which
+    nothing may change. The other stages have seen the picture that a draped scene shows, and a
+    recorded mosaic has noise of its own.
     """
-    return scene.depth is not None if stage == "aperture" else scene.kind != DRAPED
+    if stage == "aperture":
+        return scene.depth is not None or scene.in_focus
+    return scene.kind not in (DRAPED, MOSAIC)
 
 
 def _titled(progress: TrainingProgress | None, title: str) -> Callable[[int, int], None] | None:
@@ -192,7 +246,7 @@ def _loss(stage: str, modules: nn.ModuleDict) -> nn.Module:
     if stage == "exposure":
         return ExposureLoss(known["exposure"])
     if stage == "noise":
-        return NoiseLoss(known["exposure"], known["noise"])
+        return NoiseLoss(known["noise"])
     if stage == "aperture":
         return ApertureLoss(known["exposure"], known["noise"], known["aperture"])
     return BaselineLoss(known["baseline"])
@@ -202,7 +256,7 @@ def train_stage(
     name: str,
     loss: nn.Module,
     trained: nn.Module,
-    pairs: ReferencePairs,
+    pairs: ReferencePairs | DetailCrops,
     stage: StageConfig,
     accelerator: Accelerator,
     *,
@@ -237,9 +291,10 @@ def train_stage(
     loss.requires_grad_(False)
     trained.requires_grad_(True)
     loss.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.Adam(trained.parameters(), lr=stage.learning_rate)
+    optimizer = torch.optim.AdamW(trained.parameters(), lr=stage.learning_rate, weight_decay=1e-4)
+    average = AveragedModel(trained, multi_avg_fn=get_ema_multi_avg_fn(stage.average))  # type: ignore[no-untyped-call]
     clock = Clock(stage, on_cpu=device.type == "cpu")
-    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer}
+    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer, "average": average}
     if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
         parts["scaler"] = accelerator.scaler
 
@@ -267,6 +322,7 @@ def train_stage(
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
             stepper.step()
+            average.update_parameters(trained)
             clock.tick()
             _agree(clock, accelerator)
             stepper.zero_grad()
@@ -275,6 +331,7 @@ def train_stage(
                 if progress is not None:
                     progress(clock.share, means)
             state.save_when_due()
+    trained.load_state_dict(average.module.state_dict())
     return clock
 
 
@@ -357,7 +414,7 @@ def _follow(means: dict[str, float], values: dict[str, torch.Tensor], name: str)
 
 @torch.no_grad()
 def validate(
-    loss: nn.Module, pairs: ReferencePairs, crop: int, accelerator: Accelerator
+    loss: nn.Module, pairs: ReferencePairs | DetailCrops, crop: int, accelerator: Accelerator
 ) -> dict[str, float]:
     """Means of the values of `loss` on 64 fixed pairs."""
     means: dict[str, float] = {}

@@ -111,7 +111,7 @@ GRID = {"isos": [100, 200], "exposure_times": [0.01, 0.1], "f_numbers": [4, 8]}
         ),
         ({"scorer": {"niose": 1.0}}, "did you mean 'noise'"),
         ({"scorer": {"noise": 1.0, "mine:noise": 1.0}}, "differ behind the colon"),
-        ({"noise": "bnak"}, "one of True, False, 'bank', 'exact'; did you mean 'bank'"),
+        ({"noise": "bnak"}, "one of True, False, 'bank', 'exact', 'sensor'; did you mean 'bank'"),
         ({"noise": ["bank"]}, r"`noise` \(=\['bank'\]\) must be one of True, False"),
         ({"autoreset_mode": "NEXT"}, "did you mean 'NEXT_STEP'"),
         ({"num_envs": 2**16 + 1}, r"`num_envs` \(=65537\) .*\[1, 65536\]"),

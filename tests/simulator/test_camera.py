@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import FrozenInstanceError, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,38 +14,75 @@ from hypothesis import strategies as st
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.noise.read_noise import ReadNoise
 from tests.simulator.z6_noise import z6_noise
 from tests.strategies import log_uniform
 
+#: Variance of rounding to the Z6's digital numbers, on the scale where white is 1.
+ROUNDING = 1 / 12 / (15520 - 1008) ** 2
+
 
 @pytest.mark.parametrize(
-    ("iso", "base", "extrapolated"),
+    ("iso", "base", "stops"),
     [
-        *((iso, iso, False) for iso in (100, 400, 800, 1600, 6400)),
+        *((iso, iso, 0) for iso in (100, 400, 800, 1600, 6400)),
         # The Z6 switches gain at ISO 800, where read noise falls: nothing is interpolated across.
-        *((iso, 400, False) for iso in (600, 799.99)),
-        *((iso, 100, True) for iso in (25, 50)),
-        *((iso, 6400, True) for iso in (12800, 409600)),
+        *((iso, 400, 0) for iso in (600, 799.99)),
+        *((25, 100, -2), (50, 100, -1), (12800, 6400, 1), (409600, 6400, 6)),
     ],
 )
 def test_z6_is_the_table_and_scales_where_it_has_no_neighbours(
-    iso: float, base: int, extrapolated: bool
+    iso: float, base: int, stops: float
 ) -> None:
-    """Shot noise scales with the ISO, read noise with its square."""
+    """Shot noise scales with the ISO, read noise before it is rounded with its square."""
     nlf, (shot, read) = get_camera("nikon_z6").nlf(iso), z6_noise(base)
     assert nlf.shot == pytest.approx(iso / base * shot, rel=1e-12)
-    assert nlf.read == pytest.approx((iso / base) ** 2 * read, rel=1e-12)
-    assert nlf.extrapolated is extrapolated
+    assert nlf.read == pytest.approx((iso / base) ** 2 * (read - ROUNDING) + ROUNDING, rel=1e-12)
+    assert (nlf.extrapolation, nlf.extrapolated) == (stops, stops != 0)
 
 
-@pytest.mark.parametrize("iso", [100, 200, 400, 800, 1600, 3200, 6400])
-def test_70d_is_the_eld_calibration(iso: int) -> None:
-    """K = 0.4075 ISO / 100 DN per electron, ln sigma = 0.5681 ln K + 1.9983 DN, to their digits."""
-    gain = 0.4075 * iso / 100
-    sigma = math.exp(0.5681 * math.log(gain) + 1.9983)
-    nlf = get_camera("canon_70d").nlf(iso)
-    assert nlf.shot == pytest.approx((gain / 15583,) * 4, rel=1e-4)
-    assert nlf.read == pytest.approx(((sigma / 15583) ** 2,) * 4, rel=5e-4)
+@pytest.mark.real_data
+@pytest.mark.parametrize(
+    ("name", "entry", "inferred"),
+    [
+        ("canon_5d4", "CanonEOS5D4", {}),
+        ("canon_700d", "CanonEOS700D", {}),
+        ("canon_70d", "CanonEOS70D", {}),
+        # Its read noise falls at ISO 400, where its second profile is taken.
+        ("nikon_d850", "NikonD850", dict.fromkeys((400, 800, 1600, 3200, 6400), "Profile-2")),
+        ("sony_a7s2", "SonyA7S2", {}),
+    ],
+)
+def test_elds_cameras_are_its_calibration(
+    data_dir: Path, name: str, entry: str, inferred: dict[int, str]
+) -> None:
+    """K = Kmin ISO / 100 DN per electron; ln sigma = slope ln K + bias, in DN of 15583."""
+    known = json.loads((data_dir / "noise_eld.json").read_text())["cameras"][entry]
+    for stop, iso in enumerate((100, 200, 400, 800, 1600, 3200, 6400)):
+        gain, fits = known["Kmin"] * iso / 100, known[inferred.get(iso, "Profile-1")]
+        sigma, row = (
+            math.exp(fits[key]["slope"] * math.log(gain) + fits[key]["bias"])
+            for key in ("g_scale", "R_scale")
+        )
+        nlf, read_noise = get_camera(name).nlf(iso), get_camera(name).read_noise(iso)
+        assert nlf.shot == pytest.approx((gain / 15583,) * 4, rel=1e-5)
+        assert nlf.read == pytest.approx(((sigma / 15583) ** 2,) * 4, rel=5e-4)  # the 70D's digits
+        assert read_noise.row * sigma == pytest.approx(row, rel=1e-5)
+        assert read_noise.shape == pytest.approx(sum(known["G_shape"][2 * stop : 2 * stop + 2]) / 2)
+
+
+def test_row_noise_between_the_calibrated_isos() -> None:
+    """Over log ISO, inside a segment; in the 70D's table at 100 and 200, the D850's at 200."""
+    half, low = (
+        get_camera("canon_70d").read_noise(100 * math.sqrt(2), 3),
+        ReadNoise(0.0459616, 0.14286),
+    )
+    assert half.box_factor == 3
+    assert half.row == pytest.approx((0.0459616 + get_camera("canon_70d").read_noise(200).row) / 2)
+    assert half.shape == pytest.approx((0.14286 + 0.11429) / 2)
+    assert get_camera("canon_70d").read_noise(50) == low
+    d850 = get_camera("nikon_d850")
+    assert d850.read_noise(399) == d850.read_noise(200) != d850.read_noise(400)
 
 
 def test_interpolation_is_log_log_inside_a_segment() -> None:
@@ -60,8 +99,9 @@ def test_interpolation_is_log_log_inside_a_segment() -> None:
 
 def test_a_segment_begins_at_its_iso_not_at_its_first_calibration() -> None:
     camera = replace(get_camera("nikon_z6"), segments=(700.0,))
-    assert camera.nlf(699).read[1] == pytest.approx((699 / 400) ** 2 * 5.22487909303224e-08)
-    assert camera.nlf(750).read[1] == pytest.approx((750 / 800) ** 2 * 2.22569604502207e-08)
+    for iso, base, read in ((699, 400, 5.22487909303224e-08), (750, 800, 2.22569604502207e-08)):
+        scaled = (iso / base) ** 2 * (read - ROUNDING) + ROUNDING
+        assert camera.nlf(iso).read[1] == pytest.approx(scaled)
     assert camera.nlf(750).shot[1] == pytest.approx(750 / 800 * 6.19623102159152e-05)
 
 
@@ -69,8 +109,10 @@ def test_one_measurement_calibrates_a_camera() -> None:
     measured = NoiseLevelFunction((1e-4,) * 4, (1e-6,) * 4)
     camera = get_camera("nikon_z6").with_nlf(200, measured)
     assert camera.nlf(200) == measured
-    assert camera.nlf(800).read == pytest.approx((16e-6,) * 4)
-    assert camera.nlf(800).extrapolated
+    assert camera.nlf(800).read == pytest.approx((16e-6 - 15 * ROUNDING,) * 4)
+    assert camera.nlf(800).extrapolation == 2
+    coarse = profile().with_nlf(200, replace(measured, read=(5e-8,) * 4))  # less than its rounding
+    assert coarse.nlf(12800).read == pytest.approx((5e-8,) * 4)
 
 
 @pytest.mark.parametrize(
@@ -139,11 +181,13 @@ def test_bad_iso(iso: Any) -> None:
 
 
 def test_unknown_names_propose_the_nearest() -> None:
-    assert list_cameras() == ["canon_70d", "nikon_z6"]
-    with pytest.raises(ValueError, match="did you mean 'nikon_z6'"):
-        get_camera("nikon_z7")
+    canons, others = ["canon_5d4", "canon_700d", "canon_70d"], ["nikon_d850", "nikon_z6"]
+    assert list_cameras() == [*canons, *others, "sony_a7s2"]
+    for near in ("nikon_z7", "nikon_d80", "canon_70", "canon_5d3", "sony_a7"):
+        with pytest.raises(ValueError, match=f"did you mean '{near[:-1]}"):
+            get_camera(near)
     for wrong in ("qqqq", ["nikon_z6"]):
-        with pytest.raises(ValueError, match=r"must be one of \['canon_70d', 'nikon_z6'\]"):
+        with pytest.raises(ValueError, match=r"must be one of \['canon_5d4', .*'sony_a7s2'\]"):
             get_camera(wrong)  # type: ignore[arg-type]
 
 
@@ -159,7 +203,11 @@ def test_profiles_are_hashable_values() -> None:
 # -- for any input --------------------------------------------------------------------
 
 
-@given(st.sampled_from(["nikon_z6", "canon_70d"]), log_uniform(1e-3, 1e8), log_uniform(1, 4))
+@given(
+    st.sampled_from(["nikon_z6", "canon_70d", "nikon_d850"]),
+    log_uniform(1e-3, 1e8),
+    log_uniform(1, 4),
+)
 def test_noise_grows_with_iso_within_a_conversion_gain(name: str, iso: float, more: float) -> None:
     camera = get_camera(name)
     higher = iso * more

@@ -1,6 +1,7 @@
 """Running episodes: frames of the simulator, rewards, masks, and copies that go on alike."""
 
 import copy
+import math
 import multiprocessing
 import pickle
 from collections.abc import Callable
@@ -15,8 +16,10 @@ from ae_env.episodes import core as core_module
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
 from ae_env.scorers.score_table import ScoreTables, prepare_scene
+from simulator.camera import get_camera
 from simulator.capture.sensor import exposed_light
 from simulator.noise.generator import frame_normals, noise_keys
+from simulator.noise.read_noise import ReadNoise
 from tests.ae_env.environments import assert_equal, make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
@@ -27,6 +30,23 @@ def _frames(env: Any) -> list[tuple[np.ndarray, ...]]:
     shown = [env.reset(seed=3)]
     shown += [env.step(rng.integers(64, size=3))[::4] for _ in range(10)]
     return [(o["raw"], info["clipped_high"], info["excess_noise"]) for o, info in shown]
+
+
+def test_rows_of_the_read_noise_show_where_asked_for() -> None:
+    """R and G1 share their rows, G2 has others."""
+    known = get_camera("canon_70d")
+    camera = replace(known, read_noise_by_iso={100.0: ReadNoise(0.9, 0.1)})
+    envs = make_envs(noise="sensor", camera=camera, motion="none", observation="linear")
+    darkest = [max(envs.core.grid, key=lambda s: (s.iso, -s.exposure_time, s.f_number))] * 3
+    envs.reset(seed=3)
+    actions = np.array([list(envs.core.grid).index(state) for state in darkest])
+    first, *others = (envs.step(actions)[0]["raw"] for _ in range(6))
+    rows = np.stack([(other - first).mean(axis=-1) for other in others])  # (5, 3, 4, H)
+    correlation = np.corrcoef(rows.transpose(2, 0, 1, 3).reshape(4, -1))
+    assert correlation[0, 1] > 0.5 < correlation[2, 3]
+    assert np.abs(correlation[:2, 2:]).max() < 5 * math.sqrt(2 / rows[:, :, 0].size)
+    with pytest.raises(ValueError, match="has no calibration of row noise"):
+        make_envs(noise="sensor")
 
 
 @pytest.mark.parametrize("noise", ["bank", "exact"])
@@ -58,7 +78,9 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
             normals = frame_normals(key, (4, 36, 36), noise)
             nlf = exposure.target
             shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
-            noisy = light + np.sqrt(np.maximum(light, 0) * shot + read) * normals
+            read = read - 1.0 / (12.0 * span**2)  # what rounding adds
+            variance = np.maximum(np.maximum(light, 0) * shot + read, 0)
+            noisy = light + np.sqrt(variance) * normals
             numbers = np.clip(np.rint(noisy * span + black), 0, core.camera.white_level)
             assert np.abs(raw - numbers).max() <= 1
             different, total = different + (raw != numbers).sum(), total + raw.size

@@ -36,7 +36,8 @@ def _env(**arguments: Any) -> Any:
 def test_frames_are_those_of_the_reference_camera(lighting: Any, make_lamp: Any) -> None:
     env, scene = _env(lighting=lighting, noise=False, observation="linear"), _scene()
     reference = ReferenceCamera(CAMERA, box_factor=4)
-    before = ReferenceScene("grey", "grey", "test", scene.light, scene.reference)
+    native = scene.light.repeat_interleave(4, 1).repeat_interleave(4, 2)
+    before = ReferenceScene("grey", "grey", "test", native, scene.reference)
     env.reset(seed=4)
     rate = lighting.get("frame_rate", 30.0)
     for frame, state in enumerate((0, 17, 22, 37, 50, 63), start=1):

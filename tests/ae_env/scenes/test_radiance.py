@@ -79,6 +79,37 @@ def test_views_of_a_panorama_share_one_scale(tmp_path: Path) -> None:
     assert all(s.illuminance is None and s.noise_free and s.box_factor == 8 for s in scenes)
 
 
+def test_maps_are_sampled_where_they_have_the_photosites(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Rows of one pixel, green and dark in turn: G1, beside red, differs from G2."""
+    still = np.ones((520, 520, 3), np.float32)
+    still[::2] = 0.2
+    write_exr(tmp_path / "fine.exr", still)
+    write_exr(tmp_path / "coarse.exr", still[:200, :200])
+    panorama = np.ones((256, 512, 3), np.float32)  # 94 photosites in 60 degrees
+    write_exr(tmp_path / "wide.exr", panorama)
+    caplog.set_level(logging.INFO)
+    for name, crop, resolution, sampled, k in (
+        *(("fine", "box", 64, True, 4), ("fine", "native", 64, True, 1)),
+        *(("coarse", "box", 64, False, 3), ("coarse", "native", 64, True, 1)),
+        *(("coarse", "native", 128, False, 1), ("wide", "native", 48, False, 1)),
+        *(("wide", "native", 40, True, 1), ("wide", "box", 40, False, 6)),
+    ):
+        caplog.clear()
+        request = SceneRequest("all", CAMERA, resolution, crop)
+        scene, *_ = radiance_scenes(tmp_path / f"{name}.exr", request, name=name, group=name)
+        assert (scene.sampled, scene.box_factor) == (sampled, k)
+        assert scene.light.shape == (4, resolution, resolution)
+        assert ("planes share their places" in caplog.text) != sampled
+        assert torch.equal(scene.light[1], scene.light[2]) == (not sampled or name == "wide")
+        if name == "fine":  # a lens of half a photosite leaves 0.57 of such a contrast
+            ratio = float(scene.light[1].mean() / scene.light[2].mean())
+            assert max(ratio, 1 / ratio) == pytest.approx(
+                (0.6 + 0.4 * 0.57) / (0.6 - 0.228), rel=0.01
+            )
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [

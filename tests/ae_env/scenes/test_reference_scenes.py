@@ -1,6 +1,7 @@
 """Scenes of the reference camera: splits, light, depth of real photographs, draped pictures."""
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,11 +9,11 @@ import pytest
 import torch
 
 from ae_env.scenes.reference_scenes import (
-    RADIANCE_MAPS,
+    _edge_ratio,
     depth_photographs,
     draped_scenes,
+    mosaic_scenes,
     reference_scenes,
-    sharpened,
 )
 from simulator import CameraSettings, get_camera
 from simulator.reference.reference_camera import DRAPED, ReferenceScene
@@ -38,9 +39,6 @@ def test_no_source_is_in_two_splits(scenes: dict[str, list[ReferenceScene]]) -> 
     groups = [{s.group for s in scenes[split]} for split in SPLITS]
     assert all(groups)
     assert sum(map(len, groups)) == len(set().union(*groups))
-    stems = [set(RADIANCE_MAPS[split]) for split in SPLITS]
-    assert [len(s) for s in stems] == [4, 2, 7]
-    assert len(set().union(*stems)) == 13
     ids = [s.scene_id for split in SPLITS for s in scenes[split]]
     assert len(ids) == len(set(ids))
 
@@ -67,7 +65,7 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
         *("spot_light", "motion"),
     }
     for scene in train:
-        assert scene.light.shape == (4, 48, 48)
+        assert (scene.light.shape, scene.size) == ((3, 96, 96), (48, 48))
         assert scene.light.dtype == torch.float32
         assert bool((scene.light >= 0).all())
         assert (scene.depth is not None) == (scene.kind == "depth")
@@ -79,31 +77,44 @@ def test_kinds_and_light(scenes: dict[str, list[ReferenceScene]]) -> None:
     assert 0.05 < np.median(surfaces) < 0.3  # reflectances of nature
 
 
-def test_radiance_maps_by_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tmp_path / "maps").mkdir()
-    panorama = np.full((256, 512, 3), 0.5)
-    panorama[:, 192:320] = 4.0  # the quarter ahead
-    write_exr(tmp_path / "maps" / "city.exr", panorama)
-    write_exr(tmp_path / "maps" / "unknown.exr", panorama)
-    with caplog.at_level(logging.WARNING):
-        found = reference_scenes("validation", CAMERA, number=0, size=64, radiance=tmp_path)
-    assert "no radiance map 'StillLife'" in caplog.text
-    views = [s for s in found if s.kind == "radiance"]
+def test_panoramas_are_cut_and_coarse_pictures_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "hdri_cc0").mkdir()
+    row, column = np.mgrid[:256, :512]
+    panorama = np.stack([1.0 + column % 128, 1.0 + row, 1.0 + row % 2], axis=2)
+    write_exr(tmp_path / "hdri_cc0" / "city.exr", panorama)
+    with caplog.at_level(logging.INFO):
+        found = reference_scenes("validation", CAMERA, number=0, size=64, data=tmp_path)
+        views = [s for s in found if s.kind == "radiance"]
+        wide = reference_scenes("validation", CAMERA, number=0, size=128, data=tmp_path)
     assert [s.scene_id for s in views] == ["city-000", "city-090", "city-180", "city-270"]
+    assert "city-000: too coarse (128 photosites a side), left out" in caplog.text
+    assert all(s.kind == "photograph" for s in wide)
     assert {s.group for s in views} == {"city"}
     for view in views:
-        assert view.depth is None
-        assert view.light.shape == (4, 64, 64)
-        assert view.light[1].mean().item() == pytest.approx(0.12, rel=0.01)  # flat in 90 degrees
+        assert (view.depth, view.size, view.light.shape) == (None, (64, 64), (3, 128, 128))
         assert f"{view.illuminance:g} lux assumed" in view.source
         assert view.reference.log2_exposure == pytest.approx(-np.log2(view.illuminance / 2.5))
-    write_exr(tmp_path / "maps" / "StillLife.exr", np.ones((256, 300)))  # no panorama
-    found = reference_scenes("validation", CAMERA, number=0, size=64, radiance=tmp_path)
-    assert "StillLife" in {s.scene_id for s in found}
-    train = reference_scenes("train", CAMERA, number=0, size=64, radiance=tmp_path)
-    assert all(s.kind == "photograph" for s in train)
-    with pytest.raises(FileNotFoundError, match="`radiance`"):
-        reference_scenes("train", CAMERA, number=0, radiance=tmp_path / "none")
+        assert bool(view.sampled and view.in_focus)
+    # A quarter of the circle each, its pixels as they are: every one looks the same here.
+    assert len({float(v.light.sum()) for v in views}) == 1
+    with pytest.raises(FileNotFoundError, match="`data`"):
+        reference_scenes("train", CAMERA, number=0, data=tmp_path / "none")
+
+
+@pytest.mark.real_data
+def test_real_pictures_share_no_group_between_splits(data_dir: Path) -> None:
+    made = {s: reference_scenes(s, CAMERA, number=0, size=128, data=data_dir) for s in SPLITS}
+    for split, scenes in made.items():
+        scenes += mosaic_scenes(split, CAMERA, data_dir, size=128)
+    groups = [{s.group for s in made[split]} for split in SPLITS]
+    assert len(groups[2]) >= 25
+    assert sum(map(len, groups)) == len(set().union(*groups))
+    assert all(s.sampled and s.size == (128, 128) for scenes in made.values() for s in scenes)
+    names = [{s.scene_id for s in scenes} for scenes in made.values()]
+    assert "CRW_0112" in names[0]
+    assert {"CRW_0117", "CRW_0119", "chelsea"} <= names[2]
 
 
 def test_motorcycle_has_the_depth_of_its_calibration() -> None:
@@ -114,14 +125,11 @@ def test_motorcycle_has_the_depth_of_its_calibration() -> None:
     front, middle = depth_photographs(CAMERA)
     assert (front.scene_id, middle.scene_id) == ("motorcycle-front", "motorcycle-middle")
     assert front.group == middle.group == "motorcycle"
-    assert front.light.shape == (4, 250, 370)
+    assert (front.light.shape, front.size) == ((3, 500, 740), (250, 370))
     assert torch.equal(front.depth, middle.depth)
     depth = 0.193001 * 994.978 / (np.where(np.isfinite(disparity), disparity, np.nan) + 31.086)
-    four = depth[:500, :740].reshape(250, 2, 370, 2).transpose(0, 2, 1, 3).reshape(250, 370, 4)
-    known = np.isfinite(four).all(axis=2)
-    ours = front.depth.numpy()[known]
-    # One of the four depths, the second farthest: never a mean of two sides of an edge.
-    np.testing.assert_allclose(ours, np.sort(four[known], axis=1)[:, 2], rtol=1e-5)
+    known = np.isfinite(depth[:500, :740])
+    np.testing.assert_allclose(front.depth.numpy()[known], depth[:500, :740][known], rtol=1e-5)
     assert 1.8 < front.depth.min() < front.depth.max() < 6.0
     assert bool((front.light >= 0).all())
 
@@ -140,30 +148,35 @@ def test_real_cones(data_dir: Path) -> None:
     cones = depth_photographs(CAMERA, data=data_dir)[2:]
     assert [s.scene_id for s in cones] == ["cones-front", "cones-middle"]
     for scene in cones:
-        assert scene.light.shape == (4, 187, 225)
-        assert scene.depth.shape == (187, 225)
+        assert scene.size == (187, 225)
         assert bool(torch.isfinite(scene.depth).all())
         assert 4.5 < np.quantile(blur(scene), 0.97) < 6.3
 
 
-def picture(size: int = 64) -> ReferenceScene:
-    light = torch.rand(4, size, size, generator=torch.Generator().manual_seed(1))
+def test_drapes_keep_light_and_group_and_have_a_blur_in_range() -> None:
+    light = torch.rand(3, 128, 96, generator=torch.Generator().manual_seed(1))
     reference = CameraSettings(100, 1 / 64, 4)
-    return ReferenceScene("a", "the-group", "indoor", light, reference, illuminance=100.0)
+    scene = ReferenceScene("a", "the-group", "indoor", light, reference, illuminance=100.0)
+    others = replace(scene, in_focus=False), replace(scene, light=light[[0, 1, 1, 2]])
+    drapes = list(draped_scenes([scene, *others], CAMERA, copies=4))
+    assert len({d.scene_id for d in drapes}) == len(drapes) == 4
+    assert not torch.equal(drapes[0].depth, drapes[1].depth)
+    for copy in drapes:
+        assert torch.equal(copy.light, light)
+        assert (copy.group, copy.kind, copy.size) == ("the-group", DRAPED, (64, 48))
+        assert blur(copy).max() <= 7.0 + 1e-3
+        assert blur(copy).min() < 0.35  # something is in focus
 
 
-def test_light_and_group_stay_and_depth_is_new() -> None:
-    scene = picture()
-    first, second = draped_scenes([scene], CAMERA, copies=2)
-    for copy in (first, second):
-        assert torch.equal(copy.light, sharpened(scene).light)
-        assert (copy.group, copy.kind) == ("the-group", DRAPED)
-    assert first.scene_id != second.scene_id
-    assert not torch.equal(first.depth, second.depth)  # type: ignore[arg-type]
-
-
-def test_blur_of_draped_pictures_is_in_range() -> None:
-    for scene in draped_scenes([picture(size=128)], CAMERA, copies=6):
-        diameter = blur(scene)
-        assert diameter.max() <= 7.0 + 1e-3
-        assert diameter.min() < 0.35  # something is in focus
+def test_softness_is_that_of_edges() -> None:
+    # Edges anywhere in a pixel: 2/3 of the square lies between neighbours, 5/3 between second ones.
+    rng = np.random.default_rng(0)
+    edge = np.repeat(rng.uniform(1.0, 2.0, (256, 64)), 400, axis=1)  # 50 steps to a pixel
+    offset = rng.integers(0, 400, 256)
+    rows = np.stack([np.roll(r, o) for r, o in zip(edge, offset, strict=True)])
+    pixels = rows.reshape(256, -1, 50).mean(axis=2)
+    assert _edge_ratio(pixels) == pytest.approx(0.4, abs=0.01)
+    assert _edge_ratio(rng.uniform(1.0, 1.1, (256, 256))) == pytest.approx(1.0, abs=0.02)
+    assert _edge_ratio(rows) == pytest.approx(0.5, abs=0.01)
+    smooth = np.exp(np.sin(np.arange(512) / 20) * 0.1)[None].repeat(4, axis=0)
+    assert _edge_ratio(smooth) == pytest.approx(0.25, abs=0.01)

@@ -11,7 +11,7 @@ from ae_env.scenes.split import Shot, group_shots, split_groups
 from tests.ae_env.scene_files import load, write_hdr
 
 
-def test_large_folder_is_split_by_group(tmp_path: Path) -> None:
+def test_large_folder_is_split_by_group(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     names = [f"subject{i}/{name}" for i in range(15) for name in "ab"]
     for name in names[:28]:
         write_hdr(tmp_path / f"{name}.hdr")
@@ -25,6 +25,10 @@ def test_large_folder_is_split_by_group(tmp_path: Path) -> None:
     assert {s.group for s in train}.isdisjoint(s.group for s in test)
     assert sorted(s.scene_id for s in train + test) == sorted(s.scene_id for s in both)
     assert sorted(s.scene_id for s in both) == sorted(names)
+    left_out = [15 - len({s.group for s in part}) for part in (train, test)]
+    lines = [r.getMessage() for r in caplog.records if "--split all" in r.getMessage()]
+    for line, split, count in zip(lines, ("train", "test"), left_out, strict=True):
+        assert f"split '{split}' leaves out {count} of 15 source groups" in line
 
 
 def test_groups_file_names_the_groups(tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ def test_an_environment_is_the_base(tmp_path):
         (("--policy", "matix:P", "--scenes", "bundled:small"), "did you mean 'matrix"),
         (("--preset", "broken.yaml"), "starts"),
         (("--policy", "random", "--author", "me"), "give --append too"),
+        (("--policy", "random", "--on-error", "skip"), "give that, too"),
         (("--preset", "ae_bench_v1", "--append", "."), "must be a file, but it is a folder"),
     ],
 )
@@ -77,6 +78,18 @@ def test_mistakes_are_one_line(ae_env, tmp_path, arguments, message):
     assert (code, text, error.strip().count("\n")) == (2, "", 0), error
     assert message in error
     assert not (tmp_path / "evaluation").exists()
+
+
+def test_broken_files_of_a_folder_are_skipped_when_asked(ae_env, dng, tmp_path, caplog):
+    (tmp_path / "env.yaml").write_text("{simulator: null, resolution: 36}")
+    (tmp_path / "IMG_2.dng").write_bytes(b"\xff\xd8\xff")
+    command = ("evaluate", "--env", tmp_path / "env.yaml", "--scenes", dng.parent)
+    command += ("--policy", "random", "--frames", 2, "--workers", 1)
+    code, _, error = ae_env(*command)
+    assert (code, "a JPEG file; --on-error skip" in error) == (2, True)
+    code, _, error = ae_env(*command, "--on-error", "skip")
+    assert code == 0, error
+    assert "1 of 2 scene files skipped (IMG_2.dng: " in caplog.text
 
 
 def test_a_preset_end_to_end_and_again(ae_env, tmp_path, preset):

@@ -88,8 +88,8 @@ def test_a_seed_beyond_those_of_evaluations_is_refused_at_once(tmp_path: Path) -
 
 def test_next_commands_are_quoted() -> None:
     agents = {"ppo": Path("my out/agents/ppo"), "regression": Path("my out/agents/regression")}
-    lines = next_commands("my raws", Path("my out"), agents)
+    lines = next_commands("my raws", Path("my out"), agents, "skip")
     assert lines[0] == (
         "ae-env evaluate --policy 'ppo:my out/agents/ppo' --policy matrix:tuned "
-        "--scenes 'my raws' --out 'my out/meters'"
+        "--scenes 'my raws' --on-error skip --out 'my out/meters'"
     )

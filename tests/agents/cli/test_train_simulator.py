@@ -1,15 +1,18 @@
 from collections import Counter
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
 import yaml
 
+from ae_env.scenes import detail
 from agents.cli import train_simulator
 from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
 from simulator.training.config import SimulatorConfig
 from simulator.training.data import ReferencePairs
+from simulator.training.detail import DetailCrops
 
 TINY = """\
 preset: compact
@@ -21,18 +24,23 @@ aperture: {steps: 2, batch: 2, crop: 16}
 
 
 def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C in the second stage; the same command finishes, and simulate takes the result."""
+    """Ctrl-C in the second stage; the same command finishes, and simulate takes the result.
+
+    Without a folder of real files, on a few drawn pictures."""
+    monkeypatch.delenv("AE_ENV_DATA", raising=False)
+    monkeypatch.setattr(detail, "_DRAWN", {"train": 2, "validation": 1})
     monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
     (tmp_path / "tiny.yaml").write_text(TINY)
-    real, steps = ReferencePairs.batch, []
+    steps = []
 
-    def batch(self, step, *arguments, **options):
-        steps.append((self.stage, step))
-        if steps.count(("noise", 1)) == 1 and steps[-1] == ("noise", 1):
+    def batch(self, step, *arguments, real, **options):
+        steps.append((getattr(self, "stage", "noise"), step))
+        if steps.count(("exposure", 1)) == 1 and steps[-1] == ("exposure", 1):
             raise KeyboardInterrupt
         return real(self, step, *arguments, **options)
 
-    monkeypatch.setattr(ReferencePairs, "batch", batch)
+    for kind in (ReferencePairs, DetailCrops):
+        monkeypatch.setattr(kind, "batch", partialmethod(batch, real=kind.batch))
     arguments = ("train-simulator", "tiny.yaml", "--device", "cpu")
     code, _, error = ae_env(*arguments)
     assert code == 130
@@ -41,7 +49,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     code, text, error = ae_env(*arguments)
     assert (code, error) == (0, "")
     trained = [s for s in steps[before:] if s[1] < 2]
-    assert trained[:2] == [("exposure", 0), ("exposure", 1)]  # its validation, not its training
+    assert trained[:2] == [("noise", 0), ("noise", 1)]  # its validation, not its training
     folder = tmp_path / "runs" / "simulator" / "tiny"
     weights = folder / "compact.safetensors"
     relative = weights.relative_to(tmp_path)
@@ -51,7 +59,9 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert list(folder.glob("tensorboard/**/events.out*"))
     _, card = load_modules(weights)
     assert card["command"] == "ae-env train-simulator tiny.yaml --device cpu"
+    assert list(card["stages"]) == ["noise", "exposure", "aperture"]
     assert [stage["steps"] for stage in card["stages"].values()] == [2, 2, 2]
+    assert {"leaves": 2, "chart": 2, "smooth": 2, "depth": 3}.items() <= card["scenes"].items()
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
 
 
@@ -65,5 +75,5 @@ def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
     deep = [Counter(s.kind for s in own if s.depth is not None) for own in splits.values()]
     assert deep == [{"depth": 3, "draped": 2}, {"depth": 2}]
     for scene in (scene for scenes in splits.values() for scene in scenes):
-        assert scene.light.shape == ((4, 16, 16) if scene.kind == "draped" else (4, 32, 32))
+        assert (scene.size, scene.sampled) == ((32, 32), True)
         assert scene.illuminance is not None

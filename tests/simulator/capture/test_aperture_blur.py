@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.blurred_light import Denoised
+from simulator.capture.denoised import Denoised
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.blur import disc_blur
 from simulator.optics.disc_bank import DIAMETERS, HALO, DiscBank, added_blur
@@ -26,17 +26,17 @@ def light(seed: int = 0) -> Tensor:
 def aperture_blur(diameter: float = 2.0 / math.sqrt(3)) -> MapApertureBlur:
     """At f/4 the default adds exactly 2 px, a disc of the bank, to a picture at f/8."""
     assert 2.0 in DIAMETERS
-    return MapApertureBlur(light(0), Denoised(light(1)), torch.full((24, 24), diameter), 8.0)
+    return MapApertureBlur(light(), torch.full((24, 24), diameter), 8.0)
 
 
 def test_each_light_is_blurred_by_its_own_bank_and_cached() -> None:
     made, kernel = aperture_blur(), torch.zeros(9, 9)
-    for denoised in (False, True):
-        result = made.opened(4.0, denoised=denoised)
-        expected = disc_blur(light(int(denoised)), 2.0)
+    for denoised in (None, Denoised(light(1)), Denoised(light(2))):
+        result = made.opened(4.0, denoised)
+        expected = disc_blur(light() if denoised is None else denoised.light, 2.0)
         torch.testing.assert_close(result, expected, atol=1e-5, rtol=0)
-        assert made.opened(4.0, denoised=denoised) is result
-        assert not torch.equal(made.opened(5.6, denoised=denoised), result)
+        assert made.opened(4.0, denoised) is result
+        assert not torch.equal(made.opened(5.6, denoised), result)
     kernel[4, 4] = 1.0
     energy = disc_blur(kernel, 2.0).square().sum()
     remaining = made.remaining_variance(4.0)
@@ -48,8 +48,8 @@ def test_a_lamp_of_any_brightness_stays_finite() -> None:
     for lamp in (0.0, 1e30):
         scene = light()
         scene[:, 12, 12] = lamp
-        made = MapApertureBlur(scene, Denoised(scene), torch.full((24, 24), 3.0), 8.0)
-        opened.append(made.opened(4.0, denoised=False))
+        made = MapApertureBlur(scene, torch.full((24, 24), 3.0), 8.0)
+        opened.append(made.opened(4.0, None))
     assert bool(opened[1].isfinite().all())
     # A disc's 6 px away nothing of the lamp arrives, and nothing of the shadows is lost.
     torch.testing.assert_close(opened[1][:, 3, 3], opened[0][:, 3, 3])
@@ -65,7 +65,7 @@ def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> No
     assert made.extent(8.0) == made.extent(11.0) == 0.0
     assert made.remaining_variance(4.0) is None
     result = made.opened(4.0)
-    assert made.opened(4.0, denoised=True) is result
+    assert made.opened(4.0, Denoised(light())) is result
     f_source, f_target = torch.tensor([8.0]), torch.tensor([4.0])
     image = light()[None]
     expected = module(image, torch.zeros_like(image), f_source, f_target)[0]
@@ -85,9 +85,9 @@ def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
     monkeypatch.setattr(
         "simulator.capture.aperture_blur.make_tiles", functools.partial(make_tiles, tile=tile)
     )
-    made = MapApertureBlur(image, Denoised(image), diameter, 8.0)
+    made = MapApertureBlur(image, diameter, 8.0)
     for f_number in (5.6, 2.8):
-        result = made.opened(f_number, denoised=True)
+        result = made.opened(f_number, None)
         whole = DiscBank(image).blurred(added_blur(diameter, 8.0, f_number))
         torch.testing.assert_close(result, whole, rtol=0, atol=3e-6)
         assert torch.equal(result[:, diameter == 0], image[:, diameter == 0])
@@ -104,12 +104,10 @@ def test_only_what_is_out_of_focus_is_blurred(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr("simulator.capture.aperture_blur.DiscBank", Spy)
     image, diameter = torch.rand(4, 300, 400), torch.zeros(300, 400)
-    assert torch.equal(
-        MapApertureBlur(image, Denoised(image), diameter, 8.0).opened(4.0, denoised=True), image
-    )
+    assert torch.equal(MapApertureBlur(image, diameter, 8.0).opened(4.0, None), image)
     assert not pixels
     diameter[-32:, -32:] = 5.0
-    MapApertureBlur(image, Denoised(image), diameter, 8.0).opened(4.0, denoised=True)
+    MapApertureBlur(image, diameter, 8.0).opened(4.0, None)
     assert (32 + HALO) ** 2 <= sum(pixels) <= (48 + HALO) ** 2  # in cells of 16 pixels
 
 
@@ -120,10 +118,10 @@ def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
         calls.append(1)
         return torch.full((24, 24), 2.0)
 
-    made = MapApertureBlur(light(), Denoised(light()), estimate, 8.0)
+    made = MapApertureBlur(light(), estimate, 8.0)
     assert made.extent(8.0) == made.extent(16.0) == 0.0
     assert not calls
     assert made.extent(4.0) == pytest.approx(2 * math.sqrt(3))
-    made.opened(4.0, denoised=False)
+    made.opened(4.0, None)
     made.remaining_variance(5.6)
     assert calls == [1]

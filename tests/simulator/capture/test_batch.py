@@ -13,7 +13,6 @@ from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_cam
 from simulator.capture import batch as batch_module
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.batch import CaptureBatch
-from simulator.capture.blurred_light import Denoised
 from simulator.capture.sensor import Transitions, noise_balance, record
 from simulator.noise.generator import Noise, noise_keys, single_normals
 
@@ -35,7 +34,7 @@ def prepared(index: int) -> PreparedScene:
         changes["defocus"] = 2.0
     if index == 4:
         found = torch.full((24, 20), 1.0)
-        changes["aperture_blur"] = MapApertureBlur(light, Denoised(light), found, 4.0)
+        changes["aperture_blur"] = MapApertureBlur(light, found, 4.0)
     nlf = NoiseLevelFunction.zero() if index in (0, 2) else Z6.nlf(800)
     return PreparedScene(light, REFERENCE, Z6, nlf, **changes)
 

@@ -23,7 +23,10 @@ def random_light(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) -> torch.Tensor:
-    """The capture in float64, from the formulas of the noise top-up: numbers before rounding."""
+    """The capture in float64, from the formulas of the noise top-up: numbers before rounding.
+
+    Rounding will add 1/12, which is part of the target's noise.
+    """
     x = (light.double() * exposure.ratio).clamp(-1e6, 1e6)
     source, target = exposure.source_noise, exposure.target
 
@@ -33,7 +36,8 @@ def reference(light: torch.Tensor, exposure: Exposure, normals: torch.Tensor) ->
 
     share = exposure.remaining_variance
     left = 1.0 if share is None else share.double()
-    missing = (variance(target) - left * variance(source)).clamp(min=0.0)
+    rounding = 1.0 / (12.0 * torch.tensor(Z6.span, dtype=torch.float64)[:, None, None] ** 2)
+    missing = (variance(target) - left * variance(source) - rounding).clamp(min=0.0)
     return in_numbers(x + missing.sqrt() * normals.double()).clamp(0.0, Z6.white_level)
 
 
@@ -65,7 +69,7 @@ def test_captures_are_those_of_the_reference(
     exact = reference(light, exposure, normals)
     transitions, frames = Transitions.of([light], [exposure]), torch.empty(2, 4, *size)
     counts = record(transitions, Z6, keys=keys, noise=kind, signals=frames[:1], count=True)
-    record_stepwise(transitions, Z6, keys, kind, frames[1:])
+    record_stepwise(transitions.before_rounding(Z6), Z6, keys, kind, frames[1:])
     for frame in frames:
         numbers = in_numbers(frame)
         assert float((numbers - numbers.round()).abs().max()) < 0.005  # float32 of 14 bits: 0.001
@@ -113,7 +117,10 @@ def test_a_frame_is_the_same_alone_in_a_batch_and_on_any_number_of_threads(kind:
     """Planes of more than 65,536 samples, which are worked on in two pieces."""
     lights = [random_light(4, 250, 265, seed=i) for i in range(3)]
     exposures = [Exposure(0.6 * (i + 1), CLEAN, Z6.nlf(400 * 4**i)) for i in range(3)]
-    keys, table = noise_keys(np.arange(3), 2), exposure_table(exposures)
+    keys, table = (
+        noise_keys(np.arange(3), 2),
+        Transitions.of(lights, exposures).before_rounding(Z6).table,
+    )
     for threads in (1, 3):
         codes, signals = np.empty((3, 4, 66250), np.uint8), np.empty((3, 4, 66250), np.float32)
         outputs = {"codes": codes, "signals": signals}

@@ -15,6 +15,7 @@ from simulator.networks.aperture_module import (
     DEAD_ZONE,
     LARGEST,
     ApertureModule,
+    AperturePreset,
     DefocusMap,
     added_blur,
     band_features,
@@ -23,7 +24,6 @@ from simulator.networks.aperture_module import (
     to_diameter,
     usable_defocus,
 )
-from simulator.networks.noise_module import Preset
 from simulator.optics.blur import disc_blur
 from simulator.optics.thin_lens import Lens
 
@@ -33,7 +33,7 @@ def picture(*size: int) -> Tensor:
     return torch.from_numpy(values) * 5.0
 
 
-def module(preset: Preset = "compact") -> ApertureModule:
+def module(preset: AperturePreset = "compact") -> ApertureModule:
     torch.manual_seed(1)
     made = ApertureModule(preset).eval().requires_grad_(False)
     if preset == "paper":
@@ -53,7 +53,7 @@ F4, F8, F11 = (torch.full((2,), f) for f in (4.0, 8.0, 8 * 2**0.5))
 
 
 @pytest.mark.parametrize("preset", ["compact", "paper"])
-def test_only_the_images_that_open_change(preset: Preset) -> None:
+def test_only_the_images_that_open_change(preset: AperturePreset) -> None:
     image = picture(16, 19)
     made = with_map(4.0) if preset == "compact" else module("paper")
     for target in (F8, 2 * F8):

@@ -43,7 +43,7 @@ def raw(noise: bool = True) -> RawImage:
 def compact() -> CameraSimulator:
     torch.manual_seed(0)
     made = CameraSimulator("compact", device="cpu")
-    made.noise.network.tail.weight.mul_(3)
+    torch.nn.init.normal_(made.noise.network.tail.weight, std=0.02)
     made.aperture.network.tail.bias.fill_(1.2)  # about 3 px, well above the dead zone
     return made
 
@@ -63,12 +63,14 @@ def test_tolerance_nought_equals_the_full_run(
         full = compact.simulate(source, target, seed=3, tolerance=None, **scene)
         assert torch.equal(full.data, stages.capture)
         frame = compact.simulate(source, target, seed=3, tolerance=0, **scene)
+        assert frame.noise == full.noise
+        assert frame.metadata == full.metadata
+        if noise and "noise_reduction" not in prepared.plan(target).modules:
+            continue  # noise that is topped up has the same distribution, but is another draw
         numbers = [(f.data.double() * 14512).round() for f in (full, frame)]
         difference = (numbers[0] - numbers[1]).abs()
         assert difference.max() <= 1
         assert difference.mean() < 2e-2  # a number that is nearly halfway
-        assert frame.noise == full.noise
-        assert frame.metadata == full.metadata
 
 
 def test_every_module_runs_for_every_transition(
@@ -96,7 +98,7 @@ def test_every_module_runs_for_every_transition(
 def test_raws_prepared_scenes_and_scenes_run_alike(compact: CameraSimulator) -> None:
     source, target = raw(), TARGETS[3]
     prepared = compact.prepare(source, image_speed=0.5, defocus=2.0)
-    scene = SimpleNamespace(prepared=replace(prepared, denoised=None))
+    scene = SimpleNamespace(prepared=replace(prepared, denoised=()))
     given = {"image_speed": 0.5, "defocus": 2.0}
     frames = [
         compact.simulate(source, target, tolerance=None, **given).data,
@@ -135,9 +137,8 @@ def test_without_networks_the_full_run_is_exposure_and_noise(scene: dict, noise:
 
 
 def test_the_tolerance_of_a_prepared_scene_is_kept(compact: CameraSimulator) -> None:
-    strict = compact.prepare(raw(), tolerance=0)
-    assert [compact.prepare(s).tolerance for s in (strict, raw())] == [0.0, 0.1]
-    noisier = CameraSettings(6400, 1 / 64, 8)
-    frames = [compact.simulate(s, noisier, seed=1).data for s in (strict, raw())]
-    assert not torch.equal(*frames)  # denoised with tolerance 0, topped up without
-    assert torch.equal(compact.simulate(strict, noisier, seed=1, tolerance=0.1).data, frames[1])
+    loose = compact.prepare(raw(), tolerance=100)
+    assert [compact.prepare(s).tolerance for s in (loose, raw())] == [100.0, 0.1]
+    frames = [compact.simulate(s, TARGETS[0], seed=1).data for s in (loose, raw())]
+    assert not torch.equal(*frames)  # as noisy as it was, and denoised
+    assert torch.equal(compact.simulate(loose, TARGETS[0], seed=1, tolerance=0.1).data, frames[1])

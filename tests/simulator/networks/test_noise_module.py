@@ -49,55 +49,63 @@ def test_variance_by_hand_and_below_zero() -> None:
     assert tiny.flatten().tolist() == pytest.approx([5e-9] * 16, rel=1e-5)
 
 
-@pytest.mark.parametrize("preset", ["compact", "paper"])
-def test_the_networks_see_image_and_deviation(preset: Preset) -> None:
-    """The compact one that of the smoothed signal; the paper's gives a residual."""
-    module, image = NoiseModule(preset), noisy()
+def test_the_papers_network_sees_image_and_deviation_and_gives_a_residual() -> None:
+    module, image = NoiseModule("paper"), noisy()
     module.network = Seen(0.125)
-    residual = image if preset == "paper" else torch.zeros_like(image)
-    assert torch.equal(module(image, SHOT, READ), residual + 0.125)
-    seen, deviation = torch.cat(module.network.given, dim=1).split(4, dim=1)
+    assert torch.equal(module(image, SHOT, READ), image + 0.125)
+    seen, deviation = module.network.given[0].split(4, dim=1)
     assert torch.equal(seen, image)
-    signal = image.double().numpy()
-    if preset == "compact":
-        signal = uniform_filter(signal, (1, 1, 5, 5), mode="nearest")
     shot, read = (np.array(v)[:, None, None] for v in (NLF.shot, NLF.read))
-    expected = np.sqrt(read + shot * signal[0].clip(min=0))
-    tolerance = 1e-5 if preset == "paper" else 1e-4
-    np.testing.assert_allclose(deviation[0].numpy(), expected, rtol=tolerance)
+    expected = np.sqrt(read + shot * image.double().numpy()[0].clip(min=0))
+    np.testing.assert_allclose(deviation[0].numpy(), expected, rtol=1e-5)
+    smooth = uniform_filter(image.double().numpy(), (1, 1, 5, 5), mode="nearest")
+    np.testing.assert_allclose(smoothed(image).numpy(), smooth, atol=1e-6)
 
 
-@pytest.mark.parametrize("exponent", [-12, -1, 5, 12])
-def test_compact_commutes_with_exposure(exponent: int) -> None:
-    """Exposing by c turns the noise level function into (c shot, c^2 read)."""
-    torch.manual_seed(0)
-    module = NoiseModule("compact").eval().requires_grad_(False)
-    module.network.tail.weight.mul_(30.0)
-    # One bias anywhere would end this once training moved it from 0.
-    assert all(parameter.ndim == 4 for parameter in module.network.parameters())
-    c, image = 2.0**exponent, noisy()
-    after = module(image, SHOT, READ)
-    assert (after - image).abs().mean() > 0.01  # the network does something
-    assert torch.equal(module(image * c, SHOT * c, READ * c * c), after * c)
+# Presets
+
+
+@pytest.mark.parametrize(
+    ("preset", "limit"), [("nano", 100_000), ("compact", 1_000_000), ("large", 6_000_000)]
+)
+def test_sizes_of_the_family(preset: Preset, limit: int) -> None:
+    module = NoiseModule(preset)
+    assert limit / 2 < sum(p.numel() for p in module.parameters()) <= limit
+    assert module.commutes
+    assert module.residual is None
+    with pytest.raises(ValueError, match=r"`preset` \(='tiny'\) must be one of \['nano', 'compact"):
+        NoiseModule("tiny")  # type: ignore[arg-type]
+
+
+def test_operations_by_hand() -> None:
+    """Two per weight and place; a level has a quarter of the places of the one before."""
+    convolutions = [(1, 9, 16, 16), (1, 9, 16, 4)]  # head and tail
+    convolutions += 4 * [(1, 9, 16, 16)] + 4 * [(4, 9, 24, 24)] + 4 * [(16, 9, 32, 32)]  # blocks
+    convolutions += [(4, 4, 16, 24), (16, 4, 24, 32)]  # down: 2 x 2, to a quarter of the places
+    convolutions += [(1, 1, 24, 16), (4, 1, 32, 24)]  # up: each place has one weight of 2 x 2
+    expected = sum(2 * taps * wide * out / places for places, taps, wide, out in convolutions)
+    assert NoiseModule("nano").operations == round(expected) == 41_472
+    assert not NoiseModule("paper").commutes
+    assert NoiseModule("paper").operations > 100_000
 
 
 # The gate
 
 
-@pytest.mark.parametrize("preset", ["compact", "paper"])
+@pytest.mark.parametrize("preset", ["nano", "paper"])
 def test_the_gate_is_each_images_own_and_changes_no_other(preset: Preset) -> None:
-    torch.manual_seed(0)
-    module = NoiseModule(preset).requires_grad_(False)
+    module = NoiseModule(preset).eval().requires_grad_(False)
+    torch.nn.init.normal_(module.network.tail.weight)
     image = noisy().expand(3, -1, -1, -1)
     factor = torch.tensor([[1.0], [0.0], [2.0]])
     together = module(image, factor * SHOT, factor * READ)
     assert torch.equal(together[1], image[1])
     for i in (0, 2):
         inputs = image[i : i + 1], factor[i] * SHOT, factor[i] * READ
-        if preset == "compact":
-            deviation = variance_map(smoothed(inputs[0]), *inputs[1:]).sqrt()
-            expected = module.network(inputs[0], deviation)
-        else:
+        if preset == "paper":
             level = variance_map(*inputs).sqrt()
             expected = inputs[0] + module.network(torch.cat([inputs[0], level], dim=1))
-        torch.testing.assert_close(together[i : i + 1], expected, rtol=1e-5, atol=1e-6)
+        else:
+            expected = module.network(*inputs)
+        torch.testing.assert_close(together[i : i + 1], expected, rtol=1e-5, atol=1e-5)
+        assert not torch.equal(together[i], image[i])

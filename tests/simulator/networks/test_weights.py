@@ -81,8 +81,9 @@ def test_tensors_of_other_networks_are_refused(saved: Path, name: str) -> None:
         ("{", "is damaged"),
         ("[" * 10**6, "net-0.5.json is damaged"),
         ("[]", "must hold a JSON object"),
-        ('{"format": [1]}', r"model card of format 1, got \[1\]"),
-        ('{"format": 1}', "must hold the hash, `sha256`"),
+        ('{"format": [1]}', r"model card of format 2, got \[1\]"),
+        ('{"format": 2}', "must hold the hash, `sha256`"),
+        ({"residual": {"detail": []}}, "must be a calibration"),
         *(({"preset": p}, re.escape(f"unknown preset {p!r}")) for p in ("huge", None, ["compact"])),
     ],
 )
@@ -128,18 +129,29 @@ def test_a_writer_that_is_killed_leaves_no_pair_of_two_trainings(
 def test_shipped_weights_load_by_name(
     saved: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """From a package that ships one set, in a folder without any."""
+    """From a package that ships two sizes, in a folder without any; the second errs as its card
+    says."""
     root = tmp_path_factory.mktemp("package")
     (root / "pretrained").mkdir()
     for ending in (".json", ".safetensors"):
         beside(saved, ending).rename(root / "pretrained" / f"compact{ending}")
+    residual = {"detail": [0.0, 1.0], "bias": [0.2, 0.1], "variance": [0.0, 0.3], "spread": 1.5}
+    save_modules(root / "pretrained/nano", build_modules("nano"), "nano", {"residual": residual})
     monkeypatch.setattr(weights, "resources", SimpleNamespace(files=lambda _: root))
     monkeypatch.chdir(saved.parent)
-    assert list_pretrained() == ["compact"]
-    simulator = CameraSimulator.from_pretrained("compact", device="cpu")
-    assert simulator.noise is not None
-    assert simulator.noise.preset == "compact"
-    with pytest.raises(ValueError, match=r"one of \['compact'\] .* did you mean 'compact'\?"):
+    assert list_pretrained() == ["compact", "nano"]
+    simulators = [CameraSimulator.from_pretrained(n, device="cpu") for n in ("nano", "compact")]
+    assert [[n.preset for n in s.noises] for s in simulators] == [["nano"], ["nano", "compact"]]
+    for simulator in simulators:  # a noise module alone takes the aperture's of the compact set
+        assert simulator.noise is simulator.noises[-1]
+        assert simulator.aperture is not None
+        nano = simulator.noises[0].residual
+        assert nano is not None
+        assert nano.to_card() == residual
+    assert simulators[1].noise.residual is None  # type: ignore[union-attr]
+    with pytest.raises(
+        ValueError, match=r"one of \['compact', 'nano'\] .* did you mean 'compact'\?"
+    ):
         load_modules("compcat")
     with pytest.raises(ValueError) as caught:
         load_modules("zzz")

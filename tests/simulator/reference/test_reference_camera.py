@@ -14,6 +14,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
 from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.sampling import sample_mosaic
 from simulator.settings import CameraSettings
 
 BASE = CameraSettings(100, 1 / 64, 4)
@@ -66,17 +67,20 @@ def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth):
         assert bool(white[1, 20, 20])
 
 
-def test_box_average_and_marked_stops_in_the_blur():
+def test_photosites_averages_and_marked_stops_in_the_blur():
     shot = scene(flat(0.1, 4), torch.full((4, 4), 1.0))
     native, boxed = (ReferenceCamera(sensor(1e-4, 1e-8), box_factor=k) for k in (1, 4))
     expected = native.blur_diameter(shot, 4.0)
-    torch.testing.assert_close(boxed.blur_diameter(shot, 4.0), expected / 4)
+    torch.testing.assert_close(boxed.blur_diameter(shot, 4.0), expected[:1, :1] / 4)
+    fine = scene(torch.ones(3, 8, 8), torch.full((8, 8), 1.0))  # two photosites to a packed pixel
+    torch.testing.assert_close(native.blur_diameter(fine, 4.0), expected)
     # f/5.6 stands for 4 sqrt(2), f/11 for 8 sqrt(2)
     torch.testing.assert_close(native.blur_diameter(shot, 11.0), expected / (2 * math.sqrt(2)))
 
 
 def test_scene_without_depth_or_in_focus_is_left_as_it_is():
     light, camera = torch.rand(4, 7, 5), ReferenceCamera(sensor(1e-4, 1e-8))
+    assert not scene(light).sampled
     assert float(camera.blur_diameter(scene(light), 4.0).max()) == 0.0
     far = scene(light, torch.full((7, 5), math.inf), lens=Lens(0.05, math.inf))
     for sharp in (scene(light), scene(light, torch.full((7, 5), 2.0)), far):
@@ -121,9 +125,52 @@ def test_rounding_and_box_average_in_the_variance():
     read = (0.6 / 16000) ** 2
     sample = record(ReferenceCamera(sensor(1e-5, read)), 0.0, 100.0)
     assert sample.var() == pytest.approx(read, rel=0.03)
-    cameras = (ReferenceCamera(sensor(1e-4, 1e-6), box_factor=k) for k in (1, 3))
-    plain, boxed = (record(camera, 0.2, 100.0).var() for camera in cameras)
-    assert plain / boxed == pytest.approx(9.0, rel=0.03)
+    # An average of k x k has whole multiples of 1/k^2 numbers: sigma is 0.6 of them, then 0.2.
+    camera = ReferenceCamera(sensor(1e-5, read), box_factor=3)
+    boxed = record(camera, 0.0, 100.0, 480) * 16000 * 9
+    np.testing.assert_allclose(boxed, boxed.round(), atol=2e-3)
+    assert (boxed.round() % 9 != 0).mean() > 0.5
+    assert boxed.var() == pytest.approx(read * 16000**2 * 9, rel=0.03)
+    assert record(camera, 0.2, 100.0).mean() == pytest.approx(0.2, rel=1e-3)
+    # Clipped first, averaged then: half of the samples white, half at 0.2.
+    half = flat(0.2, 8)
+    half[..., ::2] = 5.0
+    even = ReferenceCamera(sensor(0.0, 0.0), box_factor=4)
+    for averaged in (even.record(half, 100.0, torch.Generator()), even.clip(half, 100.0)):
+        torch.testing.assert_close(averaged, flat(0.6, 2))
+
+
+def test_each_photosite_sees_its_own_colour_at_its_own_place():
+    """A point lands in the plane of its photosite; stripes of one photosite tell G1 from G2."""
+    for cfa, order in (("RGGB", (0, 1, 2, 3)), ("GBRG", (2, 3, 0, 1))):
+        body = sensor(1e-4, 1e-8)
+        camera = ReferenceCamera(replace(body, cfa=BayerPattern(cfa)))
+        # A lens of half a photosite, cut at two: what falls on photosites of the same plane.
+        middle = 1 + 2 * math.exp(-8.0)
+        middle = (middle / (middle + 2 * math.exp(-2.0))) ** 2
+        for plane, (row, column) in zip(order, ((4, 4), (4, 5), (5, 4), (5, 5)), strict=True):
+            light = torch.zeros(3, 8, 8)
+            light[(0, 1, 1, 2)[plane], row, column] = 1.0
+            seen = camera.blurred_light(scene(light), 4.0)
+            assert float(seen[plane].sum()) == pytest.approx(middle, rel=1e-3)
+            others = seen.sum((1, 2)) > 0
+            assert others.tolist() == [i == plane or {i, plane} == {1, 2} for i in range(4)]
+        # Rows red and green in turn at the finest pitch: G1 shares red's rows, G2 does not.
+        rows = torch.arange(16) % 2
+        light = torch.stack([1.0 - rows, 1.0 * rows, 0.0 * rows])[:, :, None].expand(3, 16, 16)
+        g1, g2 = camera.blurred_light(scene(light.contiguous()), 4.0)[1:3, 2:-2, 2:-2]
+        first = cfa == "RGGB"  # G1 in the even rows, which are red
+        assert float((g2 if first else g1).min()) > 0.75
+        assert float((g1 if first else g2).max()) < 0.25
+    # Transposed, the greens change places; mirrored, every plane lies elsewhere.
+    light = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
+    seen, turned, mirrored = (
+        sample_mosaic(each) for each in (light, light.transpose(1, 2), light.flip(2))
+    )
+    assert torch.equal(turned, seen.transpose(1, 2)[[0, 2, 1, 3]])
+    assert not torch.equal(mirrored, seen.flip(2))
+    plain = camera.blurred_light(scene(torch.full((3, 8, 8), 0.3)), 4.0)
+    torch.testing.assert_close(plain, flat(0.3, 4))
 
 
 def test_no_noise_at_all_is_exact():
@@ -229,7 +276,8 @@ def test_bad_input_is_refused():
     bad = [torch.where(torch.eye(8) > 0, z, depth) for z in (0.0, -1.0, 0.04, math.nan)]
     for call, arguments, message in (
         (scene, (flat(-0.1),), r"`light`.*must be >= 0"),
-        (scene, (torch.zeros(3, 8, 8),), "`light`"),
+        (scene, (torch.zeros(5, 8, 8),), "`light`"),
+        (scene, (torch.zeros(3, 7, 8),), "`light`.*even sides"),
         (scene, (flat(0.1), depth[:, :4]), r"`depth` .*shape"),
         *((scene, (flat(0.1), each), "above the focal length") for each in bad),
         (partial(ReferenceCamera, plain, box_factor=0), (), r"`box_factor`.*must be >= 1"),
@@ -246,12 +294,15 @@ def test_a_rolling_shutter_shows_bands_of_a_lamp():
     # On for 5 ms of every 10; exposed for 1 us, four sensor rows of 1 ms to a packed row.
     lit = PulsedLamp(frequency=100.0, duty=0.5)
     settings = CameraSettings(100, 1e-6, 4)
-    lights = (camera.expose(flat(0.1, 5), BASE, settings, lamp=lamp) for lamp in (lit, None))
+    lights = (
+        camera.clip(camera.expose(flat(0.1, 10), BASE, settings, lamp=lamp), 100)
+        for lamp in (lit, None)
+    )
     # Sensor rows begin at 0, 1, ... 19 ms: lit in 0 to 4 and 10 to 14.
     shares = [np.mean([t % 10 < 5 for t in range(4 * row, 4 * row + 4)]) for row in range(5)]
     bands = torch.div(*lights)[:, :, 0]
     np.testing.assert_allclose(bands, 2.0 * np.array([shares] * 4), rtol=1e-5)
     # A whole period has no bands.
-    shot, whole = scene(flat(0.1, 5)), CameraSettings(100, 0.01, 4)
+    shot, whole = scene(flat(0.1, 10)), CameraSettings(100, 0.01, 4)
     even = camera.capture(shot, whole, seed=0, lamp=lit, start=0.0031).mean
     np.testing.assert_allclose(even, camera.capture(shot, whole, seed=0).mean)

@@ -17,10 +17,12 @@ def load(folder: Path, text: str) -> SimulatorConfig:
 
 def test_stages_in_order_with_their_defaults(tmp_path):
     config = load(tmp_path, COMPACT)
-    assert list(config.stages()) == ["exposure", "noise", "aperture"]
+    assert list(config.stages()) == ["noise", "exposure", "aperture"]
+    assert (config.noise.average, config.card()["noise"]["average"]) == (0.0, 0.0)
     assert (config.noise.steps, config.noise.minutes, config.noise.batch) == (3, None, 8)
     assert (config.aperture.steps, config.aperture.minutes) == (None, 0.5)
-    assert list(load(tmp_path, "preset: pc\nbaseline: {steps: 1}").stages()) == ["baseline"]
+    for preset, stage in (("pc", "baseline"), ("nano", "noise"), ("large", "noise")):
+        assert list(load(tmp_path, f"preset: {preset}\n{stage}: {{steps: 1}}").stages()) == [stage]
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda f: f.name)
@@ -36,8 +38,10 @@ def test_shipped_configurations_are_valid(file):
         (COMPACT.replace("steps: 3", "steps: 3, minutes: 1"), "exactly one"),
         (COMPACT.replace("{steps: 3}", "{batch: 3}"), "exactly one"),
         (COMPACT.replace("128", "257"), "`aperture.crop` (=257) must not"),
+        (COMPACT.replace("steps: 3", "steps: 3, average: 1"), "noise.average (=1)"),
+        (COMPACT.replace("compact", "nano"), "`exposure` must be left out for preset 'nano'"),
         (COMPACT.replace("128", "8"), "aperture.crop (=8)"),
-        (COMPACT.replace("compact", "pc"), "`exposure` must be left out for preset 'pc'"),
+        (COMPACT.replace("compact", "pc"), "`noise` must be left out for preset 'pc'"),
         ("preset: pc", "`baseline` must be given for preset 'pc'"),
         (f"{COMPACT}baseline: {{steps: 1}}", "`baseline` must be left out"),
         (COMPACT.replace("compact", "tiny"), "preset (='tiny')"),
@@ -57,9 +61,13 @@ def config(**changes: Any) -> SimulatorConfig:
 
 
 def test_a_later_stage_does_not_change_what_an_earlier_one_is():
-    """Else a checkpoint of the noise stage was lost when the aperture's budget is raised."""
+    """Else a checkpoint was lost when the aperture's budget is raised; the noise stage, which has
+    pictures of its own, depends on nothing else but the seed."""
     plain, longer = config(), config(aperture={"steps": 9})
-    for stage, equal in (("noise", True), ("aperture", False), (None, False)):
+    for stage, equal in (("noise", True), ("exposure", True), ("aperture", False), (None, False)):
         assert (plain.card(stage) == longer.card(stage)) is equal
-    for changes in {"seed": 1}, {"body": 2}, {"scenes": {"size": 512}}, {"exposure": {"steps": 3}}:
+    for changes in {"body": 2}, {"scenes": {"size": 512}}, {"exposure": {"steps": 3}}:
         assert config(**changes).card("exposure") != plain.card("exposure"), changes
+        assert config(**changes).card("noise") == plain.card("noise"), changes
+    for changes in {"seed": 1}, {"noise": {"steps": 3}}, {"precision": "bfloat16"}:
+        assert config(**changes).card("noise") != plain.card("noise"), changes

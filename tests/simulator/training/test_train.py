@@ -2,7 +2,7 @@ import itertools
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Sequence as SequenceOf
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,34 +10,59 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
+from torch.optim.swa_utils import AveragedModel
 
-from simulator import get_camera
+from simulator import CameraSettings, get_camera
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import DRAPED, ReferenceCamera, ReferenceScene
+from simulator.reference.reference_camera import (
+    DRAPED,
+    MOSAIC,
+    ReferenceCamera,
+    ReferenceScene,
+)
+from simulator.reference.sequences import Sequence
+from simulator.settings import exposure_ratio
 from simulator.training import train
 from simulator.training.config import SimulatorConfig, StageConfig
 from simulator.training.data import ReferencePairs, draw_sequences
+from simulator.training.detail import DetailPicture
 from simulator.training.train import Clock, make_accelerator, train_and_save, train_stage, validate
-from tests.simulator.training.scenes import scene
+from tests.simulator.training.scenes import REFERENCE, scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
 
 
 def config(preset: str = "compact", **changes: Any) -> SimulatorConfig:
-    names = ("exposure", "noise", "aperture") if preset in ("compact", "paper") else ("baseline",)
+    names = {"compact": ("noise", "exposure", "aperture"), "nano": ("noise",)}
+    names = names.get(preset, ("baseline",))
     values = {"preset": preset, "scenes": {"size": 32}, **dict.fromkeys(names, STAGE), **changes}
     return SimulatorConfig.model_validate(values)
 
 
-def scenes(config: SimulatorConfig, split: str) -> Sequence[ReferenceScene]:
+def scenes(config: SimulatorConfig, split: str) -> SequenceOf[ReferenceScene]:
     first = {"train": 0, "validation": 10}[split]
     return [scene(f"{split}-deep", seed=first), scene(f"{split}-flat", seed=first + 1, depth=False)]
 
 
-def save(folder: Path, *given: Any, progress: Any = None, **changes: Any) -> Path:
-    command = "ae-env train-simulator x.yaml"
+def pictures(config: SimulatorConfig, split: str) -> list[DetailPicture]:
+    light = torch.rand(2, 3, 64, 64, generator=torch.Generator().manual_seed(len(split)))
+    return [DetailPicture(f"{split}-{i}", f"{split}-{i}", "leaves", light[i]) for i in range(2)]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick_calibration():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("simulator.training.calibration._CROPS", 8)
+        patch.setattr("simulator.training.calibration._SIDE", 16)
+        yield
+
+
+def save(
+    folder: Path, *given: Any, progress: Any = None, scenes: Any = scenes, **changes: Any
+) -> Path:
     made, file = config(*given, **changes), folder / "net"
-    return train_and_save(made, scenes, file, command=command, tensorboard=True, progress=progress)
+    options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
+    return train_and_save(made, scenes, pictures, file, tensorboard=True, **options)
 
 
 @pytest.fixture(scope="module")
@@ -54,19 +79,24 @@ def test_the_card_says_what_was_done(trained):
     found = sorted(p.name for p in trained.parent.iterdir())
     assert found == [*names, "noise.checkpoint", "tensorboard"]
     card = card_of(trained)
-    known = {"preset": "compact", "training": config().card(), "scenes": {"depth": 1, "flat": 1}}
+    known = {"preset": "compact", "training": config().card()}
+    known["scenes"] = {"leaves": 2, "depth": 1, "flat": 1}
     assert (known | {"command": "ae-env train-simulator x.yaml"}).items() <= card.items()
     assert {"commit", "date", "machine", "versions", "sha256"} <= set(card)
     stages = card["stages"]
+    assert list(stages) == ["noise", "exposure", "aperture"]
+    assert stages["noise"]["pairs"] == 2
+    tables = card["residual"]
+    assert len(tables["detail"]) == len(tables["bias"]) == len(tables["variance"])
     values = {"exposure": {"loss"}, "noise": {"loss", "gain_db"}}
     values["aperture"] = {"loss", "map", "relative"}
     assert {name: set(stage["validation"]) for name, stage in stages.items()} == values
     for stage in stages.values():
         assert stage["steps"] == 2
-        assert stage["validation"]["loss"] > 0
-    # Any two of 20 to 25 captures of 2 scenes; the aperture's come from the one with depth.
+        assert stage["validation"]["loss"] != 0
+    # Any two of 20 to 25 captures of 2 scenes; those that open the aperture, at most a half.
     assert 2 * 20 * 19 <= stages["exposure"]["pairs"] <= 2 * 25 * 24
-    assert stages["aperture"]["pairs"] <= 25 * 24 / 2 * 1.12
+    assert stages["aperture"]["pairs"] <= 2 * 25 * 24 / 2 * 1.12
 
 
 def test_a_second_run_trains_nothing_and_ends_the_same(trained, monkeypatch):
@@ -95,6 +125,13 @@ def test_baselines_in_any_precision_and_their_logs(tmp_path):
     assert entry.step == 2
 
 
+def test_a_noise_module_alone_needs_no_scenes(tmp_path):
+    file = save(tmp_path, "nano", scenes=lambda *_: pytest.fail("it asked for scenes"))
+    modules, card = load_modules(file)
+    assert list(modules) == list(card["stages"]) == ["noise"]
+    assert modules["noise"].residual.to_card() == card["residual"]
+
+
 def test_the_seed_decides_and_progress_is_complete(trained, tmp_path):
     calls: list[tuple[str, float]] = []
     before = torch.random.get_rng_state()
@@ -104,8 +141,8 @@ def test_the_seed_decides_and_progress_is_complete(trained, tmp_path):
     for name in ("exposure.b", "noise.network.head.weight"):
         assert not torch.equal(first[name], second[name])
     order = list(dict.fromkeys(task for task, _ in calls))
-    stages = itertools.product(("exposure", "noise", "aperture"), ("rendering", "training"))
-    assert order == [f"{stage}: {task}" for stage, task in stages]
+    stages = itertools.product(("exposure", "aperture"), ("rendering", "training"))
+    assert order == ["noise: training", *(f"{stage}: {task}" for stage, task in stages)]
     for task in order:
         shares = [share for name, share in calls if name == task]
         assert shares == sorted(shares)
@@ -131,11 +168,33 @@ def test_validation_is_the_mean_over_fixed_pairs_and_changes_nothing():
     assert seen[8:] == seen[:8]
 
 
-def test_draped_scenes_teach_the_aperture_alone():
-    for kind, teaches in ((DRAPED, ["aperture"]), ("flat", ["exposure", "noise", "baseline"])):
-        one = replace(scene(depth=kind == DRAPED), kind=kind)
-        stages = ("exposure", "noise", "aperture", "baseline")
+def test_what_a_scene_teaches():
+    """The aperture: what has depth, and what is in focus throughout; the others: clean pictures."""
+    for kind, in_focus, teaches in (
+        (DRAPED, True, ["aperture"]),
+        (MOSAIC, True, ["aperture"]),
+        ("flat", True, ["exposure", "aperture", "baseline"]),
+        ("photograph", False, ["exposure", "baseline"]),
+    ):
+        one = replace(scene(depth=kind == DRAPED), kind=kind, in_focus=in_focus)
+        stages = ("exposure", "aperture", "baseline")
         assert [stage for stage in stages if train._teaches(one, stage)] == teaches
+
+
+def test_nothing_changes_where_all_is_in_focus():
+    """The wider aperture's light is that of the source: one rendering, no blur, equal targets."""
+    camera = get_camera("nikon_z6")
+    opened = CameraSettings(100, 1 / 64, 11), CameraSettings(100, 1 / 512, 4)
+    pairs = ReferencePairs(
+        [Sequence(scene(depth=False), opened)], ReferenceCamera(camera), "aperture"
+    )
+    batch = pairs.batch(0, 4, 32)
+    assert len(pairs._blurred_light) == 1
+    assert not batch.defocus.any()
+    assert batch.ratio.tolist() == pytest.approx([1.0] * 4)
+    light = scene(depth=False).light * exposure_ratio(REFERENCE, opened[0])
+    assert float(batch.target[0].sum()) == pytest.approx(float(light.sum()), rel=1e-5)
+    assert float(batch.target[0].max()) == pytest.approx(float(light.max()), rel=1e-5)
 
 
 class Watch:
@@ -167,14 +226,14 @@ class Loss(nn.Module):
         return {"loss": value, "undefined": value.detach() * math.nan}
 
 
-def run(file: Path, watch: Watch, **budget: int) -> tuple[Loss, Clock]:
+def run(file: Path, watch: Watch, **budget: float) -> tuple[Loss, Clock]:
     loss, stage = Loss(), StageConfig(batch=3, crop=16, learning_rate=0.05, **budget)
     accelerator = make_accelerator(config("pc"), "cpu", None)
     options = {"checkpoint": file, "identity": "one"}
     return loss, train_stage("noise", loss, loss.trained, watch, stage, accelerator, **options)
 
 
-@pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}])
+@pytest.mark.parametrize("budget", [{"steps": 9}, {"minutes": 1}, {"steps": 9, "average": 0.7}])
 def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path, monkeypatch, budget):
     watch = Watch(monkeypatch)
     whole, clock = run(tmp_path / "whole", watch, **budget)
@@ -187,6 +246,26 @@ def test_ctrl_c_and_again_ends_where_one_run_ends(tmp_path, monkeypatch, budget)
     assert watch.steps == [4, 5, 6, 7, 8]
     assert (clock.step, clock.seconds) == (9, 63.0)
     torch.testing.assert_close(resumed.state_dict(), whole.state_dict(), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("average", [0.0, 0.7])
+def test_the_running_average_of_the_weights_by_hand(tmp_path, monkeypatch, average):
+    """It starts at the first; without one the last ones are kept."""
+    seen: list[torch.Tensor] = []
+    real = AveragedModel.update_parameters
+
+    def update(self: AveragedModel, model: nn.Module) -> None:
+        seen.append(model.weight.detach().double().clone())
+        real(self, model)
+
+    monkeypatch.setattr(AveragedModel, "update_parameters", update)
+    loss, _ = run(tmp_path / "a", Watch(monkeypatch), steps=9, average=average)
+    expected = seen[0]
+    for weight in seen[1:]:
+        expected = average * expected + (1.0 - average) * weight
+    assert len(seen) == 9
+    torch.testing.assert_close(loss.trained.weight.double(), expected, rtol=1e-6, atol=1e-7)
+    assert torch.equal(loss.trained.weight.double(), seen[-1]) is (average == 0.0)
 
 
 def test_a_loss_that_is_not_finite_stops_the_training_before_it_does_harm(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from simulator import camera_simulator
 from simulator.networks.aperture_module import DefocusMap
-from simulator.networks.noise_module import CompactDenoiser, NoiseModule
+from simulator.networks.noise_module import NoiseModule
 from simulator.utils.tiles import in_tiles, make_tiles, varying
 
 
@@ -45,26 +45,35 @@ def test_no_tile_is_larger_than_promised_and_small_frames_go_at_once():
     assert sizes == [(24, 20)]
 
 
-def test_the_halo_covers_what_the_networks_see():
+@pytest.mark.parametrize("size", ["nano", "compact", "large", "map"])
+def test_the_halo_covers_what_the_networks_see(size):
     """What lies beyond the halo changes no bit of the centre; what lies within does."""
-    noise = NoiseModule("compact").eval().requires_grad_(False)
-    noise.network = CompactDenoiser((4, 6, 8)).requires_grad_(False)
-    noise.network.tail.weight.mul_(30)
-    blur = DefocusMap(width=6).eval().requires_grad_(False)
-    shot, read = torch.full((1, 4), 1e-2), torch.full((1, 4), 1e-4)
-    image, centre = frame(144, 148), (..., slice(72, 76), slice(72, 76))
-    for network, halo in (
-        (lambda x: noise(x, shot, read), camera_simulator._NOISE_HALO),
-        (lambda x: blur(x, torch.full_like(x, 0.01)), camera_simulator._MAP_HALO),
-    ):
-        found = []
-        for seen in (halo, 16):
-            keep = (..., slice(72 - seen, 76 + seen), slice(72 - seen, 76 + seen))
-            other = frame(144, 148, seed=7) * 3
-            other[keep] = image[keep]
-            found.append(network(other)[centre])
-        assert torch.equal(found[0], network(image)[centre])
-        assert not torch.equal(found[1], found[0])
+    if size == "map":
+        blur = DefocusMap(width=6).eval().requires_grad_(False)
+        network, halo = lambda x: blur(x, torch.full_like(x, 0.01)), camera_simulator._MAP_HALO
+    else:
+        noise = NoiseModule(size).eval().requires_grad_(False).network
+        torch.nn.init.normal_(noise.tail.weight)
+        shot, read, far = (
+            torch.full((1, 4), 1e-2),
+            torch.full((1, 4), 1e-4),
+            torch.zeros(1, 4, 1, 1),
+        )
+        halo = camera_simulator._NOISE_HALO
+        network = lambda x: noise.uncorrected(x, far.expand_as(x), shot, read)  # noqa: E731
+    image, (top, bottom) = frame(256, 256), (120, 128)
+    centre, found = (..., slice(top, bottom), slice(top, bottom)), []
+    for seen in (halo, 16):
+        keep = (..., *2 * [slice(top - seen, bottom + seen)])
+        other = frame(256, 256, seed=7) * 3
+        other[keep] = image[keep]
+        found.append(network(other)[centre])
+    assert torch.equal(found[0], network(image)[centre])
+    assert not torch.equal(found[1], found[0])
+    # A tile of it whose corner lies on a multiple of 8 gives the same.
+    tile = (..., *2 * [slice(top - halo, bottom + halo)])
+    alone = network(image[tile])[..., halo:-halo, halo:-halo]
+    torch.testing.assert_close(alone, found[0], rtol=0, atol=1e-4)
 
 
 def patches(height: int, width: int) -> Tensor:

@@ -1,0 +1,341 @@
+"""Denoising of real detail that no training saw, sampled as a sensor samples it.
+
+    ae-env bench denoising
+
+One crop of every source of the test split of `ae_env.scenes.detail`: views into radiance maps,
+photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
+every method; the gain is that of the PSNR over the noisy input. One thread.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from skimage.restoration import denoise_nl_means
+from torch import Tensor
+
+from ae_env.scenes.detail import detail_pictures
+from benchmarks.fidelity.models import checksums, trained_noise_modules
+from benchmarks.harness import Benchmark, Part, Report, Row, data_root, pivot, table
+from benchmarks.isolated import timed
+from simulator import CameraProfile, get_camera
+from simulator.noise.generator import noise_generator
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.sampling import lens_blur, sample_mosaic
+from simulator.training.detail import DetailPicture
+
+#: Sources are photographed by both cameras in turn.
+CAMERAS = ("nikon_z6", "canon_70d")
+ISOS, LEVELS = (400, 1600, 6400, 16000), (0, -3, -6)
+#: Side of a crop [packed pixel], and sources measured by one part.
+SIZE, _AT_ONCE = 128, 4
+#: Flat fields: ISOs of the table, light, and side [packed pixel].
+FLAT_LEVELS, FLAT_SIZE = (-10, -8, -6, -4, -2), 256
+#: A recorded mosaic is a case where the noise that is added has this many times its own variance.
+_CLEAN_RATIO = 16.0
+#: Non-local means' strength in units of the noise and patch size: the best of a few on
+#: the validation maps.
+NLM_STRENGTH, NLM_PATCH = 0.6, 3
+REFERENCE = "BM3D"
+#: A denoiser takes a raw (4, H, W) and its noise, and returns (4, H, W).
+Denoiser = Callable[[Tensor, NoiseLevelFunction], Tensor]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One photograph of one crop."""
+
+    source: str
+    kind: str
+    camera: CameraProfile
+    iso: int
+    level: int
+    light: Tensor
+    noisy: Tensor
+
+    @property
+    def nlf(self) -> NoiseLevelFunction:
+        """Its noise."""
+        return self.camera.nlf(self.iso)
+
+
+def sources() -> list[DetailPicture]:
+    """One real picture of every source group of the test split."""
+    found: dict[str, DetailPicture] = {}
+    for picture in detail_pictures("test", data=data_root(), drawn=0):
+        if picture.kind != "linear" and min(picture.light.shape[1:]) >= 2 * SIZE:
+            found.setdefault(picture.group, picture)
+    return [found[group] for group in sorted(found)]
+
+
+def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
+    """The photographs of a crop of `picture`, the `number`-th source."""
+    rng = np.random.default_rng([zlib.crc32(picture.name.encode()), seed])
+    mosaic = picture.light.shape[0] == 4
+    side = SIZE if mosaic else 2 * SIZE
+    top, left = (int(rng.integers(n - side + 1)) for n in picture.light.shape[1:])
+    light = picture.light[:, top : top + side, left : left + side]
+    if not mosaic:
+        light = sample_mosaic(lens_blur(light))
+    white = max(float(light.quantile(0.99)), 1e-9)
+    camera = get_camera(CAMERAS[number % len(CAMERAS)])
+    reference, made = ReferenceCamera(camera), []
+    for iso in ISOS:
+        for level in LEVELS:
+            scale = 2.0**level / white
+            own, added = picture.nlf.exposed(scale), camera.nlf(iso)
+            ratios = zip((*own.shot, *own.read), (*added.shot, *added.read), strict=True)
+            if any(_CLEAN_RATIO * a > b for a, b in ratios):
+                continue
+            exposed = light * scale
+            noisy = reference.record(exposed, iso, noise_generator(seed, number, iso, float(level)))
+            clean = exposed.clamp(max=1.0)
+            case = Case(picture.name, picture.kind, camera, iso, level, clean, noisy)
+            made.append(case)
+    return made
+
+
+def denoisers() -> dict[str, Denoiser]:
+    """Every method: the trained noise modules that are there, and the classical ones."""
+    found: dict[str, Denoiser] = {
+        name: _network(module) for name, module in trained_noise_modules().items()
+    }
+    return found | {
+        "VST + NLM": behind_anscombe(non_local_means),
+        REFERENCE: behind_anscombe(bm3d_planes),
+    }
+
+
+def _network(module: Any) -> Denoiser:
+    @torch.no_grad()
+    def denoise(raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
+        shot, read = (torch.tensor([v]) for v in (nlf.shot, nlf.read))
+        result: Tensor = module(raw[None], shot, read)[0]
+        return result
+
+    return denoise
+
+
+def measure(first: int, seed: int, quick: bool) -> list[Row]:
+    """A row for every case and method of some sources."""
+    methods, rows = denoisers(), []
+    chosen = list(enumerate(sources()))[first : first + (1 if quick else _AT_ONCE)]
+    for number, picture in chosen:
+        some = cases(number, picture, seed)
+        for case in some[::5] if quick else some:
+            before = _error(case.noisy, case.light)
+            green = case.light[1] - case.light[2]
+            for name, denoise in methods.items():
+                found: list[Tensor] = []
+                seconds = timed(lambda d=denoise, c=case, f=found: f.append(d(c.noisy, c.nlf)))  # type: ignore[misc]
+                gain = 10.0 * np.log10(before / max(_error(found[0], case.light), 1e-30))
+                kept = float(((found[0][1] - found[0][2]) * green).sum() / green.square().sum())
+                rows.append(
+                    {"part": "cases", "method": name, "source": case.source, "kind": case.kind}
+                    | {"camera": case.camera.name, "iso": case.iso, "ev": case.level}
+                    | {"gain_db": float(gain), "green_kept": kept, "milliseconds": 1e3 * seconds}
+                )
+    return rows
+
+
+def _error(image: Tensor, truth: Tensor) -> float:
+    return float((image.clamp(max=1.0).double() - truth.double()).square().mean())
+
+
+def measure_flat(camera: str, seed: int, quick: bool) -> list[Row]:
+    """Means of flat fields, before and after each network, at the calibrated ISOs."""
+    profile = get_camera(camera)
+    reference, rows = ReferenceCamera(profile), []
+    networks = {n: d for n, d in denoisers().items() if n != REFERENCE}
+    for iso in list(profile.nlf_by_iso)[:: 4 if quick else 1]:
+        for level in FLAT_LEVELS:
+            light = torch.full((4, FLAT_SIZE, FLAT_SIZE), 2.0**level)
+            noisy = reference.record(light, iso, noise_generator(seed, iso, float(level)))
+            for name, denoise in networks.items():
+                shift = (denoise(noisy, profile.nlf(iso)) - noisy).double().mean(dim=(1, 2))
+                worst = float(shift.abs().max()) / 2.0**level
+                rows.append(
+                    {"part": "flat", "method": name, "camera": camera, "iso": iso}
+                    | {"ev": level, "mean_shift": worst}
+                )
+    return rows
+
+
+# -- classical methods ----------------------------------------------------------------------------
+
+
+def behind_anscombe(denoise: Callable[[np.ndarray], np.ndarray]) -> Denoiser:
+    """`denoise`, which removes noise of standard deviation 1, as a denoiser of raws."""
+
+    def denoiser(raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
+        smooth = denoise(anscombe(raw, nlf).double().numpy())
+        return inverse_anscombe(torch.from_numpy(smooth), nlf).float()
+
+    return denoiser
+
+
+def _planes(nlf: NoiseLevelFunction) -> tuple[Tensor, Tensor]:
+    """Shot and read noise of each plane, (4, 1, 1)."""
+    shot, read = (torch.tensor(v, dtype=torch.float64)[:, None, None] for v in (nlf.shot, nlf.read))
+    return shot, read
+
+
+def anscombe(raw: Tensor, nlf: NoiseLevelFunction) -> Tensor:
+    """Generalised Anscombe transform of a raw (4, H, W): its noise has a deviation of about 1.
+
+    >>> nlf = NoiseLevelFunction((1e-3,) * 4, (0.0,) * 4)
+    >>> round(float(anscombe(torch.full((4, 1, 1), 0.1), nlf)[0]), 3)
+    20.037
+    """
+    shot, read = _planes(nlf)
+    return 2.0 * (raw / shot + 0.375 + read / shot.square()).clamp(min=0.0).sqrt()
+
+
+def inverse_anscombe(stable: Tensor, nlf: NoiseLevelFunction) -> Tensor:
+    """The raw (4, H, W) whose transform has the mean `stable`: unbiased, in closed form."""
+    shot, read = _planes(nlf)
+    # The transform of no light at all; below it the closed form turns up again.
+    d = torch.maximum(stable, 2.0 * (0.375 + read / shot.square()).sqrt())
+    root = 1.5**0.5
+    counts = d.square() / 4 - 1 / 8 + root / (4 * d) - 11 / (8 * d.square()) + 5 * root / (8 * d**3)
+    return (counts - read / shot.square()) * shot
+
+
+def non_local_means(stable: np.ndarray) -> np.ndarray:
+    """Non-local means (4, H, W), patches 3 x 3 within 6 pixels, planes compared together."""
+    options: dict[str, Any] = {"patch_size": NLM_PATCH, "patch_distance": 6, "h": NLM_STRENGTH}
+    return denoise_nl_means(stable, sigma=1.0, fast_mode=True, channel_axis=0, **options)
+
+
+def bm3d_planes(stable: np.ndarray) -> np.ndarray:
+    """BM3D (4, H, W) of the four planes jointly: blocks are matched on their mean.
+
+    Raises:
+        ImportError: If the extra ``bench`` is not installed.
+    """
+    try:
+        import bm3d
+    except ImportError:
+        raise ImportError("comparing with BM3D needs: pip install 'ae-env[bench]'") from None
+    mixed = np.tensordot(_HADAMARD, stable, axes=1).transpose(1, 2, 0)
+    smooth = bm3d.bm3d(mixed, [1.0] * 4).transpose(2, 0, 1)
+    return np.tensordot(_HADAMARD.T, smooth, axes=1)
+
+
+#: Orthonormal: the mean of the planes first, as colour BM3D puts luminance first.
+_HADAMARD = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, 1, -1, -1], [1, -1, -1, 1]]) / 2.0
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """Parts to measure."""
+    count, step = len(sources()), 1 if quick else _AT_ONCE
+    starts = list(range(0, count, step))[: 2 if quick else None]
+    arguments, depends = {"seed": seed, "quick": quick}, checksums()
+    return [
+        *(
+            Part(f"sources {i}", measure, {"first": i, **arguments}, 1, depends=depends)
+            for i in starts
+        ),
+        *(
+            Part(f"flat {c}", measure_flat, {"camera": c, **arguments}, 1, depends=depends)
+            for c in CAMERAS
+        ),
+    ]
+
+
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the results by name of the part."""
+    rows = [row for own in results.values() for row in own]
+    all_cases = [row for row in rows if row["part"] == "cases"]
+    flat = [row for row in rows if row["part"] == "flat"]
+    summary = [_summary(name, all_cases) for name in dict.fromkeys(r["method"] for r in all_cases)]
+    for row in summary:
+        own = [r["mean_shift"] for r in flat if r["method"] == row["method"]]
+        row["flat"] = max(own) if own else None
+    by_iso = [
+        {"method": row["method"], "iso": iso, "ev": ev, "gain_db": np.mean(found)}
+        for row in summary
+        for iso in ISOS
+        for ev in LEVELS
+        if (
+            found := [
+                r["gain_db"]
+                for r in all_cases
+                if (r["method"], r["iso"], r["ev"]) == (row["method"], iso, ev)
+            ]
+        )
+    ]
+    count = len({row["source"] for row in all_cases})
+    page = [
+        f"{count} sources that no training saw, one crop of {SIZE} x {SIZE} packed pixels each, "
+        "sampled through the colour filter array behind a lens blur of half a pixel (standard "
+        "deviation); Nikon Z6 and Canon 70D in turn. Light: the brightest 1 % at 2^EV of white. "
+        "Gain of PSNR over the noisy input. BM3D is the package `bm3d` on the four planes "
+        "jointly, non-local means are scikit-image's; both behind the generalised Anscombe "
+        "transform and its unbiased inverse. Differences to BM3D are paired by source, with the "
+        "95 % bootstrap interval over sources. The mean shift is the largest over flat fields of "
+        f"every calibrated ISO and light from 2^{FLAT_LEVELS[0]} to 2^{FLAT_LEVELS[-1]}.",
+        table(summary, _COLUMNS),
+        "## By ISO and light",
+        pivot(
+            by_iso,
+            line=("method", "{method}"),
+            columns="ISO {iso}, EV {ev}",
+            contents={"": "{gain_db:.2f}"},
+        ),
+    ]
+    return Report([*summary, *rows], page, {"sources": count})
+
+
+def _summary(name: str, rows: Sequence[Row]) -> Row:
+    own = [row for row in rows if row["method"] == name]
+    gains = np.array([row["gain_db"] for row in own])
+    differences = _by_source(own) - _by_source([r for r in rows if r["method"] == REFERENCE])
+    drawn = np.random.default_rng(0).integers(len(differences), size=(10_000, len(differences)))
+    low, high = np.quantile(differences[drawn].mean(axis=1), [0.025, 0.975])
+    return {
+        "part": "summary",
+        "method": name,
+        "gain_db": gains.mean(),
+        "cases": len(gains),
+        "gain_db_10_percent": np.quantile(gains, 0.1),
+        "gain_db_worst": gains.min(),
+        "to_bm3d_db": differences.mean(),
+        "ci95": [low, high],
+        "green_kept": np.median([row["green_kept"] for row in own]),
+        "milliseconds": np.median([row["milliseconds"] for row in own]),
+    }
+
+
+def _by_source(rows: Sequence[Row]) -> np.ndarray:
+    gains: dict[str, list[float]] = {}
+    for row in rows:
+        gains.setdefault(row["source"], []).append(row["gain_db"])
+    return np.array([np.mean(gains[source]) for source in sorted(gains)])
+
+
+_COLUMNS: dict[str, Any] = {
+    "method": "{method}",
+    "gain [dB]": "{gain_db:.2f}",
+    "10th percentile": "{gain_db_10_percent:.2f}",
+    "worst": "{gain_db_worst:.2f}",
+    "to BM3D [dB]": "{to_bm3d_db:+.2f} ({ci95[0]:+.2f} to {ci95[1]:+.2f})",
+    "green difference kept": "{green_kept:.2f}",
+    "mean shift": "{flat:.2%}",
+    "ms": "{milliseconds:.1f}",
+}
+
+BENCHMARK = Benchmark(
+    name="denoising",
+    title="Denoising of real detail, measured",
+    parts=parts,
+    report=report,
+    code=("simulator", "ae_env/scenes", "benchmarks/denoising", "benchmarks/fidelity/models"),
+)
+run = BENCHMARK.run

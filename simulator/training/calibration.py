@@ -1,0 +1,81 @@
+"""Measures what a trained noise module gets wrong, for the plan's predictions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, relative_detail
+from simulator.networks.noise_module import NoiseModule, variance_map
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.training.detail import DetailCrops
+
+#: Values of `relative_detail` at which errors are tabulated.
+_KNOTS = np.array([0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4, 409.6])
+#: Crops that are measured, how large they are, and captures of each.
+_CROPS, _SIDE, _CAPTURES = 192, 64, 6
+
+
+@torch.no_grad()
+def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
+    """The `Residual` of a noise module on pictures that it was not trained on.
+
+    Several captures of each crop tell what is systematic from what is noise. The first half of the
+    crops fills the tables; the second half tells how far single crops are from them.
+
+    Args:
+        noise: In evaluation mode.
+        crops: Of the validation split.
+    """
+    half = _CROPS // 2
+    blocks = [_measured(noise, crops, index) for index in range(_CROPS)]
+    detail, bias, left = (
+        np.concatenate([getattr(b, name) for b in blocks[:half]])
+        for name in ("detail", "bias", "variance")
+    )
+    bias, left = (np.maximum(_smoothed(detail, v), 0.0) for v in (bias, left))
+    first = Residual(_KNOTS, bias, left, 1.0)
+    ratios = []
+    for own in blocks[half:]:
+        predicted = own.statistics.error(first, 1.0, own.statistics.nlf, noise=False)
+        found = max(float((own.bias + own.variance).mean()), 0.0) ** 0.5
+        ratios.append(found / max(predicted, 1e-6))
+    return Residual(_KNOTS, bias, left, max(1.0, float(np.quantile(ratios, 0.9))))
+
+
+class _Measured(NamedTuple):
+    """Errors of a network on one crop, in blocks, in units of the noise's variance."""
+
+    detail: np.ndarray
+    bias: np.ndarray
+    variance: np.ndarray
+    statistics: ResidualStatistics
+
+
+def _measured(noise: NoiseModule, crops: DetailCrops, index: int) -> _Measured:
+    batch = crops.captures(index, _CAPTURES, _SIDE)
+    error = noise(batch.noisy, batch.shot, batch.read).double() - batch.clean.double()
+    scale = variance_map(batch.clean, batch.shot, batch.read).double()[0]
+    variance = error.var(dim=0)
+    bias = error.mean(dim=0).square() - variance / _CAPTURES
+    shot, read = (v[0].tolist() for v in (batch.shot, batch.read))
+    nlf = NoiseLevelFunction(tuple(shot), tuple(read))
+    detail = relative_detail(batch.noisy[0], nlf).double().flatten().numpy()
+    squares = [
+        F.avg_pool2d((v / scale)[None], BLOCK)[0].mean(dim=0).flatten().numpy()
+        for v in (bias, variance)
+    ]
+    return _Measured(detail, squares[0], squares[1], ResidualStatistics(batch.noisy[0], nlf))
+
+
+def _smoothed(detail: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Means of `values` around each knot, weights falling to 0 at the neighbouring ones."""
+    place = np.interp(detail, _KNOTS, np.arange(len(_KNOTS)))
+    weights = np.maximum(1.0 - np.abs(place[None] - np.arange(len(_KNOTS))[:, None]), 0.0)
+    total = weights.sum(axis=1)
+    means = (weights @ values) / np.maximum(total, 1e-12)
+    known = total > 1.0
+    return np.interp(np.arange(len(_KNOTS)), np.flatnonzero(known), means[known])
