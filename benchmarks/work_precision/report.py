@@ -187,7 +187,9 @@ def _by_tolerance(rows: list[Row]) -> list[Row]:
         counts = Counter(r["network"] or "none" for r in own)
         found.append(
             {
-                "kind": kind, "tolerance": tolerance, "cases": len(own),
+                "kind": kind,
+                "tolerance": tolerance,
+                "cases": len(own),
                 "networks": ", ".join(f"{n} {c / len(own):.0%}" for n, c in counts.most_common()),
                 "predicted": np.median([r["predicted"] for r in own]),
                 "measured": np.median(measured),

@@ -68,6 +68,8 @@ class SimulatorConfig(Configuration):
             built-in camera.
         body: Seed of the hidden error of its body.
         seed: Seed of everything that is random.
+        start: Weights of the same preset that the training goes on from: a name that comes with the
+            package or a file; by default it begins with random ones.
         precision: Of the networks; weights, optimiser and losses stay float32.
         scenes: Scenes of the sequences.
         exposure, noise, aperture: The three stages of a simulator.
@@ -78,6 +80,7 @@ class SimulatorConfig(Configuration):
     camera: str = "nikon_z6"
     body: int = Field(default=1, ge=0)
     seed: int = Field(default=0, ge=0)
+    start: str | None = None
     precision: Literal["float32", "bfloat16", "float16"] = "float32"
     scenes: SceneConfig = SceneConfig()
     exposure: StageConfig | None = None
@@ -113,9 +116,10 @@ class SimulatorConfig(Configuration):
         """
         values = self.model_dump(mode="json", exclude_none=True)
         if last_stage == "noise":
-            return {name: values[name] for name in ("preset", "seed", "precision", "noise")}
-        names = list(self.stages())
-        later = [] if last_stage is None else names[names.index(last_stage) + 1 :]
+            names = ("preset", "seed", "start", "precision", "noise")
+            return {name: values[name] for name in names if name in values}
+        stages = list(self.stages())
+        later = [] if last_stage is None else stages[stages.index(last_stage) + 1 :]
         return {name: value for name, value in values.items() if name not in later}
 
 

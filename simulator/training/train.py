@@ -20,7 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from simulator.camera import get_camera, list_cameras
 from simulator.networks.noise_module import NoiseModule
-from simulator.networks.weights import build_modules, save_modules
+from simulator.networks.weights import build_modules, load_modules, save_modules
 from simulator.reference.reference_camera import (
     DRAPED,
     MOSAIC,
@@ -92,12 +92,16 @@ def train_and_save(
 
     Returns:
         The file of the weights.
+
+    Raises:
+        ValueError: If `config.start` is not weights of this preset.
     """
     folder = path.parent
     accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.default_generator.manual_seed(config.seed)
         modules = build_modules(config.preset)
+    start = None if config.start is None else _started(config, modules)
     sources = {
         split: _Source(config, make_scenes, make_pictures, split)
         for split in ("train", "validation")
@@ -136,6 +140,7 @@ def train_and_save(
         meta = result_meta(command, config.seed)
         card = {
             "training": config.card(),
+            "start": start,
             "scenes": sources["train"].kinds,
             "stages": stages,
             "residual": residual,
@@ -143,6 +148,19 @@ def train_and_save(
         }
         save_modules(path, modules.to("cpu").eval(), config.preset, card)
     return sibling(path, ".safetensors")
+
+
+def _started(config: SimulatorConfig, modules: nn.ModuleDict) -> dict[str, Any]:
+    """Loads the weights that the training goes on from into `modules`; what their card says."""
+    assert config.start is not None
+    started, card = load_modules(config.start)
+    if card["preset"] != config.preset:
+        raise ValueError(
+            f"`start` (={config.start!r}) must be weights of preset {config.preset!r}, "
+            f"got {card['preset']!r}"
+        )
+    modules.load_state_dict(started.state_dict())
+    return {key: card.get(key) for key in ("sha256", "training", "stages", "start")}
 
 
 def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) -> Accelerator:

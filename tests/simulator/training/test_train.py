@@ -33,7 +33,7 @@ STAGE = {"steps": 2, "batch": 2, "crop": 16}
 
 
 def config(preset: str = "compact", **changes: Any) -> SimulatorConfig:
-    names = {"compact": ("noise", "exposure", "aperture"), "nano": ("noise",)}
+    names = {"compact": ("noise", "exposure", "aperture"), "nano": ("noise",), "large": ("noise",)}
     names = names.get(preset, ("baseline",))
     values = {"preset": preset, "scenes": {"size": 32}, **dict.fromkeys(names, STAGE), **changes}
     return SimulatorConfig.model_validate(values)
@@ -130,6 +130,19 @@ def test_a_noise_module_alone_needs_no_scenes(tmp_path):
     modules, card = load_modules(file)
     assert list(modules) == list(card["stages"]) == ["noise"]
     assert modules["noise"].residual.to_card() == card["residual"]
+
+
+def test_a_training_goes_on_from_other_weights(tmp_path):
+    first = save(tmp_path, "nano")
+    weights, card = load_modules(first)
+    still = {**STAGE, "steps": 1, "learning_rate": 1e-12}
+    (tmp_path / "on").mkdir()
+    again, later = load_modules(save(tmp_path / "on", "nano", start=str(first), noise=still))
+    for name, value in weights.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], value, rtol=0, atol=1e-8)
+    assert later["start"]["sha256"] == card["sha256"]
+    with pytest.raises(ValueError, match=r"`start`.*must be weights of preset 'large'"):
+        save(tmp_path / "on", "large", noise=STAGE, start=str(first))
 
 
 def test_the_seed_decides_and_progress_is_complete(trained, tmp_path):
