@@ -4,7 +4,7 @@ All of them are light at the pitch of the photosites, for the camera to sample: 
 are drawn there, pictures are cut out at it and never enlarged.
 
 The split by source group is fixed: procedural groups by their index, photographs and radiance maps
-by name (`ae_env.scenes.detail.detail_split`). A group has all its views in one split, and the
+by name (`ae_env.scenes.pictures.detail_split`). A group has all its views in one split, and the
 scenes of a split stay when `number` grows.
 """
 
@@ -27,14 +27,14 @@ from scipy.ndimage import distance_transform_edt
 
 from ae_env.scenes.colour import temperature_tint
 from ae_env.scenes.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
-from ae_env.scenes.detail import (
+from ae_env.scenes.photographs import PHOTOGRAPHS, read_photograph, unprocess
+from ae_env.scenes.pictures import (
     FIRST_INDEX,
     Split,
     photograph_pictures,
     radiance_files,
     recorded_mosaics,
 )
-from ae_env.scenes.photographs import PHOTOGRAPHS, read_photograph, unprocess
 from ae_env.scenes.procedural import draw, list_kinds
 from ae_env.scenes.radiance import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
 from ae_env.scenes.scene import Scene, mean_anchor, reference_settings
@@ -327,7 +327,7 @@ def mosaic_scenes(
     cannot be defocused, as each plane has but a quarter of the photosites.
 
     Args:
-        split: See `reference_scenes`; groups are split by `ae_env.scenes.detail`.
+        split: See `reference_scenes`; groups are split by `ae_env.scenes.pictures`.
         camera: Camera that photographs them; their colours are left as they were recorded.
         data: Folder of real files.
         size: Height and width [packed pixels], at most.

@@ -26,7 +26,7 @@ from agents.cli.console import (
 if TYPE_CHECKING:
     from simulator.reference.reference_camera import ReferenceScene
     from simulator.training.config import SimulatorConfig
-    from simulator.training.detail import DetailPicture
+    from simulator.training.crops import DetailPicture
 
 #: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
@@ -111,7 +111,7 @@ def reference_scenes_of(config: SimulatorConfig, split: str) -> Sequence[Referen
 
 def detail_pictures_of(config: SimulatorConfig, split: str) -> Sequence[DetailPicture]:
     """The pictures of a split that the noise stage is trained on."""
-    from ae_env.scenes.detail import detail_pictures
+    from ae_env.scenes.pictures import detail_pictures
     from simulator.utils.files import data_folder
 
     return detail_pictures(split, data=data_folder(), seed=config.seed)  # type: ignore[arg-type]

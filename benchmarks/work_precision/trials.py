@@ -1,7 +1,8 @@
 """Noisy captures of test scenes, and the truth at other settings.
 
-All scenes are of the test split, photographed by a reference camera without hidden errors, so that
-what is measured is the simulator and not one body. The simulator is not told their depth.
+All scenes but those that constants are calibrated on are of the test split, photographed by a
+reference camera without hidden errors, so that what is measured is the simulator and not one body.
+The simulator is not told their depth.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from ae_env import ExposureGrid
+from ae_env.scenes.pictures import Split
 from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.captures import cropped
 from benchmarks.harness import data_root
@@ -103,9 +105,9 @@ def trials(size: Size) -> tuple[Trial, ...]:
 
 
 @functools.cache
-def all_trials() -> tuple[Trial, ...]:
-    """All test scenes of 128 x 128 with sources of different ISO."""
-    kinds = _scenes((128, 128), _ALL_GROUPS, 256)
+def all_trials(split: Split = "test") -> tuple[Trial, ...]:
+    """All scenes of a split, 128 x 128, with sources of different ISO."""
+    kinds = _scenes((128, 128), _ALL_GROUPS, 256, split)
     return _in_turn(kinds, {kind: len(own) for kind, own in kinds.items()})
 
 
@@ -128,10 +130,12 @@ def _in_turn(kinds: dict[str, list[ReferenceScene]], counts: dict[str, int]) -> 
     )
 
 
-def _scenes(size: Size, groups: int, drawn: int) -> dict[str, list[ReferenceScene]]:
+def _scenes(
+    size: Size, groups: int, drawn: int, split: Split = "test"
+) -> dict[str, list[ReferenceScene]]:
     """Scenes of exactly `size` by kind."""
     profile = get_camera(CAMERA)
-    found = reference_scenes("test", profile, number=groups, size=drawn, data=data_root())
+    found = reference_scenes(split, profile, number=groups, size=drawn, data=data_root())
     kinds: dict[str, list[ReferenceScene]] = {
         kind: [] for kind in ("depth", "flat", "photograph", "radiance")
     }

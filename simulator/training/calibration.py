@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, relative_detail
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.training.detail import DetailCrops
+from simulator.training.crops import DetailCrops
 
 #: Values of `relative_detail` at which errors are tabulated.
 _KNOTS = np.array([0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4, 409.6])

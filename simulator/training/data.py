@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,8 +21,7 @@ from simulator.settings import CameraSettings, exposure_ratio
 Progress = Callable[[int, int], None]
 
 
-@dataclass
-class Batch:
+class Batch(NamedTuple):
     """B pairs of captures of the same crop.
 
     Args:
@@ -48,10 +47,6 @@ class Batch:
     f_target: Tensor
     parameters: Tensor
     defocus: Tensor
-
-    def to(self, device: torch.device) -> Batch:
-        """The batch on another device."""
-        return Batch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
 def draw_sequences(
@@ -122,9 +117,7 @@ class ReferencePairs:
         chosen = rng.integers(len(self.pairs), size=size)
         generator = noise_generator(self.seed, step, process, len(self.stage))
         items = [self._pair(self.pairs[i], crop, rng, generator) for i in chosen]
-        return Batch(
-            **{f.name: torch.stack([item[f.name] for item in items]) for f in fields(Batch)}
-        )
+        return Batch(*(torch.stack([item[name] for item in items]) for name in Batch._fields))
 
     def _render(self, progress: Progress | None) -> None:
         wanted: dict[int, dict[int, CameraSettings]] = {}

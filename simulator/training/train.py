@@ -32,8 +32,8 @@ from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
 from simulator.training.calibration import calibrate
 from simulator.training.config import SimulatorConfig, StageConfig
-from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.detail import DetailCrops, DetailPicture
+from simulator.training.crops import DetailCrops, DetailPicture, NoiseBatch
+from simulator.training.data import Batch, ReferencePairs, draw_sequences
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.files import sibling
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 #: Makes the scenes of a split, ``"train"`` or ``"validation"``, such as
 #: `ae_env.scenes.reference_scenes` does.
 SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
-#: Gives the pictures of a split for the noise stage, such as `ae_env.scenes.detail` does.
+#: Gives the pictures of a split for the noise stage, such as `ae_env.scenes.pictures` does.
 PictureMaker = Callable[[SimulatorConfig, str], Sequence[DetailPicture]]
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]
@@ -133,20 +133,16 @@ def train_and_save(
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
+        modules.to("cpu").eval()
         residual = None
         if "noise" in modules:
-            module = cast(NoiseModule, modules["noise"].to("cpu").eval())
+            module = cast(NoiseModule, modules["noise"])
             residual = calibrate(module, sources["validation"].crops).to_card()
         meta = result_meta(command, config.seed)
-        card = {
-            "training": config.card(),
-            "start": start,
-            "scenes": sources["train"].kinds,
-            "stages": stages,
-            "residual": residual,
-            **{k: meta[k] for k in ("command", "commit", "date", "machine", "versions")},
-        }
-        save_modules(path, modules.to("cpu").eval(), config.preset, card)
+        done = {"start": start, "scenes": sources["train"].kinds, "stages": stages}
+        origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
+        card = {"training": config.card(), **done, "residual": residual, **origin}
+        save_modules(path, modules, config.preset, card)
     return sibling(path, ".safetensors")
 
 
@@ -329,13 +325,13 @@ def train_stage(
             own.load_state_dict(past[part])
     wrapped, stepper = accelerator.prepare(loss, optimizer)
     means: dict[str, float] = {}
+    process = accelerator.process_index
     clock.start()
     with state:
         while clock.share < 1.0:
             optimizer.param_groups[0]["lr"] = learning_rate(clock.share, stage.learning_rate)
-            process = accelerator.process_index
             batch = pairs.batch(clock.step, stage.batch, stage.crop, process=process)
-            values = wrapped(batch.to(device))
+            values = wrapped(_on_device(batch, device))
             _follow(means, values, name)
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
@@ -430,6 +426,10 @@ def _follow(means: dict[str, float], values: dict[str, torch.Tensor], name: str)
             means[key] = _SMOOTHING * means.get(key, number) + (1.0 - _SMOOTHING) * number
 
 
+def _on_device(batch: Batch | NoiseBatch, device: torch.device) -> Batch | NoiseBatch:
+    return type(batch)(*(part.to(device) for part in batch))
+
+
 @torch.no_grad()
 def validate(
     loss: nn.Module, pairs: ReferencePairs | DetailCrops, crop: int, accelerator: Accelerator
@@ -438,7 +438,7 @@ def validate(
     means: dict[str, float] = {}
     loss.eval()
     for step in range(_VALIDATION_STEPS):
-        batch = pairs.batch(step, _VALIDATION_BATCH, crop).to(accelerator.device)
+        batch = _on_device(pairs.batch(step, _VALIDATION_BATCH, crop), accelerator.device)
         with accelerator.autocast():
             values = loss(batch)
         for key, value in values.items():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes.detail import detail_pictures
+from ae_env.scenes.pictures import detail_pictures
 from ae_env.scenes.reference_scenes import reference_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.optics.disc_bank import added_blur

@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ae_env.scenes import detail
+from ae_env.scenes import pictures
 from agents.cli import train_simulator
 from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
 from simulator.training.config import SimulatorConfig
+from simulator.training.crops import DetailCrops
 from simulator.training.data import ReferencePairs
-from simulator.training.detail import DetailCrops
 
 TINY = """\
 preset: compact
@@ -28,7 +28,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
 
     Without a folder of real files, on a few drawn pictures."""
     monkeypatch.delenv("AE_ENV_DATA", raising=False)
-    monkeypatch.setattr(detail, "_DRAWN", {"train": 2, "validation": 1})
+    monkeypatch.setattr(pictures, "_DRAWN", {"train": 2, "validation": 1})
     monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
     (tmp_path / "tiny.yaml").write_text(TINY)
     steps = []

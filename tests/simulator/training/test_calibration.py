@@ -13,7 +13,7 @@ from simulator import get_camera
 from simulator.capture.residual import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.training.calibration import calibrate
-from simulator.training.detail import DetailCrops, DetailPicture
+from simulator.training.crops import DetailCrops, DetailPicture
 
 Z6 = get_camera("nikon_z6")
 

@@ -1,6 +1,5 @@
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,8 +11,8 @@ from simulator.networks.aperture_module import DEAD_ZONE, ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, Preset
 from simulator.optics.disc_bank import DiscBank
+from simulator.training.crops import NoiseBatch
 from simulator.training.data import Batch
-from simulator.training.detail import NoiseBatch
 from simulator.training.losses import (
     ApertureLoss,
     BaselineLoss,
@@ -139,7 +138,7 @@ def opened(data: Batch) -> Batch:
     texture = torch.rand(2, 4, 32, 32, generator=torch.Generator().manual_seed(3)) * 0.4
     diameter = (data.defocus.square() - DEAD_ZONE**2).sqrt() * math.sqrt(3)
     target = DiscBank(texture).blurred(diameter[:, None])
-    return replace(data, source=texture, target=target, ratio=torch.ones(2))
+    return data._replace(source=texture, target=target, ratio=torch.ones(2))
 
 
 def aperture_loss(log_blur: Callable[..., Tensor]) -> ApertureLoss:
@@ -164,8 +163,8 @@ def test_the_true_map_costs_nothing_and_not_opening_all_of_the_change():
 @pytest.mark.parametrize("preset", ["compact", "paper"])
 def test_pairs_of_one_aperture_and_clipped_ones_are_no_trouble(preset):
     loss = ApertureLoss(ExposureModule(), NoiseModule("nano"), ApertureModule(preset))
-    same = replace(opened(batch()), f_target=torch.full((2,), 8.0))
-    white = replace(opened(batch()), source=torch.ones(2, 4, 32, 32))
+    same = opened(batch())._replace(f_target=torch.full((2,), 8.0))
+    white = opened(batch())._replace(source=torch.ones(2, 4, 32, 32))
     for data in (same, white):
         loss.zero_grad()
         value = loss(data)["loss"]

@@ -24,8 +24,8 @@ from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import train
 from simulator.training.config import SimulatorConfig, StageConfig
+from simulator.training.crops import DetailPicture
 from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.detail import DetailPicture
 from simulator.training.train import Clock, make_accelerator, train_and_save, train_stage, validate
 from tests.simulator.training.scenes import REFERENCE, scene
 

@@ -27,7 +27,7 @@ from ae_env.scenes.radiance import RADIANCE_SUFFIXES, read_radiance
 from ae_env.utils.checks import check_word
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.read import read_raw
-from simulator.training.detail import DetailPicture
+from simulator.training.crops import DetailPicture
 
 logger = logging.getLogger(__name__)
 

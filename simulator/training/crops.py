@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -64,8 +65,7 @@ class DetailPicture:
             )
 
 
-@dataclass
-class NoiseBatch:
+class NoiseBatch(NamedTuple):
     """B crops with and without noise.
 
     Args:
@@ -79,10 +79,6 @@ class NoiseBatch:
     clean: Tensor
     shot: Tensor
     read: Tensor
-
-    def to(self, device: torch.device) -> NoiseBatch:
-        """The batch on another device."""
-        return NoiseBatch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
 class DetailCrops:

@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from ae_env.scenes import detail
-from ae_env.scenes.detail import detail_pictures, detail_split
-from simulator.training.detail import DetailPicture
+from ae_env.scenes import pictures
+from ae_env.scenes.pictures import detail_pictures, detail_split
+from simulator.training.crops import DetailPicture
 from tests.ae_env.scene_files import write_hdr
 
 SPLITS = ("train", "validation", "test")
@@ -96,18 +96,18 @@ def test_mosaics_and_linear_frames_by_hand(tmp_path: Path) -> None:
 
 
 def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    monkeypatch.setattr(detail, "_SIZE", 64)
-    pictures = by_split(None, drawn=8)
+    monkeypatch.setattr(pictures, "_SIZE", 64)
+    drawn = by_split(None, drawn=8)
     assert "AE_ENV_DATA" in caplog.text
-    assert_no_group_is_shared(pictures)
-    for own in pictures.values():
+    assert_no_group_is_shared(drawn)
+    for own in drawn.values():
         assert [p.kind for p in own] == ["leaves"] * 8 + ["chart"] * 8 + ["smooth"] * 8
         for each in own:
             assert each.light.shape == (3, 64, 64)
             assert each.light.dtype == torch.float32
             assert bool(((each.light >= 0) & each.light.isfinite()).all())
     again, other = (detail_pictures("train", data=None, drawn=8, seed=s) for s in (0, 1))
-    for first, same, new in zip(pictures["train"], again, other, strict=True):
+    for first, same, new in zip(drawn["train"], again, other, strict=True):
         assert torch.equal(first.light, same.light)
         assert not torch.equal(first.light, new.light)
         assert first.group != new.group
@@ -117,9 +117,9 @@ def test_drawn_pictures(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptu
 
 @pytest.mark.real_data
 def test_recorded_mosaics_of_one_subject_are_on_one_side(data_dir: Path) -> None:
-    pictures = {s: list(detail.recorded_mosaics(data_dir, s)) for s in SPLITS}  # type: ignore[arg-type]
-    assert_no_group_is_shared(pictures)
-    found = {p.name: (split, p) for split, own in pictures.items() for p in own}
+    drawn = {s: list(pictures.recorded_mosaics(data_dir, s)) for s in SPLITS}  # type: ignore[arg-type]
+    assert_no_group_is_shared(drawn)
+    found = {p.name: (split, p) for split, own in drawn.items() for p in own}
     assert [found[f"CRW_{n}"][0] for n in ("0101", "0112", "0117", "0119")] == 2 * ["train"] + 2 * [
         "test"
     ]
