@@ -101,15 +101,15 @@ def cases(number: int, picture: DetailPicture, seed: int) -> list[Case]:
     return made
 
 
-def denoisers() -> dict[str, Denoiser]:
-    """Every method: the trained noise modules that are there, and the classical ones."""
-    found: dict[str, Denoiser] = {
-        name: _network(module) for name, module in trained_noise_modules().items()
-    }
-    return found | {
-        "VST + NLM": behind_anscombe(non_local_means),
-        REFERENCE: behind_anscombe(bm3d_planes),
-    }
+def networks() -> dict[str, Denoiser]:
+    """The trained noise modules that are there."""
+    return {name: _network(module) for name, module in trained_noise_modules().items()}
+
+
+def classical() -> dict[str, Denoiser]:
+    """The methods to compare with."""
+    planes = {"VST + NLM": non_local_means, REFERENCE: bm3d_planes}
+    return {name: behind_anscombe(denoise) for name, denoise in planes.items()}
 
 
 def _network(module: Any) -> Denoiser:
@@ -122,16 +122,16 @@ def _network(module: Any) -> Denoiser:
     return denoise
 
 
-def measure(first: int, seed: int, quick: bool) -> list[Row]:
-    """A row for every case and method of some sources."""
-    methods, rows = denoisers(), []
+def measure(methods: str, first: int, seed: int, quick: bool) -> list[Row]:
+    """A row for every case of some sources and every method of a kind."""
+    known, rows = {"networks": networks, "classical": classical}[methods](), []
     chosen = list(enumerate(sources()))[first : first + (1 if quick else _AT_ONCE)]
     for number, picture in chosen:
         some = cases(number, picture, seed)
         for case in some[::5] if quick else some:
             before = _error(case.noisy, case.light)
             green = case.light[1] - case.light[2]
-            for name, denoise in methods.items():
+            for name, denoise in known.items():
                 found: list[Tensor] = []
                 seconds = timed(lambda d=denoise, c=case, f=found: f.append(d(c.noisy, c.nlf)))  # type: ignore[misc]
                 gain = 10.0 * np.log10(before / max(_error(found[0], case.light), 1e-30))
@@ -152,12 +152,12 @@ def measure_flat(camera: str, seed: int, quick: bool) -> list[Row]:
     """Means of flat fields, before and after each network, at the calibrated ISOs."""
     profile = get_camera(camera)
     reference, rows = ReferenceCamera(profile), []
-    networks = {n: d for n, d in denoisers().items() if n != REFERENCE}
+    denoisers = networks()
     for iso in list(profile.nlf_by_iso)[:: 4 if quick else 1]:
         for level in FLAT_LEVELS:
             light = torch.full((4, FLAT_SIZE, FLAT_SIZE), 2.0**level)
             noisy = reference.record(light, iso, noise_generator(seed, iso, float(level)))
-            for name, denoise in networks.items():
+            for name, denoise in denoisers.items():
                 shift = (denoise(noisy, profile.nlf(iso)) - noisy).double().mean(dim=(1, 2))
                 worst = float(shift.abs().max()) / 2.0**level
                 rows.append(
@@ -236,17 +236,16 @@ def parts(seed: int, quick: bool) -> list[Part]:
     """Parts to measure."""
     count, step = len(sources()), 1 if quick else _AT_ONCE
     starts = list(range(0, count, step))[: 2 if quick else None]
-    arguments, depends = {"seed": seed, "quick": quick}, checksums()
-    return [
-        *(
-            Part(f"sources {i}", measure, {"first": i, **arguments}, 1, depends=depends)
-            for i in starts
-        ),
-        *(
-            Part(f"flat {c}", measure_flat, {"camera": c, **arguments}, 1, depends=depends)
-            for c in CAMERAS
-        ),
-    ]
+    arguments, weights = {"seed": seed, "quick": quick}, checksums()
+    found = []
+    for methods, depends in (("networks", weights), ("classical", {})):
+        for first in starts:
+            given = {"methods": methods, "first": first, **arguments}
+            found.append(Part(f"{methods} {first}", measure, given, 1, depends=depends))
+    for camera in CAMERAS:
+        given = {"camera": camera, **arguments}
+        found.append(Part(f"flat {camera}", measure_flat, given, 1, depends=weights))
+    return found
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -336,6 +335,10 @@ BENCHMARK = Benchmark(
     title="Denoising of real detail, measured",
     parts=parts,
     report=report,
-    code=("simulator", "ae_env/scenes", "benchmarks/denoising", "benchmarks/fidelity/models"),
+    code=(
+        *("simulator/camera", "simulator/networks", "simulator/noise", "simulator/optics"),
+        *("simulator/raw", "simulator/reference", "ae_env/scenes"),
+        *("benchmarks/denoising", "benchmarks/fidelity/models"),
+    ),
 )
 run = BENCHMARK.run

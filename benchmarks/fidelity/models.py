@@ -64,7 +64,8 @@ def train_missing() -> None:
 
 def checksums() -> dict[str, str]:
     """Checksum of the weights of each model that is there."""
-    return {name: card["sha256"] for name, card in load_models().cards.items()}
+    names = dict.fromkeys((*SIZES, *PRESETS, *BASELINES))
+    return {n: load_modules(w)[1]["sha256"] for n in names if (w := weights(n)) is not None}
 
 
 @functools.cache
