@@ -32,6 +32,7 @@ from simulator.noise.generator import Noise, check_noise
 from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
+from simulator.utils.processor import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 
 #: Depth of a scene: it is far or in focus throughout, or it is not known.
@@ -130,6 +131,8 @@ class CameraSimulator:
             raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
         if precision not in ("float32", "bfloat16"):
             raise ValueError(f"`precision` (={precision!r}) must be 'float32' or 'bfloat16'")
+        if precision == "bfloat16":
+            check_bfloat16(self.device)
         self.precision = precision
         self._results = NetworkCache(cache)
         self.exposure = ExposureModule().requires_grad_(False).to(self.device)

@@ -26,6 +26,7 @@ from simulator import (
 )
 from simulator.capture.plan import DEFAULT_TOLERANCE
 from simulator.training.data import settings_parameters
+from simulator.utils.processor import computes_bfloat16
 
 Dtype = Literal["float32", "bfloat16"]
 
@@ -78,14 +79,16 @@ class Method:
 
 
 def all_methods() -> list[Method]:
-    """Every method whose weights are there."""
+    """Every method whose weights are there; in bfloat16 where the processor computes it."""
     bare, models = CameraSimulator(device="cpu"), load_models()
     methods = [
         Method("exposure", prepare=_Exposed),
         Method("exposure+nlf", prepare=bare.prepare),
         _with_non_local_means(bare),
     ]
-    dtypes: tuple[Dtype, ...] = ("float32", "bfloat16")
+    dtypes: list[Dtype] = ["float32"]
+    if computes_bfloat16(torch.device("cpu")):
+        dtypes.append("bfloat16")
     for dtype in dtypes:
         for name in FAMILY:
             tolerances = TOLERANCES if name == "large" and dtype == "float32" else (DEFAULT,)

@@ -37,6 +37,7 @@ from simulator.training.data import Batch, ReferencePairs, draw_sequences
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.files import sibling
+from simulator.utils.processor import check_bfloat16
 from simulator.utils.results import result_meta
 
 if TYPE_CHECKING:
@@ -180,6 +181,8 @@ def make_accelerator(config: SimulatorConfig, device: str, logs: Path | None) ->
         log_with=None if logs is None else "tensorboard",
         project_dir=None if logs is None else str(logs),
     )
+    if precision == "bf16":
+        check_bfloat16(accelerator.device)
     if logs is not None:
         accelerator.init_trackers(config.preset)
     return accelerator
