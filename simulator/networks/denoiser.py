@@ -161,9 +161,9 @@ class Denoiser(nn.Module):
         z, far = stabiliser.forward(_padded(image)), _padded(far)
         near = box_mean(z, _NEAR)
         features = (
-            _LEVEL * torch.asinh((z - near) / _LEVEL),
-            torch.asinh(4.0 * (near - far)),
-            torch.asinh(near / _LEVEL),
+            _LEVEL * _asinh((z - near) / _LEVEL),
+            _asinh(4.0 * (near - far)),
+            _asinh(near / _LEVEL),
             stabiliser.linearity.expand_as(z),
         )
         residual = self._residual(torch.cat(features, dim=1)).float()
@@ -194,6 +194,13 @@ class Denoiser(nn.Module):
             x = block(up(x).add_(skip))
         residual: Tensor = self.tail(x)
         return residual
+
+
+def _asinh(x: Tensor) -> Tensor:
+    """Inverse hyperbolic sine, of vectorised functions: torch's own takes three times as long."""
+    size = x.abs().clamp(max=1e18)  # whose square is finite
+    square = size.square()
+    return torch.log1p(size + square / (1.0 + (1.0 + square).sqrt())).copysign(x)
 
 
 def _padded(image: Tensor) -> Tensor:
