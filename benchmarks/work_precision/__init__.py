@@ -16,8 +16,9 @@ from benchmarks.work_precision import plans, precision
 from benchmarks.work_precision.report import report
 from benchmarks.work_precision.trials import SIZES
 
-#: Processes among which the scenes of the plan's predictions are shared out.
-_SHARES = 8
+#: Processes among which the scenes of the plan's predictions are shared out: of the validation
+#: split, which the plan's constants were calibrated on, and of the test split.
+_SHARES = {"validation": 4, "test": 8}
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
@@ -28,10 +29,10 @@ def parts(seed: int, quick: bool) -> list[Part]:
     found = [
         Part(f"precision {size[0]}", precision.measure, {"size": size, **common}) for size in SIZES
     ]
-    shares = 1 if quick else _SHARES
-    for share in range(shares):
-        arguments = {"share": share, "shares": shares, **common}
-        found.append(Part(f"bound {share}", plans.bound, arguments))
+    for split, shares in _SHARES.items():
+        for share in range(1 if quick else shares):
+            arguments = {"split": split, "share": share, "shares": shares, **common}
+            found.append(Part(f"bound {split} {share}", plans.bound, arguments))
     found += [Part(kind, plans.left_out, {"kind": kind, **common}) for kind in plans.KINDS]
     weights = checksums()
     return [replace(part, depends=weights) for part in found]

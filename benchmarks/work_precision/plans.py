@@ -21,6 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ae_env.scenes.pictures import Split
 from benchmarks.harness import Row
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
@@ -32,47 +33,73 @@ from benchmarks.work_precision.trials import (
     source_settings,
     trials,
 )
-from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, RawImage
+from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, PreparedScene, RawImage
 from simulator.capture.sensor import exposed_light
 from simulator.noise.noise_level_function import noise_variance
 from simulator.noise.top_up import top_up_variance
 
-#: Photographs of each scene, and fair states of it; one more is any other of the grid.
-DRAWS, FAIR = 8, 3
+#: Photographs of each scene, and fair states of it; a third as many are any others of the grid.
+DRAWS, FAIR = 8, 12
+#: One state in so many is tried with every tolerance.
+_EVERY = 5
 #: Standard deviations are pooled over squares of this side [pixel].
 _WINDOW = 9
 #: Light from here on is white in every capture: what differs above cannot show.
 _WHITE = 1.0 - 1e-6
 
 
-def bound(seed: int, share: int, shares: int, quick: bool) -> list[Row]:
-    """One row per scene, state and tolerance, of every `shares`-th scene from `share` on."""
+def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list[Row]:
+    """One row per scene, state and tolerance, of every `shares`-th scene from `share` on.
+
+    Every state is tried with the default tolerance; some of the test split with all of them.
+    """
     own, rows = simulator("large"), []
-    known = trials((128, 128))[:3] if quick else all_trials()
+    known = trials((128, 128))[:3] if quick else all_trials(split)
     for number, trial in list(enumerate(known))[share::shares]:
         raws = [trial.raw(seed + 100 * number + i) for i in range(DRAWS)]
-        prepared = {
-            t: [own.prepare(raw, depth=trial.depth, tolerance=t) for raw in raws]
-            for t in TOLERANCES
-        }
-        rest = [s for s in GRID if s not in trial.states()]
-        other = [rest[7 * number % len(rest)]] if rest else []
-        for settings in (*trial.states(1 if quick else FAIR), *other):
+        prepared = _prepared(own, raws, trial)
+        for position, settings in enumerate(_states(trial, number)[:: FAIR if quick else 1]):
             truth, target = trial.mean(settings), raws[0].camera.nlf(settings.iso)
             wanted = noise_variance(truth, target)
             # White in the scene: no difference there can show.
             shows = torch.where(truth < _WHITE, wanted, torch.inf)
-            for tolerance in TOLERANCES:
+            every = split == "test" and position % _EVERY == 0
+            for tolerance in TOLERANCES if every else (DEFAULT,):
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
                 planned = _Draws(*(torch.stack(own) for own in zip(*pairs, strict=True)))
-                row: Row = {"part": "bound", "kind": trial.scene.kind}
+                row: Row = {"part": "bound", "split": split, "kind": trial.scene.kind}
                 row |= {"scene": trial.scene.scene_id, "source": str(trial.source)}
                 row |= {"settings": str(settings), "tolerance": tolerance}
                 row |= {"network": plan.network, "errors": dict(plan.errors)}
                 row |= {"predicted": plan.predicted_error, "bound": plan.error_bound}
                 rows.append(row | {"measured": planned.distance(truth, wanted, shows)})
     return rows
+
+
+def _states(trial: Trial, number: int) -> list[CameraSettings]:
+    """Fair states of the `number`-th scene, and some of the others, after every third of them."""
+    rest = [s for s in GRID if s not in trial.states()]
+    found = list(trial.states(FAIR))
+    if rest:
+        for i in range(FAIR // 3):
+            place = (7 * number + i * len(rest) * 3 // FAIR) % len(rest)
+            found.insert(4 * i + 3, rest[place])
+    return found
+
+
+def _prepared(
+    own: CameraSimulator, raws: Sequence[RawImage], trial: Trial
+) -> dict[float, list[PreparedScene]]:
+    """The photographs prepared for each tolerance; positive ones share the networks' runs."""
+    found: dict[float, list[PreparedScene]] = {}
+    for tolerance in sorted(TOLERANCES):
+        if tolerance <= TOLERANCES[1]:
+            options: dict[str, Any] = {"depth": trial.depth, "tolerance": tolerance}
+            found[tolerance] = [own.prepare(raw, **options) for raw in raws]
+        else:
+            found[tolerance] = [replace(p, tolerance=tolerance) for p in found[TOLERANCES[1]]]
+    return found
 
 
 def _before_noise(prepared: PreparedScene, settings: CameraSettings) -> tuple[Tensor, Tensor]:
