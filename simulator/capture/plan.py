@@ -344,17 +344,18 @@ class SimulationPlan:
             f"{name} ({self.network})" if name == "noise_reduction" else name
             for name in self.modules
         ]
-        parts = [f"{name} {error:.2g}" for name, error in self.errors.items() if error >= 0.005]
+        parts = [f"{name} {_short(error)}" for name, error in self.errors.items() if error >= 0.005]
         avoidable = math.hypot(self.errors["left out"], self.errors["network"])
         within = "kept" if avoidable <= self.tolerance else "out of reach, this is the least error"
         capture, shared = self.milliseconds
-        once = f" and {shared:.3g} ms once for all settings" if shared else ""
+        once = f" and {_short(shared)} ms once for all settings" if shared else ""
         return (
             f"{self.settings}: {self.exposure_ratio:.4g} x the light; {' -> '.join(runs)}\n"
-            f"error {self.predicted_error:.2g} of the target's noise, 90 % bound "
-            f"{self.error_bound:.2g}{': ' * bool(parts)}{', '.join(parts)} "
+            f"error {_short(self.predicted_error)} of the target's noise, 90 % bound "
+            f"{_short(self.error_bound)}{': ' * bool(parts)}{', '.join(parts)} "
             f"(tolerance {self.tolerance:g}: {within})\n"
-            f"cost {_counted(self.operations)} operations, about {capture:.2g} ms a capture{once}"
+            f"cost {_counted(self.operations)} operations, about {_short(capture)} ms a capture"
+            f"{once}"
         )
 
     def details(self) -> str:
@@ -362,7 +363,7 @@ class SimulationPlan:
         lines = []
         for step in self.steps:
             if step.reason:
-                error = f" (error {step.error:.2g})" if step.error else ""
+                error = f" (error {_short(step.error)})" if step.error else ""
                 lines.append(
                     f"{'runs' if step.runs else 'left out'} {step.name}: {step.reason}{error}"
                 )
@@ -376,6 +377,11 @@ class SimulationPlan:
 
     def __str__(self) -> str:
         return self.explain()
+
+
+def _short(number: float) -> str:
+    """Two significant digits, without an exponent up to a million."""
+    return f"{float(f'{number:.2g}'):,g}"
 
 
 def _counted(number: int) -> str:
