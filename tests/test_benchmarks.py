@@ -6,12 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from agents.cli.bench import BENCHMARKS
 from benchmarks import harness
+from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.harness import Benchmark, FinishedParts, Part, Report, cell, pivot, rounded, table
 from benchmarks.throughput import full_frame
+from benchmarks.work_precision.plans import _Draws
 from benchmarks.work_precision.precision import pareto_front
+from simulator import NoiseLevelFunction
 
 
 def test_cells_of_missing_values_are_empty_and_pipes_escaped() -> None:
@@ -94,3 +98,26 @@ def test_every_benchmark_of_the_command_can_be_imported() -> None:
 def test_the_front_of_time_and_error() -> None:
     points = [(1.0, 30.0), (2.0, 35.0), (3.0, 34.0), (4.0, 35.004)]
     assert pareto_front(points) == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("shift", "spread"), [(0.5, 1.5), (0.0, 0.8), (2.0, 1.0)])
+def test_the_distance_of_two_normal_distributions(shift: float, spread: float) -> None:
+    """Of N(m + 0.01 shift, 0.01 spread) and N(m, 0.01), half of the variance being added last."""
+    generator, half = torch.Generator().manual_seed(0), (0.01 * spread) ** 2 / 2
+    drawn = torch.randn(16, 4, 96, 96, generator=generator) * half**0.5
+    draws = _Draws(0.2 + 0.01 * shift + drawn, torch.full_like(drawn, half))
+    truth, variance = torch.full((4, 96, 96), 0.2), torch.full((4, 96, 96), 1e-4)
+    expected = (shift**2 + (spread - 1.0) ** 2) ** 0.5
+    assert draws.distance(truth, variance, variance) == pytest.approx(expected, rel=0.02)
+
+
+def test_the_inverse_anscombe_transform_is_unbiased() -> None:
+    """Means of transformed samples of 2 to 200 electrons give the electrons back."""
+    generator, electrons = torch.Generator().manual_seed(0), torch.tensor([2.0, 5.0, 30.0, 200.0])
+    mean = electrons[:, None, None].expand(4, 400, 400).contiguous() / 1000.0
+    samples = torch.poisson(1000.0 * mean, generator=generator) / 1000.0
+    samples += 2e-3 * torch.randn(samples.shape, generator=generator)
+    nlf = NoiseLevelFunction((1e-3,) * 4, (4e-6,) * 4)
+    stable = anscombe(samples.double(), nlf).mean(dim=(1, 2), keepdim=True)
+    found = 1000.0 * inverse_anscombe(stable, nlf).flatten()
+    assert found.tolist() == pytest.approx(electrons.tolist(), rel=0.02)
