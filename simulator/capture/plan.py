@@ -44,7 +44,10 @@ EXTRAPOLATION_ERROR = 0.1
 #: Factors on predicted errors, below which 90 % of the measured ones are: `ae-env bench
 #: work-precision` on validation scenes. The network's comes on top of its own `spread`.
 _BOUND = {
-    **{"left out": 1.15, "network": 1.12, "clipped highlights": 1.2, "unknown depth": 1.1},
+    "left out": 1.15,
+    "network": 1.12,
+    "clipped highlights": 1.2,
+    "unknown depth": 1.1,
     "ISO": 2.5,
 }
 #: Below this are 90 % of the errors where no part is predicted: single noisy samples that were

@@ -17,6 +17,7 @@ from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import Step
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.plan import (
+    _BOUND,
     _LEAST_BOUND,
     DEFAULT_TOLERANCE,
     HIDDEN_LIGHT,
@@ -334,14 +335,16 @@ def test_each_decision_says_what_it_costs() -> None:
     made = PreparedScene(light, settings, replace(camera, segments=()), nlf, denoised=denoised)
     tiny, strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.09, 0.2, 0.3))
     assert "leaving it out would be an error of 0.25" in strict.steps[1].reason
-    for plan, found, bound in ((tiny, 0.1, 0.15), (strict, 0.1, 0.15), (loose, 0.25, 0.3)):
+    network_bound, loose_bound = 0.1 * 1.5 * _BOUND["network"], 0.25 * _BOUND["left out"]
+    cases = (tiny, 0.1, network_bound), (strict, 0.1, network_bound), (loose, 0.25, loose_bound)
+    for plan, found, bound in cases:
         assert plan.predicted_error == pytest.approx(found, rel=1e-3)
         assert plan.error_bound == pytest.approx(math.hypot(bound, _LEAST_BOUND), rel=1e-3)
         assert plan.network == ("nano" if found == 0.1 else None)
     assert "noise_reduction (nano)" in strict.explain()
     assert "network 0.1 (tolerance 0.2: kept)" in strict.explain()
     assert "network 0.1 (tolerance 0.09: out of reach, this is the least error)" in str(tiny)
-    assert "90 % bound 0.15: network" in strict.explain()
+    assert "90 % bound 0.17: network" in strict.explain()
     assert "left out 0.25 (tolerance 0.3: kept)" in loose.explain()
     assert "hardly noisier" in loose.left_out["noise_reduction"]
     assert "(error 0.25)" in loose.details()
@@ -364,7 +367,7 @@ def test_what_clipped_highlights_hide_by_quadrature(ratio: float) -> None:
         square = quad(lambda u: (min(ratio / u, 1.0) - ratio) ** 2, 0, 1, points=[ratio])[0]
     error = HIDDEN_LIGHT * math.sqrt(0.1 * square / noise)
     assert plan.errors["clipped highlights"] == pytest.approx(error, rel=1e-6)
-    bound = math.hypot(1.6 * error, plan.errors["rounding"], _LEAST_BOUND)
+    bound = math.hypot(_BOUND["clipped highlights"] * error, plan.errors["rounding"], _LEAST_BOUND)
     assert plan.error_bound == pytest.approx(bound)
     assert plan.clipped_source == pytest.approx(0.1)
 
