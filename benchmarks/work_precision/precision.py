@@ -43,8 +43,9 @@ def measure(size: Sequence[int], seed: int, quick: bool) -> list[Row]:
         scenes, count = QUICK[height]
         chosen, methods = chosen[:scenes], methods[: None if height < 512 else 9]
     records: dict[str, dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+    small = trials((128, 128))[0]
     for method in methods:  # warm-up
-        _captured(method, chosen[0].raw(seed), chosen[0].states(1), seed)
+        _captured(method, small.raw(seed), small.states(1), seed)
     for index, trial in enumerate(chosen):
         _one_trial(records, methods, trial, trial.states(count), seed + 1000 * index, index)
     floor = records.pop(REFERENCE)
