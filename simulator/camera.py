@@ -150,7 +150,8 @@ class CameraProfile:
         if not self.read_noise_by_iso:
             raise ValueError(
                 f"camera {self.name!r} has no calibration of row noise and of the read noise's "
-                "shape: `noise` must be 'exact' or 'bank', or give `read_noise_by_iso`"
+                "shape: `noise` must be 'exact' or 'bank'; a profile of your own has it in "
+                "`read_noise_by_iso`"
             )
         _check_iso(iso)
         table = self.read_noise_by_iso

@@ -82,21 +82,21 @@ def save_picture(path: Path, picture: Any) -> Path:
     return write_atomically(path, buffer.getvalue())
 
 
-def parse_seconds(text: str) -> float:
-    """Seconds from ``"1/60"`` or ``"0.5"``."""
+def parse_seconds(text: str, name: str = "shutter") -> float:
+    """Seconds from ``"1/60"`` or ``"0.5"``, the option `name`."""
     numerator, _, denominator = text.removesuffix("s").partition("/")
     try:
         return float(numerator) / float(denominator or 1)
     except (ValueError, ZeroDivisionError):
-        raise ValueError(f"`shutter` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
+        raise ValueError(f"`{name}` (={text!r}) must be seconds, such as 1/60 or 0.5") from None
 
 
-def parse_f_number(text: str) -> float:
-    """F-number from ``"4"`` or ``"f/4"``."""
+def parse_f_number(text: str, name: str = "aperture") -> float:
+    """F-number from ``"4"`` or ``"f/4"``, the option `name`."""
     try:
         return float(text.lower().removeprefix("f").removeprefix("/"))
     except ValueError:
-        raise ValueError(f"`aperture` (={text!r}) must be an f-number, such as 4 or f/4") from None
+        raise ValueError(f"`{name}` (={text!r}) must be an f-number, such as 4 or f/4") from None
 
 
 def scene_files(scenes: Any, on_error: str) -> Any:

@@ -60,7 +60,7 @@ Noise = Annotated[
 
 
 SourceIso = Annotated[
-    float | None, typer.Option(help="ISO speed of RAW, where the file does not say its settings.")
+    float | None, typer.Option(help="ISO speed of RAW, instead of what the file says.")
 ]
 SourceShutter = Annotated[str | None, typer.Option(help="Exposure time of RAW [s].")]
 SourceAperture = Annotated[str | None, typer.Option(help="F-number of RAW.")]
@@ -103,6 +103,8 @@ def simulate(
         if path is not None and path.suffix.lower() != suffix:
             raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
+    if noise == "sensor":
+        source.camera.read_noise(iso)  # refuses a camera without its calibration
     for name, path in (("out", out), ("png", png)):
         if path is not None:
             make_folder(path.parent, name=name, file=path)
@@ -162,7 +164,9 @@ def source_settings(
         raise ValueError(
             "give all of --source-iso, --source-shutter and --source-aperture, or none"
         )
-    return CameraSettings(iso, parse_seconds(shutter), parse_f_number(aperture))
+    return CameraSettings(
+        iso, parse_seconds(shutter, "source-shutter"), parse_f_number(aperture, "source-aperture")
+    )
 
 
 def _write_png(path: Path, raw: RawImage) -> Path:

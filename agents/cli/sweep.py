@@ -64,13 +64,14 @@ def sweep(
     check_tolerance(tolerance)
     device = torch_device(device)
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
+    simulator = make_simulator(weights, device, cache)
     make_folder(out)
     scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth, cache)
     sheet = out / "contact_sheet.png"
     save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
     files = {"contact sheet": sheet}
     if dngs:
-        grid, simulator = ExposureGrid.default(), make_simulator(weights, device, cache)
+        grid = ExposureGrid.default()
         prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
         with progress_bars() as progress, progress("DNGs") as task:
             for i, settings in enumerate(grid):

@@ -47,12 +47,15 @@ def train_simulator(
 
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
+    from simulator.networks.weights import build_modules
     from simulator.training.config import load_config
-    from simulator.training.train import train_and_save
+    from simulator.training.train import load_start, train_and_save
 
     training = load_config(config)
     if seed is not None:
         training = training.model_copy(update={"seed": seed})
+    if training.start is not None:
+        load_start(training, build_modules(training.preset))
     folder = Path("runs/simulator") / config.stem if out is None else out
     make_folder(folder)
     device = torch_device(device)

@@ -22,6 +22,8 @@ _SORTED = 4096
 _WORTH_A_THREAD = 2**16
 #: Variance of the Laplacian of noise of variance 1: 4^2 + 4.
 _LAPLACIAN = 20.0
+#: Light is above white for sure where it is so by this many standard deviations of its noise.
+SURE = 4.0
 _FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
 
 
@@ -97,7 +99,7 @@ _SUMS = {"reassoc", "nnan", "nsz", "contract"}
 
 
 @kernel(fastmath=_SUMS, boundscheck=False)
-def _excess_error(share, edges, ratio, source, target, floor):  # type: ignore[no-untyped-def]
+def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ignore[no-untyped-def]
     """`LightStatistics.excess_error` of bins.
 
     Args:
@@ -107,6 +109,7 @@ def _excess_error(share, edges, ratio, source, target, floor):  # type: ignore[n
         source: (2, P) shot and read noise of the light.
         target: (2, P) shot and read noise that are wanted.
         floor: Least variance that counts as noise.
+        sure: Standard deviations of the source's noise above white from which a bin is white.
     """
     total = 0.0
     for plane in range(share.shape[0]):
@@ -120,8 +123,9 @@ def _excess_error(share, edges, ratio, source, target, floor):  # type: ignore[n
             for index in range(len(shares)):
                 wanted = read + shot * light[index]
                 given = source_read + source_shot * light[index]
+                shows = ratio * light[index] - sure * np.sqrt(given) <= 1.0
                 beyond = np.sqrt(given / (wanted if wanted > floor else floor)) - 1.0
-                beyond = beyond if beyond > 0.0 else 0.0
+                beyond = beyond if beyond > 0.0 and shows else 0.0
                 total += shares[index] * beyond * beyond
     return np.sqrt(total / 2.0)
 
@@ -213,7 +217,7 @@ class LightStatistics:
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
         noises = _numbers(source), _numbers(target)
-        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR))
+        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR, SURE))
 
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
         """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.

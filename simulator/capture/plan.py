@@ -353,7 +353,11 @@ class SimulationPlan:
         ]
         parts = [f"{name} {_short(error)}" for name, error in self.errors.items() if error >= 0.005]
         avoidable = math.hypot(self.errors["left out"], self.errors["network"])
-        within = "kept" if avoidable <= self.tolerance else "out of reach, this is the least error"
+        within = "kept"
+        if avoidable > self.tolerance:
+            within = "out of reach, the least of these networks"
+        elif self.predicted_error > self.tolerance + 0.005:
+            within = "kept by what can be chosen"
         capture, shared = self.milliseconds
         once = f" and {_short(shared)} ms once for all settings" if shared else ""
         return (
@@ -387,14 +391,14 @@ class SimulationPlan:
 
 
 def _short(number: float) -> str:
-    """Two significant digits, without an exponent up to a million."""
-    return f"{float(f'{number:.2g}'):,g}"
+    """Two significant digits, without an exponent unless it is tiny."""
+    return f"{float(f'{number:.2g}'):,.15g}"
 
 
 def _counted(number: int) -> str:
     for unit, name in ((1e9, "billion"), (1e6, "million")):
         if number >= unit:
-            return f"{number / unit:.2g} {name}"
+            return f"{_short(number / unit)} {name}"
     return str(number)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from simulator.capture.light_statistics import SURE
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
 #: Side of a block [packed pixel], and blocks that are looked at, at most about this many.
@@ -147,6 +148,8 @@ class ResidualStatistics:
         wanted = np.maximum(shot * (level * ratio) + read, _TINY)
         own = np.array(self.nlf.shot)[:, None] * level + np.array(self.nlf.read)[:, None]
         relative = own * (ratio * ratio) / wanted
+        if noise:  # what is surely white in the capture shows no error
+            share = np.where(ratio * (level - SURE * np.sqrt(own)) > 1.0, 0.0, share)
         left = variance * relative
         spread = np.square(np.sqrt(1.0 + left) - 1.0) if noise else left
         return math.sqrt(float(np.vdot(share, bias * relative + spread)))

@@ -300,5 +300,7 @@ def _noise(
         logger.warning("the NoiseProfile of the file cannot be one, and is not used")
     if camera.nlf_by_iso:
         return None, f"camera calibration ({camera.name})"
-    estimate = estimate_nlf(packed)
-    return estimate.scaled(float(box_factor**2)), "blind estimate"
+    # Clipped at black, a dark raw shows no read noise; rounding alone leaves this much.
+    rounding = NoiseLevelFunction((0.0,) * 4, tuple(1.0 / (12.0 * s**2) for s in camera.span))  # type: ignore[arg-type]
+    estimate = estimate_nlf(packed).scaled(float(box_factor**2)).at_least(rounding)
+    return estimate, "blind estimate"

@@ -98,7 +98,7 @@ class SimulatorConfig(Configuration):
                 rule = "must be given" if wanted else "must be left out"
                 raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
         for name, stage in self.stages().items():
-            if stage.crop > self.scenes.size:
+            if name != "noise" and stage.crop > self.scenes.size:
                 raise ValueError(
                     f"`{name}.crop` (={stage.crop}) must not exceed `scenes.size` "
                     f"(={self.scenes.size})"

@@ -32,8 +32,8 @@ from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
 from simulator.training.calibration import calibrate
 from simulator.training.config import SimulatorConfig, StageConfig
-from simulator.training.crops import DetailCrops, DetailPicture, NoiseBatch
-from simulator.training.data import Batch, ReferencePairs, draw_sequences
+from simulator.training.crops import DetailCrops, DetailPicture
+from simulator.training.data import ReferencePairs, draw_sequences
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.files import sibling
@@ -102,7 +102,7 @@ def train_and_save(
     with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
         torch.default_generator.manual_seed(config.seed)
         modules = build_modules(config.preset)
-    start = None if config.start is None else _started(config, modules)
+    start = None if config.start is None else load_start(config, modules)
     sources = {
         split: _Source(config, make_scenes, make_pictures, split)
         for split in ("train", "validation")
@@ -147,10 +147,17 @@ def train_and_save(
     return sibling(path, ".safetensors")
 
 
-def _started(config: SimulatorConfig, modules: nn.ModuleDict) -> dict[str, Any]:
-    """Loads the weights that the training goes on from into `modules`; what their card says."""
+def load_start(config: SimulatorConfig, modules: nn.ModuleDict) -> dict[str, Any]:
+    """Loads the weights that a training goes on from into `modules`; what their card says.
+
+    Raises:
+        ValueError: If `config.start` is not weights of this preset.
+    """
     assert config.start is not None
-    started, card = load_modules(config.start)
+    try:
+        started, card = load_modules(config.start)
+    except ValueError as error:
+        raise ValueError(f"`start` (={config.start!r}): {error}") from None
     if card["preset"] != config.preset:
         raise ValueError(
             f"`start` (={config.start!r}) must be weights of preset {config.preset!r}, "
@@ -304,6 +311,8 @@ def train_stage(
     Raises:
         ValueError: If the loss is not finite.
     """
+    from accelerate.utils import send_to_device
+
     device = accelerator.device
     loss.requires_grad_(False)
     trained.requires_grad_(True)
@@ -334,7 +343,7 @@ def train_stage(
         while clock.share < 1.0:
             optimizer.param_groups[0]["lr"] = learning_rate(clock.share, stage.learning_rate)
             batch = pairs.batch(clock.step, stage.batch, stage.crop, process=process)
-            values = wrapped(_on_device(batch, device))
+            values = wrapped(send_to_device(batch, device))
             _follow(means, values, name)
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
@@ -429,19 +438,17 @@ def _follow(means: dict[str, float], values: dict[str, torch.Tensor], name: str)
             means[key] = _SMOOTHING * means.get(key, number) + (1.0 - _SMOOTHING) * number
 
 
-def _on_device(batch: Batch | NoiseBatch, device: torch.device) -> Batch | NoiseBatch:
-    return type(batch)(*(part.to(device) for part in batch))
-
-
 @torch.no_grad()
 def validate(
     loss: nn.Module, pairs: ReferencePairs | DetailCrops, crop: int, accelerator: Accelerator
 ) -> dict[str, float]:
     """Means of the values of `loss` on 64 fixed pairs."""
+    from accelerate.utils import send_to_device
+
     means: dict[str, float] = {}
     loss.eval()
     for step in range(_VALIDATION_STEPS):
-        batch = _on_device(pairs.batch(step, _VALIDATION_BATCH, crop), accelerator.device)
+        batch = send_to_device(pairs.batch(step, _VALIDATION_BATCH, crop), accelerator.device)
         with accelerator.autocast():
             values = loss(batch)
         for key, value in values.items():

@@ -75,7 +75,12 @@ def test_every_step_runs_or_has_a_reason(
     lines = str(plan).splitlines()
     assert len(lines) == 3
     assert max(map(len, lines)) < 200
-    assert lines[1].endswith("kept)" if networks else ("kept)", "the least error)"))
+    if plan.predicted_error <= tolerance:
+        assert lines[1].endswith(f"(tolerance {tolerance:g}: kept)")
+    elif math.hypot(plan.errors["left out"], plan.errors["network"]) <= tolerance:
+        assert lines[1].endswith(("kept by what can be chosen)", "kept)"))
+    else:
+        assert lines[1].endswith("out of reach, the least of these networks)")
 
 
 def test_the_networks_run_where_they_are_needed() -> None:
@@ -343,7 +348,7 @@ def test_each_decision_says_what_it_costs() -> None:
         assert plan.network == ("nano" if found == 0.1 else None)
     assert "noise_reduction (nano)" in strict.explain()
     assert "network 0.1 (tolerance 0.2: kept)" in strict.explain()
-    assert "network 0.1 (tolerance 0.09: out of reach, this is the least error)" in str(tiny)
+    assert "network 0.1 (tolerance 0.09: out of reach, the least of these networks)" in str(tiny)
     assert "90 % bound 0.17: network" in strict.explain()
     assert "left out 0.25 (tolerance 0.3: kept)" in loose.explain()
     assert "hardly noisier" in loose.left_out["noise_reduction"]

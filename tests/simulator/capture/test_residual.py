@@ -38,14 +38,16 @@ def test_noise_that_is_left_in_a_flat_field_and_in_white_noise(variance: float) 
 
 
 def test_exposure_and_target_by_hand() -> None:
-    """Noise 1e-4 * 0.25 + 1e-6 times 8^2 on top of 2e-4 * 2 + 1e-5; squared bias of 0.09."""
-    relative = (1e-4 * 0.25 + 1e-6) * 64 / (2e-4 * 2.0 + 1e-5)
-    found = ResidualStatistics(torch.full((4, 16, 24), 0.25), nlf(1e-4, 1e-6))
+    """Noise 1e-4 * 0.05 + 1e-6 times 8^2 on top of 2e-4 * 0.4 + 1e-5; squared bias of 0.09."""
+    relative = (1e-4 * 0.05 + 1e-6) * 64 / (2e-4 * 0.4 + 1e-5)
+    found = ResidualStatistics(torch.full((4, 16, 24), 0.05), nlf(1e-4, 1e-6))
     network, target = leaves(0.09, 0.5, detailed=1e6), nlf(2e-4, 1e-5)
     expected = math.hypot(0.3 * math.sqrt(relative), math.sqrt(1 + 0.5 * relative) - 1)
     assert found.error(network, 8.0, target) == pytest.approx(expected)
     expected = math.sqrt((0.09 + 0.5) * relative)
     assert found.error(network, 8.0, target, noise=False) == pytest.approx(expected)
+    assert found.error(network, 64.0, target) == 0.0  # a white frame
+    assert found.error(network, 64.0, target, noise=False) > 1.0
     again = pickle.loads(pickle.dumps(found))
     assert again.error(network, 8.0, target, noise=False) == pytest.approx(expected)
 
