@@ -101,8 +101,9 @@ def test_a_flat_field_keeps_its_mean(simulator: CameraSimulator, size: int) -> N
         assert float((ratio - 1).abs().max()) < 0.002, (iso, level)
 
 
+@pytest.mark.xfail(strict=True, reason="0.53: the aperture stage was trained for minutes only")
 def test_opening_blurs_what_is_out_of_focus_and_only_that(simulator: CameraSimulator) -> None:
-    """Nearly half of the error of exposing alone is gone where the blur is 3 pixels or more."""
+    """Half of the error of exposing alone where the circle of confusion is 3 pixels or more."""
     camera = get_camera("nikon_z6")
     body = ReferenceCamera(camera)
     scenes = [s for s in reference_scenes("test", camera, number=10, size=128) if s.kind == "depth"]
@@ -119,7 +120,7 @@ def test_opening_blurs_what_is_out_of_focus_and_only_that(simulator: CameraSimul
         used = blurred & inner & (truth < 0.5).all(0) & (raw.data < 0.5).all(0)
         errors["before"] += float((raw.data - truth)[:, used].square().sum())
         errors["after"] += float((opened - truth)[:, used].square().sum())
-    assert math.sqrt(errors["after"] / errors["before"]) < 0.55
+    assert math.sqrt(errors["after"] / errors["before"]) < 0.5
 
 
 def test_a_sharp_picture_stays_sharp(simulator: CameraSimulator) -> None:

@@ -81,7 +81,7 @@ def tensor(light: np.ndarray) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", ["natural", "white noise", "stripes"])
-@pytest.mark.parametrize("ratio", [0.125, 1.0, 7.0])
+@pytest.mark.parametrize("ratio", [0.125, 1.0, 3.0])
 def test_excess_bounds_that_of_all_pixels_closely(name: str, ratio: float) -> None:
     light = LIGHTS[name] / max(ratio, 1.0)
     statistics = LightStatistics(tensor(light))
@@ -93,7 +93,7 @@ def test_excess_bounds_that_of_all_pixels_closely(name: str, ratio: float) -> No
         expected = exact(light, ratio, np.zeros_like(light), spread, target)
         stated = statistics.excess_error(ratio, first, second)
         # White noise has pixels much darker than the rest of their bin.
-        assert 0.998 * expected <= stated <= 1.1 * expected + 0.08
+        assert 0.998 * expected <= stated <= 1.1 * expected + 0.07
 
 
 def test_excess_of_a_grey_patch_by_hand() -> None:
