@@ -224,8 +224,8 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         raise ValueError(
             f"`scenes` (={str(spec)!r}) must hold raws ({_RAW_ENDINGS}) or radiance maps "
-            f"({', '.join(RADIANCE_SUFFIXES)}); its files end in: "
-            f"{endings or 'there are none, or the folder cannot be read'}"
+            f"({', '.join(RADIANCE_SUFFIXES)}); "
+            + (f"its files end in: {endings}" if endings else "it has no file that can be read")
         )
     return base, sorted(files, key=_natural)
 

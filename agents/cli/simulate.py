@@ -116,7 +116,7 @@ def simulate(
         console.print(text, highlight=False, soft_wrap=True)
     result = simulator.simulate(prepared, settings, seed=seed, noise=noise)  # type: ignore[arg-type]
     result = replace(result, metadata={**source.metadata, **result.metadata})
-    for line in _remarks(source, result):
+    for line in _remarks(source, result, details=details):
         print_line(line)
     write_dng(out, result)
     files = {"DNG": out}
@@ -125,15 +125,18 @@ def simulate(
     print_files(files)
 
 
-def _remarks(source: RawImage, result: RawImage) -> Iterator[str]:
-    """Lines about what the result hides at the ends of its range, and what had to be guessed."""
+def _remarks(source: RawImage, result: RawImage, *, details: bool) -> Iterator[str]:
+    """Lines about what the result hides at the ends of its range, and what had to be guessed.
+
+    The plan's details have said already how far the noise is from its calibration.
+    """
     from simulator import exposure_ratio
 
     numbers, white = result.to_mosaic(), result.camera.white_level
     ends = [(numbers == end).mean() for end in (0, white)]
     yield f"recorded: {ends[0]:.2%} of the samples at black, {ends[1]:.2%} at white"
     stops = result.camera.nlf(result.settings.iso).extrapolation
-    if stops:
+    if stops and not details:
         where = "above" if stops > 0 else "below"
         iso, camera = f"{result.settings.iso:g}", result.camera.name
         yield f"noise: ISO {iso} is {abs(stops):.1f} stops {where} the calibration of {camera}"

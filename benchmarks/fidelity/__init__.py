@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from benchmarks.fidelity import defocus, pairs, pictures
+from benchmarks.fidelity import defocus, in_focus, pairs, pictures
 from benchmarks.fidelity.models import checksums, load_models, train_missing
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, table
 
@@ -21,6 +21,7 @@ from benchmarks.harness import Benchmark, Part, Report, Row, data_root, table
 SECTIONS: dict[str, tuple[Any, str]] = {
     "pairs": (pairs, "The paper's table"),
     "defocus": (defocus, "Defocus: f/11 to f/4"),
+    "in focus": (in_focus, "Pictures in focus"),
     "pictures": (pictures, "Pictures"),
 }
 
@@ -36,6 +37,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
         for mix in pairs.PAIRS
     ]
     found.append(Part("defocus", defocus.measure, arguments))
+    found.append(Part("in focus", in_focus.measure, arguments))
     found.append(Part("pictures", pictures.measure, arguments))
     weights = checksums()
     return [replace(part, threads=1, depends=weights) for part in found]

@@ -62,9 +62,9 @@ def train_missing() -> None:
             subprocess.run([*command, str(CONFIGS / f"{name}.yaml")], cwd=ROOT, check=True)
 
 
-def checksums() -> dict[str, str]:
-    """Checksum of the weights of each model that is there."""
-    names = dict.fromkeys((*SIZES, *PRESETS, *BASELINES))
+def checksums(*names: str) -> dict[str, str]:
+    """Checksum of the weights of each of `names`, or of all models, that is there."""
+    names = names or tuple(dict.fromkeys((*SIZES, *PRESETS, *BASELINES)))
     return {n: load_modules(w)[1]["sha256"] for n in names if (w := weights(n)) is not None}
 
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 from benchmarks.fidelity.models import checksums, train_missing
 from benchmarks.harness import Benchmark, Part
 from benchmarks.work_precision import plans, precision
+from benchmarks.work_precision.methods import FAMILY
 from benchmarks.work_precision.report import report
 from benchmarks.work_precision.trials import SIZES
 
@@ -34,8 +35,10 @@ def parts(seed: int, quick: bool) -> list[Part]:
             arguments = {"split": split, "share": share, "shares": shares, **common}
             found.append(Part(f"bound {split} {share}", plans.bound, arguments))
     found += [Part(kind, plans.left_out, {"kind": kind, **common}) for kind in plans.KINDS]
-    weights = checksums()
-    return [replace(part, depends=weights) for part in found]
+    own, every = checksums(*FAMILY), checksums()
+    return [
+        replace(part, depends=every if part.task is precision.measure else own) for part in found
+    ]
 
 
 BENCHMARK = Benchmark(

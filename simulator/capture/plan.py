@@ -380,7 +380,7 @@ class SimulationPlan:
                 )
         if self.excess_noise:
             lines.append(f"noise variance {self.excess_noise:.1%} above the target's")
-        if self.clipped_source:
+        if self.clipped_source >= 5e-5:
             lines.append(f"{self.clipped_source:.2%} of the source is saturated")
         if self.extrapolated:
             lines.append(f"the ISO is {self.extrapolated:.2g} stops beyond the noise calibration")

@@ -1,8 +1,9 @@
 """What a denoising network leaves of the noise and takes from detail: predicted from the source.
 
 A network errs by the noise that it leaves and by the detail that it takes for noise. Both are, in
-units of the noise, functions of how far detail stands out of the noise. They are measured once for
-each network, on pictures that it was not trained on, and are part of its weights' card.
+units of the noise, functions of how well noise and detail can be told apart: of the error that the
+best linear filter would make. They are measured once for each network, on pictures that it was not
+trained on, and are part of its weights' card.
 """
 
 from __future__ import annotations
@@ -20,36 +21,64 @@ import torch.nn.functional as F
 from simulator.capture.light_statistics import SURE
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
-#: Side of a block [packed pixel], and blocks that are looked at, at most about this many.
-BLOCK, _BLOCKS = 8, 8192
+#: Side of a block, over which light is averaged, and of a window, over which detail is [packed
+#: pixel]; blocks that are looked at, at most about this many.
+BLOCK, _WINDOW, _BLOCKS = 8, 32, 16384
 #: Variance of the Laplacian of noise of variance 1: 4^2 + 4.
 _LAPLACIAN = 20.0
-#: Detail below this share of the noise cannot be told from none: blocks are small.
-_LEAST_DETAIL = 0.1
+#: Relative variance of its square: twice the squared autocorrelation, over as many samples.
+_CHANCE = 2.0 * (20.0**2 + 4 * 8.0**2 + 4 * 2.0**2 + 4 * 1.0**2) / 20.0**2
+#: Shares of white noise in octaves of detail, from the finest: 3/4, 3/16, ..., and what is coarser.
+_OCTAVES = (0.75, 0.1875, 0.046875, 0.015625)
+#: What the Wiener error of a window of noise alone comes to by chance.
+_LEAST = 0.003
 #: Levels of light that blocks are gathered into, for quick answers.
 _LEVELS = 24
 _TINY = 1e-30
-_TABLES = ("detail", "bias", "variance")
+_TABLES = ("wiener_error", "bias", "variance")
 
 
-def relative_detail(light: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
-    """How far detail stands out of the noise, in blocks of 8 x 8 pixels.
+def wiener_error(light: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
+    """Mean square error of the best linear filter, in units of the noise's variance.
 
-    The energy of the Laplacian, all planes together, over that of noise alone, less 1.
+    Where detail has S times the energy of the noise, the Wiener filter errs by S / (1 + S) of the
+    noise. S is estimated for each octave from the energy of the Laplacian of the light averaged
+    over 1, 2, 4 and 8 pixels, all planes together, in windows of 32 x 32 pixels.
 
     Args:
         light: (4, H, W) as recorded.
         nlf: Its noise, not zero.
 
     Returns:
-        (H // 8, W // 8), at least 0; one block for a frame of fewer pixels.
+        (H // 8, W // 8) in [0, 1], alike within a window; one block for a frame of fewer pixels.
     """
+    size = light.shape[-2:]
+    window = tuple(min(_WINDOW, n) for n in size)
+    shot, read = (torch.tensor(v)[:, None, None].to(light) for v in (nlf.shot, nlf.read))
+    noise = F.avg_pool2d(light, window).clamp_(min=0.0).mul_(shot).add_(read).clamp_(min=_TINY)
+    error = torch.zeros_like(noise[0])
+    for octave, share in enumerate(_OCTAVES):
+        if octave:
+            if min(light.shape[-2:]) < 2:
+                break
+            light, window = F.avg_pool2d(light, 2), tuple(max(1, n // 2) for n in window)
+        energy = F.avg_pool2d(_laplacian(light).square_(), window)
+        excess = (energy / noise).mean(dim=0) * (4.0**octave / _LAPLACIAN) - 1.0
+        chance = _CHANCE / (len(light) * window[0] * window[1])
+        mean, spread = excess.mean(), excess.var(correction=0).clamp(min=chance)
+        excess = mean + (1.0 - chance / spread) * (excess - mean)
+        error += share * (1.0 - 1.0 / (1.0 + excess.clamp_(min=0.0)))
+    rows, columns = (
+        (torch.arange(max(1, n // BLOCK)) * BLOCK // _WINDOW).clamp(max=windows - 1)
+        for n, windows in zip(size, error.shape, strict=True)
+    )
+    return error[rows][:, columns]
+
+
+def _laplacian(light: torch.Tensor) -> torch.Tensor:
     padded = F.pad(light[None], (1, 1, 1, 1), mode="replicate")[0]
     around = padded[:, 2:, 1:-1] + padded[:, :-2, 1:-1] + padded[:, 1:-1, 2:] + padded[:, 1:-1, :-2]
-    energy = _blocks((around - 4.0 * light).square_())
-    shot, read = (torch.tensor(v)[:, None, None].to(light) for v in (nlf.shot, nlf.read))
-    noise = _blocks(light).clamp_(min=0.0).mul_(shot).add_(read).clamp_(min=_TINY)
-    return (energy / noise).mean(dim=0).div_(_LAPLACIAN).sub_(1.0).clamp_(min=0.0)
+    return around.sub_(light, alpha=4.0)
 
 
 def _blocks(image: torch.Tensor) -> torch.Tensor:
@@ -62,13 +91,13 @@ class Residual:
     """Error of one network in units of the standard deviation of the noise that it removes.
 
     Args:
-        detail: (K,) ascending values of `relative_detail`.
+        wiener_error: (K,) ascending values of `wiener_error`.
         bias: (K,) mean square of the systematic error there: detail that is taken for noise.
         variance: (K,) mean variance of what comes out: noise that is left.
         spread: Factor on a predicted error below which 90 % of the measured ones are.
     """
 
-    detail: np.ndarray
+    wiener_error: np.ndarray
     bias: np.ndarray
     variance: np.ndarray
     spread: float
@@ -98,9 +127,9 @@ class Residual:
         rounded = {n: [float(f"{v:.4g}") for v in t] for n, t in tables.items()}
         return {**rounded, "spread": round(self.spread, 3)}
 
-    def at(self, detail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Squared bias and variance where `detail` stands out that far."""
-        place, knots = np.log2(detail + _LEAST_DETAIL), np.log2(self.detail + _LEAST_DETAIL)
+    def at(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Squared bias and variance where the Wiener filter has this `error`."""
+        place, knots = np.log2(error + _LEAST), np.log2(self.wiener_error + _LEAST)
         return np.interp(place, knots, self.bias), np.interp(place, knots, self.variance)
 
 
@@ -158,9 +187,9 @@ class ResidualStatistics:
         """Squared bias and variance of a network by plane and level of light, (4, L) each."""
         found = self._gathered.get(residual)
         if found is None:
-            detail, _, place, counts = self._measured
+            error, _, place, counts = self._measured
             sums = [
-                np.stack([np.bincount(p, v, _LEVELS) for p in place]) for v in residual.at(detail)
+                np.stack([np.bincount(p, v, _LEVELS) for p in place]) for v in residual.at(error)
             ]
             found = sums[0] / np.maximum(counts, 1), sums[1] / np.maximum(counts, 1)
             self._gathered[residual] = found
@@ -180,23 +209,23 @@ class ResidualStatistics:
 
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Detail (N,) and light (4, N) of blocks, their levels (4, N), and how many each has."""
+        """Wiener error (N,) and light (4, N) of blocks, their levels, and how many each has."""
         rows = _some_rows(self.light)
         parts = [self.light[:, top:bottom] for top, bottom in rows]
-        detail = torch.cat([relative_detail(part, self.nlf).flatten() for part in parts])
+        error = torch.cat([wiener_error(part, self.nlf).flatten() for part in parts])
         light = torch.cat([_blocks(part).flatten(1) for part in parts], dim=1).clamp_(min=0.0)
         values = light.double().cpu().numpy()
         order = np.argsort(np.argsort(values, axis=1), axis=1)
         place = order * _LEVELS // values.shape[1]
         counts = np.stack([np.bincount(p, minlength=_LEVELS) for p in place])
-        return detail.double().cpu().numpy(), values, place, counts
+        return error.double().cpu().numpy(), values, place, counts
 
 
 def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
     """First row, and row after the last, of the bands that are looked at."""
     height, width = light.shape[-2:]
     blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
-    if blocks <= _BLOCKS or height < 2 * BLOCK:
+    if blocks <= _BLOCKS or height < 2 * _WINDOW:
         return [(0, height)]
-    step = BLOCK * math.ceil(blocks / _BLOCKS)
-    return [(top, top + BLOCK) for top in range(0, height - BLOCK + 1, step)]
+    step = _WINDOW * math.ceil(blocks / _BLOCKS)
+    return [(top, top + _WINDOW) for top in range(0, height - _WINDOW + 1, step)]

@@ -8,15 +8,15 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, relative_detail
+from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, wiener_error
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.training.crops import DetailCrops
 
-#: Values of `relative_detail` at which errors are tabulated.
-_KNOTS = np.array([0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8, 25.6, 51.2, 102.4, 409.6])
+#: Values of `wiener_error` at which errors are tabulated.
+_KNOTS = np.array([0.0, 0.003, 0.006, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
 #: Crops that are measured, how large they are, and captures of each.
-_CROPS, _SIDE, _CAPTURES = 192, 64, 6
+_CROPS, _SIDE, _CAPTURES = 192, 128, 4
 
 
 @torch.no_grad()
@@ -32,11 +32,11 @@ def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
     """
     half = _CROPS // 2
     blocks = [_measured(noise, crops, index) for index in range(_CROPS)]
-    detail, bias, left = (
+    error, bias, left = (
         np.concatenate([getattr(b, name) for b in blocks[:half]])
-        for name in ("detail", "bias", "variance")
+        for name in ("wiener_error", "bias", "variance")
     )
-    bias, left = (np.maximum(_smoothed(detail, v), 0.0) for v in (bias, left))
+    bias, left = (np.maximum(_smoothed(error, v), 0.0) for v in (bias, left))
     first = Residual(_KNOTS, bias, left, 1.0)
     ratios = []
     for own in blocks[half:]:
@@ -49,31 +49,31 @@ def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
 class _Measured(NamedTuple):
     """Errors of a network on one crop, in blocks, in units of the noise's variance."""
 
-    detail: np.ndarray
+    wiener_error: np.ndarray
     bias: np.ndarray
     variance: np.ndarray
     statistics: ResidualStatistics
 
 
 def _measured(noise: NoiseModule, crops: DetailCrops, index: int) -> _Measured:
-    batch = crops.captures(index, _CAPTURES, _SIDE)
+    batch = crops.captures(index, _CAPTURES, min(_SIDE, crops.largest))
     error = noise(batch.noisy, batch.shot, batch.read).double() - batch.clean.double()
     scale = variance_map(batch.clean, batch.shot, batch.read).double()[0]
     variance = error.var(dim=0)
     bias = error.mean(dim=0).square() - variance / _CAPTURES
     shot, read = (v[0].tolist() for v in (batch.shot, batch.read))
     nlf = NoiseLevelFunction(tuple(shot), tuple(read))
-    detail = relative_detail(batch.noisy[0], nlf).double().flatten().numpy()
+    expected = wiener_error(batch.noisy[0], nlf).double().flatten().numpy()
     squares = [
         F.avg_pool2d((v / scale)[None], BLOCK)[0].mean(dim=0).flatten().numpy()
         for v in (bias, variance)
     ]
-    return _Measured(detail, squares[0], squares[1], ResidualStatistics(batch.noisy[0], nlf))
+    return _Measured(expected, squares[0], squares[1], ResidualStatistics(batch.noisy[0], nlf))
 
 
-def _smoothed(detail: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _smoothed(error: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Means of `values` around each knot, weights falling to 0 at the neighbouring ones."""
-    place = np.interp(detail, _KNOTS, np.arange(len(_KNOTS)))
+    place = np.interp(error, _KNOTS, np.arange(len(_KNOTS)))
     weights = np.maximum(1.0 - np.abs(place[None] - np.arange(len(_KNOTS))[:, None]), 0.0)
     total = weights.sum(axis=1)
     means = (weights @ values) / np.maximum(total, 1e-12)

@@ -104,6 +104,8 @@ class DetailCrops:
         weights = np.array([_WEIGHTS.get(name, 1.0) for name in sorted(kinds)])
         self._shares = weights / weights.sum()
         self.pairs = list(pictures)
+        #: Side of the largest crop that there is [packed pixel].
+        self.largest = max(min(p.light.shape[1:]) // _photosites(p) for p in self.pairs)
 
     def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> NoiseBatch:
         """The crops of one step.
@@ -136,6 +138,10 @@ class DetailCrops:
         self, crop: int, rng: np.random.Generator
     ) -> tuple[Tensor, Tensor, Tensor, CameraProfile, int]:
         """Light, shot and read noise, camera and averaged samples of a crop."""
+        if crop > self.largest:
+            raise ValueError(
+                f"`crop` (={crop}) must not exceed the largest picture, {self.largest}"
+            )
         while True:
             kind = self.kinds[int(rng.choice(len(self.kinds), p=self._shares))]
             picture = kind[int(rng.integers(len(kind)))]
@@ -158,12 +164,16 @@ class DetailCrops:
             return planes * scale, shots, reads, camera, k
 
 
+def _photosites(picture: DetailPicture) -> int:
+    """Samples of a picture per packed pixel and side: a recorded mosaic is packed already."""
+    return 1 if picture.light.shape[0] == 4 else 2
+
+
 def _planes(
     picture: DetailPicture, crop: int, k: int, rng: np.random.Generator
 ) -> tuple[Tensor, NoiseLevelFunction] | None:
     """A crop averaged by k, its mean arbitrary, and the noise in it; None if it is too small."""
-    mosaic = picture.light.shape[0] == 4
-    side = crop * k * (1 if mosaic else 2)
+    mosaic, side = picture.light.shape[0] == 4, crop * k * _photosites(picture)
     height, width = picture.light.shape[1:]
     if side > min(height, width):
         return None

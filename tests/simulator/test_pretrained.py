@@ -40,7 +40,7 @@ def test_cards_say_how_the_weights_were_made() -> None:
         for entry in ("training", "scenes", "stages", "command", "commit", "date", "sha256"):
             assert card[entry], entry
         assert list(card["stages"]) == ["noise", "exposure", "aperture"][:stages]
-        assert set(card["residual"]) == {"detail", "bias", "variance", "spread"}
+        assert set(card["residual"]) == {"wiener_error", "bias", "variance", "spread"}
 
 
 # What follows holds for the weights that are shipped, on pictures that no training saw.

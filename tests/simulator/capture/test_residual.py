@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from simulator.capture import residual as residual_module
-from simulator.capture.residual import Residual, ResidualStatistics, relative_detail
+from simulator.capture.residual import Residual, ResidualStatistics, wiener_error
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
 
@@ -21,7 +21,7 @@ def nlf(shot: float, read: float) -> NoiseLevelFunction:
 def leaves(bias: float, variance: float, *, detailed: float = 0.0) -> Residual:
     """Squared bias and variance of a network without detail, and squared bias with much of it."""
     tables = np.array([bias, detailed]), np.full(2, variance)
-    return Residual(np.array([0.0, 1000.0]), *tables, 1.0)
+    return Residual(np.array([0.0, 1.0]), *tables, 1.0)
 
 
 @pytest.mark.parametrize("variance", [0.0, 0.3, 3.0])
@@ -62,31 +62,60 @@ def test_levels_of_light_count_by_their_share() -> None:
     assert error == pytest.approx(math.sqrt(sum(squares) / 2), rel=1e-5)
 
 
-@pytest.mark.parametrize("amplitude", [0.002, 0.05])
-def test_detail_of_waves_by_hand(amplitude: float) -> None:
-    """The Laplacian of a cos(kx) is 2 a (1 - cos k) cos(kx); that of noise has 20 variances."""
-    k = 2 * math.pi / 8
-    wave = torch.cos(k * torch.arange(64, dtype=torch.float64)).float()
-    light = (0.3 + amplitude * wave).expand(4, 32, 64)
-    noise = nlf(1e-6, 1e-7)
-    ratio = 2 * (amplitude * (1 - math.cos(k))) ** 2 / (20 * (1e-6 * 0.3 + 1e-7))
-    inner = relative_detail(light, noise)[:, 1:-1]
-    assert inner.shape == (4, 6)
-    np.testing.assert_allclose(inner.numpy(), max(ratio - 1, 0.0), rtol=1e-3)
+@pytest.mark.parametrize("amplitude", [0.0004, 0.002, 0.05])
+@pytest.mark.parametrize("size", [(32, 128), (90, 128)])
+def test_wiener_error_of_waves_by_hand(amplitude: float, size: tuple[int, int]) -> None:
+    """Octave by octave: S / (1 + S) of the noise, for shares 3/4, 3/16, 3/64 and the rest.
+
+    The mean of a wave over n pixels has sin(nk/2) / (n sin(k/2)) of its amplitude, the Laplacian of
+    a cos(nkx) is 2 a (1 - cos nk) cos(nkx), and that of noise has 20 variances.
+    """
+    k, variance, expected = 2 * math.pi / 32, 1e-6 * 0.3 + 1e-7, 0.0
+    for n, share in ((1, 3 / 4), (2, 3 / 16), (4, 3 / 64), (8, 1 / 64)):
+        left = amplitude * math.sin(n * k / 2) / (n * math.sin(k / 2))
+        energy = (2 * left * (1 - math.cos(n * k))) ** 2 / 2
+        excess = max(energy / (20 * variance / n**2) - 1.0, 0.0)
+        expected += share * excess / (1.0 + excess)
+    wave = torch.cos(k * (torch.arange(128, dtype=torch.float64) + 0.5)).float()
+    light = (0.3 + amplitude * wave).expand(4, *size)
+    error = wiener_error(light, nlf(1e-6, 1e-7))
+    assert error.shape == tuple(n // 8 for n in size)
+    np.testing.assert_allclose(error.numpy(), expected, rtol=2e-3)
+    assert (expected > 0.01) == (amplitude > 0.001)
 
 
-def test_detail_of_noise_is_small_and_of_too_much_noise_is_its_excess() -> None:
-    """Twice the deviation is four times the energy, 3 more than that of the noise."""
+def test_wiener_error_of_noise_is_hardly_any_and_of_too_much_noise_is_its_excess() -> None:
+    """Twice the deviation is four times the energy: S is 3, whatever the octave."""
     rng, noise = np.random.default_rng(1), nlf(0.0, 1e-6)
-    for scale, least, most in ((1e-3, 0.0, 0.1), (2e-3, 2.8, 3.2)):
-        light = torch.from_numpy(rng.normal(0.2, scale, (4, 128, 128)).astype(np.float32))
-        assert least <= float(relative_detail(light, noise).mean()) <= most
+    for scale, least, most in ((1e-3, 0.0, 0.005), (2e-3, 0.745, 0.755)):
+        light = torch.from_numpy(rng.normal(0.2, scale, (4, 256, 256)).astype(np.float32))
+        assert least <= float(wiener_error(light, noise).mean()) <= most
 
 
-def test_tables_are_read_by_the_logarithm_of_detail() -> None:
-    """0.3, 0.7, 1.5 and the tenth that cannot be seen: 0.4, 0.8, 1.6."""
+def test_wiener_error_is_that_of_the_place() -> None:
+    """Noise that is taken for detail in one half of the frame does not count in the other."""
+    rng = np.random.default_rng(2)
+    scale = np.where(np.arange(192) < 64, 1e-3, 8e-3)
+    light = torch.from_numpy(rng.normal(0.2, scale, (4, 100, 192)).astype(np.float32))
+    error = wiener_error(light, nlf(0.0, 1e-6))
+    assert error.shape == (12, 24)
+    assert float(error[:, :4].max()) < 0.02  # the next window borders on the other half
+    assert float(error[:, 8:].min()) > 0.95
+    assert torch.equal(error[11], error[8])  # the rest belongs to the last window
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (5, 3), (17, 64)])
+def test_wiener_error_of_small_frames(size: tuple[int, int]) -> None:
+    error = wiener_error(torch.full((4, *size), 0.2), nlf(0.0, 1e-6))
+    assert error.shape == tuple(max(1, n // 8) for n in size)
+    assert float(error.abs().max()) == 0.0
+
+
+def test_tables_are_read_by_the_logarithm_of_the_wiener_error() -> None:
+    """0.097, 0.197, 0.397 and the 0.003 that is there by chance: 0.1, 0.2, 0.4."""
     table = np.array([0.2, 0.6]), np.array([1.0, 0.0])
-    bias, variance = Residual(np.array([0.3, 1.5]), *table, 1.0).at(np.array([0, 0.3, 0.7, 1.5, 9]))
+    residual = Residual(np.array([0.097, 0.397]), *table, 1.0)
+    bias, variance = residual.at(np.array([0, 0.097, 0.197, 0.397, 1]))
     np.testing.assert_allclose(bias, [0.2, 0.2, 0.4, 0.6, 0.6])
     np.testing.assert_allclose(variance, [1.0, 1.0, 0.5, 0.0, 0.0], atol=1e-12)
 
@@ -96,7 +125,7 @@ def test_of_a_large_frame_some_rows_are_looked_at(monkeypatch: pytest.MonkeyPatc
     network, noise = leaves(0.0, 0.2, detailed=3.0), nlf(1e-3, 1e-5)
     whole = ResidualStatistics(light, noise).error(network, 2.0, noise)
     monkeypatch.setattr(residual_module, "_BLOCKS", 32)
-    monkeypatch.setattr(residual_module, "relative_detail", seen := Spy())
+    monkeypatch.setattr(residual_module, "wiener_error", seen := Spy())
     assert ResidualStatistics(light, noise).error(network, 2.0, noise) == pytest.approx(whole)
     assert seen.rows == 32
 
@@ -106,10 +135,10 @@ class Spy:
 
     def __call__(self, light: torch.Tensor, noise: NoiseLevelFunction) -> torch.Tensor:
         self.rows += light.shape[1]
-        return relative_detail(light, noise)
+        return wiener_error(light, noise)
 
 
-CARD = {"detail": [0.0, 2.0], "bias": [0.5, 0.25], "variance": [1.0, 0.75], "spread": 1.25}
+CARD = {"wiener_error": [0.0, 0.5], "bias": [0.5, 0.25], "variance": [1.0, 0.75], "spread": 1.25}
 
 
 def test_cards() -> None:

@@ -83,7 +83,7 @@ def test_tensors_of_other_networks_are_refused(saved: Path, name: str) -> None:
         ("[]", "must hold a JSON object"),
         ('{"format": [1]}', r"model card of format 2, got \[1\]"),
         ('{"format": 2}', "must hold the hash, `sha256`"),
-        ({"residual": {"detail": []}}, "must be a calibration"),
+        ({"residual": {"wiener_error": []}}, "must be a calibration"),
         *(({"preset": p}, re.escape(f"unknown preset {p!r}")) for p in ("huge", None, ["compact"])),
     ],
 )
@@ -135,7 +135,8 @@ def test_shipped_weights_load_by_name(
     (root / "pretrained").mkdir()
     for ending in (".json", ".safetensors"):
         beside(saved, ending).rename(root / "pretrained" / f"compact{ending}")
-    residual = {"detail": [0.0, 1.0], "bias": [0.2, 0.1], "variance": [0.0, 0.3], "spread": 1.5}
+    tables = {"wiener_error": [0.0, 1.0], "bias": [0.2, 0.1], "variance": [0.0, 0.3]}
+    residual = tables | {"spread": 1.5}
     save_modules(root / "pretrained/nano", build_modules("nano"), "nano", {"residual": residual})
     monkeypatch.setattr(weights, "resources", SimpleNamespace(files=lambda _: root))
     monkeypatch.chdir(saved.parent)

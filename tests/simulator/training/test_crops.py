@@ -107,3 +107,10 @@ def test_pictures_that_are_none() -> None:
     for pictures, bodies in (([], [Z6]), ([flat()], [])):
         with pytest.raises(ValueError, match="`pictures` and `cameras` must not be empty"):
             DetailCrops(pictures, bodies)
+
+
+def test_a_crop_that_no_picture_holds() -> None:
+    crops = DetailCrops([flat(side=40), picture(3, 96, 100)], [Z6])
+    assert crops.batch(0, 2, 48).noisy.shape == (2, 4, 48, 48)
+    with pytest.raises(ValueError, match=r"`crop` \(=49\) must not exceed the largest picture, 48"):
+        crops.batch(0, 1, 49)

@@ -87,7 +87,7 @@ def test_the_card_says_what_was_done(trained):
     assert list(stages) == ["noise", "exposure", "aperture"]
     assert stages["noise"]["pairs"] == 2
     tables = card["residual"]
-    assert len(tables["detail"]) == len(tables["bias"]) == len(tables["variance"])
+    assert len(tables["wiener_error"]) == len(tables["bias"]) == len(tables["variance"])
     values = {"exposure": {"loss"}, "noise": {"loss", "gain_db"}}
     values["aperture"] = {"loss", "map", "relative"}
     assert {name: set(stage["validation"]) for name, stage in stages.items()} == values
