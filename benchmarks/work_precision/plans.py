@@ -51,7 +51,7 @@ _WHITE = 1.0 - 1e-6
 def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list[Row]:
     """One row per scene, state and tolerance, of every `shares`-th scene from `share` on.
 
-    Every state is tried with the default tolerance; some of the test split with all of them.
+    Every state is tried with the default tolerance, some with all of them.
     """
     own, rows = simulator("large"), []
     known = trials((128, 128))[:3] if quick else all_trials(split)
@@ -63,8 +63,7 @@ def bound(seed: int, split: Split, share: int, shares: int, quick: bool) -> list
             wanted = noise_variance(truth, target)
             # White in the scene: no difference there can show.
             shows = torch.where(truth < _WHITE, wanted, torch.inf)
-            every = split == "test" and position % _EVERY == 0
-            for tolerance in TOLERANCES if every else (DEFAULT,):
+            for tolerance in (DEFAULT,) if position % _EVERY else TOLERANCES:
                 plan = prepared[tolerance][0].plan(settings)
                 pairs = [_before_noise(one, settings) for one in prepared[tolerance]]
                 planned = _Draws(*(torch.stack(own) for own in zip(*pairs, strict=True)))

@@ -101,7 +101,6 @@ def test_a_flat_field_keeps_its_mean(simulator: CameraSimulator, size: int) -> N
         assert float((ratio - 1).abs().max()) < 0.002, (iso, level)
 
 
-@pytest.mark.xfail(strict=True, reason="0.53: the aperture stage was trained for minutes only")
 def test_opening_blurs_what_is_out_of_focus_and_only_that(simulator: CameraSimulator) -> None:
     """Half of the error of exposing alone where the circle of confusion is 3 pixels or more."""
     camera = get_camera("nikon_z6")

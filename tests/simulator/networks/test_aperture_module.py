@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from simulator.networks.aperture_module import (
+    BLUR_FACTOR,
     DEAD_ZONE,
     LARGEST,
     ApertureModule,
@@ -71,12 +72,13 @@ def test_dead_zone_by_hand() -> None:
 
 
 def test_a_known_map_is_blurred_by_what_the_wider_aperture_adds() -> None:
-    """3 px at f/8, less the dead zone z: 9 - z^2 squared; f/4 adds 2^2 - 1 times that. A point
+    """3 px at f/8, less the dead zone z: 9 - z^2 squared, times a factor squared; f/4 adds 2^2 - 1
+        times that. A point
     becomes a spot of second moment d^2 / 16 per axis."""
     image = torch.zeros(2, 4, 41, 41)
     image[..., 20, 20] = 1.0
     output = with_map(3.0)(image, torch.zeros_like(image), F8, F4).double().numpy()
-    squared = (9 - DEAD_ZONE**2) * 3
+    squared = BLUR_FACTOR**2 * (9 - DEAD_ZONE**2) * 3
     offsets = np.arange(41) - 20
     moments = (output.sum(-1) * offsets**2).sum(-1)
     np.testing.assert_allclose(output.sum((-2, -1)), 1.0, atol=1e-5)
@@ -117,7 +119,7 @@ def test_a_picture_in_focus_is_not_touched_by_a_stray_estimate() -> None:
     assert is_defocused(diameter, image).tolist() == [0.0, 1.0]
     trusted = usable_defocus(diameter, image)
     assert float(trusted[0].max()) == 0.0
-    assert float(trusted[1].max()) == pytest.approx((6.0**2 - DEAD_ZONE**2) ** 0.5)
+    assert float(trusted[1].max()) == pytest.approx(BLUR_FACTOR * (6.0**2 - DEAD_ZONE**2) ** 0.5)
 
 
 @pytest.mark.parametrize("spread", [0.2, 1.0, 3.0])
