@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from benchmarks.captures import recorded
-from benchmarks.denoising import behind_anscombe, non_local_means
+from benchmarks.denoising import Denoiser, classical
 from benchmarks.fidelity.models import load_models, weights
 from simulator import (
     CameraSettings,
@@ -84,7 +84,7 @@ def all_methods() -> list[Method]:
     methods = [
         Method("exposure", prepare=_Exposed),
         Method("exposure+nlf", prepare=bare.prepare),
-        _with_non_local_means(bare),
+        *(_denoised_by(name, denoise, bare) for name, denoise in classical().items()),
     ]
     dtypes: list[Dtype] = ["float32"]
     if computes_bfloat16(torch.device("cpu")):
@@ -128,9 +128,8 @@ class _Exposed:
         return self._raw.data * exposure_ratio(self._raw.settings, settings)
 
 
-def _with_non_local_means(bare: CameraSimulator) -> Method:
-    """Non-local means behind the Anscombe transform, once, then as a simulator without networks."""
-    denoise = behind_anscombe(non_local_means)
+def _denoised_by(name: str, denoise: Denoiser, bare: CameraSimulator) -> Method:
+    """A denoiser, once, then as a simulator without networks."""
 
     def prepare(raw: RawImage) -> Prepared:
         prepared = bare.prepare(raw)
@@ -138,7 +137,7 @@ def _with_non_local_means(bare: CameraSimulator) -> Method:
             prepared, light=denoise(prepared.light, prepared.nlf), nlf=NoiseLevelFunction.zero()
         )
 
-    return Method("non-local means", prepare=prepare)
+    return Method(name, prepare=prepare)
 
 
 def planned(name: str, tolerance: float, dtype: Dtype = "float32") -> Method:

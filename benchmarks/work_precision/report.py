@@ -20,7 +20,8 @@ HEADLINE, QUICK = ROOT / "docs" / "images" / "work_precision.png", "work_precisi
 _COLOURS = {
     "exposure+nlf": "#E69F00",
     "exposure": "#999999",
-    "non-local means": "#CC79A7",
+    "VST + NLM": "#CC79A7",
+    "BM3D": "#AA4499",
     "large full": "#56B4E9",
     "large": "#0072B2",
     "compact": "#4477AA",

@@ -17,9 +17,9 @@ from simulator.optics.disc_bank import DiscBank, added_blur
 AperturePreset = Literal["compact", "paper"]
 #: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
 DEAD_ZONE = 1.0
-#: Factor on estimated diameters, as too little blur errs more than too much: of 1, 1.1 ... 1.3
+#: Factor on estimated diameters, as too little blur errs more than too much: of 1, 1.1 ... 1.4
 #: that with the least error on validation scenes where these are blurred by 1.5 pixels and more.
-BLUR_FACTOR = 1.25
+BLUR_FACTOR = 1.3
 #: Up to the first of these [pixel] a picture's most blurred detail counts as sharp, from the second
 #: on as defocused.
 IN_FOCUS = (1.7, 2.2)
