@@ -40,7 +40,7 @@ GRID = ExposureGrid.default()
 #: them to have a size [pixel].
 _SETS: dict[Size, tuple[dict[str, int], int, int]] = {
     (128, 128): ({"depth": 4, "flat": 2, "photograph": 2, "radiance": 4}, 12, 256),
-    (512, 768): ({"depth": 2}, 4, 768),
+    (512, 768): ({"depth": 1}, 2, 768),
 }
 _ALL_GROUPS = 32
 

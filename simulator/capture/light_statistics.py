@@ -237,7 +237,12 @@ class LightStatistics:
         return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
 
     def blur_change(
-        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+        self,
+        ratio: float,
+        source: NoiseLevelFunction,
+        target: NoiseLevelFunction,
+        *,
+        noise: bool = True,
     ) -> float:
         """What a disc of one pixel changes, in units of the target's noise; other than in
         `curvature` estimated, not bounded: the noise of the light itself is taken out.
@@ -246,10 +251,14 @@ class LightStatistics:
             ratio: Exposure ratio from the light to the target.
             source: Noise of the light, at its own exposure.
             target: Noise that the capture should have.
+            noise: Whether a capture is wanted, in which what is surely white shows no change.
         """
         bins = self._bins
+        own = _variance(bins.light, source)
         wanted = np.maximum(_variance(bins.light * ratio, target), _FLOOR)
-        detail = np.maximum(bins.disc - _LAPLACIAN * _variance(bins.light, source), 0.0)
+        detail = np.maximum(bins.disc - _LAPLACIAN * own, 0.0)
+        if noise:
+            detail = np.where(ratio * (bins.light - SURE * np.sqrt(own)) > 1.0, 0.0, detail)
         return abs(ratio) / 32.0 * _root_mean(bins.share, detail / wanted)
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:

@@ -212,7 +212,7 @@ def _small_noise(given: Situation, error: float) -> str:
         return "the source's noise is small against the target's"
     if error == 0.0:
         return "the target is at least as noisy: noise is added up to it"
-    return "the source is hardly noisier than the target, elsewhere noise is added up to it"
+    return "the source's noise beyond the target's is within the tolerance"
 
 
 def _no_aperture(given: Situation) -> Step:
@@ -365,7 +365,8 @@ class SimulationPlan:
             f"error {_short(self.predicted_error)} of the target's noise, 90 % bound "
             f"{_short(self.error_bound)}{': ' * bool(parts)}{', '.join(parts)} "
             f"(tolerance {self.tolerance:g}: {within})\n"
-            f"cost {_counted(self.operations)} operations, about {_short(capture)} ms a capture"
+            f"cost {_counted(self.operations)} operations, about {_short(max(capture, 0.01))} ms a "
+            "capture"
             f"{once}"
         )
 
@@ -379,11 +380,14 @@ class SimulationPlan:
                     f"{'runs' if step.runs else 'left out'} {step.name}: {step.reason}{error}"
                 )
         if self.excess_noise:
-            lines.append(f"noise variance {self.excess_noise:.1%} above the target's")
+            lines.append(
+                f"noise variance {1.0 + self.excess_noise:.4g} times the target's, white included"
+            )
         if self.clipped_source >= 5e-5:
             lines.append(f"{self.clipped_source:.2%} of the source is saturated")
         if self.extrapolated:
-            lines.append(f"the ISO is {self.extrapolated:.2g} stops beyond the noise calibration")
+            stops = f"{self.extrapolated:.2g} stop{'s' * (self.extrapolated != 1.0)}"
+            lines.append(f"the ISO is {stops} beyond the noise calibration")
         return "\n".join(lines)
 
     def __str__(self) -> str:

@@ -243,29 +243,34 @@ class PreparedScene:
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.source_light(exposure)
         balance = noise_balance(light, exposure)
-        depth = self._depth_error(settings, exposure)
+        depth = self._depth_error(settings, exposure, noise)
         return make_plan(settings, exposure, given, balance, self.saturated_share, depth)
 
-    def _depth_error(self, settings: CameraSettings, exposure: Exposure) -> float:
-        """Error due to a depth that is not known, in units of the target's noise."""
+    def _depth_error(self, settings: CameraSettings, exposure: Exposure, noise: bool) -> float:
+        """Error due to a depth that is not known, in units of the target's noise.
+
+        Where noise is wanted it is that of a capture, in which white is white.
+        """
         blur = self.aperture_blur
         if blur is None or settings.effective_f_number == blur.f_number:  # no map is needed
             return 0.0
         wider = (blur.f_number / settings.effective_f_number) ** 2
-        disc = self.statistics.blur_change(exposure.ratio, self.nlf, exposure.target)
+        noises = self.nlf, exposure.target
+        disc = self.statistics.blur_change(exposure.ratio, *noises, noise=noise)
         if wider <= 1.0:  # what a smaller aperture would sharpen stays blurred
             return KEPT_BLUR_ERROR * disc * blur.mean_square_diameter * (1.0 - wider)
         missed = disc * MISSED_BLUR**2 * (wider - 1.0)
-        return math.hypot(missed, DEPTH_ERROR * self._added_blur(exposure))
+        return math.hypot(missed, DEPTH_ERROR * self._added_blur(exposure, noise))
 
-    def _added_blur(self, exposure: Exposure) -> float:
+    def _added_blur(self, exposure: Exposure, noise: bool) -> float:
         """What the blur of the opening aperture changes, in units of the target's noise."""
         if exposure.opened_to is None:
             return 0.0
-        sharp = self.light if exposure.denoised is None else exposure.denoised.light
-        change = (self.source_light(exposure) - sharp).mul_(exposure.ratio).square_()
-        wanted = noise_variance(sharp * exposure.ratio, exposure.target).clamp_(min=1e-30)
-        return float((change / wanted).double().mean().sqrt())
+        light = self.light if exposure.denoised is None else exposure.denoised.light
+        lights, white = (light, self.source_light(exposure)), 1.0 if noise else float("inf")
+        sharp, opened = ((part * exposure.ratio).clamp_(max=white) for part in lights)
+        wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
+        return float(((opened - sharp).square_() / wanted).double().mean().sqrt())
 
     def source_light(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""

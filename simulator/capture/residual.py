@@ -32,6 +32,8 @@ _CHANCE = 2.0 * (20.0**2 + 4 * 8.0**2 + 4 * 2.0**2 + 4 * 1.0**2) / 20.0**2
 _OCTAVES = (0.75, 0.1875, 0.046875, 0.015625)
 #: What the Wiener error of a window of noise alone comes to by chance.
 _LEAST = 0.003
+#: A frame of n pixels keeps at least this many nths of its noise, however smooth it is.
+_FEW = 2.0
 #: Levels of light that blocks are gathered into, for quick answers.
 _LEVELS = 24
 _TINY = 1e-30
@@ -68,6 +70,7 @@ def wiener_error(light: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
         mean, spread = excess.mean(), excess.var(correction=0).clamp(min=chance)
         excess = mean + (1.0 - chance / spread) * (excess - mean)
         error += share * (1.0 - 1.0 / (1.0 + excess.clamp_(min=0.0)))
+    error.clamp_(min=min(1.0, _FEW / (size[0] * size[1])))
     rows, columns = (
         (torch.arange(max(1, n // BLOCK)) * BLOCK // _WINDOW).clamp(max=windows - 1)
         for n, windows in zip(size, error.shape, strict=True)
