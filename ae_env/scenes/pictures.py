@@ -1,6 +1,6 @@
 """Pictures with real detail at the pitch of the photosites, for the networks' training and tests.
 
-A folder of data (see docs/simulator-training.md) gives radiance maps, photographs and raws; dead
+A folder of data (see docs/networks.md) gives radiance maps, photographs and raws; dead
 leaves, charts and smooth shading are drawn. Everything is split by source group: the same place,
 subject or photographer's series is on one side only.
 """

@@ -101,7 +101,7 @@ def reference_scenes(
             whatever `number` is.
         size: Height and width [packed pixels], half as many as photosites; pictures that are
             smaller keep their size, and are left out below 128 and below `size`, which is logged.
-        data: Folder of real files (see docs/simulator-training.md), for radiance maps and further
+        data: Folder of real files (see docs/networks.md), for radiance maps and further
             photographs; None leaves them out.
         seed: Seed of the procedural groups; part of their names.
 

@@ -66,9 +66,11 @@ def sweep(
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     simulator = make_simulator(weights, device, cache)
     make_folder(out)
-    scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth, cache)
     sheet = out / "contact_sheet.png"
-    save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
+    with progress_bars() as progress, progress("contact sheet") as task:
+        scene = _small_scene(Scene.from_raw(source, scene_id=raw.stem), weights, depth, cache)
+        save_picture(sheet, contact_sheet(scene, camera=source.camera, seed=seed))
+        task(1, 1)
     files = {"contact sheet": sheet}
     if dngs:
         grid = ExposureGrid.default()

@@ -93,7 +93,8 @@ def test_a_baseline_is_compared_with_the_sample():
 @pytest.mark.parametrize("level", [0.01, 0.3])
 def test_the_noise_loss_is_the_logarithm_of_what_is_left(level):
     """Mean square 1 in units of the noise costs log 1, and 2 (1 - 0.9) for being no better; half
-    the error a quarter of it; none the floor of 3e-4. The paper's L1 is a half normal's mean."""
+    the error a quarter of it; none the floor of 3e-4. The paper's L1 is a half normal's mean
+    times the deviation."""
     data = noise_batch(level)
     for left, loss in ((1.0, 0.2), (0.5, math.log(0.25)), (0.0, math.log(3e-4))):
         halfway = partial(torch.lerp, data.clean, weight=left)
@@ -102,7 +103,9 @@ def test_the_noise_loss_is_the_logarithm_of_what_is_left(level):
         gain = 60.0 if left == 0.0 else -20 * math.log10(left)  # at most a million times
         assert float(values["gain_db"]) == pytest.approx(gain, abs=1e-4)
     paper = NoiseLoss(denoiser(lambda both: torch.zeros_like(both[:, :4]), "paper"))
-    assert paper(data)["loss"].item() == pytest.approx(math.sqrt(2 / math.pi), rel=0.03)
+    assert paper(data)["loss"].item() == pytest.approx(
+        math.sqrt(2 / math.pi * (SHOT * level + READ)), rel=0.03
+    )
 
 
 def test_the_noise_loss_counts_each_pixels_noise_and_that_of_the_whole_crop():
