@@ -16,7 +16,7 @@ from ae_env.scenes.loading import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, get_camera
-from simulator.networks.aperture_module import DEAD_ZONE
+from simulator.networks.aperture_module import BLUR_FACTOR, DEAD_ZONE
 from simulator.networks.weights import build_modules, save_modules
 from tests.ae_env.environments import assert_equal, check_parity, make_env, rollout
 from tests.ae_env.scene_files import load, write_hdr
@@ -81,7 +81,7 @@ def test_errors_name_the_value_and_the_rule(spec: object, words: str) -> None:
 #: Circle of confusion that the networks of these tests find everywhere [pixel].
 FOUND = 4.0
 #: What is left of it after the dead zone.
-DIAMETER = math.sqrt(FOUND**2 - DEAD_ZONE**2)
+DIAMETER = BLUR_FACTOR * math.sqrt(FOUND**2 - DEAD_ZONE**2)
 NOISY = CameraSettings(6400, 1 / 1024, 8)
 
 
