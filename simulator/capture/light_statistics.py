@@ -95,10 +95,11 @@ def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[
             levels[1, plane, index] = max(levels[1, plane, index], bins[index, 5])
 
 
-_SUMS = {"reassoc", "nnan", "nsz", "contract"}
+#: Floating-point rules of sums over bins.
+SUMS = {"reassoc", "nnan", "nsz", "contract"}
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
+@kernel(fastmath=SUMS, boundscheck=False)
 def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ignore[no-untyped-def]
     """`LightStatistics.excess_error` of bins.
 
@@ -130,7 +131,7 @@ def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ig
     return np.sqrt(total / 2.0)
 
 
-@kernel(fastmath=_SUMS, boundscheck=False)
+@kernel(fastmath=SUMS, boundscheck=False)
 def _curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no-untyped-def]
     """Root mean squares over bins of second differences in units of a target's noise.
 
@@ -216,7 +217,7 @@ class LightStatistics:
             return 0.0
         bins = self._bins
         # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
-        noises = _numbers(source), _numbers(target)
+        noises = noise_numbers(source), noise_numbers(target)
         return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR, SURE))
 
     def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
@@ -233,7 +234,7 @@ class LightStatistics:
         bins = self._bins
         # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
         squares = bins.edges[0], bins.disc, bins.row
-        disc, row = _curvature(bins.share, *squares, float(ratio), _numbers(target), _FLOOR)
+        disc, row = _curvature(bins.share, *squares, float(ratio), noise_numbers(target), _FLOOR)
         return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
 
     def blur_change(
@@ -334,12 +335,12 @@ class LightStatistics:
 
 
 def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
-    shot, read = _numbers(nlf)[..., None]
+    shot, read = noise_numbers(nlf)[..., None]
     return read + shot * signal
 
 
 @functools.lru_cache(maxsize=256)
-def _numbers(nlf: NoiseLevelFunction) -> np.ndarray:
+def noise_numbers(nlf: NoiseLevelFunction) -> np.ndarray:
     """(2, 4) shot and read noise of the planes."""
     return np.array([nlf.shot, nlf.read])
 

@@ -4,6 +4,8 @@ A network errs by the noise that it leaves and by the detail that it takes for n
 units of the noise, functions of how well noise and detail can be told apart: of the error that the
 best linear filter would make. They are measured once for each network, on pictures that it was not
 trained on, and are part of its weights' card.
+
+This module imports numba.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.capture.light_statistics import SURE
+from simulator.capture.light_statistics import SUMS, SURE, noise_numbers
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.utils.jit import kernel
 
 #: Side of a block, over which light is averaged, and of a window, over which detail is [packed
 #: pixel]; blocks that are looked at, at most about this many.
@@ -136,6 +139,39 @@ class Residual:
         return np.interp(place, knots, self.bias), np.interp(place, knots, self.variance)
 
 
+@kernel(fastmath=SUMS, boundscheck=False)
+def _error(bias, variance, level, share, ratio, source, target, noise, sure):  # type: ignore[no-untyped-def]
+    """`ResidualStatistics.error`.
+
+    Args:
+        bias: (P, L) squared bias of the network, in units of the source's noise.
+        variance: (P, L) variance of what comes out, in the same units.
+        level: (P, L) mean light.
+        share: (P, L) share of all samples.
+        ratio: Exposure ratio to the target.
+        source: (2, P) shot and read noise of the light.
+        target: (2, P) shot and read noise that are wanted.
+        noise: Whether noise of the target's is added.
+        sure: Standard deviations of the source's noise above white from which a level is white
+            in a noisy capture.
+    """
+    total = 0.0
+    for plane in range(level.shape[0]):
+        for index in range(level.shape[1]):
+            light = level[plane, index]
+            own = source[0, plane] * light + source[1, plane]
+            wanted = target[0, plane] * light * ratio + target[1, plane]
+            relative = own * ratio * ratio / (wanted if wanted > _TINY else _TINY)
+            left = variance[plane, index] * relative
+            if noise:
+                if ratio * (light - sure * np.sqrt(own)) > 1.0:
+                    continue
+                beyond = np.sqrt(1.0 + left) - 1.0
+                left = beyond * beyond
+            total += share[plane, index] * (bias[plane, index] * relative + left)
+    return np.sqrt(total)
+
+
 class ResidualStatistics:
     """Predicts the errors of networks on one recorded light, for any target.
 
@@ -175,16 +211,8 @@ class ResidualStatistics:
                 is an error in full.
         """
         level, share = self._levels
-        bias, variance = self._of(residual)
-        shot, read = (np.array(v)[:, None] for v in (target.shot, target.read))
-        wanted = np.maximum(shot * (level * ratio) + read, _TINY)
-        own = np.array(self.nlf.shot)[:, None] * level + np.array(self.nlf.read)[:, None]
-        relative = own * (ratio * ratio) / wanted
-        if noise:  # what is surely white in the capture shows no error
-            share = np.where(ratio * (level - SURE * np.sqrt(own)) > 1.0, 0.0, share)
-        left = variance * relative
-        spread = np.square(np.sqrt(1.0 + left) - 1.0) if noise else left
-        return math.sqrt(float(np.vdot(share, bias * relative + spread)))
+        noises = noise_numbers(self.nlf), noise_numbers(target)
+        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise, SURE))
 
     def _of(self, residual: Residual) -> tuple[np.ndarray, np.ndarray]:
         """Squared bias and variance of a network by plane and level of light, (4, L) each."""
@@ -198,17 +226,12 @@ class ResidualStatistics:
             self._gathered[residual] = found
         return found
 
-    @property
+    @functools.cached_property
     def _levels(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean light, and share of all samples, by plane and level, (4, L) each."""
-        _, _light, _place, counts = self._measured
-        return self._means, counts / counts.sum()
-
-    @functools.cached_property
-    def _means(self) -> np.ndarray:
         _, light, place, counts = self._measured
         sums = [np.bincount(p, v, _LEVELS) for p, v in zip(place, light, strict=True)]
-        return np.stack(sums) / np.maximum(counts, 1)
+        return np.stack(sums) / np.maximum(counts, 1), counts / counts.sum()
 
     @functools.cached_property
     def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -178,7 +178,9 @@ class Denoiser(nn.Module):
         sigma = (shot.float()[:, :, None, None] * clean.clamp(min=0.0)).add_(root.square()).sqrt_()
         taken = ((image.float() - clean) / sigma).clamp_(-2.0 * _LARGEST, 2.0 * _LARGEST)
         mean = _coarse_mean(_padded(taken), _MEAN_CELLS)[..., :height, :width]
-        return clean + sigma * mean
+        # Windows are smaller at the borders, so these count more than their share: made up for.
+        rest = (sigma * (taken - mean)).mean(dim=(2, 3), keepdim=True)
+        return clean + sigma * (mean + rest / sigma.mean(dim=(2, 3), keepdim=True))
 
     def _residual(self, x: Tensor) -> Tensor:
         x = self.head(x)

@@ -197,6 +197,8 @@ def in_tiles(
         raise ValueError("`fallback` (=None) must give the values of pixels that are not `needed`")
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)
+    if needed is not None and bool(needed.all()):
+        needed = None
     if needed is None and len(tiles) == 1:
         return function(*images)
     output = None if needed is None or fallback is None else fallback.clone()
