@@ -97,7 +97,7 @@ def evaluate(
     Without `--preset`, one condition: 2 episodes per scene of 8 frames, from states drawn at
     random.
 
-    Example: `ae-env evaluate --preset quick --policy matrix:tuned --policy my_policy.py:MyPolicy`
+    Example: `ae-env evaluate --preset quick --policy matrix:tuned --policy average`
     """
     options = {
         "scenes": scenes,

@@ -204,7 +204,7 @@ def next_commands(
     evaluation += ["--policy", "matrix:tuned", *own, "--out", f"{out}/meters"]
     return (
         shlex.join(evaluation),
-        "ae-env evaluate --policy my_policy.py:MyPolicy",
+        "ae-env evaluate --policy path/to/your_policy.py:YourPolicy",
         "ae-env quickstart --scenes path/to/your/raws --out my_scenes",
         "ae-env train configs/regression.yaml --out runs/regression",
     )

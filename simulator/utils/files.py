@@ -32,9 +32,14 @@ def data_folder() -> Path | None:
 
     Returns:
         The folder that ``AE_ENV_DATA`` names; where that is unset or empty, ``../shared/data``
-        beside the checkout. None if there is no such folder.
+        beside the checkout, or None if that is not there.
+
+    Raises:
+        FileNotFoundError: If the folder that is named is not there.
     """
     named = os.environ.get(DATA_VARIABLE)
+    if named and not Path(named).expanduser().is_dir():
+        raise FileNotFoundError(f"{DATA_VARIABLE} (={named!r}) must name a folder: there is none")
     beside = Path(__file__).resolve().parents[3] / "shared" / "data"
     folder = Path(named).expanduser() if named else beside
     return folder if folder.is_dir() else None

@@ -68,8 +68,11 @@ def test_targets_that_cannot_be_written(tmp_path):
 def test_the_folder_of_real_files(tmp_path, monkeypatch):
     beside = Path(__file__).resolve().parents[4] / "shared" / "data"
     unset = beside if beside.is_dir() else None
-    for value, expected in ((tmp_path, tmp_path), (tmp_path / "none", None), ("", unset)):
+    for value, expected in ((tmp_path, tmp_path), ("", unset)):
         monkeypatch.setenv("AE_ENV_DATA", str(value))
         assert data_folder() == expected
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path / "none"))
+    with pytest.raises(FileNotFoundError, match=r"AE_ENV_DATA \(='.*none'\) must name a folder"):
+        data_folder()
     monkeypatch.delenv("AE_ENV_DATA")
     assert data_folder() == unset
