@@ -11,15 +11,14 @@ from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, SceneSpec, load_scenes
 from ae_env.scenes.bundled import Split as Split
+from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
 from ae_env.scenes.loading import (
-    BUNDLED,
-    BUNDLED_PARTS,
+    NAMED,
     SceneNetworks,
     check_weights,
     is_sequence,
     without_noise,
 )
-from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
 from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
@@ -162,12 +161,12 @@ class EnvOptions:
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; of sequences, all frames.
 
-        Bundled ones stay in memory for the next environment with the same arguments.
+        Those with a name stay in memory for the next environment with the same arguments.
         """
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
         key = (self.scenes, self.split, camera, self.resolution, self.crop, finds_defocus)
-        cacheable = isinstance(self.scenes, str) and self.scenes in (*BUNDLED, *BUNDLED_PARTS)
+        cacheable = isinstance(self.scenes, str) and self.scenes in NAMED
         # A user's weights may have other content next time.
         cacheable &= not finds_defocus or self.simulator == DEFAULT_SIMULATOR
         known = _LOADED.get(key) if cacheable else None
