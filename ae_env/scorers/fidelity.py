@@ -18,8 +18,9 @@ from ae_env.scorers.protocol import Captures, DependsOn, Domain
 
 #: CIEDE2000 difference that brings the colour term to 1/e: plainly another colour.
 COLOUR_SCALE = 10.0
-#: Range of L*, for the structural similarity, and its Gaussian window's standard deviation [pixel].
-_LIGHTNESS, _SIGMA = 100.0, 1.5
+#: Range of L*, for the structural similarity; its Gaussian window's standard deviation and side
+#: [pixel]. Pictures are mirrored at their borders, so that every pixel counts, in any size.
+_LIGHTNESS, _SIGMA, _WINDOW = 100.0, 1.5, 11
 
 
 class Fidelity:
@@ -35,7 +36,7 @@ class Fidelity:
     version = 1
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W); H and W at least 11."""
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
         assert images is not None
         first, which = distinct_references(captures)
         ideal = [_lab(picture) for picture in reference_pictures(captures, first)]
@@ -51,8 +52,7 @@ def likeness(picture: np.ndarray, ideal: np.ndarray) -> float:
     difference = deltaE_ciede2000(picture, ideal)  # type: ignore[no-untyped-call]
     colour = math.exp(-float(difference.mean()) / COLOUR_SCALE)
     structure = structural_similarity(  # type: ignore[no-untyped-call]
-        picture[..., 0],
-        ideal[..., 0],
+        *(np.pad(p[..., 0], _WINDOW // 2, mode="symmetric") for p in (picture, ideal)),
         data_range=_LIGHTNESS,
         gaussian_weights=True,
         sigma=_SIGMA,
