@@ -154,8 +154,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "How to read it: [cameras](../simulator.md#cameras). Flat fields of simulated cameras, "
         "measured as EMVA 1288 has it (`benchmarks/ptc.py`), with row noise and Tukey-lambda read "
         "noise where the profile has them; mean and 95 % interval over repetitions. Off, both are "
-        "in the JSON. The engine's dark noise lies above what was put in where it is near a "
-        "digital number: it adds its rounding (1/12 DN²) to a calibration that already holds it.",
+        "in the JSON.",
         "![photon transfer curves](ptc.png)",
         "Circles: reference camera; crosses: transition engine; lines: what was put in. Intervals "
         "that hold what was put in, and the time of a frame of 4 x 128 x 128:",
