@@ -14,6 +14,7 @@ COMMANDS = [
     "convert-nima",
     "evaluate",
     "quickstart",
+    "scenes",
     "scorers",
     "simulate",
     "sweep",
