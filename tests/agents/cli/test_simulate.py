@@ -48,6 +48,12 @@ def test_a_raw_at_other_settings(ae_env, raw: RawImage, dng: Path, tmp_path: Pat
     assert read_raw(out).data.equal(back.data)
     ae_env("simulate", dng, *arguments[:-1], 4, "-o", out)
     assert not read_raw(out).data.equal(back.data)
+    before = dng.read_bytes()
+    code, _, error = ae_env("simulate", dng, *arguments, "-o", dng)
+    assert code == 2
+    assert "`out`" in error
+    assert "must not be the raw itself" in error
+    assert dng.read_bytes() == before
 
 
 @pytest.mark.parametrize(
