@@ -102,7 +102,7 @@ def simulate(
         suffix = ".dng" if name == "out" else ".png"
         if path is not None and path.suffix.lower() != suffix:
             raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
-        if path is not None and path.exists() and raw.exists() and path.samefile(raw):
+        if path is not None and path.resolve() == raw.resolve():
             raise ValueError(f"`{name}` (={str(path)!r}) must not be the raw itself")
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     if noise == "sensor":
