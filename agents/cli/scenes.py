@@ -8,12 +8,15 @@ import typer
 
 from agents.cli.console import console, print_line, progress_bars
 
-scenes = typer.Typer(no_args_is_help=True, help="Sets of real scenes.")
+scenes = typer.Typer(no_args_is_help=True)
 
 
 @scenes.callback()
 def _scenes() -> None:
-    """A group of commands, even while there is one."""
+    """Sets of real scenes.
+
+    Example: `ae-env scenes download`
+    """
 
 
 @scenes.command()
