@@ -24,6 +24,7 @@ from ae_env.options import (
     Noise,
     ObservationKind,
     Reward,
+    Source,
     Split,
 )
 from ae_env.registration import SpecProperty, names_nearest
@@ -148,6 +149,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `iso`, `exposure_time`, `f_number`, `ev100` | its settings |
     | `clipped_high`, `clipped_low` | shares of the samples at white, and at or below 2^-10 of it |
     | `excess_noise` | noise variance beyond that of the camera at these settings |
+    | `predicted_error` | the plan's error of this capture, in units of the noise that it should have: what was left out, and of a raw also what networks and saturated highlights are off by |
     | `modules` | steps of the simulator that this capture took |
     | `rewards` | dictionary of the scorer's parts, `score` and the costs |
     | `oracle_state`, `regret` | best state, and its expected score minus that of `state`; only with `with_oracle` |
@@ -167,7 +169,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     | name | default | meaning |
     |---|---|---|
-    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene` |
+    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene`; `"polyhaven"`: views of real places, `"mixed"`: as many real as procedural ones |
     | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
     | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
@@ -180,6 +182,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4 |
     | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
     | `delay` | 0 | frames between an action and the first capture that has it |
+    | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
     | `noise` | `True` | whether captures are noisy, and how the noise is made: `True` or `"bank"` looks it up in a bank of normals (`simulator.noise.generator`), `"exact"` draws it, which takes longer, `"sensor"` with row noise and tails, for cameras that have them |
@@ -212,6 +215,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         depth: Depth | float = "random",
         lighting: str | Mapping[str, Any] | Lighting = "static",
         delay: int = 0,
+        source: Source = "light",
         camera: str | CameraProfile = "nikon_z6",
         simulator: str | None = DEFAULT_SIMULATOR,
         noise: bool | Noise = True,
@@ -236,6 +240,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
             depth=depth,
             lighting=lighting,
             delay=delay,
+            source=source,
             camera=camera,
             simulator=simulator,
             noise=noise,

@@ -11,15 +11,15 @@ from ae_env.lighting import Lighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, SceneSpec, load_scenes
 from ae_env.scenes.bundled import Split as Split
+from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
 from ae_env.scenes.loading import (
-    BUNDLED,
-    BUNDLED_PARTS,
+    NAMED,
     SceneNetworks,
     check_weights,
     is_sequence,
     without_noise,
 )
-from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
+from ae_env.scenes.photographed import photographed
 from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
@@ -28,6 +28,7 @@ from simulator.camera import CameraProfile, get_camera
 from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.plan import check_tolerance
 from simulator.capture.prepared_scene import MAX_DISC_PX, MAX_IMAGE_SPEED
+from simulator.networks.denoiser import SIZES
 from simulator.utils.cache import LruCache
 
 #: Smallest frame that the default networks of the common libraries take.
@@ -38,6 +39,8 @@ Motion = Literal["random", "none"]
 Depth = Literal["random", "far", "unknown"]
 Noise = Literal["bank", "exact", "sensor"]
 Reward = Literal["capture", "expected"]
+#: What is known of a scene: its light, or one photograph of it.
+Source = Literal["light", "raw"]
 #: Longest delay [frame].
 MAX_DELAY = 16
 #: Relative tolerance of the range of settings, because nominal ones are rounded: 1/30 s for 1/32 s.
@@ -65,6 +68,7 @@ class EnvOptions:
     depth: Depth | float = "random"
     lighting: str | Mapping[str, Any] | Lighting = "static"
     delay: int = 0
+    source: Source = "light"
     camera: str | CameraProfile = "nikon_z6"
     simulator: str | None = DEFAULT_SIMULATOR
     noise: bool | Noise = True
@@ -79,6 +83,7 @@ class EnvOptions:
         check_word("observation", self.observation, get_args(ObservationKind))
         check_word("crop", self.crop, get_args(Crop))
         check_word("reward", self.reward, get_args(Reward))
+        check_word("source", self.source, get_args(Source))
         check_word("noise", self.noise, get_args(Noise), True, False)  # True is "bank"
         check_flag("sensors", self.sensors)
         check_flag("with_oracle", self.with_oracle)
@@ -162,14 +167,17 @@ class EnvOptions:
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; of sequences, all frames.
 
-        Bundled ones stay in memory for the next environment with the same arguments.
+        Those with a name stay in memory for the next environment with the same arguments.
         """
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
-        key = (self.scenes, self.split, camera, self.resolution, self.crop, finds_defocus)
-        cacheable = isinstance(self.scenes, str) and self.scenes in (*BUNDLED, *BUNDLED_PARTS)
+        needs_networks = finds_defocus or self.source == "raw"
+        networks_key = (finds_defocus, self.simulator, self.noise) if needs_networks else ()
+        size = (self.resolution, self.crop)
+        key = (self.scenes, self.split, camera, *size, self.source, *networks_key)
+        cacheable = isinstance(self.scenes, str) and self.scenes in NAMED
         # A user's weights may have other content next time.
-        cacheable &= not finds_defocus or self.simulator == DEFAULT_SIMULATOR
+        cacheable &= not needs_networks or self.simulator in (None, *SIZES)
         known = _LOADED.get(key) if cacheable else None
         if known is not None:
             return list(known)
@@ -185,6 +193,8 @@ class EnvOptions:
             crop=self.crop,
             resize=resize,
         )
+        if self.source == "raw":
+            scenes = [photographed(scene) if scene.noise_free else scene for scene in scenes]
         scenes = [self._prepared(scene, networks) for scene in scenes]
         _check_light(scenes)
         if cacheable:

@@ -27,6 +27,7 @@ from ae_env.options import (
     Noise,
     ObservationKind,
     Reward,
+    Source,
     Split,
 )
 from ae_env.registration import names_nearest
@@ -75,6 +76,7 @@ class AutoExposureVectorEnv(
         depth: Depth | float = "random",
         lighting: str | Mapping[str, Any] | Lighting = "static",
         delay: int = 0,
+        source: Source = "light",
         camera: str | CameraProfile = "nikon_z6",
         simulator: str | None = DEFAULT_SIMULATOR,
         noise: bool | Noise = True,
@@ -110,6 +112,7 @@ class AutoExposureVectorEnv(
             depth=depth,
             lighting=lighting,
             delay=delay,
+            source=source,
             camera=camera,
             simulator=simulator,
             noise=noise,

@@ -48,9 +48,9 @@ def training_scenes(scenes: SceneSpec, resolution: int = 64) -> tuple[SceneSpec,
     The others are the bundled ones, where `scenes` has too few source groups for a training split.
     """
     from ae_env.options import EnvOptions
-    from ae_env.scenes.loading import BUNDLED
+    from ae_env.scenes.loading import BUNDLED, REAL
 
-    if not isinstance(scenes, str) or scenes not in BUNDLED:
+    if not isinstance(scenes, str) or scenes not in (*BUNDLED, *REAL):
         options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
         groups = {scene.group for scene in options.load_scenes()}
         if len(groups) < MIN_TRAINING_GROUPS:

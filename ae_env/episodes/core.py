@@ -292,6 +292,7 @@ class EpisodeCore:
             "clipped_high": frames.clipped_high,
             "clipped_low": frames.clipped_low,
             "excess_noise": frames.excess_variance,
+            "predicted_error": frames.predicted_error,
             "modules": frames.modules,
         }
         if self.options.sensors:

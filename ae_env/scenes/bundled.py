@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
-import torch
 
 from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
 from ae_env.scenes.procedural import (
     GENERATOR_VERSION,
     HARD_KINDS,
     MOTION_SPEED,
-    NATIVE_SIZE,
     draw,
 )
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
+from ae_env.scenes.stored import cached_scenes
 from simulator.camera import CameraProfile
-from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.settings import CameraSettings
-from simulator.utils.cache import DiskCache, cache_key
+from simulator.utils.cache import cache_key
 
 logger = logging.getLogger(__name__)
 
@@ -75,15 +71,10 @@ def bundled_scenes(
     """
     kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
     scenes: list[Scene] = []
-    cache = DiskCache()
     for name in ["train", "test"] if split == "all" else [split]:
         key = _cache_key(name, camera, resolution, crop, size, part)
-        loaded = _from_tensors(cache.get("scenes", key), camera, resolution)
-        if loaded is None:
-            loaded = [_rounded(s) for s in _make(name, camera, resolution, crop, size, kinds)]
-            if loaded:
-                cache.put("scenes", key, _to_tensors(loaded))
-        scenes += loaded
+        made = partial(_make, name, camera, resolution, crop, size, kinds)
+        scenes += cached_scenes(key, made, camera, resolution)
     return scenes
 
 
@@ -135,19 +126,6 @@ def _procedural_scene(kind: str, index: int, camera: CameraProfile) -> Scene:
     )
 
 
-def _rounded(scene: Scene) -> Scene:
-    """The scene with its light rounded as in the cache, so that a cached run equals a fresh one."""
-    return replace(scene, light=scene.light.clamp(max=65504.0).half().float())
-
-
-# -- the cache: float16 light, and the other fields as JSON in a tensor of bytes ------------------
-
-_FIELDS = (
-    *("scene_id", "group", "illuminance", "white_balance", "kind", "hard", "median_speed"),
-    *("box_factor", "source"),
-)
-
-
 def _cache_key(
     split: str,
     camera: CameraProfile,
@@ -159,7 +137,7 @@ def _cache_key(
     return cache_key(
         {
             "generator": GENERATOR_VERSION,
-            "format": 3,
+            "format": 4,
             "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,
@@ -171,42 +149,3 @@ def _cache_key(
             "part": part,
         }
     )
-
-
-def _to_tensors(scenes: list[Scene]) -> dict[str, torch.Tensor]:
-    rows = []
-    for scene in scenes:
-        row = {name: getattr(scene, name) for name in _FIELDS}
-        reference = scene.reference
-        rows.append(
-            row | {"reference": (reference.iso, reference.exposure_time, reference.f_number)}
-        )
-    text = np.frombuffer(json.dumps(rows).encode(), np.uint8)
-    light = torch.stack([scene.light for scene in scenes]).half()
-    return {"light": light, "rows": torch.from_numpy(text.copy())}
-
-
-def _from_tensors(
-    tensors: dict[str, torch.Tensor] | None, camera: CameraProfile, resolution: int | None
-) -> list[Scene] | None:
-    """The scenes of `_to_tensors`; None if there are none, or they cannot be those asked for."""
-    if tensors is None:
-        return None
-    try:
-        rows, light = json.loads(tensors["rows"].numpy().tobytes()), tensors["light"]
-        side = NATIVE_SIZE if resolution is None else resolution
-        if light.shape != (len(rows), 4, side, side):
-            raise ValueError(f"{len(rows)} scenes of {side} x {side} have light {light.shape}")
-        return [  # `Scene` checks the values
-            Scene(
-                light=own.float(),
-                reference=CameraSettings(*row.pop("reference")),
-                camera=camera,
-                nlf=NoiseLevelFunction.zero(),
-                **row,
-            )
-            for row, own in zip(rows, light, strict=True)
-        ]
-    except (ValueError, KeyError, TypeError) as error:
-        logger.warning("the cached bundled scenes are damaged (%s) and are made again", error)
-        return None

@@ -16,6 +16,7 @@ import torch
 
 from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
+from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest
 from ae_env.utils.checks import did_you_mean
 from ae_env.utils.user_code import load_attribute
@@ -35,6 +36,10 @@ BUNDLED: dict[str, Size] = {
 }
 #: Those of one kind, or of the hard part.
 BUNDLED_PARTS = {f"bundled:{kind}": kind for kind in (*KINDS, HARD)}
+#: Views into Poly Haven's panoramas, alone and with as many procedural scenes.
+REAL = ("polyhaven", "mixed")
+#: All scenes that have a name.
+NAMED = (*BUNDLED, *BUNDLED_PARTS, *REAL)
 #: Ways to name scenes, see `load_scenes`.
 SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any]
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
@@ -57,6 +62,8 @@ def load_scenes(
             - ``"bundled"``; ``"bundled:small"``: the first two source groups of each kind;
               ``"bundled:large"``: four times the training groups, the same test groups;
               ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
+            - ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`); ``"mixed"``:
+              such views and bundled procedural scenes, as many of each;
             - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
             - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
               given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
@@ -122,6 +129,11 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
             return bundled_scenes(split, camera, resolution, request.crop, size=size, part=part)
         finest = bundled_scenes(split, camera, None, size=size, part=part)
         return [request.sized(scene) for scene in finest]
+    if spec == "polyhaven":
+        return polyhaven_scenes(request)
+    if spec == "mixed":
+        bundled = _by_name("bundled", split, request)
+        return mixed_scenes(request, [scene for scene in bundled if scene.kind != "photograph"])
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
@@ -130,12 +142,11 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
                 names = inspect.signature(found).parameters
                 found = found(**{name: given for name, given in known.items() if name in names})
             return [request.sized(scene) for scene in _checked(found, spec)]
-        bundled = [*BUNDLED, *BUNDLED_PARTS]
-        hint = did_you_mean(spec, bundled, cutoff=0.7)
+        hint = did_you_mean(spec, NAMED, cutoff=0.7)
         if hint or spec.startswith("bundled:"):
             raise ValueError(
-                f"`scenes` (={spec!r}) must be one of {bundled}, an existing file, folder or glob, "
-                f"or 'pkg.mod:attr'{hint}"
+                f"`scenes` (={spec!r}) must be one of {[*NAMED]}, an existing file, folder or "
+                f"glob, or 'pkg.mod:attr'{hint}"
             )
     return folder_scenes(spec, request)
 
@@ -152,10 +163,10 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
         if name != where and name not in known:
             hint = did_you_mean(name, known)
             raise ValueError(f"`scenes` field {name!r} must be one of {[where, *known]}{hint}")
-    if spec[where] in (*BUNDLED, *BUNDLED_PARTS):
+    if spec[where] in NAMED:
         raise ValueError(
             f"`scenes` (={dict(spec)!r}): {where!r} must be a file, folder or glob; give the name "
-            f"{spec[where]!r} itself for the bundled scenes"
+            f"{spec[where]!r} itself for those scenes"
         )
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 

@@ -188,9 +188,13 @@ def assumed_ev100(group: str) -> float:
 
 
 def perspective(
-    panorama: np.ndarray, azimuth: float, size: int, field_of_view: float = FIELD_OF_VIEW
+    panorama: np.ndarray,
+    azimuth: float,
+    size: int,
+    field_of_view: float = FIELD_OF_VIEW,
+    pitch: float = 0.0,
 ) -> np.ndarray:
-    """A level pin-hole view into an equirectangular panorama (gnomonic projection).
+    """A pin-hole view into an equirectangular panorama (gnomonic projection).
 
     Args:
         panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
@@ -198,6 +202,7 @@ def perspective(
         azimuth: Longitude of the view's middle [degrees].
         size: Height and width of the view [pixels].
         field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
+        pitch: Angle of the view's middle above the horizon [degrees].
 
     Returns:
         (3, size, size) float32. Sampled bilinearly at least as densely as the panorama has
@@ -209,11 +214,14 @@ def perspective(
     per_radian = panorama.shape[2] / (2.0 * math.pi)
     dense = max(1, math.ceil(per_radian / (size / (2.0 * half))))
     axis = half * ((np.arange(size * dense) + 0.5) / (size * dense) * 2.0 - 1.0)
-    longitude = math.radians(azimuth) + np.arctan(axis)[None, :]
-    latitude = np.arctan2(-axis[:, None], np.hypot(1.0, axis)[None, :])
+    sine, cosine = math.sin(math.radians(pitch)), math.cos(math.radians(pitch))
+    right, up = axis[None, :], cosine * -axis[:, None] + sine
+    forward = cosine + sine * axis[:, None]
+    longitude = math.radians(azimuth) + np.arctan2(right, forward)
+    latitude = np.arctan2(up, np.hypot(forward, right))
     column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
     row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
-    view = _bilinear(panorama, row, np.broadcast_to(column, row.shape))
+    view = _bilinear(panorama, row, column)
     return np.asarray(
         view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
     )
@@ -222,14 +230,15 @@ def perspective(
 def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Values of (3, H, W) at fractional positions: columns wrap around, rows are clamped."""
     height, width = image.shape[1:]
-    row = np.clip(row, 0.0, height - 1.0)
-    y0, x0 = np.floor(row).astype(int), np.floor(column).astype(int)
-    fy, fx = (row - y0).astype(np.float32), (column - x0).astype(np.float32)
-    y1, x1 = np.minimum(y0 + 1, height - 1), (x0 + 1) % width
-    x0 = x0 % width
-    above = (1.0 - fx) * image[:, y0, x0] + fx * image[:, y0, x1]
-    below = (1.0 - fx) * image[:, y1, x0] + fx * image[:, y1, x1]
-    return np.asarray((1.0 - fy) * above + fy * below)
+    wide = np.concatenate([image[..., -1:], image, image[..., :1]], axis=2)
+    # grid_sample counts from -1 to 1 over the whole pixels, of which there are two more in a row.
+    x = (np.mod(column + 0.5, width) + 1.0) * 2.0 / (width + 2) - 1.0
+    y = (row + 0.5) * 2.0 / height - 1.0
+    places = torch.from_numpy(np.stack([x, y], axis=-1).astype(np.float32))
+    values = torch.nn.functional.grid_sample(
+        torch.from_numpy(wide)[None], places[None], padding_mode="border", align_corners=False
+    )
+    return values[0].numpy()
 
 
 def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ae_env.scorers.composite import developed
+from ae_env.scorers.fidelity import distinct_references, reference_pictures
 from ae_env.scorers.luma import luma_of
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
 from ae_env.utils.model_files import find_model_file
@@ -122,7 +122,7 @@ class Matches:
         height, width = images.shape[2:]
         orb = _detector(height, width, MOST_MATCHED)
         matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-        first, which = _distinct_references(captures)
+        first, which = distinct_references(captures)
         references = [
             orb.detectAndCompute(picture, None)
             for picture in luma_bytes(reference_pictures(captures, first))
@@ -140,39 +140,6 @@ class Matches:
             )
             scores.append(inliers / len(known))
         return torch.tensor(scores, dtype=torch.float64)
-
-
-def reference_pictures(captures: Captures, which: list[int]) -> torch.Tensor:
-    """sRGB (N, 3, H, W) of the captures' scenes at the right exposure, without noise and blur.
-
-    Args:
-        captures: The captures.
-        which: Indices of N of them.
-    """
-    ratio = captures.ratio * torch.exp2(captures.ev100 - captures.proper_ev)
-    light = captures.scene_light[which] * ratio[which].to(captures.scene_light)[:, None, None, None]
-    return developed(
-        light.clamp(0.0, 1.0),
-        captures.white_balance[which],
-        [captures.colour_matrices[i] for i in which],
-    )
-
-
-def _distinct_references(captures: Captures) -> tuple[list[int], list[int]]:
-    """The first capture of each distinct reference, and the index of each capture's reference."""
-    first: list[int] = []
-    which: list[int] = []
-    by_key: dict[tuple[str, float], int] = {}
-    exposure = captures.ratio * torch.exp2(captures.ev100 - captures.proper_ev)
-    light = captures.scene_light
-    for i, (scene, ratio) in enumerate(zip(captures.scene_ids, exposure.tolist(), strict=True)):
-        key = scene, round(math.log2(ratio), 6) if 0 < ratio < math.inf else ratio
-        known = by_key.get(key)
-        if known is None or not torch.equal(light[i], light[first[known]]):
-            known = by_key[key] = len(first)
-            first.append(i)
-        which.append(known)
-    return first, which
 
 
 # -- BRISQUE --------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@
 | `exposure_measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy` |
 | `detail.py` | `shim`, `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
+| `fidelity.py` | `fidelity` |
 | `nima.py`, `niqe.py` | `nima_aesthetic`, `nima_technical`; `niqe` |
 | `opencv.py` | `brisque`, `keypoints`, `matches` |
 | `registry.py` | ``pyiqa:METRIC`` |
@@ -44,6 +45,7 @@ from ae_env.scorers.exposure_measures import (
     MidGrey,
     WellExposedness,
 )
+from ae_env.scorers.fidelity import Fidelity
 from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
 from ae_env.scorers.niqe import Niqe
 from ae_env.scorers.opencv import Brisque, Keypoints, Matches
@@ -82,6 +84,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "snr": SignalToNoise,
     "blind_noise": BlindNoise,
     "defects": Defects,
+    "fidelity": Fidelity,
     "analytic_exposure": AnalyticExposure,
     "analytic_noise": AnalyticNoise,
     "analytic_white_balance": AnalyticWhiteBalance,

@@ -18,6 +18,7 @@ from agents.cli.bench import bench
 from agents.cli.cache_command import cache
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
+from agents.cli.scenes import scenes
 from agents.cli.scorers import convert_nima, scorers
 from agents.cli.simulate import simulate
 from agents.cli.sweep import sweep
@@ -37,9 +38,10 @@ for command in (
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
+app.add_typer(scenes, name="scenes")
 
 #: Commands that go on where they were stopped.
-_RESUMING = ("quickstart", "train", "train-simulator", "evaluate", "bench")
+_RESUMING = ("quickstart", "train", "train-simulator", "evaluate", "bench", "scenes")
 #: Errors about the user's options and files.
 _USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 #: Exit status after Ctrl-C, and after SIGTERM.

@@ -36,6 +36,8 @@ class FrameStatistics:
         clipped_high: Share of the samples that are clipped high: at white.
         excess_variance: Mean over the pixels of the noise variance beyond the target's, relative
             to it; in flickering light, that of the frame's mean light.
+        predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
+            light without noise only what is left out.
         modules: Names of the steps that ran, joined by ``"+"``.
         keys: Keys of the noise, uint64.
     """
@@ -43,6 +45,7 @@ class FrameStatistics:
     clipped_low: np.ndarray
     clipped_high: np.ndarray
     excess_variance: np.ndarray
+    predicted_error: np.ndarray
     modules: np.ndarray
     keys: np.ndarray
 
@@ -176,6 +179,7 @@ class CaptureBatch:
             clipped_low=counts[:, 0] / samples,
             clipped_high=counts[:, 1] / samples,
             excess_variance=columns.excess_variance[rows],
+            predicted_error=columns.predicted_error[rows],
             modules=columns.modules[rows],
             keys=keys,
         )
@@ -187,7 +191,8 @@ class CaptureBatch:
         columns, noisy, exposures = self._rows, self.noise is not None, []
         for index, row, gain in zip(indices.tolist(), rows.tolist(), gains.tolist(), strict=True):
             prepared = self._light(index).prepared
-            exposure = prepared.exposure(self.states[row % len(self.states)], gain=gain)
+            settings = self.states[row % len(self.states)]
+            exposure = prepared.exposure(settings, gain=gain)
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
             columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
             columns.any_blurs |= bool(blurs)
@@ -195,6 +200,12 @@ class CaptureBatch:
                 columns.light[row] = prepared.source_light(exposure).contiguous()
             excess = _excess_variance(prepared.statistics, exposure) if noisy else 0.0
             columns.excess_variance[row] = excess
+            if prepared.nlf.is_zero:  # a whole plan takes longer than a step may
+                left_out = [step.error for step in exposure.steps if not step.runs]
+                columns.predicted_error[row] = math.hypot(*left_out)
+            else:
+                plan = prepared.plan(settings, noise=noisy, gain=gain)
+                columns.predicted_error[row] = plan.predicted_error
             columns.modules[row] = _modules(exposure, noisy)
             exposures.append(exposure)
         columns.table[rows] = exposure_table(exposures)
@@ -285,6 +296,7 @@ class _Rows:
         table: (5, 4) float32 each, of `exposure_table`.
         excess_variance: As in `FrameStatistics`; NaN where it depends on blurred light that is not
             made yet.
+        predicted_error: As in `FrameStatistics`.
         modules: Names of the steps, joined by ``"+"``.
         light: (4, H, W) that is exposed; where it is blurred, until its scene blurs another.
         remaining_variance: `Exposure.remaining_variance` of that light; None for all.
@@ -295,6 +307,7 @@ class _Rows:
 
     def __init__(self, count: int) -> None:
         self.gain, self.excess_variance = np.full(count, np.nan), np.zeros(count)
+        self.predicted_error = np.zeros(count)
         self.table, self.blurs = np.zeros((count, 5, 4), np.float32), np.zeros(count, bool)
         self.any_blurs = False
         objects = np.empty((4, count), object)

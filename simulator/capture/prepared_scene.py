@@ -231,14 +231,17 @@ class PreparedScene:
             steps=steps,
         )
 
-    def plan(self, settings: CameraSettings, *, noise: bool = True) -> SimulationPlan:
+    def plan(
+        self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
+    ) -> SimulationPlan:
         """Steps, reasons, predicted error and cost of a capture at `settings`.
 
         Args:
             settings: Settings to simulate.
             noise: False plans `expected`, the light without noise, instead of a capture.
+            gain: Light relative to this scene's.
         """
-        given = self._situation(settings, noise, gain=1.0)
+        given = self._situation(settings, noise, gain)
         exposure = self._exposure(settings, given)
         # A clean source lacks all of the noise: its light need not be made to see that.
         light = self.light if exposure.source.is_zero else self.source_light(exposure)

@@ -14,7 +14,7 @@ from tests.ae_env.environments import assert_equal, make_env, rollout
 
 INFO_KEYS = {
     *("scene_id", "state", "iso", "exposure_time", "f_number", "ev100"),
-    *("clipped_high", "clipped_low", "excess_noise", "modules", "rewards"),
+    *("clipped_high", "clipped_low", "excess_noise", "predicted_error", "modules", "rewards"),
 }
 
 

@@ -17,7 +17,7 @@ ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], 
 #: Values of `ODD` that an argument takes.
 TAKES: dict[str, list[Any]] = {
     **{key: [] for key in ("split", "grid", "scorer", "observation", "resolution", "crop")},
-    **{key: [] for key in ("lighting", "delay", "camera", "reward")},
+    **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
     **{key: [True] for key in ("sensors", "noise", "with_oracle")},
     **{key: [1.5] for key in ("motion", "depth")},
     **{key: [None] for key in ("simulator", "render_mode")},

@@ -14,6 +14,7 @@ COMMANDS = [
     "convert-nima",
     "evaluate",
     "quickstart",
+    "scenes",
     "scorers",
     "simulate",
     "sweep",
@@ -50,8 +51,8 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert result.exit_code == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", result.output)
     assert re.search(rf"Example: \W?ae-env {command} ", text)
-    assert ("--out" in text) == (command not in ("cache", "scorers"))
-    assert ("--seed" in text) == (command not in ("cache", "scorers", "convert-nima"))
+    assert ("--out" in text) == (command not in ("cache", "scenes", "scorers"))
+    assert ("--seed" in text) == (command not in ("cache", "scenes", "scorers", "convert-nima"))
 
 
 def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:

@@ -1,0 +1,321 @@
+"""Real places: views into panoramas of Poly Haven, under light of a known level.
+
+The assets are listed in ``configs/scenes/polyhaven.yaml``: public 1k maps (CC0) by name, with their
+kind and split. Each is looked for in the folder of real files and in the user's cache, where
+`download` puts it; nothing of it comes with the package.
+
+A map is linear but relative. How much light there is is drawn by its kind (`ILLUMINANCE`,
+log-uniform), once for each map, as the illuminance of a surface that is turned to where it gets the
+most. Every view then has the light that the map itself casts on a subject in it
+(`incident_light`), which is less where the light comes from behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from ae_env.scenes.bundled import Split
+from ae_env.scenes.radiance import native_size, perspective, read_radiance
+from ae_env.scenes.scene import Crop, Scene, SceneRequest
+from ae_env.scenes.stored import cached_scenes
+from ae_env.utils.presets import find_preset
+from simulator.camera import CameraProfile
+from simulator.utils.cache import cache_dir, cache_key
+from simulator.utils.config_file import Configuration, load_yaml
+from simulator.utils.files import data_folder
+
+logger = logging.getLogger(__name__)
+
+#: Illuminance by kind [lux], where it is most: the range that a map's is drawn from.
+ILLUMINANCE = {
+    "night": (0.5, 20.0),
+    "twilight": (10.0, 500.0),
+    "indoor": (50.0, 1_000.0),
+    "studio": (200.0, 3_000.0),
+    "backlit": (50.0, 1_000.0),
+    "tunnel": (20.0, 500.0),
+    "forest": (500.0, 10_000.0),
+    "overcast": (2_000.0, 20_000.0),
+    "low_sun": (5_000.0, 30_000.0),
+    "sun": (30_000.0, 100_000.0),
+}
+#: Kinds that count as hard.
+_HARD = ("night", "backlit", "tunnel")
+#: Views of one map, unless others are asked for.
+VIEWS = 8
+#: Fields of view [degrees], uniform: of lenses of 19 to 39 mm on a full frame.
+_FIELDS_OF_VIEW = (50.0, 85.0)
+#: Standard deviation and largest size of the pitch [degrees].
+_PITCH, _LARGEST_PITCH = 8.0, 20.0
+#: Where the maps come from, and the folder of the cache that they go to.
+URL = "https://dl.polyhaven.org/file/ph-assets/HDRIs/hdr/1k/"
+_FOLDER = "polyhaven"
+#: Seconds in which a server must answer, and go on answering.
+_TIMEOUT = 30.0
+#: Further attempts at a file that arrives broken.
+_RETRIES = 2
+#: A map with as many pixels at its very maximum was cut there; with this share at 0, below.
+_CUT_PIXELS, _CUT_SHARE = 40, 1e-3
+#: Latitudes that a surface is turned to, to find where it gets the most light [degrees].
+_TURNED = (-30.0, 0.0, 30.0, 60.0, 90.0)
+#: Side of the cells that light is summed over [pixels of a map].
+_CELL = 4
+#: Luminance of linear sRGB.
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+#: Raised when the views change.
+_VERSION = 1
+
+
+class Asset(Configuration):
+    """A panorama.
+
+    Args:
+        name: Public name.
+        kind: Kind of light.
+        split: ``"train"`` or ``"test"``.
+        group: Source group: the place; by default the asset itself.
+        file: Where it lies in a folder of real files.
+        bytes: Length of the file.
+        sha256: Of the file.
+    """
+
+    name: str = Field(pattern=r"[a-z0-9_]+")
+    kind: Literal[tuple(ILLUMINANCE)]  # type: ignore[valid-type]
+    split: Literal["train", "test"]
+    group: str | None = None
+    file: str | None = None
+    bytes: int = Field(gt=0)
+    sha256: str = Field(pattern=r"[0-9a-f]{64}")
+
+    @property
+    def place(self) -> str:
+        """Source group."""
+        return self.group or self.name
+
+    @property
+    def file_name(self) -> str:
+        """Name of the file where it is published."""
+        return f"{self.name}_1k.hdr"
+
+    @property
+    def path(self) -> Path | None:
+        """The file, in the folder of real files or in the cache; None where it is in neither."""
+        data, own = data_folder(), self.file or f"hdri_pool/{self.name}.hdr"
+        known = [] if data is None else [data / own, data / _FOLDER / self.file_name]
+        for path in (*known, cache_dir() / _FOLDER / self.file_name):
+            if path.is_file() and path.stat().st_size == self.bytes:
+                return path
+        return None
+
+
+class _AssetList(Configuration):
+    assets: tuple[Asset, ...]
+
+
+@cache
+def list_assets() -> tuple[Asset, ...]:
+    """Every asset, in the order of the list."""
+    return load_yaml(find_preset("polyhaven", "scenes"), _AssetList).assets
+
+
+def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0) -> list[Scene]:
+    """Views into the panoramas of a split, of each map one after the other.
+
+    Args:
+        request: Split, camera and size.
+        views: Views of each map, at least 1.
+        seed: Of the views' directions, their fields of view and the level of the light.
+
+    Raises:
+        FileNotFoundError: If maps are missing; the message names the command that fetches them.
+    """
+    assets = [a for a in list_assets() if request.split in ("all", a.split)]
+    missing = [asset.name for asset in assets if asset.path is None]
+    if missing:
+        raise FileNotFoundError(
+            f"`scenes` (='polyhaven'): {len(missing)} of {len(assets)} maps are missing "
+            f"({', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}), "
+            "`ae-env scenes download` fetches them; or set AE_ENV_DATA to a folder that has them"
+        )
+    camera, plain = request.camera, request.resize is Scene.resized
+    resolution = request.resolution if plain else None
+    crop: Crop = request.crop if plain else "box"
+    key = {"polyhaven": [a.sha256 for a in assets], "version": _VERSION, "views": views}
+    key |= {"seed": seed, "camera": camera.name, "colour_matrix": camera.colour_matrix}
+    key |= {"resolution": resolution, "crop": crop, "wanted": request.resolution}
+    # Kinds and levels of light may be edited without the files.
+    key |= {"kinds": [[a.kind, *ILLUMINANCE[a.kind]] for a in assets]}
+    size = native_size(request.resolution)
+    make = partial(_make, assets, camera, size, resolution, crop, views, seed)
+    scenes = cached_scenes(cache_key(key), make, camera, size if resolution is None else resolution)
+    return scenes if plain else [request.sized(scene) for scene in scenes]
+
+
+def _make(
+    assets: Sequence[Asset],
+    camera: CameraProfile,
+    size: int,
+    resolution: int | None,
+    crop: Crop,
+    views: int,
+    seed: int,
+) -> Iterator[Scene]:
+    logger.info("cutting %d views from each of %d panoramas", views, len(assets))
+    for asset in assets:
+        for scene in asset_views(asset, camera, size=size, views=views, seed=seed):
+            yield scene.resized(resolution, crop)
+
+
+def asset_views(
+    asset: Asset, camera: CameraProfile, *, size: int, views: int = VIEWS, seed: int = 0
+) -> Iterator[Scene]:
+    """The views of one map, of `size` packed pixels a side; see `polyhaven_scenes`.
+
+    The light is sampled at the pitch of the photosites, 2 x `size` a side. Where a map has fewer
+    pixels in a view, it is smooth at that pitch; averaged to half of them or less it is not.
+    """
+    path = asset.path
+    if path is None:
+        raise FileNotFoundError(f"`asset` (={asset.name!r}) must be there: ae-env scenes download")
+    panorama = read_radiance(path)
+    seen = _cells(panorama)
+    rng = np.random.default_rng([zlib.crc32(asset.name.encode()), seed])
+    low, high = np.log(ILLUMINANCE[asset.kind])
+    lux = math.exp(rng.uniform(low, high))
+    most = max(incident_light(seen, a, p) for p in _TURNED for a in range(0, 360, 30))
+    cut = "".join(f"; {where} in the map" for where in cut_values(panorama))
+    for index in range(views):
+        azimuth = (index + rng.random()) * 360.0 / views - 180.0
+        pitch = float(np.clip(_PITCH * rng.standard_normal(), -_LARGEST_PITCH, _LARGEST_PITCH))
+        angle = rng.uniform(*_FIELDS_OF_VIEW)
+        light = incident_light(seen, azimuth + 180.0, -pitch)
+        view = perspective(panorama, azimuth, 2 * size, angle, pitch)
+        yield Scene.from_radiance(
+            view * np.float32(math.pi / light),
+            camera,
+            scene_id=f"{asset.name}-{index:02d}",
+            group=asset.place,
+            illuminance=lux * min(light / most, 1.0),
+            kind=asset.kind,
+            hard=asset.kind in _HARD,
+            sampled=True,
+            source=f"Poly Haven {asset.name} (CC0), {azimuth:.0f} degrees, {angle:.0f} wide{cut}",
+        )
+
+
+def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
+    """Illuminance that a panorama casts on a surface, in units of its luminance times steradian.
+
+    What an incident-light meter reads that is held before the subject and faces the camera: turned
+    against the view. A white diffuse surface there has a luminance of it over pi.
+
+    Args:
+        panorama: (3, H, W) linear sRGB; columns are longitudes from -180 degrees, rows latitudes
+            from +90 degrees.
+        azimuth: Longitude that the surface faces [degrees].
+        pitch: Latitude that it faces [degrees]; 90 is level ground.
+    """
+    height, width = panorama.shape[1:]
+    longitude = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * math.pi
+    latitude = (0.5 - (np.arange(height) + 0.5) / height) * math.pi
+    faced, tilt = math.radians(azimuth), math.radians(pitch)
+    cosine = np.cos(latitude)[:, None] * math.cos(tilt) * np.cos(longitude - faced)[None, :]
+    cosine += np.sin(latitude)[:, None] * math.sin(tilt)
+    weight = np.maximum(cosine, 0.0) * np.cos(latitude)[:, None]
+    luminance = np.tensordot(_LUMINANCE, panorama, axes=1)
+    return float((luminance * weight).sum(dtype=np.float64) * 2.0 * math.pi**2 / (height * width))
+
+
+def cut_values(panorama: np.ndarray) -> list[str]:
+    """What a panorama (3, H, W) does not show: ``"highlights are cut"``, ``"shadows are cut"``."""
+    found = []
+    brightest = panorama.max(axis=0)
+    if int((brightest == brightest.max()).sum()) >= _CUT_PIXELS:
+        found.append("highlights are cut")
+    if float((brightest <= 0.0).mean()) >= _CUT_SHARE:
+        found.append("shadows are cut")
+    return found
+
+
+def _cells(panorama: np.ndarray) -> np.ndarray:
+    """The panorama averaged over cells, which light is summed over."""
+    height, width = (n // _CELL for n in panorama.shape[1:])
+    cut = panorama[:, : height * _CELL, : width * _CELL]
+    return np.asarray(cut.reshape(3, height, _CELL, width, _CELL).mean(axis=(2, 4)))
+
+
+def download(
+    *, url: str = URL, timeout: float = _TIMEOUT, progress: Callable[[int, int, str], None] | None
+) -> list[Path]:
+    """Fetches the maps that are missing into the cache; those that are there stay.
+
+    A file is put in place when it is complete and its hash is the list's, so a download that was
+    stopped goes on where it was. The environment's proxy (``HTTPS_PROXY``) is used.
+
+    Args:
+        url: Folder that serves ``NAME_1k.hdr``.
+        timeout: Seconds in which the server must answer, and go on answering.
+        progress: Called with the bytes that are there, all bytes, and the name of the next map.
+
+    Returns:
+        The files that were fetched.
+
+    Raises:
+        ImportError: If the extra ``hdr`` is not installed.
+        ConnectionError: If a map cannot be fetched, or is not the one of the list.
+    """
+    try:
+        import pooch
+        from requests import RequestException
+    except ImportError:
+        raise ImportError("downloading scenes needs: pip install 'ae-env[hdr]'") from None
+    pooch.get_logger().setLevel("ERROR")
+    assets = list_assets()
+    folder = cache_dir() / _FOLDER
+    store = pooch.create(
+        path=folder,
+        base_url=url if url.endswith("/") else f"{url}/",
+        registry={asset.file_name: f"sha256:{asset.sha256}" for asset in assets},
+        retry_if_failed=_RETRIES,
+    )
+    fetch = pooch.HTTPDownloader(timeout=timeout)
+    total = sum(asset.bytes for asset in assets)
+    done, fetched = 0, []
+    for asset in assets:
+        if progress is not None:
+            progress(done, total, asset.name)
+        if asset.path is None:
+            try:
+                fetched.append(Path(store.fetch(asset.file_name, downloader=fetch)))
+            except (RequestException, ValueError) as error:
+                raise ConnectionError(
+                    f"{store.get_url(asset.file_name)} cannot be fetched: "
+                    f"{' '.join(str(error).split())}; run the command again, what is there stays"
+                ) from error
+        done += asset.bytes
+    if progress is not None:
+        progress(done, total, "")
+    return fetched
+
+
+def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene]) -> list[Scene]:
+    """Real views and `procedural` scenes of the same split in equal parts.
+
+    Of whichever there are more, some are left out, evenly over the maps or the list.
+    """
+    splits: tuple[Split, ...] = ("train", "test")
+    maps = sum(a.split == request.split or request.split not in splits for a in list_assets())
+    views = math.ceil(len(procedural) / maps)
+    real = polyhaven_scenes(request, views=views)
+    by_view = sorted(range(len(real)), key=lambda i: (i % views, i // views))
+    kept = sorted(by_view[: len(procedural)])
+    return [*procedural, *(real[i] for i in kept)]

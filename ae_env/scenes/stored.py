@@ -1,0 +1,89 @@
+"""Scenes between runs: float16 light in the cache folder, the other fields as JSON beside it."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from ae_env.scenes.procedural import NATIVE_SIZE
+from ae_env.scenes.scene import Scene
+from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.settings import CameraSettings
+from simulator.utils.cache import DiskCache
+
+logger = logging.getLogger(__name__)
+
+_FIELDS = (
+    *("scene_id", "group", "illuminance", "white_balance", "kind", "hard", "median_speed"),
+    *("box_factor", "source", "sampled"),
+)
+
+
+def cached_scenes(
+    key: str, make: Callable[[], Iterable[Scene]], camera: CameraProfile, resolution: int | None
+) -> list[Scene]:
+    """Scenes without noise of `camera`, from the cache where they have been made before.
+
+    Args:
+        key: Of all that they depend on (`simulator.utils.cache.cache_key`).
+        make: Makes them, all of one size.
+        camera: In whose colours they are.
+        resolution: Packed pixels a side; None for `NATIVE_SIZE`.
+    """
+    cache = DiskCache()
+    loaded = _from_tensors(cache.get("scenes", key), camera, resolution)
+    if loaded is None:
+        loaded = [_rounded(scene) for scene in make()]
+        if loaded:
+            cache.put("scenes", key, _to_tensors(loaded))
+    return loaded
+
+
+def _rounded(scene: Scene) -> Scene:
+    """The scene with its light rounded as in the cache, so that a cached run equals a fresh one."""
+    return replace(scene, light=scene.light.clamp(max=65504.0).half().float())
+
+
+def _to_tensors(scenes: list[Scene]) -> dict[str, torch.Tensor]:
+    rows = []
+    for scene in scenes:
+        row = {name: getattr(scene, name) for name in _FIELDS}
+        reference = scene.reference
+        rows.append(
+            row | {"reference": (reference.iso, reference.exposure_time, reference.f_number)}
+        )
+    text = np.frombuffer(json.dumps(rows).encode(), np.uint8)
+    light = torch.stack([scene.light for scene in scenes]).half()
+    return {"light": light, "rows": torch.from_numpy(text.copy())}
+
+
+def _from_tensors(
+    tensors: dict[str, torch.Tensor] | None, camera: CameraProfile, resolution: int | None
+) -> list[Scene] | None:
+    """The scenes of `_to_tensors`; None if there are none, or they cannot be those asked for."""
+    if tensors is None:
+        return None
+    try:
+        rows, light = json.loads(tensors["rows"].numpy().tobytes()), tensors["light"]
+        side = NATIVE_SIZE if resolution is None else resolution
+        if light.shape != (len(rows), 4, side, side):
+            raise ValueError(f"{len(rows)} scenes of {side} x {side} have light {light.shape}")
+        return [  # `Scene` checks the values
+            Scene(
+                light=own.float(),
+                reference=CameraSettings(*row.pop("reference")),
+                camera=camera,
+                nlf=NoiseLevelFunction.zero(),
+                **row,
+            )
+            for row, own in zip(rows, light, strict=True)
+        ]
+    except (ValueError, KeyError, TypeError) as error:
+        logger.warning("the cached scenes are damaged (%s) and are made again", error)
+        return None

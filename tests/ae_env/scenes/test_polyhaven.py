@@ -1,0 +1,265 @@
+"""Poly Haven's panoramas: the list, light of the map itself, downloads from a server near by."""
+
+import hashlib
+import math
+import threading
+import time
+from collections import Counter
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+
+from ae_env.scenes import polyhaven
+from ae_env.scenes.loading import load_scenes
+from ae_env.scenes.polyhaven import (
+    ILLUMINANCE,
+    Asset,
+    asset_views,
+    cut_values,
+    download,
+    incident_light,
+    list_assets,
+)
+from ae_env.scenes.scene import WHITE_SIGNAL
+from simulator import get_camera
+
+CAMERA = get_camera("nikon_z6")
+
+
+def test_the_list_splits_places_and_each_kind_is_tested():
+    splits = {}
+    for asset in list_assets():
+        assert splits.setdefault(asset.place, asset.split) == asset.split
+    assert len({a.name for a in list_assets()}) == len(list_assets()) >= 40
+    tested = {a.kind for a in list_assets() if a.split == "test"}
+    assert tested >= {"night", "indoor", "backlit", "forest", "sun", "overcast", "studio", "tunnel"}
+    assert list(splits.values()).count("test") >= 15  # enough for intervals
+
+
+# -- light ----------------------------------------------------------------------------------------
+
+
+def panorama(light) -> np.ndarray:
+    """(3, 256, 512) grey light as a function of longitude and latitude [radians]."""
+    longitude = (np.arange(512) + 0.5) / 512 * 2 * np.pi - np.pi
+    latitude = np.pi / 2 - (np.arange(256) + 0.5) / 256 * np.pi
+    grey = np.broadcast_to(light(longitude[None, :], latitude[:, None]), (256, 512))
+    return np.repeat(grey[None], 3, axis=0).astype(np.float32)
+
+
+@pytest.mark.parametrize(("azimuth", "pitch"), [(0, 90), (17, 0), (-120, 35), (0, -90)])
+def test_an_even_sky_all_around_gives_pi_times_its_luminance(azimuth: float, pitch: float) -> None:
+    even = panorama(lambda lon, lat: 2.0 + 0.0 * lat + 0.0 * lon)
+    assert incident_light(even, azimuth, pitch) == pytest.approx(2.0 * math.pi, rel=1e-4)
+
+
+def test_a_dome_above_gives_half_of_that_to_a_wall():
+    dome = panorama(lambda lon, lat: (lat > 0) + 0.0 * lon)
+    assert incident_light(dome, 0, 90) == pytest.approx(math.pi, rel=1e-3)
+    for azimuth in (0, 45, 180):
+        assert incident_light(dome, azimuth, 0) == pytest.approx(math.pi / 2, rel=1e-3)
+    assert incident_light(dome, 0, -90) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_small_lamp_lights_a_surface_by_the_cosine():
+    at = math.radians(40), math.radians(20)
+
+    def lamp(longitude, latitude):
+        near = (abs(longitude - at[0]) < 0.03) & (abs(latitude - at[1]) < 0.03)
+        return 500.0 * near
+
+    light = panorama(lamp)
+    straight = incident_light(light, 40, 20)
+    for azimuth, pitch in ((40, 80), (70, 20), (40, -30), (-140, -20)):
+        a, p = math.radians(azimuth) - at[0], math.radians(pitch)
+        cosine = math.sin(p) * math.sin(at[1]) + math.cos(p) * math.cos(at[1]) * math.cos(a)
+        expected = straight * max(cosine, 0.0)
+        assert incident_light(light, azimuth, pitch) == pytest.approx(expected, abs=straight / 200)
+
+
+@pytest.fixture
+def an_asset(tmp_path, monkeypatch):
+    """Makes an asset of a panorama, as the file that a folder of real files holds."""
+
+    def make(light: np.ndarray, kind: str = "overcast") -> Asset:
+        import cv2
+
+        path = tmp_path / "hdri_pool" / "made.hdr"
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), light.transpose(1, 2, 0)[:, :, ::-1])
+        monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+        content = path.read_bytes()
+        digest = hashlib.sha256(content).hexdigest()
+        return Asset(name="made", kind=kind, split="test", bytes=len(content), sha256=digest)
+
+    return make
+
+
+def test_a_white_wall_under_an_even_sky_is_white_at_the_incident_light(an_asset):
+    """Even light all around: a view of it is as bright as a white surface that it lights, at every
+    level of the light."""
+    even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
+    for scene in asset_views(an_asset(even), CAMERA, size=32, views=3):
+        green = scene.light[1:3].mean().item()
+        assert green == pytest.approx(WHITE_SIGNAL, rel=0.01)
+        low, high = ILLUMINANCE["overcast"]
+        assert low <= scene.illuminance <= high
+        assert scene.sampled
+        assert scene.box_factor == 1
+
+
+def test_a_view_towards_the_light_has_less_on_its_subject(an_asset):
+    """A bright half of the world: the view into it is lit from behind."""
+    half = panorama(lambda lon, lat: np.where(np.abs(lon) < np.pi / 2, 1.0, 0.05) + 0.0 * lat)
+    lux, seen = [], []
+    for scene in asset_views(an_asset(half), CAMERA, size=16, views=16):
+        lux.append(scene.illuminance)
+        seen.append(scene.light[1].median().item())
+    order = np.argsort(lux)
+    assert lux[order[-1]] / lux[order[0]] == pytest.approx(20, rel=0.3)
+    assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
+
+
+def test_the_seed_draws_views_and_level(an_asset):
+    asset = an_asset(panorama(lambda lon, lat: 1.5 + np.cos(5 * lon) * np.cos(lat)))
+    first, again, other = (
+        [(s.illuminance, s.light.sum().item()) for s in asset_views(asset, CAMERA, size=16, seed=n)]
+        for n in (0, 0, 1)
+    )
+    assert first == again
+    assert not {lux for lux, _ in first} & {lux for lux, _ in other}
+
+
+def test_maps_that_are_cut_say_so(an_asset):
+    gradient = panorama(lambda lon, lat: 2.0 + np.sin(lat) + 0.3 * np.cos(lon))
+    assert cut_values(gradient) == []
+    assert cut_values(np.minimum(gradient, 2.9)) == ["highlights are cut"]
+    assert cut_values(np.maximum(gradient - 1.2, 0.0)) == ["shadows are cut"]
+    asset = an_asset(np.minimum(gradient, 2.9))
+    assert "highlights are cut" in next(asset_views(asset, CAMERA, size=16)).source
+
+
+# -- real maps ------------------------------------------------------------------------------------
+
+
+def test_real_scenes_alone_and_mixed(data_dir):
+    real = load_scenes("polyhaven", "test", camera=CAMERA, resolution=64)
+    assert len({s.group for s in real}) >= 15
+    assert all(s.light.shape == (4, 64, 64) and s.box_factor == 4 for s in real)
+    again = load_scenes("polyhaven", "test", camera=CAMERA, resolution=64)  # from the cache
+    assert all(a.content == b.content for a, b in zip(real, again, strict=True))
+    for scene in real:
+        assert 1e-3 < scene.illuminance <= ILLUMINANCE[scene.kind][1] * (1 + 1e-6)
+    mixed = load_scenes("mixed", "test", camera=CAMERA, resolution=64)
+    kinds = Counter(scene.source.startswith("Poly Haven") for scene in mixed)
+    assert kinds[True] == kinds[False] > 60
+    assert {s.group for s in mixed if s.source.startswith("Poly")} == {s.group for s in real}
+
+
+def test_missing_maps_name_the_command(tmp_path, monkeypatch):
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
+    with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
+        load_scenes("polyhaven", "test", camera=CAMERA)
+
+
+# -- downloads ------------------------------------------------------------------------------------
+
+CONTENT = {f"map_{i}": bytes([i]) * (5000 + i) for i in range(3)}
+
+
+@pytest.fixture
+def server(tmp_path, monkeypatch):
+    """A server of three maps; `faults` names what is wrong with the next answers of each."""
+    faults: dict[str, list[str]] = {}
+    asked: list[str] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            name = self.path.split("/")[-1].removesuffix("_1k.hdr")
+            asked.append(name)
+            content = CONTENT[name]
+            fault = faults.get(name, []).pop(0) if faults.get(name) else ""
+            if fault == "error":
+                self.send_error(503)
+                return
+            if fault == "slow":
+                time.sleep(1.5)
+            if fault == "other":
+                content = content[::-1] + b"x"
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content[:100] if fault == "truncated" else content)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    running = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=running.serve_forever, daemon=True).start()
+    assets = tuple(
+        Asset(
+            name=name,
+            kind="sun",
+            split="test",
+            bytes=len(content),
+            sha256=hashlib.sha256(content).hexdigest(),
+        )
+        for name, content in CONTENT.items()
+    )
+    monkeypatch.setattr(polyhaven, "list_assets", lambda: assets)
+    monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))
+    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    yield f"http://127.0.0.1:{running.server_port}/maps", faults, asked
+    running.shutdown()
+    running.server_close()
+
+
+def stored(tmp_path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in (tmp_path / "cache" / "polyhaven").iterdir()}
+
+
+def test_a_download_fetches_what_is_missing(server, tmp_path):
+    url, _, asked = server
+    seen: list[tuple[int, int, str]] = []
+    assert len(download(url=url, progress=lambda *values: seen.append(values))) == 3
+    assert stored(tmp_path) == {f"{name}_1k.hdr": content for name, content in CONTENT.items()}
+    total = sum(map(len, CONTENT.values()))
+    assert seen[0] == (0, total, "map_0")
+    assert seen[-1][:2] == (total, total)
+    assert download(url=url, progress=None) == []
+    assert len(asked) == 3
+
+
+@pytest.mark.parametrize("fault", ["error", "truncated", "other", "slow"])
+def test_a_broken_answer_is_asked_for_again(server, tmp_path, fault: str) -> None:
+    url, faults, asked = server
+    faults["map_1"] = [fault]
+    assert len(download(url=url, timeout=0.5, progress=None)) == 3
+    assert asked == ["map_0", "map_1", "map_1", "map_2"]
+    assert stored(tmp_path)["map_1_1k.hdr"] == CONTENT["map_1"]
+
+
+@pytest.mark.parametrize("fault", ["error", "truncated", "other"])
+def test_what_stays_broken_is_said_and_nothing_is_lost(
+    server, tmp_path, monkeypatch, fault: str
+) -> None:
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    url, faults, _ = server
+    faults["map_1"] = [fault] * 3
+    with pytest.raises(ConnectionError, match=r"map_1_1k.hdr cannot be fetched: .*what is there"):
+        download(url=url, progress=None)
+    assert set(stored(tmp_path)) == {"map_0_1k.hdr"}  # no half of a file either
+    assert len(download(url=url, progress=None)) == 2
+
+
+def test_a_proxy_is_honoured(server, monkeypatch):
+    """The proxy gets the whole address; here the server itself plays it."""
+    url, _, asked = server
+    monkeypatch.delenv("NO_PROXY")
+    monkeypatch.setenv("HTTP_PROXY", url.removesuffix("/maps"))
+    monkeypatch.setenv("http_proxy", url.removesuffix("/maps"))
+    assert len(download(url="http://maps.invalid/1k/", progress=None)) == 3
+    assert asked == list(CONTENT)
