@@ -53,14 +53,13 @@ def photographed(
     noise = noise_generator(seed, zlib.crc32(scene.scene_id.encode()), iso, ev)
     taken = ReferenceCamera(scene.camera, box_factor=k).record(light, iso, noise)
     raw = RawImage(taken, settings, scene.camera, white_balance=scene.white_balance, box_factor=k)
-    return Scene.from_raw(
-        raw,
-        scene_id=scene.scene_id,
-        group=scene.group,
-        illuminance=scene.illuminance,
-        kind=scene.kind,
-        hard=scene.hard,
-        median_speed=scene.median_speed,
-        allowed=scene.allowed,
+    known = Scene.from_raw(raw, scene_id=scene.scene_id)
+    return replace(
+        scene,
+        light=known.light,
+        reference=settings,
+        nlf=known.nlf,
+        saturated=known.saturated,
+        defocus_map=None,  # of another f-number
         source=f"{scene.source}; photographed at {settings}",
     )
