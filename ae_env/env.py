@@ -136,7 +136,8 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     ## Rewards
 
-    Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`.
+    Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`:
+    clipping and noise are those of the recorded frame.
 
     ## Info
 

@@ -139,7 +139,7 @@ def contact_sheet(
         )
     paths = _checked_paths(path, len(grid))
     scene = _averaged(scene, CAPTURE_PIXELS)
-    tables = ScoreTables(grid, camera, make_scorer(scorer), use_cache=False)
+    tables = ScoreTables(grid, camera, make_scorer(scorer))
     table = tables.table(scene, speed=speed, defocus=defocus)
     prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
     frames = prepared.stream(grid.states, seed=seed)

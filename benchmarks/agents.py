@@ -17,7 +17,7 @@ from typing import Any
 from agents.cli.console import print_files, progress_bars
 from agents.episodes import make_envs
 from agents.evaluation.engine import evaluate
-from agents.evaluation.running import cache_score_tables, fit_policies
+from agents.evaluation.running import fit_policies
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
 from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
 from agents.report.evaluation_report import write_report
@@ -86,8 +86,6 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
 def _train(jobs: dict[str, list[TrainingJob]]) -> None:
     everything = [job for own in zip(*jobs.values(), strict=True) for job in own]
     with progress_bars() as progress, ExitStack() as bars:
-        with progress("score tables") as task:
-            cache_score_tables(everything[0].config.environment, task)
         tasks = {job.name: bars.enter_context(progress(job.name)) for job in everything}
 
         def report(name: str, done: int, total: int, values: dict[str, float]) -> None:

@@ -101,7 +101,6 @@ class EpisodeCore:
         self._light = FrameLight(
             self.lighting, self.episodes, self.scenes, self.camera, options.resolution
         )
-        self._part_scores = PartScores(self.tables, self.scenes, self.episodes, static=self._static)
         self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
         self._at_rest: dict[int, PreparedScene] = {}
         frame_bytes = 16 * options.resolution**2
@@ -112,6 +111,14 @@ class EpisodeCore:
             self.camera,
             noise=_NOISES[options.noise],
             cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
+        )
+        self._part_scores = PartScores(
+            self.tables,
+            self.scenes,
+            self.episodes,
+            self._captures,
+            static=self._static,
+            expected=options.reward == "expected",
         )
 
     def _cached_frames(self) -> int:
@@ -278,7 +285,7 @@ class EpisodeCore:
         outputs: dict[str, np.ndarray] = {_OUTPUTS[self.options.observation]: raw}
         if self._part_scores.reads_images:  # else no float of every sample is made
             outputs.setdefault("signals", np.empty(raw.shape, np.float32))
-        if "flicker" in costs:
+        if "flicker" in costs or self._part_scores.reads_codes:
             outputs.setdefault("codes", np.empty(raw.shape, np.uint8))
         frames = self._captures.record(
             episodes.light_index[env_indices],
@@ -297,12 +304,14 @@ class EpisodeCore:
         }
         if self.options.sensors:
             columns["sensor_normals"] = frames.sensor_normals(2)
-        columns |= self._part_scores.of(env_indices, outputs.get("signals"), gains, rows)
+        codes = outputs.get("codes") if self._part_scores.reads_codes else None
+        images = outputs.get("signals") if self._part_scores.reads_images else None
+        columns |= self._part_scores.of(env_indices, frames, codes, images, gains, rows)
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         if "flicker" in costs:
-            codes = outputs["codes"].reshape(len(raw), -1)
-            columns["image_mean"] = codes.sum(axis=1, dtype=np.int64) / (255.0 * codes.shape[1])
+            flat = outputs["codes"].reshape(len(raw), -1)
+            columns["image_mean"] = flat.sum(axis=1, dtype=np.int64) / (255.0 * flat.shape[1])
         return columns
 
     def _prepared(self, light_index: int) -> PreparedScene:
@@ -332,21 +341,28 @@ class EpisodeCore:
 
         Takes the scores and the image means out of `columns`.
         """
-        rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
-        rewards["score"] = self._totals(rewards, env_indices)
+        if self.options.reward == "expected" and not self.tables.closed_form:
+            rewards = self._from_tables(env_indices)
+            for name in self.scorer.parts:
+                columns.pop(f"score:{name}", None)
+        else:
+            rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
+            rewards["score"] = self.scorer.totals(rewards)
         reward = rewards["score"].copy()
         for name, cost in self._costs(env_indices, columns.pop("image_mean", None)).items():
             rewards[name] = cost
             reward -= self.options.costs[name] * cost
         return rewards, reward
 
-    def _totals(self, parts: dict[str, np.ndarray], env_indices: np.ndarray) -> np.ndarray:
-        """(B,) float64 scores before costs."""
-        # A closed form is its own expectation, and needs no table of all states.
-        if self.options.reward == "expected" and not self.scorer.closed_form:
-            pairs = zip(env_indices.tolist(), self.episodes.state[env_indices], strict=True)
-            return np.array([self.score_table(env_index).mean[state] for env_index, state in pairs])
-        return self._part_scores.totals(parts, env_indices)
+    def _from_tables(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
+        """(B,) expected scores by part, and "score", where they take captures to work out."""
+        pairs = zip(env_indices.tolist(), self.episodes.state[env_indices].tolist(), strict=True)
+        found = [(self.score_table(env_index), state) for env_index, state in pairs]
+        rewards = {
+            name: np.array([table.parts[name][state] for table, state in found])
+            for name in self.scorer.parts
+        }
+        return rewards | {"score": np.array([table.mean[state] for table, state in found])}
 
     def _costs(self, env_indices: np.ndarray, means: np.ndarray | None) -> dict[str, np.ndarray]:
         """(B,) each; 0 in the first frame of an episode."""
@@ -399,6 +415,7 @@ class EpisodeCore:
                 defocus=episode.defocus,
                 gain=gain,
                 row_gain=rows,
+                prepared=self._prepared(int(self.episodes.light_index[env_index])),
             )
             known = self._tables[env_index] = (key, table)
         return known[1]

@@ -10,21 +10,27 @@ import torch
 from ae_env.episodes.state import Episodes
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
+from ae_env.scorers.protocol import Captures, reads_pixels
 from ae_env.scorers.score_table import ScoreTables
+from simulator.capture.batch import CaptureBatch, FrameStatistics
+from simulator.noise.noise_level_function import NoiseLevelFunction
 
 
 class PartScores:
-    """Scores captures; in static light, those with a closed form are cached.
+    """Scores the captures of running episodes.
+
+    Parts that look at no frame are cached in static light, and so are expectations.
 
     Args:
-        tables: The scorer, and where its closed forms are worked out.
+        tables: The scorer, and where expectations are worked out.
         scenes: Scenes that are photographed.
         episodes: The episodes that photograph them.
+        batch: What photographs them.
         static: Whether the light never changes.
+        expected: Whether the parts that are measured on frames are replaced by their expectation.
 
     Attributes:
+        reads_codes: Whether a part is measured on the codes of the frames.
         reads_images: Whether a part looks at the images.
         reads_pixels: Whether a part looks at all pixels of a frame, in torch.
     """
@@ -34,33 +40,41 @@ class PartScores:
         tables: ScoreTables,
         scenes: Sequence[Scene],
         episodes: Episodes,
+        batch: CaptureBatch,
         *,
         static: bool,
+        expected: bool,
     ) -> None:
-        self.tables, self.scorer, self.grid = tables, tables.scorer, tables.grid
+        self.tables, self.grid, self.batch = tables, tables.grid, batch
         self.scenes, self.episodes, self._static = scenes, episodes, static
-        # By `Episodes.light_index` and state, the last column that of the whole scorer; and which
-        # lights have been scored.
+        self._code_scores, self._others = tables.code_scores, tables.others
+        others = self._others
+        # By `Episodes.light_index` and state; and which lights have been scored.
         lights = len(scenes) + len(episodes.light_index)
-        self._closed = self.scorer.names("light", "blur") if static else []
-        self._closed_columns = [f"score:{name}" for name in self._closed]
-        self._scores = np.zeros((lights, len(self.grid), len(self._closed) + 1))
+        self._known = [] if others is None else others.names("light", "blur")
+        self._scores = np.zeros((lights, len(self.grid), len(self._known)))
         self._scored = np.zeros(lights, bool)
-        self.reads_images = not self.scorer.closed_form
-        self._keeps_totals = static and self.scorer.closed_form
-        others = None if static else tables.others
+        self._means = np.full((lights, len(self.grid), 3), np.nan)
+        self._box_factors = np.array([scene.box_factor for scene in scenes])
+        self.reads_images = not tables.closed_form and not expected
+        self._measures = bool(self._code_scores.parts)
+        self._expected = expected
+        self.reads_codes = self._measures and not expected
         self.reads_pixels = self.reads_images or (
-            others is not None and any(map(reads_pixels, others.parts.values()))
+            not static and others is not None and any(map(reads_pixels, others.parts.values()))
         )
 
     def forget(self, lights: np.ndarray) -> None:
         """Makes the scores under these `Episodes.light_index` unknown."""
         self._scored[lights] = False
+        self._means[lights] = np.nan
 
     def of(
         self,
         env_indices: np.ndarray,
-        frames: np.ndarray | None,
+        frames: FrameStatistics,
+        codes: np.ndarray | None,
+        images: np.ndarray | None,
         gains: np.ndarray,
         rows: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
@@ -68,51 +82,72 @@ class PartScores:
 
         Args:
             env_indices: (B,) of the environments.
-            frames: (B, 4, R, R) float32 captures, where `reads_images`.
+            frames: Statistics of their frames.
+            codes: (B, 4, R, R) uint8 of the frames, where `reads_codes`.
+            images: (B, 4, R, R) float32 frames, where `reads_images`.
             gains: (B,) light relative to the scenes' own.
             rows: (B, R) light of each row relative to that, or None; see `Captures`.
         """
-        lights, states = self.episodes.light_index[env_indices], self.episodes.state[env_indices]
-        scores: dict[str, np.ndarray] = {}
-        if self._static:
-            if not self._scored[lights].all():
-                self._score(env_indices)
-            known = self._scores[lights, states].T
-            scores = dict(zip(self._closed_columns, known, strict=False))
-            if self.scorer.closed_form:
-                return scores
-        scenes = [self.scenes[scene] for scene in self.episodes.scene[env_indices].tolist()]
-        captures = self._captures(env_indices, scenes, gains, rows)
-        parts: CompositeScorer | None = self.scorer
-        kinds: tuple[DependsOn, ...] = ("image",)
-        if not self._static:
-            fused = self.tables.fused
-            found = fused.scores(captures, fused.means(scenes, captures))
-            scores = {f"score:{name}": values for name, values in found.items()}
-            parts, kinds = self.tables.others, ("image", "light", "blur")
-        images = None if frames is None else torch.from_numpy(frames).clamp(0.0, 1.0)
-        if parts is not None:
-            for name, values in parts.score_parts(images, captures, kinds).items():
-                scores[f"score:{name}"] = values.numpy()
-        return scores
+        boxes = self._box_factors[self.episodes.scene[env_indices]]
+        brought = frames.source_noise * np.square(boxes)[:, None, None]
+        captures: Captures | None = None
+        if self.reads_images or not self._static or self._code_scores.reads_captures:
+            captures = self._captures(env_indices, gains, rows, brought)
+        scores = self._known_scores(env_indices, captures)
+        if self._measures:
+            states = self.episodes.state[env_indices]
+            if codes is None:
+                means = self._expected_means(env_indices, boxes, rows)
+            else:
+                means = self._code_scores.measured(codes, states, brought)
+            scores |= self._code_scores.scores(captures, means)
+        if images is not None and self._others is not None and captures is not None:
+            shown = torch.from_numpy(images).clamp(0.0, 1.0)
+            found = self._others.score_parts(shown, captures, ("image",))
+            scores |= {name: values.numpy() for name, values in found.items()}
+        return {f"score:{name}": values for name, values in scores.items()}
 
-    def totals(self, parts: dict[str, np.ndarray], env_indices: np.ndarray) -> np.ndarray:
-        """(B,) float64 of the whole scorer, from the scores of its parts."""
-        if self._keeps_totals:
-            lights = self.episodes.light_index[env_indices]
-            return self._scores[lights, self.episodes.state[env_indices], -1]
-        return self.scorer.totals(parts)
+    def _known_scores(
+        self, env_indices: np.ndarray, captures: Captures | None
+    ) -> dict[str, np.ndarray]:
+        """Scores of the parts that look at no frame."""
+        if self._others is None or not self._known:
+            return {}
+        if not self._static and captures is not None:
+            found = self._others.score_parts(None, captures, ("light", "blur"))
+            return {name: values.numpy() for name, values in found.items()}
+        lights, states = self.episodes.light_index[env_indices], self.episodes.state[env_indices]
+        if not self._scored[lights].all():
+            self._score(env_indices)
+        return dict(zip(self._known, self._scores[lights, states].T, strict=True))
+
+    def _expected_means(
+        self, env_indices: np.ndarray, boxes: np.ndarray, rows: np.ndarray | None
+    ) -> np.ndarray:
+        """`CodeScores.expected` of the captures; in static light, cached."""
+        lights, states = self.episodes.light_index[env_indices], self.episodes.state[env_indices]
+        missing = np.isnan(self._means[lights, states, 0]) | (not self._static)
+        if missing.any():
+            transitions = self.batch.transitions(lights[missing], states[missing])
+            gains = None if rows is None else rows[missing]
+            found = self._code_scores.expected(transitions, states[missing], boxes[missing], gains)
+            self._means[lights[missing], states[missing]] = found
+        return self._means[lights, states]
 
     def _captures(
         self,
         env_indices: np.ndarray,
-        scenes: Sequence[Scene],
         gains: np.ndarray,
         rows: np.ndarray | None,
+        brought: np.ndarray,
     ) -> Captures:
+        scenes = [self.scenes[scene] for scene in self.episodes.scene[env_indices].tolist()]
         light = None
         if not self.reads_pixels:
             light = torch.empty(1).expand(len(env_indices), *scenes[0].light.shape)
+        noises = None
+        if brought.any():
+            noises = [NoiseLevelFunction(tuple(s), tuple(r)) for s, r in brought.tolist()]
         return describe_captures(
             scenes,
             [self.grid[state] for state in self.episodes.state[env_indices].tolist()],
@@ -122,22 +157,20 @@ class PartScores:
             gain=gains,
             row_gain=rows,
             light=light,
+            source_noise=noises,
+            noisy=self.tables.noise,
         )
 
     def _score(self, env_indices: np.ndarray) -> None:
-        """Works out the scores with a closed form, where the lights of `env_indices` lack them."""
+        """Scores the parts that look at no frame, where the lights of `env_indices` lack them."""
         lights, first = np.unique(self.episodes.light_index[env_indices], return_index=True)
         missing = ~self._scored[lights]
         lights, first = lights[missing], first[missing]
         for light, env_index in zip(lights.tolist(), env_indices[first].tolist(), strict=True):
             episode = self.episodes[env_index]
-            parts = self.tables.closed_parts(
+            parts = self.tables.known_parts(
                 self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
             )
-            for column, name in enumerate(self._closed):
+            for column, name in enumerate(self._known):
                 self._scores[light, :, column] = parts[name]
-        if self.scorer.closed_form:
-            columns = np.moveaxis(self._scores[lights], -1, 0).copy()
-            totals = self.scorer.totals(dict(zip(self._closed, columns, strict=False)))
-            self._scores[lights, :, -1] = totals
         self._scored[lights] = True

@@ -12,6 +12,7 @@ import torch
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.protocol import Captures
 from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.cache import LruCache
 
@@ -29,6 +30,8 @@ def describe_captures(
     gain: np.ndarray,
     row_gain: np.ndarray | None = None,
     light: torch.Tensor | None = None,
+    source_noise: Sequence[NoiseLevelFunction] | None = None,
+    noisy: bool = True,
 ) -> Captures:
     """`Captures` of one state each of `scenes`, all (B,) long.
 
@@ -41,6 +44,8 @@ def describe_captures(
         gain: (B,) light relative to the scenes' own.
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
         light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
+        source_noise: See `Captures`.
+        noisy: See `Captures`.
     """
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
@@ -60,6 +65,8 @@ def describe_captures(
         white_balance=torch.tensor([c.white_balance for c in scenes]),
         colour_matrices=[c.camera.colour_matrix for c in scenes],
         row_gain=None if row_gain is None else torch.from_numpy(row_gain),
+        source_noise=source_noise,
+        noisy=noisy,
     )
 
 

@@ -147,7 +147,7 @@ class Balanced(CompositeScorer):
     """
 
     def __init__(self) -> None:
-        weighted: dict[str, tuple[Scorer, float]] = {
+        weighted: dict[str, tuple[Any, float]] = {
             "brightness": (Brightness(), 0.30),
             "highlights": (Highlights(), 0.15),
             "shadows": (Shadows(), 0.10),

@@ -64,6 +64,9 @@ class Captures:
         row_gain: (B, H) float64, light of each row relative to the frame's mean, which is in
             `ratio` and `proper_ev`: the bands of flickering light. None where every row of every
             capture has the same.
+        source_noise: Noise that the source of each capture brings, of a native pixel, B long; None
+            where all come from light without noise.
+        noisy: Whether the captures have noise.
     """
 
     settings: Sequence[CameraSettings]
@@ -76,6 +79,8 @@ class Captures:
     white_balance: torch.Tensor
     colour_matrices: Sequence[ColourMatrix | None]
     row_gain: torch.Tensor | None = None
+    source_noise: Sequence[NoiseLevelFunction] | None = None
+    noisy: bool = True
 
     def __len__(self) -> int:
         return len(self.settings)
@@ -96,6 +101,25 @@ class Captures:
         if self.row_gain is None:
             return light
         return light + self.row_gain.log2().to(base.dtype)[:, None, :, None]
+
+    def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
+        """Variance of a native pixel's noise in the captures, at the recorded `signal`.
+
+        The camera's own at the settings, or the source's where it brought more.
+
+        Args:
+            signal: (B, 4, ...), at least 0, white is 1.
+        """
+        variance = torch.zeros_like(signal)
+        if not self.noisy:
+            return variance
+        for noises in (self.nlf, self.source_noise or ()):
+            if noises:
+                shape = (len(self), 4, *[1] * (signal.ndim - 2))
+                shot = torch.tensor([n.shot for n in noises]).reshape(shape).to(signal)
+                read = torch.tensor([n.read for n in noises]).reshape(shape).to(signal)
+                variance = variance.maximum(signal * shot + read)
+        return variance
 
     @cached_property
     def ev100(self) -> torch.Tensor:

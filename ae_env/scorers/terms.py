@@ -1,15 +1,18 @@
-"""The built-in scorers that have a closed form on the noise-free light.
+"""The terms that `balanced` is made of, and `Banding`.
 
-The constants of the five that `balanced` is made of were frozen before any agent was trained.
+Exposure and blur are known of a capture; `Highlights`, `Shadows` and `Noise` are measured on the
+frame that was recorded. Their constants were frozen before any agent was trained.
 
-These are the definitions. The environment evaluates `Highlights`, `Shadows` and `Noise` by a fused
-kernel that reads their constants from here (`ae_env.scorers.fused`) and agrees within 1e-6.
+These are the definitions. The environment evaluates those three from the histogram of a frame's
+codes, and has their expectation in closed form (`ae_env.scorers.code_terms`).
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
+from ae_env.observation import decode_observation, encode_observation
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
 
 
@@ -55,27 +58,37 @@ class Banding:
         return 1.0 / (1.0 + (spread / self.scale) ** 2)
 
 
-class Highlights:
-    """Blown highlights: ``exp(-f / 0.15)``.
+def code_signals() -> torch.Tensor:
+    """(256,) float32 signals of the 8-bit codes; 0 up to the code of black."""
+    signals = torch.from_numpy(decode_observation(np.arange(256, dtype=np.uint8)))
+    signals[: int(encode_observation(torch.zeros(1))) + 1] = 0.0
+    return signals
 
-    f is the mean over the pixels of the largest ``sigmoid(log2(x) / 0.12)`` of its planes: the
-    share of the frame at or above sensor white.
+
+def recorded_signal(images: torch.Tensor) -> torch.Tensor:
+    """Signal of raw `images` (B, 4, H, W) as their 8-bit codes show it, at least 0.
+
+    The terms are functions of these codes, so that what rates a frame is what an agent sees of it.
+    """
+    return code_signals().to(images.device)[encode_observation(images).long()]
+
+
+class Highlights:
+    """Blown highlights: ``exp(-f / 0.15)``, f the share of pixels with a plane at white.
+
+    At white is the last of the 8-bit codes: 0.996 of sensor white or more.
 
     Attributes:
         scale: Share at which the score is 1/e, 0.15.
-        width: Of the sigmoid, 0.12 stop.
     """
 
     domain: Domain = "raw"
-    depends_on: DependsOn = "light"
     scale = 0.15
-    width = 0.12
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        brightest = captures.log2_light.amax(dim=1)  # (B, H, W); the sigmoid is monotone
-        fraction = torch.sigmoid(brightest / self.width).mean(dim=(1, 2), dtype=torch.float64)
-        return torch.exp(-fraction / self.scale)
+        blown = recorded_signal(images).amax(dim=1) >= 1.0
+        return torch.exp(-blown.double().mean(dim=(1, 2)) / self.scale)
 
 
 class Shadows:
@@ -83,45 +96,53 @@ class Shadows:
 
     Attributes:
         scale: Share at which the score is 1/e, 0.20.
-        depth: How far below white a pixel is half blocked, 9 stops.
+        depth: How far below white a sample is half blocked, 9 stops.
         width: Of the sigmoid, 0.5 stop.
     """
 
     domain: Domain = "raw"
-    depends_on: DependsOn = "light"
     scale = 0.20
     depth = 9.0
     width = 0.5
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        dark = torch.sigmoid((captures.log2_light + self.depth).mul_(-1.0 / self.width))
+        dark = self.shares(recorded_signal(images))
         return torch.exp(-dark.mean(dim=(1, 2, 3), dtype=torch.float64) / self.scale)
+
+    @classmethod
+    def shares(cls, signal: torch.Tensor) -> torch.Tensor:
+        """How far samples of a recorded `signal` are blocked, 0 to 1."""
+        stops = signal.clamp(min=2.0**-40).log2_()
+        return torch.sigmoid((stops + cls.depth).mul_(-1.0 / cls.width))
 
 
 class Noise:
     """Signal-to-noise ratio of a native sensor pixel: mean of ``s / (s + 18^1.5)``, s = SNR^1.5.
 
-    SNR is ``min(x, 1) / sqrt(shot x + read)``. The NLF is that of the sensor's own pixels, not of
-    the box-averaged frame: otherwise ISO would be nearly free.
+    SNR is ``x / sqrt(variance)`` of the recorded value x. The variance is that of the noise in the
+    frame: shot and read noise at the settings, or the source's where it brought more; none where
+    the frame has none. It is of the sensor's own pixels, not of the box-averaged frame: otherwise
+    ISO would be nearly free.
 
     Attributes:
         half_snr: SNR at which the score is a half, 18.
     """
 
     domain: Domain = "raw"
-    depends_on: DependsOn = "light"
     half_snr = 18.0
 
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        shot = torch.tensor([n.shot for n in captures.nlf])[:, :, None, None]
-        read = torch.tensor([n.read for n in captures.nlf])[:, :, None, None]
-        light = captures.light.clamp(min=0.0)
-        variance = (light * shot.to(light)).add_(read.to(light)).clamp_(min=1e-30)
-        power = (light.clamp_(max=1.0).square_() / variance).pow_(0.75)  # SNR**1.5
-        share: torch.Tensor = power / (power + self.half_snr**1.5)
-        return share.mean(dim=(1, 2, 3), dtype=torch.float64)
+        signal = recorded_signal(images)
+        shares = self.shares(signal, captures.noise_variance(signal))
+        return shares.mean(dim=(1, 2, 3), dtype=torch.float64)
+
+    @classmethod
+    def shares(cls, signal: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+        """``s / (s + 18^1.5)`` of samples of a recorded `signal`, >= 0, with this noise."""
+        power = (signal.square() / variance.clamp(min=1e-30)).pow_(0.75)  # SNR**1.5
+        return power / (power + cls.half_snr**1.5)
 
 
 class Sharpness:

@@ -120,19 +120,20 @@ def run_quickstart(
         device: Torch device of the agents' networks.
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
+    from ae_env.options import EnvOptions
     from ae_env.utils.checks import check_integer
     from agents.episodes import training_scenes
     from agents.evaluation.engine import evaluate
     from agents.evaluation.evaluation_plan import MAX_SEED
-    from agents.evaluation.running import cache_score_tables, fit_policies
+    from agents.evaluation.running import fit_policies
     from agents.report.evaluation_report import write_report
 
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
     files = scene_files(scenes, on_error)
     source, zero_shot = training_scenes(files)
     environment = {"scenes": source, "split": "train", "resolution": 64}
-    with progress("scenes and score tables") as task:
-        cache_score_tables(environment, task)
+    with progress("scenes") as task:  # into the cache, before processes share the trainings
+        task(1, 1, f"{len(EnvOptions.from_kwargs(environment).load_scenes())} to learn from")
     agents = _train(environment, out, seed, progress, device)
     unseen = {"scenes": files, "split": "test", "resolution": 64}
     policies = _policies(unseen, agents, device)

@@ -58,24 +58,6 @@ def fit_policies(
         envs.close()
 
 
-def cache_score_tables(environment: Mapping[str, Any], progress: Progress) -> None:
-    """Works out the score tables of all scenes, so that every process finds them in the cache.
-
-    Args:
-        environment: Arguments of the environment.
-        progress: Called with scenes done, scenes in all, and "".
-    """
-    from ae_env.options import EnvOptions
-    from ae_env.scorers.score_table import ScoreTables
-
-    options = EnvOptions.from_kwargs(environment)
-    scenes = options.load_scenes()
-    tables = ScoreTables(options.make_grid(), options.make_camera(), options.make_scorer())
-    for i, scene in enumerate(scenes):
-        tables.closed_parts(scene)
-        progress(i + 1, len(scenes), "")
-
-
 def run_batch(
     name: str,
     policy: Policy,

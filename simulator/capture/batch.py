@@ -39,6 +39,7 @@ class FrameStatistics:
         predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
             light without noise only what is left out.
         modules: Names of the steps that ran, joined by ``"+"``.
+        source_noise: (B, 2, 4) shot and read noise that the source brings to the frame.
         keys: Keys of the noise, uint64.
     """
 
@@ -47,6 +48,7 @@ class FrameStatistics:
     excess_variance: np.ndarray
     predicted_error: np.ndarray
     modules: np.ndarray
+    source_noise: np.ndarray
     keys: np.ndarray
 
     def sensor_normals(self, count: int) -> np.ndarray:
@@ -128,6 +130,13 @@ class CaptureBatch:
             if missing.any():
                 self._blur(indices[missing], rows[missing])
 
+    def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
+        """Light and exposures of the frames of scenes that are prepared; see `record`."""
+        rows, remaining = indices * len(self.states) + states, None
+        if self._rows.any_blurs:  # else all of the source's variance remains
+            remaining = self._rows.remaining_variance[rows]
+        return Transitions(self._rows.light[rows], self._rows.table[rows], remaining)
+
     def record(
         self,
         indices: np.ndarray,
@@ -154,16 +163,13 @@ class CaptureBatch:
             signals: (B, 4, H, W) float32, on the scale where white is 1.
         """
         rows, columns = indices * len(self.states) + states, self._rows
-        keys = noise_keys(seeds, frames)
-        light, remaining = columns.light[rows], None
-        if columns.any_blurs:  # else all of the source's variance remains
-            remaining = columns.remaining_variance[rows]
+        keys, transitions = noise_keys(seeds, frames), self.transitions(indices, states)
         read_noise = None
         if self.noise == "sensor":
             pairs = zip(indices.tolist(), states.tolist(), strict=True)
             read_noise = [self._light(i).prepared.read_noise(self.states[s]) for i, s in pairs]
         counts = record(
-            Transitions(light, columns.table[rows], remaining),
+            transitions,
             self.camera,
             keys=None if self.noise is None else keys,
             noise=self.noise or "bank",
@@ -174,13 +180,14 @@ class CaptureBatch:
             signals=None if signals is None else torch.from_numpy(signals),
             count=True,
         )
-        samples = light[0].numel()
+        samples = transitions.light[0].numel()
         return FrameStatistics(
             clipped_low=counts[:, 0] / samples,
             clipped_high=counts[:, 1] / samples,
             excess_variance=columns.excess_variance[rows],
             predicted_error=columns.predicted_error[rows],
             modules=columns.modules[rows],
+            source_noise=transitions.averaged_table()[:, 3:],
             keys=keys,
         )
 

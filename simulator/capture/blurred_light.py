@@ -84,6 +84,15 @@ class BlurredLight:
         self._added: dict[float, float] = {}
         self._cache: LruCache[torch.Tensor] = LruCache(cache_bytes)
 
+    def copy(self, cache_bytes: int) -> BlurredLight:
+        """One of the same light with an empty cache of its own."""
+        nlf, statistics = self.residuals.nlf, self.statistics
+        copied = BlurredLight(
+            self.light, self.denoised, nlf, self.aperture_blur, statistics, cache_bytes
+        )
+        copied.residuals = self.residuals
+        return copied
+
     def is_of(
         self,
         light: torch.Tensor,

@@ -95,6 +95,16 @@ class Transitions:
         table[:, 2] -= 1.0 / (12.0 * np.square(np.array(camera.span, np.float32)))
         return replace(self, table=table)
 
+    def averaged_table(self) -> np.ndarray:
+        """`table` in which each source's noise is what its blur leaves in the mean."""
+        if self.remaining_variance is None:
+            return self.table
+        left = [1.0 if share is None else float(share.mean()) for share in self.shares()]
+        kept, table = np.array(left, np.float32)[:, None, None], self.table.copy()
+        table[:, 1:3] += (1.0 - kept) * table[:, 3:]
+        table[:, 3:] *= kept
+        return table
+
     def shares(self) -> list[torch.Tensor | None]:
         """`remaining_variance` as a list, one entry for each frame."""
         known = self.remaining_variance

@@ -123,7 +123,7 @@ def test_border_shows_the_score_and_the_oracle_is_framed() -> None:
     sheet = np.asarray(image)
     assert image.mode == "RGB"
     np.testing.assert_array_equal(sheet, np.asarray(contact_sheet(scene, grid=SMALL, seed=3)))
-    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced"), use_cache=False).table(scene)
+    table = ScoreTables(SMALL, CAMERA, make_scorer("balanced")).table(scene)
     layout = _layout(SMALL)
     for state in range(8):
         x, y = layout.corner(state)

@@ -144,6 +144,32 @@ def test_noise_free_scenes_neither_need_nor_notice_networks(tmp_path: Path) -> N
         _make(simulator=str(damaged))
 
 
+@pytest.mark.parametrize("reward", ["capture", "expected"])
+def test_what_is_in_the_frame_moves_the_reward(weights: str, reward: str) -> None:
+    """All at ISO 100 and 1/15 s, of one picture: rewards rise as frames have less noise."""
+    generator = torch.Generator().manual_seed(0)
+    picture = replace(
+        flat_scene(0.05), light=0.05 * (1.0 + 0.1 * torch.rand(4, 40, 40, generator=generator))
+    )
+    noisy = replace(picture, nlf=CAMERA.nlf(NOISY.iso))
+
+    def made(scene: Scene, **arguments: Any) -> tuple[float, dict[str, float]]:
+        fixed = {"motion": "none", "depth": "far", "reward": reward, **arguments}
+        env = _make(scenes=[scene], **{"simulator": None, **fixed})
+        _, info = env.reset(seed=0, options={"state": _state(100, 1 / 15, 8)})
+        return info["rewards"]["score"], info["rewards"]
+
+    clean, terms = made(picture)
+    assert made(picture, noise=False)[1]["noise"] == pytest.approx(1.0)
+    assert terms["noise"] < 0.99
+    left, its_terms = made(noisy)  # exposure and noise level function alone: the noise stays
+    assert left < clean
+    assert its_terms["noise"] < terms["noise"]
+    denoised, _ = made(noisy, simulator=weights)
+    assert left < denoised <= clean + 0.01
+    assert made(noisy, simulator=weights, tolerance=1e6)[0] == left  # no network is needed
+
+
 def test_states_cleaner_than_the_source_are_denoised(weights: str) -> None:
     for simulator, denoised in ((weights, True), (None, False)):
         env = _make(simulator=simulator, motion="none", depth="far")
@@ -155,20 +181,18 @@ def test_states_cleaner_than_the_source_are_denoised(weights: str) -> None:
         assert info["excess_noise"] > 1.0 or denoised
 
 
-def test_closed_forms_are_those_of_the_denoised_light(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    noisy = flat_scene(0.2, denoised=0.1)
+def test_denoised_light_is_scored_where_it_is_taken() -> None:
+    """Where a target is cleaner than the source, it is the denoised light's score."""
+    noisy = replace(flat_scene(0.2, denoised=0.1), nlf=CAMERA.nlf(6400))
     tables = ScoreTables(ExposureGrid.default(), CAMERA, make_scorer("balanced"))
-    without, found = tables.table(flat_scene(0.1)), tables.table(noisy)
-    np.testing.assert_array_equal(found.mean, without.mean)
-    raw = tables.table(replace(noisy, denoised=None))
-    assert np.abs(raw.mean - found.mean).max() > 0.01
+    without, found = tables.table(flat_scene(0.1)).parts, tables.table(noisy).parts
+    state = 9  # ISO 100, 1/15 s, f/5.6: denoised
+    for name in ("highlights", "shadows", "noise"):
+        assert found[name][state] == pytest.approx(without[name][state], abs=1e-5)
+    raw = tables.table(replace(noisy, denoised=None)).parts
+    assert raw["noise"][state] < found["noise"][state] - 0.1
     mapped = replace(noisy, denoised=None, defocus_map=torch.ones(40, 40))
-    assert tables.table(mapped).parts["sharpness"][0] < raw.parts["sharpness"][0]
-    files = list((tmp_path / "score_tables").glob("*"))
-    assert len(files) == 4  # one each: none is taken for another
+    assert tables.table(mapped).parts["sharpness"][0] < raw["sharpness"][0]
 
 
 def point_scene(size: int = 80) -> Scene:

@@ -23,13 +23,13 @@ TENSORS += [name for name, value in vars(Captures).items() if isinstance(value, 
 
 def test_a_mapping_is_the_weighted_mean() -> None:
     captures = make_captures(random_scene(), [GRID[i] for i in (3, 20, 50)], 0.1, 1.0)
-    mixed = make_scorer({"noise": 3.0, "highlights": 1.0})
-    expected = 0.75 * make_scorer("noise")(None, captures)
-    expected += 0.25 * make_scorer("highlights")(None, captures)
+    mixed = make_scorer({"brightness": 3.0, "sharpness": 1.0})
+    expected = 0.75 * make_scorer("brightness")(None, captures)
+    expected += 0.25 * make_scorer("sharpness")(None, captures)
     torch.testing.assert_close(mixed(None, captures), expected)
     assert mixed.closed_form
-    assert mixed.depends_on == "light"
-    assert make_scorer("balanced").depends_on == "blur"
+    assert mixed.depends_on == "blur"
+    assert make_scorer("balanced").depends_on == "image"
 
 
 def test_callables_see_the_view_they_ask_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ def test_a_real_entry_point_works_and_is_listed_beside_broken_ones() -> None:
         with pytest.raises(ValueError, match=rf"`scorer` \(='{name}'\) cannot be loaded.*{error}"):
             make_scorer(name)
     assert (rows["balanced"].domain, rows["defects"].domain) == ("raw", "srgb")
-    assert (rows["balanced"].depends_on, rows["noise"].depends_on) == ("blur", "light")
+    assert (rows["balanced"].depends_on, rows["noise"].depends_on) == ("image", "image")
     assert rows["nima_technical"].needs == "weights: AE_ENV_NIMA_TECHNICAL"
     assert rows["keypoints"].needs == "extra cv"
     for row in rows.values():
@@ -263,7 +263,7 @@ def test_scores_are_shares_and_the_oracle_has_the_highest(
         light, reference, CAMERA, scene_id="any", nlf=nlf, illuminance=illuminance
     )
     for name in list_scorers(self_contained=True):
-        tables = ScoreTables(grid, CAMERA, make_scorer(name), use_cache=False)
+        tables = ScoreTables(grid, CAMERA, make_scorer(name))
         table = tables.table(scene, speed=speed, defocus=defocus, gain=gain)
         for values in (table.mean, *table.parts.values()):
             assert values.shape == (len(grid),)

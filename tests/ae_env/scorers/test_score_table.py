@@ -1,9 +1,6 @@
-"""Score tables: expectations over noise, their standard errors, the oracle, the cache."""
+"""Score tables: expectations over noise, their standard errors, the oracle."""
 
-import gc
-import weakref
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,15 +10,10 @@ import torch
 from ae_env.episodes.core import EpisodeCore
 from ae_env.grid import ExposureGrid
 from ae_env.options import EnvOptions
-from ae_env.scenes import Scene, reference_settings
+from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, make_scorer
-from ae_env.scorers.fused import FusedScores
-from ae_env.scorers.protocol import Captures
 from ae_env.scorers.score_table import ScoreTables
-from ae_env.scorers.terms import Highlights
-from simulator import get_camera
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.utils.cache import DiskCache
 from tests.ae_env.environments import SMALL as ENV
 from tests.ae_env.scorer_images import CAMERA, Own, make_scene
 
@@ -91,144 +83,9 @@ def test_oracle_is_the_best_state_and_ties_go_to_the_lower_iso() -> None:
     grid = ExposureGrid((100, 400, 1600), (1 / 400, 1 / 100, 1 / 25), (4, 8))
     for ev100 in np.arange(2.0, 16.0, 0.37):
         scene = replace(_scene(), illuminance=2.5 * 2.0**ev100)
-        best = _tables("brightness", grid=grid, use_cache=False).table(scene)
+        best = _tables("brightness", grid=grid).table(scene)
         alike = np.flatnonzero(best.mean > best.mean.max() - 1e-7)
         assert best.oracle == alike[0]
-
-
-def _files(cache: Path) -> list[Path]:
-    return list((cache / "score_tables").glob("*"))
-
-
-@pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path))
-    return tmp_path
-
-
-def test_second_time_comes_from_the_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = _scene()
-    first = _tables().table(scene, speed=0.2, defocus=1.5)
-    assert len(_files(cache)) == 1
-    monkeypatch.setattr(FusedScores, "means", None)  # would fail if it were called again
-    second = _tables().table(scene, speed=0.2, defocus=1.5)
-    np.testing.assert_array_equal(first.mean, second.mean)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda means: means[:-1],
-        lambda means: means.reshape(-1),
-        lambda means: means * float("nan"),
-        lambda means: torch.where(means == means.max(), float("inf"), means),
-        b"",
-        b"not a table",
-    ],
-)
-def test_a_damaged_table_is_made_again(
-    cache: Path, change: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Bytes that are no file of a table, or a whole file whose content cannot be."""
-    expected, disk = _tables().table(_scene()).mean, DiskCache(cache)
-    (file,) = _files(cache)
-    stored = disk.get("score_tables", file.stem)
-    if isinstance(change, bytes):
-        file.write_bytes(change)
-    else:
-        disk.put("score_tables", file.stem, stored | {"means": change(stored["means"])})
-    np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
-    assert ("made again" in caplog.text) == isinstance(change, bytes)
-    mended = disk.get("score_tables", file.stem)
-    assert torch.equal(mended["means"], stored["means"])
-
-
-def test_key_changes_with_everything_that_changes_the_scores(cache: Path) -> None:
-    class Strict(Highlights):
-        version = 1
-        scale = 0.05
-
-    own, scene = Highlights(), _scene()
-    own.scale = 0.1  # a constant of the object, where that of `Strict` is of the class
-    noisy = replace(scene, nlf=CAMERA.nlf(100))
-    calibrated = {100: CAMERA.nlf(100), 6400: CAMERA.nlf(6400)}
-    plain = replace(CAMERA, nlf_by_iso=calibrated, segments=())
-    tables = [
-        _tables(),
-        _tables(grid=ExposureGrid((100,), (1 / 500,), (4,))),
-        _tables(camera=get_camera("canon_70d")),
-        _tables(camera=CAMERA.with_nlf(100, CAMERA.nlf(100).scaled(2.0))),
-        _tables(camera=plain),
-        _tables(camera=replace(plain, segments=(800,))),
-        _tables({"highlights": 1.0, "noise": 1.0}),
-        *(_tables(CompositeScorer({"highlights": s})) for s in (Highlights(), own, Strict())),
-    ]
-    uses = [(each, scene) for each in [*tables, tables[0]]]  # the first one again
-    uses += [(tables[0], replace(scene, **fields)) for fields in (
-        {"light": scene.light * 1.5},
-        {"reference": reference_settings(9.0)},
-        {"illuminance": None},
-        {"white_balance": (2.0, 1.0, 1.5)},
-        {"scene_id": "another"},
-        {"defocus_map": torch.full((40, 40), 2.0)},
-    )]  # fmt: skip
-    uses += [(tables[0], replace(noisy, denoised=scene.light * x)) for x in (0.9, 0.8)]
-    for each, shown in uses:
-        each.table(shown)
-    assert len(_files(cache)) == len(uses) - 1
-
-
-def test_scores_in_memory_are_bounded_and_keep_no_scene_alive(
-    cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = []
-
-    class Counted(Highlights):
-        def __call__(self, images: Any, captures: Captures) -> torch.Tensor:
-            made.append(len(captures))
-            return super().__call__(images, captures)
-
-    each = 8 * len(SMALL) + 1000  # one part, and what an entry takes itself
-    monkeypatch.setattr("ae_env.scorers.score_table.MEMORY_BYTES", 3 * each)
-    tables, scene = _tables(Counted(), use_cache=False), _scene()
-    for gain, count in zip((3, 2, 4, 3, 8, 3, 4, 8, 2), (1, 2, 3, 3, 4, 4, 4, 4, 5), strict=True):
-        tables.table(scene, gain=float(gain))  # 8 takes the place of 2
-        assert len(made) == count
-        assert tables._light_parts.nbytes <= 3 * each
-
-    gone = weakref.ref(scene)
-    del scene
-    gc.collect()
-    assert gone() is None
-    for seed in range(4):  # new scenes may get the old one's id, but never its scores
-        expected = _tables(Counted(), use_cache=False).table(_scene(seed)).mean
-        np.testing.assert_array_equal(tables.table(_scene(seed)).mean, expected)
-
-
-def test_a_folder_that_cannot_be_written_is_not_needed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    expected = _tables(use_cache=False).table(_scene()).mean
-    (tmp_path / "file").write_text("in the way")
-    monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "file"))
-    np.testing.assert_array_equal(_tables().table(_scene()).mean, expected)
-    assert "could not be cached" in caplog.text
-
-
-def test_scorers_that_cannot_be_keyed_are_not_cached(cache: Path) -> None:
-    """A network is no constant; and what a function closes over cannot be hashed."""
-    scorer = Highlights()
-    scorer.network = torch.nn.Linear(2, 2)  # type: ignore[attr-defined]
-    table = _tables(CompositeScorer({"highlights": scorer})).table(_scene())
-    assert np.isfinite(table.mean).all()
-    for value in (0.25, 0.75):
-
-        def constant(images: Any, captures: Captures, value: float = value) -> torch.Tensor:
-            return torch.full((len(captures),), value)
-
-        constant.domain, constant.depends_on = "raw", "light"  # type: ignore[attr-defined]
-        assert _tables(constant).table(_scene()).mean.tolist() == [value] * 8
-    assert _files(cache) == []
 
 
 def test_bands_count_whatever_form_the_gain_has() -> None:

@@ -34,7 +34,7 @@ def result(tmp_path_factory):
 
 def test_some_states_score_as_they_do_in_a_whole_table(result):
     scorer, options, scene = make_scorer("balanced"), PLAN.options(), result.scenes[0]
-    tables = ScoreTables(result.grid, options.make_camera(), scorer, use_cache=False)
+    tables = ScoreTables(result.grid, options.make_camera(), scorer)
     whole = tables.table(scene, speed=0.3, defocus=1.5).mean
     states = [63, 0, 20, 41]
     found = state_scores(scorer, options, scene, states, speed=0.3, defocus=1.5)
@@ -56,9 +56,7 @@ def test_means_are_over_frames_then_groups(result):
     assert table == other_scores(result, PLAN)  # those of the run are these
     assert list(table) == ["brightness", "sharpness"]
     # By hand: two scenes of the three, each a group of its own.
-    tables = ScoreTables(
-        result.grid, PLAN.options().make_camera(), make_scorer("brightness"), use_cache=False
-    )
+    tables = ScoreTables(result.grid, PLAN.options().make_camera(), make_scorer("brightness"))
     for policy, track in result.tracks.items():
         means = [tables.table(result.scenes[j]).mean[track.states[0, j]].mean() for j in (0, 1)]
         assert table["brightness"][policy] == pytest.approx(np.mean(means), abs=1e-9)

@@ -1,0 +1,375 @@
+"""The terms that are measured on the recorded frame, from the histogram of its 8-bit codes.
+
+`Highlights`, `Shadows` and `Noise` are means over the samples of functions of the recorded value:
+of a frame, sums over the histogram of its codes (`CodeScores.measured`). Their expectation over the
+noise of a light is a mean over the light of smooth functions, which are tabulated once for each
+noise (`CodeScores.expected`): exact for the means, and for scores to the first order in their
+noise, which a frame of thousands of samples averages. The definitions are those of
+`ae_env.scorers.terms`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from ae_env.observation import PEDESTAL, encode_observation
+from ae_env.scorers.composite import CompositeScorer
+from ae_env.scorers.protocol import Captures
+from ae_env.scorers.terms import (
+    Banding,
+    Brightness,
+    Highlights,
+    Noise,
+    Shadows,
+    Sharpness,
+    code_signals,
+)
+from simulator.camera import CameraProfile
+from simulator.capture.sensor import Transitions, record
+from simulator.settings import CameraSettings
+from simulator.utils.cache import LruCache
+from simulator.utils.jit import addresses, as_pointer, kernel
+from simulator.utils.threads import in_shares
+
+#: Memory for tabulated expectations [byte].
+_BYTES = 2**25
+#: Samples times frames from which another thread is worth waking.
+_WORTH_A_THREAD = 2**15
+#: Column of the means for each term; and the terms that need none.
+_COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
+_WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
+#: Expectations are tabulated at this many values between two codes, up to a code beyond white that
+#: noise does not bring back.
+_FINE, _LAST_CODE = 8, 288
+_SIGNALS = code_signals()
+
+
+class CodeScores:
+    """Those parts of a scorer that are made of the terms above, composites of them included.
+
+    Args:
+        scorer: The scorer whose parts they are.
+        camera: The body that takes the captures.
+        states: The settings of the S states.
+        noise: Whether captures are noisy.
+
+    Attributes:
+        parts: Those parts by name.
+    """
+
+    def __init__(
+        self,
+        scorer: CompositeScorer,
+        camera: CameraProfile,
+        states: Sequence[CameraSettings],
+        *,
+        noise: bool,
+    ) -> None:
+        self.parts = {n: p for n, p in scorer.parts.items() if _is_known(p) and _has_pixels(p)}
+        #: Whether a part needs `Captures` besides the means.
+        self.reads_captures = any(type(part) not in _COLUMNS for part in self.parts.values())
+        self.camera, self.noise = camera, noise
+        isos = sorted({state.iso for state in states})
+        noises = [camera.nlf(iso) for iso in isos]
+        self._which = np.array([isos.index(state.iso) for state in states])
+        self._shot_read = np.array([[n.shot, n.read] for n in noises])[self._which]  # (S, 2, 4)
+        self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
+        self._dark = Shadows.shares(_SIGNALS).numpy()
+        self._edges = _code_edges(camera)
+        self._tables: LruCache[np.ndarray] = LruCache(_BYTES)
+
+    def _noise_shares(self, shot_read: np.ndarray, brought: np.ndarray | None = None) -> np.ndarray:
+        """(K, 4, 256) float32 `Noise.shares` of each code.
+
+        Args:
+            shot_read: (K, 2, 4) noise of a native pixel.
+            brought: (K, 2, 4) that the source brings; None for none.
+        """
+        light = _SIGNALS.double().numpy()
+        variance = np.zeros((len(shot_read), 4, 256))
+        if self.noise:
+            variance = shot_read[:, 0, :, None] * light + shot_read[:, 1, :, None]
+            if brought is not None:
+                other = brought[:, 0, :, None] * light + brought[:, 1, :, None]
+                variance = np.maximum(variance, other)
+        shares: np.ndarray = Noise.shares(_SIGNALS, torch.from_numpy(variance).float()).numpy()
+        return shares
+
+    def scores(self, captures: Captures | None, means: np.ndarray) -> dict[str, np.ndarray]:
+        """Scores (B,) float64 by part.
+
+        Args:
+            captures: The captures; None unless `reads_captures`.
+            means: (B, 3) result of `measured` or `expected` for them.
+        """
+        return {name: _score(part, means, captures) for name, part in self.parts.items()}
+
+    def _of_frames(self, states: np.ndarray, brought: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Noise shares (K, 4, 256) and which of them each frame has; see `measured`."""
+        noisy = brought.any(axis=(1, 2))
+        if not noisy.any():
+            return self._shares, self._which[states]
+        own = self._noise_shares(self._shot_read[states[noisy]], brought[noisy])
+        which = self._which[states]
+        which[noisy] = len(self._shares) + np.arange(len(own))
+        return np.concatenate([self._shares, own]), which
+
+    def measured(self, codes: np.ndarray, states: np.ndarray, brought: np.ndarray) -> np.ndarray:
+        """Means (B, 3) of recorded frames: shares of blown and of blocked samples, and `noise`.
+
+        Args:
+            codes: (B, 4, H, W) uint8 of the frames.
+            states: (B,) at which they were taken.
+            brought: (B, 2, 4) shot and read noise that the sources bring, of a native pixel.
+        """
+        shares, which = self._of_frames(states, brought)
+        flat = codes.reshape(len(codes), 4, -1)
+        means = np.empty((len(codes), 3))
+        least = max(1, _WORTH_A_THREAD // flat[0].size)
+        fixed = (flat, shares, which, self._dark, means)
+        in_shares(lambda a, b: measure_codes(a, b, *fixed), len(codes), least=least)
+        return means
+
+    def expected(
+        self,
+        transitions: Transitions,
+        states: np.ndarray,
+        box_factors: np.ndarray,
+        row_gain: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Expectation (B, 3) of `measured` over the noise that the transitions add.
+
+        Args:
+            transitions: Light and exposures.
+            states: (B,) of the frames.
+            box_factors: (B,) sensor pixels averaged per side into one of the frame.
+            row_gain: (B, H) light of each row relative to the frame's, or None.
+        """
+        table = transitions.before_rounding(self.camera).averaged_table()
+        brought = table[:, 3:] * np.square(box_factors)[:, None, None]
+        if not self.noise:
+            codes = np.empty((len(table), *transitions.light[0].shape), np.uint8)
+            record(transitions, self.camera, row_gain=row_gain, codes=codes)
+            return self.measured(codes, states, brought)
+        shares, which = self._of_frames(states, brought)
+        keys = [table[i, 1:].tobytes() + states[i].tobytes() for i in range(len(table))]
+        numbers: dict[bytes, int] = {}
+        tables: list[np.ndarray] = []
+        for i, key in enumerate(keys):
+            if key not in numbers:
+                numbers[key] = len(tables)
+                tables.append(self._tabulated(key, table[i, 1:3], shares[which[i]]))
+        height, width = transitions.light[0].shape[-2:]
+        rows = np.ones((len(table), 1)) if row_gain is None else row_gain
+        fixed = (
+            addresses(transitions.light),
+            1 if row_gain is None else height,
+            height * width if row_gain is None else width,
+            table[:, 0].astype(np.float32),
+            rows.astype(np.float32),
+            np.stack(tables),
+            np.array([numbers[key] for key in keys]),
+        )
+        means = np.empty((len(table), 3))
+        least = max(1, _WORTH_A_THREAD // (4 * height * width))
+        in_shares(lambda a, b: expect_means(a, b, *fixed, means), len(table), least=least)
+        return means
+
+    def _tabulated(self, key: bytes, missing: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """(4, G, 3) float32 expectations by light: above the last code, blocked, and `noise`."""
+        found = self._tables.get(key)
+        if found is None:
+            found = np.empty((4, _FINE * _LAST_CODE, 3), np.float32)
+            white = np.zeros(256, np.float32)
+            white[255] = 1.0
+            for plane in range(4):
+                values = np.stack([white, self._dark, shares[plane]], axis=1)
+                shot, read = missing[:, plane]
+                expect_codes(values, self._edges[plane], shot, read, found[plane])
+            self._tables.put(key, found, found.nbytes)
+        return found
+
+
+def _code_edges(camera: CameraProfile) -> np.ndarray:
+    """(4, 256) signals from which a plane is recorded as each code or one above.
+
+    A signal is rounded to digital numbers first: halfway below the first number of a code.
+    """
+    numbers = np.arange(camera.white_level + 1.0)
+    edges = np.empty((4, 256))
+    for plane, (black, span) in enumerate(zip(camera.black_level, camera.span, strict=True)):
+        signals = torch.from_numpy((numbers - black) / span)
+        first = np.searchsorted(encode_observation(signals).numpy(), np.arange(256))
+        edges[plane] = (first - 0.5 - black) / span
+    return edges
+
+
+def _is_known(part: Any) -> bool:
+    """Whether `part` is exactly what is computed here; a subclass may do something else."""
+    if isinstance(part, CompositeScorer):
+        known = type(part).__module__.startswith("ae_env.")
+        return known and all(map(_is_known, part.parts.values()))
+    # An instance with constants of its own is not known either.
+    return type(part) in (*_COLUMNS, *_WITHOUT_PIXELS) and not vars(part)
+
+
+def _has_pixels(part: Any) -> bool:
+    if isinstance(part, CompositeScorer):
+        return any(map(_has_pixels, part.parts.values()))
+    return type(part) in _COLUMNS
+
+
+def _score(part: Any, means: np.ndarray, captures: Captures | None) -> np.ndarray:
+    if isinstance(part, CompositeScorer):
+        scores = {name: _score(inner, means, captures) for name, inner in part.parts.items()}
+        return part.totals(scores)
+    column = _COLUMNS.get(type(part))
+    if column is None:
+        return np.asarray(part(None, captures).numpy())
+    values = means[:, column]
+    return np.asarray(np.clip(values if column == 2 else np.exp(-values / part.scale), 0.0, 1.0))
+
+
+# -- the kernels ----------------------------------------------------------------------------------
+
+_ZERO, _ONE = np.float32(0), np.float32(1)
+#: Distance at which noise no longer matters, in its standard deviations.
+_FAR = 6.0
+_PEDESTAL = np.float32(PEDESTAL)
+_SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
+_END = np.float32(_FINE * _LAST_CODE - 1.001)
+_BLOCK = 256
+_jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
+
+
+@_jit
+def measure_codes(  # type: ignore[no-untyped-def]
+    first, last, codes, shares, which, dark, means
+):
+    """Means of the frames `first` to `last`.
+
+    Args:
+        first: First frame.
+        last: One past the last.
+        codes: (B, 4, N) uint8.
+        shares: (K, 4, 256) float32, what a sample of each code adds to `noise`.
+        which: (B,) which of them each frame has.
+        dark: (256,) float32, what a sample of each code adds to the share of blocked ones.
+        means: (B, 3) float64 to write to.
+    """
+    size = codes.shape[2]
+    # Four histograms: a sample need not wait for that of the sample before.
+    counts = np.empty((4, 256), np.int32)
+    whole = size // 4 * 4
+    for frame in range(first, last):
+        blown, blocked, clean = 0, 0.0, 0.0
+        red, green, other, blue = codes[frame]
+        for i in range(size):
+            brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
+            blown += brightest == 255
+        for plane in range(4):
+            samples = codes[frame, plane]
+            counts[:] = 0
+            for i in range(0, whole, 4):
+                counts[0, samples[i]] += 1
+                counts[1, samples[i + 1]] += 1
+                counts[2, samples[i + 2]] += 1
+                counts[3, samples[i + 3]] += 1
+            for i in range(whole, size):
+                counts[0, samples[i]] += 1
+            for code in range(256):
+                count = counts[0, code] + counts[1, code] + counts[2, code] + counts[3, code]
+                blocked += count * np.float64(dark[code])
+                clean += count * np.float64(shares[which[frame], plane, code])
+        means[frame, 0] = blown / size
+        means[frame, 1] = blocked / (4 * size)
+        means[frame, 2] = clean / (4 * size)
+
+
+@_jit
+def expect_codes(values, edges, shot, read, out):  # type: ignore[no-untyped-def]
+    """Expectations of functions of the code that noisy light is recorded as.
+
+    Args:
+        values: (256, F) float32, the functions.
+        edges: (256,) signals from which each code is recorded, or one above.
+        shot: Shot noise that is added.
+        read: Read noise that is added.
+        out: (G, F) float32 to write to, at `_FINE` values of light between two codes.
+    """
+    unit = (1.0 + PEDESTAL) / 255.0**2
+    for i in range(len(out)):
+        light = unit * (i / _FINE) ** 2 - PEDESTAL
+        variance = max(light, 0.0) * shot + read
+        spread = math.sqrt(max(variance, 1e-30))
+        lowest, highest = light - _FAR * spread, light + _FAR * spread
+        code = np.searchsorted(edges, lowest, side="right") - 1
+        code = max(code, 0)
+        for f in range(out.shape[1]):
+            out[i, f] = values[code, f]
+        while code < 255:
+            code += 1
+            if edges[code] > highest:
+                break
+            above = 0.5 * math.erfc((edges[code] - light) / (spread * math.sqrt(2.0)))
+            for f in range(out.shape[1]):
+                out[i, f] += above * (values[code, f] - values[code - 1, f])
+
+
+@_jit
+def expect_means(  # type: ignore[no-untyped-def]
+    first, last, light, rows, columns, ratio, row_gain, tables, which, means
+):
+    """Expected means of the frames `first` to `last`.
+
+    Args:
+        first: First frame.
+        last: One past the last.
+        light: (B,) addresses of (4, R, C) float32.
+        rows: R; 1 where all rows have the same gain.
+        columns: C.
+        ratio: (B, 4) float32, what the light is multiplied by.
+        row_gain: (B, R) float32.
+        tables: (K, 4, G, 3) float32 of `expect_codes`.
+        which: (B,) which of them each frame has.
+        means: (B, 3) float64 to write to.
+    """
+    kept = np.empty(_BLOCK, np.float32)
+    size = rows * columns
+    for frame in range(first, last):
+        pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
+        signal = numba.carray(pointer, (4, size))
+        blown = blocked = clean = 0.0
+        for row in range(rows):
+            gain = row_gain[frame, row]
+            for start in range(row * columns, (row + 1) * columns, _BLOCK):
+                end = min(start + _BLOCK, (row + 1) * columns)
+                kept[:] = _ONE
+                dark = bright = _ZERO
+                for plane in range(4):
+                    factor = ratio[frame, plane] * gain
+                    table = tables[which[frame], plane]
+                    for i in range(start, end):
+                        x = signal[plane, i] * factor + _PEDESTAL
+                        place = min(np.sqrt(x if x > _ZERO else _ZERO) * _SCALE, _END)
+                        index = np.int32(place)
+                        share = place - np.float32(index)
+                        low, high = table[index], table[index + 1]
+                        kept[i - start] *= _ONE - (low[0] + share * (high[0] - low[0]))
+                        dark += low[1] + share * (high[1] - low[1])
+                        bright += low[2] + share * (high[2] - low[2])
+                blocked += dark
+                clean += bright
+                left = _ZERO
+                for i in range(end - start):
+                    left += kept[i]
+                blown += end - start - left
+        means[frame, 0] = blown / size
+        means[frame, 1] = blocked / (4 * size)
+        means[frame, 2] = clean / (4 * size)
