@@ -309,8 +309,9 @@ def expect_codes(values, edges, shot, read, out):  # type: ignore[no-untyped-def
         variance = max(light, 0.0) * shot + read
         spread = math.sqrt(max(variance, 1e-30))
         lowest, highest = light - _FAR * spread, light + _FAR * spread
-        code = np.searchsorted(edges, lowest, side="right") - 1
-        code = max(code, 0)
+        code = 0
+        while code < 255 and edges[code + 1] <= lowest:
+            code += 1
         for f in range(out.shape[1]):
             out[i, f] = values[code, f]
         while code < 255:

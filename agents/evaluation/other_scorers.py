@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import NDArray
 
-from ae_env.scorers import CompositeScorer, make_scorer
-from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import prepare_scene
+from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTables
 from agents.evaluation.evaluation_plan import EvaluationPlan, groups_in_turn
 from agents.evaluation.result import EvaluationResult
-
-if TYPE_CHECKING:
-    from ae_env.options import EnvOptions
-    from ae_env.scenes import Scene
-
-Floats = NDArray[np.float64]
-#: Noisy captures that a scorer of images is averaged over.
-NOISE_SEEDS = 2
-#: States rated at once.
-_CHUNK = 16
 
 
 def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, dict[str, float]]:
@@ -36,27 +20,24 @@ def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, di
         result: The results in unchanging light.
         plan: The plan, with the names of the scorers.
     """
-    tables = len(result.scene_ids) // len(plan.starts)
-    count = tables // len(plan.seeds)
+    pairs = len(result.scene_ids) // len(plan.starts)  # of scenes and seeds
+    count = pairs // len(plan.seeds)
     scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first
     chosen = groups_in_turn(scenes, plan.other_scorer_scenes)
     options = plan.options()
     made = {name: make_scorer(name) for name in plan.other_scorers}  # raises before any work
     found: dict[str, dict[str, float]] = {}
     for name, scorer in made.items():
+        tables = ScoreTables(
+            options.make_grid(), options.make_camera(), scorer, tolerance=options.tolerance
+        )
         means: dict[str, dict[str, list[float]]] = {policy: {} for policy in result.tracks}
         for scene in chosen:
             j = scenes.index(scene)
-            episodes = np.flatnonzero(np.arange(len(result.scene_ids)) % tables == j)
-            visited = np.unique(
-                np.concatenate([t.states[:, episodes].ravel() for t in result.tracks.values()])
-            )
+            episodes = np.flatnonzero(np.arange(len(result.scene_ids)) % pairs == j)
             speed = 0.0 if result.speed is None else float(result.speed[j])
             defocus = 0.0 if result.defocus is None else float(result.defocus[j])
-            scores = np.full(len(result.grid), np.nan)
-            scores[visited] = state_scores(
-                scorer, options, scene, visited.tolist(), speed=speed, defocus=defocus
-            )
+            scores = tables.table(scene, speed=speed, defocus=defocus).mean
             for policy, track in result.tracks.items():
                 mean = float(scores[track.states[:, episodes]].mean())
                 means[policy].setdefault(scene.group, []).append(mean)
@@ -65,50 +46,3 @@ def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, di
             for policy, groups in means.items()
         }
     return found
-
-
-def state_scores(
-    scorer: CompositeScorer,
-    options: EnvOptions,
-    scene: Scene,
-    states: Sequence[int],
-    *,
-    speed: float = 0.0,
-    defocus: float = 0.0,
-) -> Floats:
-    """Expected score of some states of a scene, ``(n,)``; image scorers over `NOISE_SEEDS`.
-
-    Args:
-        scorer: The scorer.
-        options: The environment's arguments: grid, camera, tolerance.
-        scene: The scene.
-        states: Indices into the grid.
-        speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
-    """
-    camera, grid = options.make_camera(), options.make_grid()
-    prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
-    prepared = replace(prepared, tolerance=options.tolerance)
-    found = []
-    for first in range(0, len(states), _CHUNK):
-        settings = [grid[int(state)] for state in states[first : first + _CHUNK]]
-        count = len(settings)
-        captures = describe_captures(
-            [scene] * count,
-            settings,
-            camera,
-            speed=np.full(count, speed),
-            defocus=np.full(count, defocus),
-            gain=np.ones(count),
-        )
-        parts = scorer.score_parts(None, captures, ("light", "blur"))
-        sums = {name: values.numpy() for name, values in parts.items()}
-        totals = []
-        for seed in range(1 if scorer.closed_form else NOISE_SEEDS):
-            if not scorer.closed_form:
-                images = prepared.expose(settings, seed=seed).clamp_(0.0, 1.0)
-                drawn = scorer.score_parts(images, captures, ("image",))
-                sums |= {name: values.numpy() for name, values in drawn.items()}
-            totals.append(scorer.totals(sums))
-        found.append(np.mean(totals, axis=0))
-    return np.concatenate(found)

@@ -24,6 +24,7 @@ from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.residual import ResidualStatistics
 from simulator.capture.sensor import NoiseBalance, Transitions, record
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.raw.highlights import ABOVE_WHITE
 from simulator.settings import CameraSettings
 
 #: Error that a capture may have, in units of the target's noise: by default the distribution of a
@@ -490,12 +491,14 @@ def _hidden_highlights(given: Situation, share: float) -> float:
     """Error of what a `share` of the pixels, saturated in the source, would show when darker.
 
     Light above white is taken to be distributed as natural highlights are, with a density that
-    falls with its square: what is white stands for light of at least that.
+    falls with its square; what is white stands for twice that, its median.
     """
     ratio = given.ratio
     if not share or ratio >= 1.0 or ratio <= 0.0:
         return 0.0
-    square = 2.0 * ratio * (1.0 - ratio + ratio * math.log(ratio))
+    shown = min(ABOVE_WHITE * ratio, 1.0)
+    square = shown**2 * (1.0 - ratio) + 2.0 * shown * ratio * math.log(ratio)
+    square += ratio * (1.0 - ratio) + ratio * (1.0 - shown) ** 2
     variance = sum(s * ratio + r for s, r in zip(given.target.shot, given.target.read, strict=True))
     return HIDDEN_LIGHT * math.sqrt(share * square / max(variance / 4.0, 1e-30))
 

@@ -24,7 +24,7 @@ def clipped(*pixels: tuple[float, ...], balance: tuple[float, float, float] = BA
     ("recorded", "expected"),
     [  # a white of level L is L / 2, L, L / 1.25 by BALANCE; L is known while red is not clipped
         *(((v / 2, v, v / 1.25), (v / 2, v, v / 1.25)) for v in WHITE[:3]),
-        ((4.5, 9.0, 7.2), (1.0, 2.0, 1.6)),  # at least as bright as red's white
+        ((4.5, 9.0, 7.2), (2.0, 4.0, 3.2)),  # twice as bright as red's white
         ((3.0, 0.3, 0.2), (1.0, 0.3, 0.2)),  # a red lamp stays red
         ((0.9, 1.0, 0.2), (0.9, 1.025, 0.2)),  # levels 1.8 and 0.25 are known
     ],
@@ -39,7 +39,7 @@ def test_clipped_planes_become_as_bright_as_white(recorded, expected) -> None:
 def test_a_full_photosite_below_white_and_an_absurd_balance() -> None:
     raw = clipped((1.0, 1.0, 1.0))
     raw.data[1] = 0.94  # a smaller full well than the other green's
-    assert neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist() == pytest.approx([1, 2, 2, 1.6])
+    assert neutral_highlights(raw, raw.saturated)[:, 0, 0].tolist() == pytest.approx([2, 4, 4, 3.2])
     raw = clipped((1.0, 1.0, 1.0), balance=(1e30, 1.0, 1.0))
     assert neutral_highlights(raw, raw.saturated).max() == 16.0
 
@@ -49,7 +49,7 @@ def test_captures_and_scenes_show_neutral_highlights(ratio: float) -> None:
     pixels = [(v / 2, v, v / 1.25) for v in WHITE]
     raw, settings = clipped(*pixels), CameraSettings(100, ratio / 64, 4)
     prepared = CameraSimulator(device="cpu").prepare(raw)
-    level = torch.tensor([0.5, 1.1, 1.6, 2.0]) * ratio
+    level = torch.tensor([0.5, 1.1, 1.6, 4.0]) * ratio
     expected = level / torch.tensor([2, 1, 1, 1.25])[:, None]
     scene = Scene.from_raw(raw, scene_id="raw")
     for found in (prepared, scene.prepared):
