@@ -119,6 +119,7 @@ class PartScores:
             self.tables.camera,
             speed=self.episodes.speed[env_indices],
             defocus=self.episodes.defocus[env_indices],
+            movements=[self.episodes[index].movement for index in env_indices.tolist()],
             gain=gains,
             row_gain=rows,
             light=light,
@@ -131,9 +132,7 @@ class PartScores:
         lights, first = lights[missing], first[missing]
         for light, env_index in zip(lights.tolist(), env_indices[first].tolist(), strict=True):
             episode = self.episodes[env_index]
-            parts = self.tables.closed_parts(
-                self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
-            )
+            parts = self.tables.closed_parts(self.scenes[episode.scene], **episode.moves)
             for column, name in enumerate(self._closed):
                 self._scores[light, :, column] = parts[name]
         if self.scorer.closed_form:

@@ -28,10 +28,11 @@ from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import clip_and_quantise
+from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.utils.cache import DiskCache, LruCache, cache_key
 
 #: Bumped when the way that scores are computed changes.
-TABLE_VERSION = 4
+TABLE_VERSION = 5
 #: Memory for cached scores [byte]: some 10,000 scenes at 64 states.
 MEMORY_BYTES = 2**25
 #: States evaluated at once: more only spends time in memory paging. Where only the blur matters,
@@ -77,6 +78,7 @@ def prepare_scene(
     *,
     speed: float = 0.0,
     defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
     gain: float = 1.0,
 ) -> PreparedScene:
     """`scene` as `camera` sees it in an episode.
@@ -85,19 +87,25 @@ def prepare_scene(
         scene: The scene.
         camera: The body that takes the captures.
         speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
+        movement: Directions of the image's motion, and the subject's own.
         gain: Light relative to the scene's own.
     """
     prepared = replace(scene.prepared, camera=camera)
-    return in_episode(prepared, speed=speed, defocus=defocus, gain=gain)
+    return in_episode(prepared, speed=speed, defocus=defocus, movement=movement, gain=gain)
 
 
 def in_episode(
-    prepared: PreparedScene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+    prepared: PreparedScene,
+    *,
+    speed: float = 0.0,
+    defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
+    gain: float = 1.0,
 ) -> PreparedScene:
     """A scene's `prepared` in an episode; the arguments are those of `prepare_scene`."""
     pixels = defocus * prepared.light.shape[-2] / 64.0
-    return replace(prepared, image_speed=speed, defocus=pixels, gain=gain)
+    return replace(prepared, image_speed=speed, defocus=pixels, movement=movement, gain=gain)
 
 
 class ScoreTables:
@@ -145,6 +153,7 @@ class ScoreTables:
         *,
         speed: float = 0.0,
         defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> ScoreTable:
@@ -154,16 +163,18 @@ class ScoreTables:
             scene: The scene.
             speed: See `prepare_scene`.
             defocus: See `prepare_scene`.
+            movement: See `prepare_scene`.
             gain: Light relative to the scene's own; (S,) where it depends on the state, as in
                 flickering light.
             row_gain: (S, H) light of each row relative to that, see `Captures`.
         """
-        parts = self.closed_parts(scene, speed=speed, defocus=defocus, gain=gain, row_gain=row_gain)
+        moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
+        parts = self.closed_parts(scene, **moves, gain=gain, row_gain=row_gain)
         if self.scorer.closed_form:
             parts = {name: parts[name] for name in self.scorer.parts}
             mean = self.scorer.totals(parts)
             return ScoreTable(mean, np.zeros(len(self.grid)), parts, scene.allowed)
-        samples = self._samples(scene, speed, defocus, gain, row_gain)
+        samples = self._samples(scene, moves, gain, row_gain)
         totals = self.scorer.totals({**parts, **samples})  # (seeds, S)
         if not self.noise:
             error = np.zeros(len(self.grid))
@@ -181,10 +192,12 @@ class ScoreTables:
         *,
         speed: float = 0.0,
         defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
         """Scores (S,) of those parts of the scorer that have a closed form; see `table`."""
+        moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
         light: Any = {"gain": gain, "row_gain": row_gain}
         if isinstance(gain, np.ndarray) or row_gain is not None:  # hardly comes again
             found = self._of_light(scene, **light)
@@ -193,9 +206,9 @@ class ScoreTables:
         parts = dict(found.parts)
         if self.fused.parts:
             states = self.grid.states
-            captures = self._captures.describe(scene, states, speed=speed, defocus=defocus, **light)
+            captures = self._captures.describe(scene, states, **moves, **light)
             parts |= self.fused.scores(captures, found.means)
-        return parts | self._parts(scene, ("blur",), speed, defocus, **light)
+        return parts | self._parts(scene, ("blur",), moves, **light)
 
     def _of_steady_light(self, scene: Scene, gain: float) -> _LightParts:
         """The parts that do not depend on blur, cached in memory; of the own light, on disk too."""
@@ -249,13 +262,15 @@ class ScoreTables:
         self,
         scene: Scene,
         kinds: tuple[DependsOn, ...],
-        speed: float = 0.0,
-        defocus: float = 0.0,
+        moves: dict[str, Any] | None = None,
         *,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        """Scores (S,) of those of `others` that depend on one of `kinds`."""
+        """Scores (S,) of those of `others` that depend on one of `kinds`.
+
+        `moves` has the arguments of `SceneCaptures.describe` that blur depends on.
+        """
         names = [] if self.others is None else self.others.names(*kinds)
         if self.others is None or not names:
             return {}
@@ -268,8 +283,7 @@ class ScoreTables:
             captures = self._captures.describe(
                 scene,
                 self.grid.states[part],
-                speed=speed,
-                defocus=defocus,
+                **(moves or {}),
                 gain=gain[part] if isinstance(gain, np.ndarray) else gain,
                 row_gain=None if row_gain is None else row_gain[part],
             )
@@ -280,13 +294,12 @@ class ScoreTables:
     def _samples(
         self,
         scene: Scene,
-        speed: float,
-        defocus: float,
+        moves: dict[str, Any],
         gain: float | np.ndarray,
         row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
-        prepared = prepare_scene(scene, self.camera, speed=speed, defocus=defocus)
+        prepared = prepare_scene(scene, self.camera, **moves)
         prepared = replace(prepared, tolerance=self.tolerance)
         if not isinstance(gain, np.ndarray):
             gain = np.full(len(self.grid), gain)
@@ -295,9 +308,7 @@ class ScoreTables:
         for part in _slices(len(self.grid), _CHUNK):
             states = self.grid.states[part]
             gains, rows = gain[part], None if row_gain is None else row_gain[part]
-            captures = self._captures.describe(
-                scene, states, speed=speed, defocus=defocus, gain=gains, row_gain=rows
-            )
+            captures = self._captures.describe(scene, states, **moves, gain=gains, row_gain=rows)
             light: Any = {"gain": gains, "row_gain": rows}
             for seed in range(self.noise_seeds):
                 if self.noise:

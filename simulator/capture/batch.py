@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,11 @@ from simulator.camera import CameraProfile
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure, exposure_table
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.scene_blur import SceneBlur, moved
 from simulator.capture.sensor import Transitions, noise_balance, record
 from simulator.noise.generator import Noise, noise_keys, single_normals
 from simulator.optics.blur_kernels import Blur, blur_many
+from simulator.optics.blur_kernels import streak as motion_streak
 from simulator.settings import CameraSettings
 from simulator.utils.threads import in_shares
 
@@ -226,9 +229,11 @@ class CaptureBatch:
         try:
             opened = [pair for pair in planned if exposures[pair[1]].opened_to is not None]
             _in_shares(self._open, opened)
-            blurs = [self._begin_blur(index, row) for index, row in planned]
-            blur_many([blur for blur in blurs if blur is not None], limit=LIGHT_LIMIT)
-            _in_shares(self._balance, opened)
+            begun = [self._begin_blur(index, row) for index, row in planned]
+            blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
+            tasks = [task for task in begun if callable(task)]
+            in_shares(lambda first, last: [task() for task in tasks[first:last]], len(tasks))
+            _in_shares(self._balance, planned)
         except BaseException:  # some of the light is not made
             self.forget(indices)
             raise
@@ -238,7 +243,7 @@ class CaptureBatch:
         """Opens the aperture, which caches its result."""
         self._light(index).prepared.source_light(self._rows.exposure[row])
 
-    def _begin_blur(self, index: int, row: int) -> Blur | None:
+    def _begin_blur(self, index: int, row: int) -> Blur | Callable[[], None] | None:
         columns, exposure = self._rows, self._rows.exposure[row]
         columns.light[row], blur = self._light(index).blurred(exposure)
         remaining = exposure.remaining_variance
@@ -253,7 +258,8 @@ class CaptureBatch:
         if np.isnan(columns.excess_variance[row]):
             balance = noise_balance(columns.light[row], columns.exposure[row])
             columns.excess_variance[row] = balance.relative_excess_variance
-        if not self._cache_light:  # an aperture blur caches the light of each f-number
+        opened = columns.exposure[row].opened_to is not None
+        if opened and not self._cache_light:  # an aperture blur caches the light of each f-number
             self._light(index).prepared = self._prepared(index)
 
 
@@ -337,18 +343,19 @@ class _SceneLight:
         self._defocused: dict[tuple[Any, ...], torch.Tensor] = {}  # by aperture
         self._blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
         self._streak: torch.Tensor | None = None
+        self._scene_blur = SceneBlur()
 
-    def blurred(self, exposure: Exposure) -> tuple[torch.Tensor, Blur | None]:
+    def blurred(self, exposure: Exposure) -> tuple[torch.Tensor, Blur | Callable[[], None] | None]:
         """The light (4, H, W) with the blur of `exposure`, valid until the next call.
 
         Returns:
-            The light, and the blur (`simulator.optics.blur_kernels.blur_many`) that fills it; None
-            where that was done before.
+            The light, and the blur (`simulator.optics.blur_kernels.blur_many`) or the function that
+            fills it; None where that was done before.
         """
         if self._blurred is not None and self._blurred[0] == exposure.blur:
             return self._blurred[1], None
         light = self._defocused.get(exposure.lens_blur)
-        source = defocused = moved = None
+        source = defocused = streak = None
         if light is None:
             light = source = self.prepared.source_light(exposure).contiguous()
             if exposure.defocus_px:
@@ -359,12 +366,30 @@ class _SceneLight:
             source = light if source is None else source
             if self._streak is None:
                 self._streak = self._take(light)
-            light = moved = self._streak
+            light = streak = self._streak
         self._blurred = (exposure.blur, light)
-        if defocused is None and moved is None:
+        if defocused is None and streak is None:
             return light, None
         assert source is not None
-        return light, Blur(source, exposure.defocus_px, defocused, exposure.motion_px, moved)
+        if exposure.is_uniform:
+            return light, Blur(source, exposure.defocus_px, defocused, exposure.motion_px, streak)
+        return light, partial(self._fill, exposure, source, defocused, streak)
+
+    def _fill(
+        self,
+        exposure: Exposure,
+        source: torch.Tensor,
+        defocused: torch.Tensor | None,
+        streak: torch.Tensor | None,
+    ) -> None:
+        """Blurs `source` into `defocused` by the lens and into `streak` by motion, where given."""
+        if defocused is not None:
+            source = self._scene_blur.defocused(source, exposure, defocused)
+        if streak is not None:
+            if exposure.path is None:
+                motion_streak(source, exposure.motion_px, streak, limit=LIGHT_LIMIT)
+            else:
+                moved(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure, streak)
 
     def _take(self, like: torch.Tensor) -> torch.Tensor:
         return self._free.pop() if self._free else torch.empty(like.shape)
@@ -378,3 +403,4 @@ class _SceneLight:
     def _drop_defocused(self) -> None:
         self._free.extend(self._defocused.values())
         self._defocused.clear()
+        self._scene_blur.forget()
