@@ -389,7 +389,7 @@ class _SceneLight:
             if exposure.path is None:
                 motion_streak(source, exposure.motion_px, streak, limit=LIGHT_LIMIT)
             else:
-                moved(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure, streak)
+                moved(source, exposure, streak)
 
     def _take(self, like: torch.Tensor) -> torch.Tensor:
         return self._free.pop() if self._free else torch.empty(like.shape)

@@ -95,16 +95,11 @@ class Layout:
         assert self.subject is not None
         return self.subject[None].float()
 
-    def without_subject(self, light: torch.Tensor) -> torch.Tensor:
-        """`light` (P, H, W) with the nearest background in place of the subject."""
-        height, width = light.shape[-2:]
-        return light.reshape(-1, height * width)[:, self._background].reshape(light.shape)
-
     @cached_property
-    def _background(self) -> torch.Tensor:
-        """(H W,) int64, the nearest pixel of the background to each pixel."""
+    def behind(self) -> torch.Tensor:
+        """(H, W) int64, the pixel of the background nearest to each, counted row by row."""
         assert self.subject is not None
         rows, columns = distance_transform_edt(
             self.subject.numpy(), return_distances=False, return_indices=True
         )
-        return torch.from_numpy((rows * self.subject.shape[1] + columns).reshape(-1)).long()
+        return torch.from_numpy(rows.astype(np.int64) * self.subject.shape[1] + columns)

@@ -15,7 +15,7 @@ from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
 from simulator.capture.sensor import defocused_light
 from simulator.optics.disc_bank import DiscBank, remaining_variance
-from simulator.optics.motion_path import Path, Taps, path_blur, path_taps
+from simulator.optics.motion_path import Path, Taps, path_blur, path_blur_apart, path_taps
 from simulator.utils.tiles import TILE
 
 
@@ -56,7 +56,7 @@ def moved(light: torch.Tensor, exposure: Exposure, out: torch.Tensor | None = No
     """`light` (4, H, W), behind the lens already, as it moves along the paths of `exposure`.
 
     Args:
-        light: Light, not beyond `LIGHT_LIMIT`.
+        light: Light; limited to `LIGHT_LIMIT`.
         exposure: An exposure with a path.
         out: See `SceneBlur.defocused`.
     """
@@ -64,14 +64,9 @@ def moved(light: torch.Tensor, exposure: Exposure, out: torch.Tensor | None = No
     height, width = light.shape[-2:]
     taps = path_taps(exposure.path, height, width)
     if exposure.subject_path is None or exposure.layout is None:
-        return path_blur(light, taps, out)
+        return path_blur(light, taps, out, limit=LIGHT_LIMIT)
     own, layout = path_taps(exposure.subject_path, height, width), exposure.layout
-    mask = layout.mask.to(light.device)
-    out = path_blur(layout.without_subject(light), taps, out)
-    covered = path_blur(torch.cat([light * mask, mask]), own)
-    out *= 1.0 - covered[-1].clamp_(max=1.0)
-    out += covered[:-1]
-    return out
+    return path_blur_apart(light, layout.mask, layout.behind, taps, own, out, limit=LIGHT_LIMIT)
 
 
 # -- noise of the source ------------------------------------------------------------------------

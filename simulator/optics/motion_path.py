@@ -24,8 +24,10 @@ from simulator.utils.threads import in_shares
 _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
 #: Points that the length of a path is summed over.
 _LENGTH_POINTS = 32
-#: Products of a tap and a sample from which another thread is worth waking.
-_WORTH_A_THREAD = 2**22
+#: Shares below this are left out.
+_LEAST_WEIGHT = 1e-9
+#: Samples from which another thread is worth waking.
+_WORTH_A_THREAD = 2**18
 _jit = functools.partial(kernel, fastmath={"contract"})
 
 
@@ -53,7 +55,7 @@ class Movement:
     @property
     def along_rows(self) -> bool:
         """Whether the shake makes a straight streak along the rows."""
-        return self.turn == 0.0 and self.direction in (0.0, math.pi, -math.pi)
+        return self.turn == 0.0 and self.direction == 0.0
 
     def path(self, speed: float, time: float, height: int) -> Path:
         """Path of the background, as the camera shakes.
@@ -75,7 +77,7 @@ class Movement:
         """Lengths of the subject's path [frame heights] in exposures of `times` (S,) [s]."""
         own, angle = self.subject_speed * times, self.subject_direction
         drift = own * math.cos(angle), own * math.sin(angle)
-        return _length(speed * times, self.direction, self.turn * times, *drift)
+        return _lengths(speed * times, self.direction, self.turn * times, *drift)
 
 
 #: That of an image which moves along the rows, wherever it has a speed.
@@ -104,34 +106,38 @@ class Path(NamedTuple):
         """Length of the whole path [pixel]."""
         if not (self.drift_x or self.drift_y):
             return self.extent
-        return float(_length(*(np.asarray(value) for value in self)))
+        return float(_length(*self))
 
 
-def _length(
-    extent: np.ndarray,
-    direction: float | np.ndarray,
-    turn: np.ndarray,
-    drift_x: np.ndarray,
-    drift_y: np.ndarray,
-) -> np.ndarray:
-    """Lengths (...) of paths; the arguments are those of `Path`."""
-    u = (np.arange(_LENGTH_POINTS) + 0.5) / _LENGTH_POINTS
-    angle = direction + turn[..., None] * u
-    x = extent[..., None] * np.cos(angle) + drift_x[..., None]
-    y = extent[..., None] * np.sin(angle) + drift_y[..., None]
-    return np.asarray(np.hypot(x, y).mean(axis=-1))
+@_jit()
+def _length(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyped-def]
+    """`Path.length`, by the midpoint rule."""
+    total = 0.0
+    for i in range(_LENGTH_POINTS):
+        angle = direction + turn * (i + 0.5) / _LENGTH_POINTS
+        total += math.hypot(extent * math.cos(angle) + drift_x, extent * math.sin(angle) + drift_y)
+    return total / _LENGTH_POINTS
+
+
+@_jit()
+def _lengths(extent, direction, turn, drift_x, drift_y):  # type: ignore[no-untyped-def]
+    """Lengths of S paths of one direction; the others are (S,)."""
+    out = np.empty(len(extent))
+    for i in range(len(out)):
+        out[i] = _length(extent[i], direction, turn[i], drift_x[i], drift_y[i])
+    return out
 
 
 # -- taps -------------------------------------------------------------------------------------
 
 
 class Taps(NamedTuple):
-    """Weighted shifts, K of them.
+    """Weighted shifts, K of them, a multiple of 4: the last may have no weight.
 
     Args:
         rows: (K,) int64, by how many rows down each looks.
         columns: (K,) int64, by how many columns to the right.
-        weights: (K,) float32, above 0; their sum is 1.
+        weights: (K,) float32, >= 0; their sum is 1.
     """
 
     rows: np.ndarray
@@ -144,70 +150,58 @@ class Taps(NamedTuple):
         return float((self.weights.astype(np.float64) ** 2).sum())
 
 
-def path_points(path: Path) -> np.ndarray:
-    """(2, N) y and x [pixel] of moments evenly spread over the exposure, their mean at 0."""
-    count = math.ceil(min(max(_POINTS_PER_PIXEL * path.length, 8.0), _MOST_POINTS))
-    u = (np.arange(count) + 0.5) / count
-    half = 0.5 * path.turn * u
-    # The chord of an arc: its length times sin(half) / half, in the mean of its directions.
-    chord, angle = path.extent * u * np.sinc(half / np.pi), path.direction + half
-    y = chord * np.sin(angle) + path.drift_y * u
-    x = chord * np.cos(angle) + path.drift_x * u
-    points = np.stack([y, x])
-    return points - points.mean(axis=1, keepdims=True)
-
-
 @functools.lru_cache(maxsize=256)
 def path_taps(path: Path, height: int, width: int) -> Taps:
     """The taps of `path` on frames of `height` x `width` pixels.
 
-    Shifts beyond the frame show its border whatever they are, so there are never more taps than the
-    frame's outline is long, about.
+    Shifts beyond the frame show its border whatever they are, so however long a path is, its taps
+    are about as many as the frame is high and wide.
     """
-    if path.turn == path.drift_y == 0.0 and path.direction in (0.0, math.pi, -math.pi):
-        return _streak_taps(
-            abs(math.copysign(path.extent, math.cos(path.direction)) + path.drift_x), width
-        )
-    points = path_points(path)
-    # Of each point's share of the path, as straight, what lies between the points.
-    steps = np.gradient(points, axis=1)
-    targets = (points**2).mean(axis=1) + (steps**2).mean(axis=1) / 12.0
-    y, x = (_widened(axis, target) for axis, target in zip(points, targets, strict=True))
-    row, column = np.floor(y), np.floor(x)
-    rows = np.concatenate([row, row, row + 1, row + 1])
-    columns = np.concatenate([column, column + 1, column, column + 1])
-    below, right = y - row, x - column
-    weights = np.concatenate(
-        [(1 - below) * (1 - right), (1 - below) * right, below * (1 - right), below * right]
-    )
-    rows = np.clip(rows, 1 - height, height - 1).astype(np.int64)
-    columns = np.clip(columns, 1 - width, width - 1).astype(np.int64)
-    pitch = 2 * width
-    found, index = np.unique(rows * pitch + columns + width, return_inverse=True)
-    total = np.bincount(index, weights, len(found)) / len(y)
-    kept = total > 1e-9
-    rows, columns = found[kept] // pitch, found[kept] % pitch - width
-    return Taps(rows, columns, (total[kept] / total[kept].sum()).astype(np.float32))
+    if path.turn == path.drift_y == 0.0 and path.direction == 0.0:
+        return _streak_taps(path.extent + path.drift_x, width)
+    count = math.ceil(min(max(_POINTS_PER_PIXEL * path.length, 8.0), _MOST_POINTS))
+    return Taps(*_rasterised(*path, count, height, width))
 
 
 def _streak_taps(extent_px: float, width: int) -> Taps:
     """The taps of a streak along the rows, as `simulator.optics.shapes.motion_kernel` has them."""
-    n, end = streak_share(extent_px)
+    n, end = streak_share(abs(extent_px))
     weights = np.ones(2 * n + 3)
     weights[0] = weights[-1] = end
     columns = np.clip(np.arange(-n - 1, n + 2), 1 - width, width - 1)
     found, index = np.unique(columns, return_inverse=True)
     total = np.bincount(index, weights / weights.sum(), len(found)).astype(np.float32)
-    return Taps(np.zeros(len(found), np.int64), found, total)
+    fill = (0, -len(found) % 4)
+    return Taps(np.zeros(len(found) + fill[1], np.int64), np.pad(found, fill), np.pad(total, fill))
 
 
 @_jit()
-def _widened(points, target):  # type: ignore[no-untyped-def]
-    """`points` along an axis, scaled such that their shares of pixels have a second moment.
+def _positions(extent, direction, turn, drift_x, drift_y, count):  # type: ignore[no-untyped-def]
+    """y and x [pixel] of moments evenly spread over the exposure, their means at 0."""
+    y, x = np.empty(count), np.empty(count)
+    for i in range(count):
+        u = (i + 0.5) / count
+        half = 0.5 * turn * u
+        # The chord of an arc: its length times sin(half) / half, in the mean of its directions.
+        chord = extent * u * (math.sin(half) / half if abs(half) > 1e-6 else 1.0)
+        y[i] = chord * math.sin(direction + half) + drift_y * u
+        x[i] = chord * math.cos(direction + half) + drift_x * u
+    return y - y.mean(), x - x.mean()
 
-    A point between two pixels has a share of each, which alone widens it: below a pixel by more
-    than the path is long.
+
+@_jit()
+def _widened(points):  # type: ignore[no-untyped-def]
+    """`points` along an axis, scaled such that their shares of pixels have the path's second moment.
+
+    That of the path is that of the points, and of the straight piece that each stands for. A point
+    between two pixels has a share of each, which alone widens it: below a pixel by more than the
+    path is long.
     """
+    target, count = 0.0, len(points)
+    for i in range(count):
+        step = 0.5 * (points[min(i + 1, count - 1)] - points[max(i - 1, 0)])
+        step = 2.0 * step if i in (0, count - 1) else step
+        target += points[i] ** 2 + step * step / 12.0
     low, high = 0.0, 1.5
     for _ in range(40):
         scale, moment = 0.5 * (low + high), 0.0
@@ -215,20 +209,54 @@ def _widened(points, target):  # type: ignore[no-untyped-def]
             value = scale * point
             share = value - math.floor(value)
             moment += value * value + share * (1.0 - share)
-        if moment < target * len(points):
+        if moment < target:
             low = scale
         else:
             high = scale
     return low * points
 
 
+@_jit()
+def _rasterised(  # type: ignore[no-untyped-def]
+    extent, direction, turn, drift_x, drift_y, count, height, width
+):
+    """Rows, columns and weights of `Taps`: each point has a share of the four pixels around it."""
+    y, x = _positions(extent, direction, turn, drift_x, drift_y, count)
+    y, x = _widened(y), _widened(x)
+    top, bottom = max(math.floor(y.min()), 1 - height), min(math.floor(y.max()) + 1, height - 1)
+    left, right = max(math.floor(x.min()), 1 - width), min(math.floor(x.max()) + 1, width - 1)
+    grid = np.zeros((bottom - top + 1, right - left + 1))
+    for i in range(count):
+        row, column = math.floor(y[i]), math.floor(x[i])
+        for down in range(2):
+            part = (y[i] - row if down else 1.0 - (y[i] - row)) / count
+            inside = min(max(row + down, top), bottom) - top
+            for over in range(2):
+                share = x[i] - column if over else 1.0 - (x[i] - column)
+                grid[inside, min(max(column + over, left), right) - left] += part * share
+    number = (grid > _LEAST_WEIGHT).sum()
+    size = (number + 3) // 4 * 4
+    rows, columns = np.zeros(size, np.int64), np.zeros(size, np.int64)
+    weights = np.zeros(size)
+    k = 0
+    for i in range(len(grid)):
+        for j in range(grid.shape[1]):
+            if grid[i, j] > _LEAST_WEIGHT:
+                rows[k], columns[k], weights[k] = i + top, j + left, grid[i, j]
+                k += 1
+    return rows, columns, (weights / weights.sum()).astype(np.float32)
+
+
 # -- blur -------------------------------------------------------------------------------------
 
 
 @_jit()
-def _blur_rows(planes, rows, columns, weights, reach, limit, out):  # type: ignore[no-untyped-def]
-    """Sums of shifted rows, four taps at a time; as many taps as a multiple of 4."""
+def _blur_rows(planes, rows, columns, weights, limit, out):  # type: ignore[no-untyped-def]
+    """Sums of shifted rows, four taps at a time."""
     height, width = planes.shape[1:]
+    reach = 0
+    for column in columns:
+        reach = max(reach, abs(column))
     padded = np.empty((height, width + 2 * reach), np.float32)
     for plane in range(len(planes)):
         for y in range(height):
@@ -252,6 +280,31 @@ def _blur_rows(planes, rows, columns, weights, reach, limit, out):  # type: igno
                     total[x] += (own[0] * a[x] + own[1] * b[x]) + (own[2] * c[x] + own[3] * d[x])
 
 
+@_jit()
+def _blur_apart(planes, mask, behind, taps, own, limit, out):  # type: ignore[no-untyped-def]
+    """Background along `taps`, the subject in front of it along `own`; see `path_blur_apart`."""
+    count, height, width = planes.shape
+    split = np.empty((1, height, width), np.float32)
+    front, cover = np.empty_like(split), np.empty_like(split)
+    _blur_rows(mask, own[0], own[1], own[2], limit, cover)
+    for plane in range(count):
+        flat = planes[plane].reshape(-1)
+        for y in range(height):
+            for x in range(width):
+                split[0, y, x] = flat[behind[y, x]]
+        _blur_rows(split, taps[0], taps[1], taps[2], limit, out[plane : plane + 1])
+        for y in range(height):
+            for x in range(width):
+                value = planes[plane, y, x]
+                value = value if value < limit else limit
+                split[0, y, x] = mask[0, y, x] * (value if value > -limit else -limit)
+        _blur_rows(split, own[0], own[1], own[2], limit, front)
+        for y in range(height):
+            for x in range(width):
+                seen = max(np.float32(1) - cover[0, y, x], np.float32(0))
+                out[plane, y, x] = seen * out[plane, y, x] + front[0, y, x]
+
+
 def path_blur(
     light: torch.Tensor,
     taps: Taps,
@@ -270,15 +323,53 @@ def path_blur(
     if not light.is_cpu:
         return _shifted_sum(light.clamp(-limit, limit), taps)
     out = torch.empty(light.shape) if out is None else out
-    fill = (0, -len(taps.weights) % 4)
-    rows, columns, weights = (np.pad(values, fill) for values in taps)
-    reach = int(np.abs(columns).max(initial=0))
     planes, result = light.contiguous().numpy(), out.numpy()
-    fixed = (rows, columns, weights, reach, np.float32(limit))
     in_shares(
-        lambda first, last: _blur_rows(planes[first:last], *fixed, result[first:last]),
+        lambda first, last: _blur_rows(
+            planes[first:last], *taps, np.float32(limit), result[first:last]
+        ),
         len(planes),
-        least=1 + _WORTH_A_THREAD // (len(weights) * planes[0].size),
+        least=1 + _WORTH_A_THREAD // planes[0].size,
+    )
+    return out
+
+
+def path_blur_apart(
+    light: torch.Tensor,
+    mask: torch.Tensor,
+    behind: torch.Tensor,
+    taps: Taps,
+    own: Taps,
+    out: torch.Tensor | None = None,
+    *,
+    limit: float = math.inf,
+) -> torch.Tensor:
+    """A subject that moves along its own path, in front of a background that moves along another.
+
+    ``(1 - A) (K_b * B) + K_s * (M L)`` with the mask M of the subject, A = K_s * M, and the
+    background B that continues behind it: uniform light stays uniform.
+
+    Args:
+        light: (P, H, W) float32, L.
+        mask: (1, H, W) float32, M.
+        behind: (H, W) int64, which pixel (counted row by row) B shows in place of each.
+        taps: Of the background's path, K_b.
+        own: Of the subject's, K_s.
+        out: See `path_blur`.
+        limit: See `path_blur`.
+    """
+    if not light.is_cpu:
+        light, mask = light.clamp(-limit, limit), mask.to(light.device)
+        background = light.flatten(1)[:, behind.to(light.device).flatten()].reshape(light.shape)
+        seen = (1.0 - _shifted_sum(mask, own)).clamp(min=0.0)
+        return seen * _shifted_sum(background, taps) + _shifted_sum(mask * light, own)
+    out = torch.empty(light.shape) if out is None else out
+    planes, result = light.contiguous().numpy(), out.numpy()
+    fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
+    in_shares(
+        lambda first, last: _blur_apart(planes[first:last], *fixed, result[first:last]),
+        len(planes),
+        least=1 + _WORTH_A_THREAD // planes[0].size,
     )
     return out
 
