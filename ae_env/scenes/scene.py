@@ -464,9 +464,7 @@ class Scene:
         if mask is not None:
             mask = mask[window].reshape(tiles).permute(0, 2, 1, 3).flatten(2).any(dim=2)
         if layout is not None:
-            seen = layout.subject
-            seen = None if seen is None else averaged(seen.float()) > 0.5
-            layout = Layout(averaged(layout.defocus).float().clamp(max=1.0), seen)
+            layout = layout.cut(*window).averaged(k)
         return replace(
             self,
             light=averaged(self.light).float(),

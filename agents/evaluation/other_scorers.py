@@ -14,6 +14,7 @@ from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import prepare_scene
 from agents.evaluation.evaluation_plan import EvaluationPlan, groups_in_turn
 from agents.evaluation.result import EvaluationResult
+from simulator.optics.motion_path import ALONG_ROWS, Movement
 
 if TYPE_CHECKING:
     from ae_env.options import EnvOptions
@@ -51,11 +52,9 @@ def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, di
             visited = np.unique(
                 np.concatenate([t.states[:, episodes].ravel() for t in result.tracks.values()])
             )
-            speed = 0.0 if result.speed is None else float(result.speed[j])
-            defocus = 0.0 if result.defocus is None else float(result.defocus[j])
             scores = np.full(len(result.grid), np.nan)
             scores[visited] = state_scores(
-                scorer, options, scene, visited.tolist(), speed=speed, defocus=defocus
+                scorer, options, scene, visited.tolist(), **result.moves(j)
             )
             for policy, track in result.tracks.items():
                 mean = float(scores[track.states[:, episodes]].mean())
@@ -75,6 +74,7 @@ def state_scores(
     *,
     speed: float = 0.0,
     defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
 ) -> Floats:
     """Expected score of some states of a scene, ``(n,)``; image scorers over `NOISE_SEEDS`.
 
@@ -84,10 +84,11 @@ def state_scores(
         scene: The scene.
         states: Indices into the grid.
         speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
+        movement: Directions of the image's motion, and the subject's own.
     """
     camera, grid = options.make_camera(), options.make_grid()
-    prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
+    prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus, movement=movement)
     prepared = replace(prepared, tolerance=options.tolerance)
     found = []
     for first in range(0, len(states), _CHUNK):
@@ -99,6 +100,7 @@ def state_scores(
             camera,
             speed=np.full(count, speed),
             defocus=np.full(count, defocus),
+            movements=[movement] * count,
             gain=np.ones(count),
         )
         parts = scorer.score_parts(None, captures, ("light", "blur"))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 
 #: Levels that `Layout.shares` counts defocus in.
@@ -77,6 +78,20 @@ class Layout:
         apart = (1.0 / depth.double() - 1.0 / distance).abs()
         relative = (apart / apart.max().clamp(min=1e-12)).float()
         return cls(relative, relative <= depth_of_field)
+
+    def averaged(self, factor: int) -> Layout:
+        """Means over `factor` x `factor` pixels; the subject is where it has most of them."""
+
+        def mean(values: torch.Tensor) -> torch.Tensor:
+            return F.avg_pool2d(values[None].double(), factor)[0]
+
+        subject = None if self.subject is None else mean(self.subject) > 0.5
+        return Layout(mean(self.defocus).float().clamp(max=1.0), subject)
+
+    def cut(self, rows: slice, columns: slice) -> Layout:
+        """A window of it."""
+        subject = None if self.subject is None else self.subject[rows, columns]
+        return Layout(self.defocus[rows, columns], subject)
 
     @cached_property
     def shares(self) -> Shares:

@@ -208,6 +208,7 @@ class PreparedScene:
             aperture_px,
             opens,
             opens_denoised,
+            self.movement.along_rows and not self._subject_moves,
         )
 
     @property

@@ -13,6 +13,7 @@ import torch
 
 from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
+from simulator.capture.layout import Layout
 from simulator.capture.sensor import defocused_light
 from simulator.optics.disc_bank import DiscBank, remaining_variance
 from simulator.optics.motion_path import Path, Taps, path_blur, path_blur_apart, path_taps
@@ -84,21 +85,32 @@ def remaining_noise(
     Returns:
         That of the whole frame, and (H, W) that of each pixel relative to it; None for 1.
     """
-    layout, own = exposure.layout, exposure.subject_path
-    if layout is None:
-        return _uniform_energy(exposure.path, exposure.defocus_px, height, width), None
-    diameter = layout.defocus * exposure.defocus_px
-    taps = None if exposure.path is None else path_taps(exposure.path, height, width)
+    path = exposure.path
+    if path is None and exposure.motion_px:
+        path = Path(exposure.motion_px)
+    blurs = path, exposure.subject_path, exposure.defocus_px
+    if exposure.layout is None:
+        return _uniform_energy(path, exposure.defocus_px, height, width), None
+    return 1.0, _remaining_noise(exposure.layout, *blurs)
+
+
+@functools.lru_cache(maxsize=2)  # a plan asks again
+def _remaining_noise(
+    layout: Layout, path: Path | None, own: Path | None, defocus_px: float
+) -> torch.Tensor:
+    height, width = layout.defocus.shape
+    diameter = layout.defocus * defocus_px
+    taps = None if path is None else path_taps(path, height, width)
     left = remaining_variance(diameter, taps)
     if own is None or layout.subject is None:
-        return 1.0, left
+        return left
     # Where the subject has part of a pixel, both parts are independent: the smeared mask of squared
     # weights says how much of the subject's noise is there.
     taps = path_taps(own, height, width)
     squared = taps._replace(weights=taps.weights**2)
     covered, noise = (path_blur(layout.mask, t)[0].clamp(max=1.0) for t in (taps, squared))
     subject = noise * (remaining_variance(diameter, taps) / taps.energy)
-    return 1.0, ((1.0 - covered).square() * left + subject).clamp(max=1.0)
+    return ((1.0 - covered).square() * left + subject).clamp(max=1.0)
 
 
 @functools.lru_cache(maxsize=4096)
