@@ -19,6 +19,7 @@ from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
 from simulator.camera import CameraProfile
+from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.raw.develop import develop
 from simulator.settings import format_exposure_time
 
@@ -108,6 +109,7 @@ def contact_sheet(
     scorer: str | Mapping[str, float] | CompositeScorer = "balanced",
     speed: float = 0.0,
     defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
     path: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
     seed: int = 0,
 ) -> Image.Image:
@@ -123,7 +125,8 @@ def contact_sheet(
         grid: The states; the default grid's 64 by default.
         scorer: Scorer of the captures, as `make_scorer` takes it.
         speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
+        movement: Directions of the image's motion, and the subject's own.
         path: States that a policy went through, the start state first; or several by name.
         seed: Seed of the noise.
 
@@ -140,8 +143,9 @@ def contact_sheet(
     paths = _checked_paths(path, len(grid))
     scene = _averaged(scene, CAPTURE_PIXELS)
     tables = ScoreTables(grid, camera, make_scorer(scorer))
-    table = tables.table(scene, speed=speed, defocus=defocus)
-    prepared = prepare_scene(scene, camera, speed=speed, defocus=defocus)
+    moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
+    table = tables.table(scene, **moves)
+    prepared = prepare_scene(scene, camera, **moves)
     frames = prepared.stream(grid.states, seed=seed)
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, speed, defocus, grid, table)
@@ -177,6 +181,7 @@ def _averaged(scene: Scene, size: int) -> Scene:
         nlf=scene.nlf.scaled(1.0 / factor**2),
         box_factor=scene.box_factor * factor,
         saturated=mask,
+        layout=None if scene.layout is None else scene.layout.averaged(factor),
     )
 
 

@@ -124,6 +124,8 @@ class EpisodeCore:
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
         apertures = len(self.grid.f_numbers)
+        if any(scene.layout is not None for scene in self.scenes):  # what their discs make of it
+            apertures += len(DIAMETERS)
         if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results
             apertures += len(DIAMETERS) + apertures
         as_recorded_and_denoised = 1 + any(s.denoised is not None for s in self.scenes)
@@ -190,7 +192,8 @@ class EpisodeCore:
         """Sets `Episodes.light_index`: episodes at rest share the light of their scene."""
         episodes = self.episodes
         scenes = episodes.scene[env_indices]
-        moves = (episodes.speed[env_indices] > 0.0) | (episodes.defocus[env_indices] > 0.0)
+        blurs = (episodes.speed, episodes.subject_speed, episodes.defocus)
+        moves = np.any([blur[env_indices] > 0.0 for blur in blurs], axis=0)
         shared, own = ~moves & self._shareable[scenes], len(self.scenes) + env_indices
         episodes.light_index[env_indices] = np.where(shared, scenes, own)
 
@@ -321,7 +324,7 @@ class EpisodeCore:
             return self._prepared_at_rest(light_index)
         episode = self.episodes[env_index]
         at_rest = self._prepared_at_rest(episode.scene)
-        return in_episode(at_rest, speed=episode.speed, defocus=episode.defocus)
+        return in_episode(at_rest, **episode.moves)
 
     def _prepared_at_rest(self, scene: int) -> PreparedScene:
         prepared = self._at_rest.get(scene)
@@ -411,8 +414,7 @@ class EpisodeCore:
                 gain, rows = self._light.of_states(env_index, self._bounds[1])
             table = self.tables.table(
                 self.scenes[episode.scene],
-                speed=episode.speed,
-                defocus=episode.defocus,
+                **episode.moves,
                 gain=gain,
                 row_gain=rows,
                 prepared=self._prepared(int(self.episodes.light_index[env_index])),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,12 +19,16 @@ STATIC_SHARE = 1.0 / 3.0
 SPEED_SIGMA = 1.3
 #: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
+#: Share of the moving episodes in which the subject moves of its own, in some of them alone.
+SUBJECT_SHARE, ALONE_SHARE = 0.5, 0.15
+#: Standard deviation of the rate at which the direction of the shake turns [rad/s].
+TURN_SIGMA = math.pi
 #: Names that a reset may choose, and their names in errors; frames count up to `MAX_FRAME`.
 OPTIONS = ("scene", "state", "frame")
 _OPTION = tuple(f"options[{name!r}]" for name in OPTIONS)
 MAX_FRAME = 2**31 - 1
 #: Uniform numbers that an episode is made of.
-_NUMBERS = 7
+_NUMBERS = 12
 #: Those have so many different values.
 _VALUES = 2.0**53
 
@@ -48,6 +53,8 @@ class Draws:
         allowed = np.stack([allowed_states(scene, num_states) for scene in scenes])
         self._starts = np.argsort(~allowed, axis=1, kind="stable")
         self._num_starts = allowed.sum(axis=1)
+        subjects = [s.layout is not None and s.layout.subject is not None for s in scenes]
+        self._has_subject = np.array(subjects)
         self._own_blur = np.array([s.own_blur(4.0) * 64.0 / options.resolution for s in scenes])
 
     def draw(
@@ -71,7 +78,7 @@ class Draws:
         """
         given = [self._chosen(options) for options in chosen or ()]  # refused before any draw
         uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
-        which, start, moving, speed, defocus, phase, seed = uniforms
+        which, start, moving, speed, defocus, phase, seed, *motion = uniforms
         scene = (which * len(self._ids)).astype(np.int64)
         frame = np.zeros(len(rngs), np.int64)
         for i, (wanted_scene, _, wanted_frame) in enumerate(given):
@@ -80,7 +87,6 @@ class Draws:
         state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
         for i, (_, wanted_state, _) in enumerate(given):
             state[i] = state[i] if wanted_state is None else wanted_state
-        speeds = (moving >= STATIC_SHARE) * np.exp(SPEED_SIGMA * ndtri(speed)) * self._speeds[scene]
         discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
         discs = _fixed_or_drawn(
             self._options.depth, np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
@@ -88,12 +94,39 @@ class Draws:
         return {
             "scene": scene,
             "state": state,
-            "speed": _fixed_or_drawn(self._options.motion, speeds),
+            **self._motion(scene, moving, speed, *motion),
             "defocus": discs,
             "focus_drive": np.hypot(discs, self._own_blur[scene]),
             "phase": phase,
             "noise_seed": (seed * _VALUES).astype(np.int64),
             "frame": frame,
+        }
+
+    def _motion(
+        self,
+        scene: np.ndarray,
+        moving: np.ndarray,
+        speed: np.ndarray,
+        direction: np.ndarray,
+        turn: np.ndarray,
+        apart: np.ndarray,
+        subject_speed: np.ndarray,
+        subject_direction: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """Columns of the motion in `scene` (K,), from K uniform numbers each."""
+        shake, own = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
+        # Either may rest where both could move: a camera on a tripod, a subject that waits.
+        moves = moving >= STATIC_SHARE
+        subject_moves = moves & self._has_subject[scene] & (apart < SUBJECT_SHARE)
+        shakes = moves & ~(subject_moves & (apart < ALONE_SHARE))
+        if self._options.motion != "random":  # one speed of the whole image
+            subject_moves = np.zeros(len(scene), bool)
+        return {
+            "speed": _fixed_or_drawn(self._options.motion, shakes * shake * self._speeds[scene]),
+            "direction": 2.0 * math.pi * direction,
+            "turn": TURN_SIGMA * ndtri(turn),
+            "subject_speed": subject_moves * own * self._speeds[scene],
+            "subject_direction": 2.0 * math.pi * subject_direction,
         }
 
     def _chosen(self, options: Mapping[str, Any]) -> tuple[int | None, int | None, int | None]:

@@ -154,6 +154,7 @@ class PartScores:
             self.tables.camera,
             speed=self.episodes.speed[env_indices],
             defocus=self.episodes.defocus[env_indices],
+            movements=[self.episodes[index].movement for index in env_indices.tolist()],
             gain=gains,
             row_gain=rows,
             light=light,
@@ -168,9 +169,7 @@ class PartScores:
         lights, first = lights[missing], first[missing]
         for light, env_index in zip(lights.tolist(), env_indices[first].tolist(), strict=True):
             episode = self.episodes[env_index]
-            parts = self.tables.known_parts(
-                self.scenes[episode.scene], speed=episode.speed, defocus=episode.defocus
-            )
+            parts = self.tables.known_parts(self.scenes[episode.scene], **episode.moves)
             for column, name in enumerate(self._known):
                 self._scores[light, :, column] = parts[name]
         self._scored[lights] = True

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+
+from simulator.optics.motion_path import Movement
 
 
 @dataclass(frozen=True)
@@ -16,7 +19,11 @@ class Episode:
         scene: Index of the scene.
         state: Current exposure state.
         speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        direction: Of the image's motion when a shutter opens [rad], 0 along the rows.
+        turn: Rate at which it turns [rad/s].
+        subject_speed: Own speed of the scene's subject [frame heights per second].
+        subject_direction: Its direction [rad].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
         focus_drive: Blur at f/4 that the focus drive reports [pixel of a 64-pixel frame].
         phase: Phase of a periodic lighting, in [0, 1).
         noise_seed: Seed of the noise, which differs from frame to frame.
@@ -26,11 +33,25 @@ class Episode:
     scene: int
     state: int
     speed: float
+    direction: float
+    turn: float
+    subject_speed: float
+    subject_direction: float
     defocus: float
     focus_drive: float
     phase: float
     noise_seed: int
     frame: int = 0
+
+    @property
+    def movement(self) -> Movement:
+        """Directions of the image's motion, and the subject's own."""
+        return Movement(self.direction, self.turn, self.subject_speed, self.subject_direction)
+
+    @property
+    def moves(self) -> dict[str, Any]:
+        """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
+        return {"speed": self.speed, "defocus": self.defocus, "movement": self.movement}
 
 
 class Episodes:
@@ -55,6 +76,7 @@ class Episodes:
     def __init__(self, count: int, delay: int) -> None:
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
         self.speed, self.defocus, self.focus_drive, self.phase = np.zeros((4, count))
+        self.direction, self.turn, self.subject_speed, self.subject_direction = np.zeros((4, count))
         self.begun = np.zeros(count, bool)
         self.light_index, self.previous = np.zeros((2, count), np.int64)
         self.pending = np.zeros((count, delay + 1), np.int64)

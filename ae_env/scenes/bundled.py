@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from ae_env.scenes.depth import drape
 from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
 from ae_env.scenes.procedural import (
     GENERATOR_VERSION,
@@ -89,11 +90,11 @@ def _make(
     logger.info("making the bundled scenes of split %r for camera %s", split, camera.name)
     for kind, index in _procedural(split, size):
         if kind in kinds:
-            yield _procedural_scene(kind, index, camera).resized(resolution, crop)
+            yield drape(_procedural_scene(kind, index, camera)).resized(resolution, crop)
     photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
         for scene in photograph_scenes(photograph, camera):
-            yield scene.resized(resolution, crop)
+            yield drape(scene).resized(resolution, crop)
 
 
 def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
@@ -137,7 +138,7 @@ def _cache_key(
     return cache_key(
         {
             "generator": GENERATOR_VERSION,
-            "format": 4,
+            "format": 5,
             "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,

@@ -24,6 +24,7 @@ import numpy as np
 from pydantic import Field
 
 from ae_env.scenes.bundled import Split
+from ae_env.scenes.depth import drape
 from ae_env.scenes.radiance import native_size, perspective, read_radiance
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
 from ae_env.scenes.stored import cached_scenes
@@ -72,7 +73,7 @@ _CELL = 4
 #: Luminance of linear sRGB.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Raised when the views change.
-_VERSION = 1
+_VERSION = 2
 
 
 class Asset(Configuration):
@@ -172,7 +173,7 @@ def _make(
     logger.info("cutting %d views from each of %d panoramas", views, len(assets))
     for asset in assets:
         for scene in asset_views(asset, camera, size=size, views=views, seed=seed):
-            yield scene.resized(resolution, crop)
+            yield drape(scene).resized(resolution, crop)
 
 
 def asset_views(

@@ -16,6 +16,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import BlurredLight
 from simulator.capture.denoised import Denoised
+from simulator.capture.layout import Layout
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -106,6 +107,9 @@ class Scene:
             no noise, or no such module.
         defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
             scene whose own defocus is to grow as the aperture opens; None where all is far.
+        layout: What is out of focus, by how much relative to an episode's defocus, and what is the
+            subject, which may move apart from the rest; None where the whole frame has one defocus
+            and one motion.
         sampled: Whether each plane was sampled at its own place, as a sensor does. False: the four
             share their places, G1 equals G2, as in every bundled scene; averaged by a large
             `box_factor` there is hardly a difference.
@@ -132,6 +136,7 @@ class Scene:
     saturated: torch.Tensor | None = None
     denoised: torch.Tensor | None = None
     defocus_map: torch.Tensor | None = None
+    layout: Layout | None = None
     sampled: bool = False
     allowed: np.ndarray | None = None
 
@@ -189,6 +194,11 @@ class Scene:
                     f"{tuple(size)}"
                 )
             object.__setattr__(self, "defocus_map", found.float())
+        if self.layout is not None and self.layout.defocus.shape != size:
+            raise ValueError(
+                f"`layout` (shape {tuple(self.layout.defocus.shape)}) must be of shape "
+                f"{tuple(size)}"
+            )
 
     @property
     def noise_free(self) -> bool:
@@ -218,6 +228,7 @@ class Scene:
             box_factor=self.box_factor,
             denoised=denoised,
             aperture_blur=aperture_blur,
+            layout=self.layout,
             blurred_light=BlurredLight(
                 self.light, denoised, self.nlf, aperture_blur, self._statistics
             ),
@@ -225,8 +236,10 @@ class Scene:
 
     @cached_property
     def content(self) -> str:
-        """Digest of the light, and of the networks' results for it."""
+        """Digest of the light, of the networks' results for it, and of its layout."""
         tensors = {"light": self.light, "denoised": self.denoised, "defocus_map": self.defocus_map}
+        if self.layout is not None:
+            tensors |= {"layout": self.layout.defocus, "subject": self.layout.subject}
         return content_digest({name: t for name, t in tensors.items() if t is not None})
 
     @cached_property
@@ -418,7 +431,8 @@ class Scene:
         Returns:
             The scene with ``nlf / k**2`` and ``box_factor * k``; a pixel counts as saturated if
             any pixel averaged into it was. `defocus_map` is the root of the mean square, as second
-            moments add, divided by k: in pixels of the new light.
+            moments add, divided by k: in pixels of the new light. The defocus of `layout` is the
+            mean, its subject where that has most of a pixel.
 
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
@@ -446,9 +460,11 @@ class Scene:
             part = planes[..., window[0], window[1]]
             return part.reshape(*planes.shape[:-2], *tiles).double().mean(dim=(-3, -1))
 
-        mask, found = self.saturated, self.defocus_map
+        mask, found, layout = self.saturated, self.defocus_map, self.layout
         if mask is not None:
             mask = mask[window].reshape(tiles).permute(0, 2, 1, 3).flatten(2).any(dim=2)
+        if layout is not None:
+            layout = layout.cut(*window).averaged(k)
         return replace(
             self,
             light=averaged(self.light).float(),
@@ -457,6 +473,7 @@ class Scene:
             saturated=mask,
             denoised=None if self.denoised is None else averaged(self.denoised).float(),
             defocus_map=None if found is None else averaged(found.square()).sqrt().float() / k,
+            layout=layout,
         )
 
     def __repr__(self) -> str:

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 
 from ae_env.scenes.scene import Scene
+from ae_env.scorers.pixel_blur import layout_blur, stacked
 from ae_env.scorers.protocol import Captures
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings, exposure_ratio
 from simulator.utils.cache import LruCache
 
@@ -27,6 +29,7 @@ def describe_captures(
     *,
     speed: np.ndarray,
     defocus: np.ndarray,
+    movements: Sequence[Movement] | None = None,
     gain: np.ndarray,
     row_gain: np.ndarray | None = None,
     light: torch.Tensor | None = None,
@@ -41,6 +44,7 @@ def describe_captures(
         camera: The body.
         speed: (B,) image speed [frame heights per second].
         defocus: (B,) blur diameter at f/4 [pixel of a 64-pixel frame].
+        movements: Directions of the motion and subjects' own, B long; None for along the rows.
         gain: (B,) light relative to the scenes' own.
         row_gain: (B, H) light of each row relative to that; None where all rows have the same.
         light: (B, 4, H, W) the scenes' `Scene.clean_light` where it is at hand already.
@@ -50,9 +54,17 @@ def describe_captures(
     height = scenes[0].light.shape[-2]
     times = np.array([s.exposure_time for s in settings])
     aperture_blurs = np.array([4.0 / s.effective_f_number for s in settings])
-    blur = np.hypot(speed * times * height, defocus * aperture_blurs * height / 64.0)
+    discs = defocus * aperture_blurs * height / 64.0
+    blur = np.hypot(speed * times * height, discs)
     own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
     blur = np.hypot(blur, own)  # exactly `blur` where they are 0
+    moves = [ALONG_ROWS] * len(scenes) if movements is None else movements
+    numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
+    parts = [
+        layout_blur(scene, move, speed=v, times=t, discs=d, own=o)
+        for scene, move, v, (t, d, o) in zip(scenes, moves, speed.tolist(), numbers, strict=True)
+    ]
+    pixel_blur = stacked(parts, blur)
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
     return Captures(
         settings=settings,
@@ -61,12 +73,13 @@ def describe_captures(
         ratio=torch.from_numpy(np.array(ratios) * gain),
         nlf=[camera.nlf(s.iso) for s in settings],
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
-        blur_px=torch.from_numpy(blur),
+        blur_px=torch.from_numpy(blur) if pixel_blur is None else pixel_blur.mean_px,
         white_balance=torch.tensor([c.white_balance for c in scenes]),
         colour_matrices=[c.camera.colour_matrix for c in scenes],
         row_gain=None if row_gain is None else torch.from_numpy(row_gain),
         source_noise=source_noise,
         noisy=noisy,
+        pixel_blur=pixel_blur,
     )
 
 
@@ -100,6 +113,7 @@ class SceneCaptures:
         *,
         speed: float = 0.0,
         defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> Captures:
@@ -110,18 +124,25 @@ class SceneCaptures:
             states: S states that follow each other in the grid.
             speed: Image speed [frame heights per second].
             defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+            movement: Directions of the image's motion, and the subject's own.
             gain: Light relative to the scene's own, one or (S,).
             row_gain: (S, H), see `describe_captures`.
         """
         known = self._known(scene, states)
-        height = scene.light.shape[-2]
-        blur = np.hypot(
-            speed * known.times * height, defocus * known.aperture_blurs * height / 64.0
+        height, own = scene.light.shape[-2], known.captures.blur_px.numpy()
+        discs = defocus * known.aperture_blurs * height / 64.0
+        pixel_blur = layout_blur(
+            scene, movement, speed=speed, times=known.times, discs=discs, own=own
         )
+        if pixel_blur is None:
+            blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
+        else:
+            blur = pixel_blur.mean_px.numpy()
         captures = replace(
             known.captures,
             scene_light=self._light(scene, len(states)),
-            blur_px=torch.from_numpy(np.hypot(blur, known.captures.blur_px.numpy())),
+            blur_px=torch.from_numpy(blur),
+            pixel_blur=pixel_blur,
         )
         if not isinstance(gain, np.ndarray) and gain == 1.0 and row_gain is None:
             return captures

@@ -9,6 +9,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import torch
 
+from ae_env.scorers.pixel_blur import PixelBlur
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 
@@ -57,7 +58,8 @@ class Captures:
         nlf: Noise of a native sensor pixel at the settings, B long.
         proper_ev: (B,) float64, EV100 of the right exposure: that of the incident light, or, where
             it is unknown, the one at which the mean of the recorded green is 0.12.
-        blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame].
+        blur_px: (B,) float64, extent of motion and defocus blur together [pixel of the frame]; the
+            root mean square over the pixels, where they differ.
         white_balance: (B, 3) gains of R, G, B.
         colour_matrices: XYZ (D65) to camera RGB of each scene's light, 3 x 3, B long; None where
             unknown.
@@ -67,6 +69,7 @@ class Captures:
         source_noise: Noise that the source of each capture brings, of a native pixel, B long; None
             where all come from light without noise.
         noisy: Whether the captures have noise.
+        pixel_blur: How many pixels have which extent of blur; None where all have `blur_px`.
     """
 
     settings: Sequence[CameraSettings]
@@ -81,6 +84,7 @@ class Captures:
     row_gain: torch.Tensor | None = None
     source_noise: Sequence[NoiseLevelFunction] | None = None
     noisy: bool = True
+    pixel_blur: PixelBlur | None = None
 
     def __len__(self) -> int:
         return len(self.settings)

@@ -27,6 +27,7 @@ from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings
 
 #: Memory for cached descriptions of captures [byte]: some 500 scenes at 64 states.
@@ -72,6 +73,7 @@ def prepare_scene(
     *,
     speed: float = 0.0,
     defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
     gain: float = 1.0,
 ) -> PreparedScene:
     """`scene` as `camera` sees it in an episode.
@@ -80,19 +82,25 @@ def prepare_scene(
         scene: The scene.
         camera: The body that takes the captures.
         speed: Image speed [frame heights per second].
-        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame].
+        defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
+        movement: Directions of the image's motion, and the subject's own.
         gain: Light relative to the scene's own.
     """
     prepared = replace(scene.prepared, camera=camera)
-    return in_episode(prepared, speed=speed, defocus=defocus, gain=gain)
+    return in_episode(prepared, speed=speed, defocus=defocus, movement=movement, gain=gain)
 
 
 def in_episode(
-    prepared: PreparedScene, *, speed: float = 0.0, defocus: float = 0.0, gain: float = 1.0
+    prepared: PreparedScene,
+    *,
+    speed: float = 0.0,
+    defocus: float = 0.0,
+    movement: Movement = ALONG_ROWS,
+    gain: float = 1.0,
 ) -> PreparedScene:
     """A scene's `prepared` in an episode; the arguments are those of `prepare_scene`."""
     pixels = defocus * prepared.light.shape[-2] / 64.0
-    return replace(prepared, image_speed=speed, defocus=pixels, gain=gain)
+    return replace(prepared, image_speed=speed, defocus=pixels, movement=movement, gain=gain)
 
 
 def source_noises(
@@ -153,6 +161,7 @@ class ScoreTables:
         *,
         speed: float = 0.0,
         defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
         prepared: PreparedScene | None = None,
@@ -163,16 +172,18 @@ class ScoreTables:
             scene: The scene.
             speed: See `prepare_scene`.
             defocus: See `prepare_scene`.
+            movement: See `prepare_scene`.
             gain: Light relative to the scene's own; (S,) where it depends on the state, as in
                 flickering light.
             row_gain: (S, H) light of each row relative to that, see `Captures`.
             prepared: The scene in this episode, where that is at hand: `prepare_scene` makes it.
         """
+        moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
         if prepared is None:
-            prepared = prepare_scene(scene, self.camera, speed=speed, defocus=defocus)
+            prepared = prepare_scene(scene, self.camera, **moves)
             prepared = replace(prepared, tolerance=self.tolerance)
         light: Any = {"gain": gain, "row_gain": row_gain}
-        episode: Any = {"speed": speed, "defocus": defocus, **light}
+        episode: Any = {**moves, **light}
         parts = self.known_parts(scene, **episode)
         if self.code_scores.parts:
             captures = self._captures.describe(scene, self.grid.states, **episode)
@@ -182,7 +193,7 @@ class ScoreTables:
         if self.closed_form:
             mean = self.scorer.totals(parts)
         else:
-            samples = self._samples(scene, prepared, **episode)
+            samples = self._samples(scene, prepared, moves, gain, row_gain)
             totals = self.scorer.totals({**parts, **samples})  # (seeds, S)
             mean = totals.mean(axis=0)
             if self.noise_seeds > 1:
@@ -199,6 +210,7 @@ class ScoreTables:
         *,
         speed: float = 0.0,
         defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
@@ -215,6 +227,7 @@ class ScoreTables:
                 self.grid.states[part],
                 speed=speed,
                 defocus=defocus,
+                movement=movement,
                 gain=gain[part] if isinstance(gain, np.ndarray) else gain,
                 row_gain=None if row_gain is None else row_gain[part],
             )
@@ -249,9 +262,7 @@ class ScoreTables:
         self,
         scene: Scene,
         prepared: PreparedScene,
-        *,
-        speed: float,
-        defocus: float,
+        moves: dict[str, Any],
         gain: float | np.ndarray,
         row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
@@ -263,7 +274,7 @@ class ScoreTables:
         for part in _slices(len(self.grid), _CHUNK):
             states, rows = self.grid.states[part], None if row_gain is None else row_gain[part]
             light: Any = {"gain": gains[part], "row_gain": rows}
-            captures = self._captures.describe(scene, states, speed=speed, defocus=defocus, **light)
+            captures = self._captures.describe(scene, states, **moves, **light)
             noises = source_noises(prepared, states, gains[part])
             captures = replace(captures, source_noise=noises, noisy=self.noise)
             for seed, images in enumerate(self._images(prepared, states, **light)):

@@ -146,9 +146,10 @@ class Noise:
 
 
 class Sharpness:
-    """Motion and defocus blur: ``1 / (1 + (b / b0)^2)``.
+    """Motion and defocus blur: mean over the pixels of ``1 / (1 + (b / b0)^2)``.
 
-    b is the extent of both blurs together in pixels of the frame, b0 a 64th of its height.
+    b is the extent of both blurs of a pixel together in pixels of the frame, b0 a 64th of its
+    height.
     """
 
     domain: Domain = "raw"
@@ -157,4 +158,7 @@ class Sharpness:
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        return 1.0 / (1.0 + (captures.blur_px * 64.0 / captures.frame_height) ** 2)
+        scale, blur = 64.0 / captures.frame_height, captures.pixel_blur
+        if blur is None:
+            return 1.0 / (1.0 + (captures.blur_px * scale) ** 2)
+        return (blur.shares / (1.0 + (blur.levels * scale) ** 2)).sum(dim=1)

@@ -8,7 +8,7 @@ keeps every finished part in a file, and shares the work between processes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -231,7 +231,7 @@ class EvaluationRun:
 
         Returns:
             ``scores`` and ``allowed`` (J, T + 1, S), the reset frame first; ``speed`` and
-            ``defocus`` (J,) that the episodes drew.
+            ``defocus`` (J,) and ``movement`` (J, 4) that the episodes drew.
         """
         count, frames, own = self.num_tables, self.plan.frames, self.episodes
         episodes = Episodes(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
@@ -253,6 +253,7 @@ class EvaluationRun:
             "allowed": np.concatenate(allowed),
             "speed": np.array([episode.speed for episode in drawn]),
             "defocus": np.array([episode.defocus for episode in drawn]),
+            "movement": np.array([astuple(episode.movement) for episode in drawn]),
         }
 
     def make(self, member: Member, condition: Condition) -> Policy:
@@ -351,6 +352,7 @@ class EvaluationRun:
             scenes=scenes,
             speed=light["speed"][table],
             defocus=light["defocus"][table],
+            movement=light["movement"][table],
         )
 
 

@@ -35,9 +35,7 @@ def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, di
         for scene in chosen:
             j = scenes.index(scene)
             episodes = np.flatnonzero(np.arange(len(result.scene_ids)) % pairs == j)
-            speed = 0.0 if result.speed is None else float(result.speed[j])
-            defocus = 0.0 if result.defocus is None else float(result.defocus[j])
-            scores = tables.table(scene, speed=speed, defocus=defocus).mean
+            scores = tables.table(scene, **result.moves(j)).mean
             for policy, track in result.tracks.items():
                 mean = float(scores[track.states[:, episodes]].mean())
                 means[policy].setdefault(scene.group, []).append(mean)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation import metrics
+from simulator.optics.motion_path import Movement
 
 if TYPE_CHECKING:
     from ae_env.grid import ExposureGrid
@@ -87,6 +88,7 @@ class EvaluationResult:
         scenes: Scene of each episode.
         speed: Image speed of each episode [frame heights per second], ``(E,)``.
         defocus: Blur diameter of each episode at f/4 [pixel of a 64-pixel frame], ``(E,)``.
+        movement: Fields of each episode's `simulator.optics.motion_path.Movement`, ``(E, 4)``.
         other_scores: Mean score of the states that each policy chose under scorers that nothing was
             trained on: by scorer, then by policy.
     """
@@ -106,7 +108,17 @@ class EvaluationResult:
     scenes: Sequence[Scene] = ()
     speed: Floats | None = None
     defocus: Floats | None = None
+    movement: Floats | None = None
     other_scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def moves(self, episode: int) -> dict[str, Any]:
+        """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
+        known = {"speed": self.speed, "defocus": self.defocus}
+        found: dict[str, Any] = {
+            n: 0.0 if v is None else float(v[episode]) for n, v in known.items()
+        }
+        drawn = () if self.movement is None else self.movement[episode].tolist()
+        return found | {"movement": Movement(*drawn)}
 
     @cached_property
     def oracle(self) -> Floats:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 #: Increased when the layout of a file changes.
-_LAYOUT = 2
+_LAYOUT = 3
 #: Python files beside one's own that count as parts of it.
 _MAX_NEIGHBOURS = 200
 #: Errors that reading a damaged file can end in.

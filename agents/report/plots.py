@@ -196,9 +196,6 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
     kinds = result.kinds.tolist()
     episode = kinds.index(_KIND) if _KIND in kinds else 0
     options = result.plan.options()
-    speed, defocus = (
-        0.0 if v is None else float(v[episode]) for v in (result.speed, result.defocus)
-    )
     files = {}
     for k, first in enumerate(range(0, len(order), _PATHS)):
         paths = {}
@@ -211,8 +208,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
             grid=result.grid,
             scorer=options.make_scorer(),
             path=paths,
-            speed=speed,
-            defocus=defocus,
+            **result.moves(episode),
         )
         name = "contact_sheet.png" if k == 0 else f"contact_sheet_{k + 1}.png"
         files[name] = write_palette_png(folder / name, picture)

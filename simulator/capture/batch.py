@@ -20,6 +20,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure, exposure_table
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.scene_light import SceneLight
 from simulator.capture.sensor import Transitions, noise_balance, record
 from simulator.noise.generator import Noise, noise_keys, single_normals
 from simulator.optics.blur_kernels import Blur, blur_many
@@ -89,7 +90,7 @@ class CaptureBatch:
 
     def _forget_all(self) -> None:
         self._rows = _Rows(self.num_scenes * len(self.states))
-        self._lights: dict[int, _SceneLight] = {}
+        self._lights: dict[int, SceneLight] = {}
         # Images that are used again: new memory costs more than what is written to it.
         self._free: list[torch.Tensor] = []
         # Row of the blurred light that each scene has at present.
@@ -219,10 +220,10 @@ class CaptureBatch:
         columns.gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
 
-    def _light(self, index: int) -> _SceneLight:
+    def _light(self, index: int) -> SceneLight:
         light = self._lights.get(index)
         if light is None:
-            light = _SceneLight(self._prepared(index), self._free, self._cache_light)
+            light = SceneLight(self._prepared(index), self._free, self._cache_light)
             self._lights[index] = light
         return light
 
@@ -233,9 +234,11 @@ class CaptureBatch:
         try:
             opened = [pair for pair in planned if exposures[pair[1]].opened_to is not None]
             _in_shares(self._open, opened)
-            blurs = [self._begin_blur(index, row) for index, row in planned]
-            blur_many([blur for blur in blurs if blur is not None], limit=LIGHT_LIMIT)
-            _in_shares(self._balance, opened)
+            begun = [self._begin_blur(index, row) for index, row in planned]
+            blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
+            tasks = [task for task in begun if callable(task)]
+            in_shares(lambda first, last: [task() for task in tasks[first:last]], len(tasks))
+            _in_shares(self._balance, planned)
         except BaseException:  # some of the light is not made
             self.forget(indices)
             raise
@@ -245,7 +248,7 @@ class CaptureBatch:
         """Opens the aperture, which caches its result."""
         self._light(index).prepared.source_light(self._rows.exposure[row])
 
-    def _begin_blur(self, index: int, row: int) -> Blur | None:
+    def _begin_blur(self, index: int, row: int) -> Blur | Callable[[], None] | None:
         columns, exposure = self._rows, self._rows.exposure[row]
         columns.light[row], blur = self._light(index).blurred(exposure)
         remaining = exposure.remaining_variance
@@ -260,7 +263,8 @@ class CaptureBatch:
         if np.isnan(columns.excess_variance[row]):
             balance = noise_balance(columns.light[row], columns.exposure[row])
             columns.excess_variance[row] = balance.relative_excess_variance
-        if not self._cache_light:  # an aperture blur caches the light of each f-number
+        opened = columns.exposure[row].opened_to is not None
+        if opened and not self._cache_light:  # an aperture blur caches the light of each f-number
             self._light(index).prepared = self._prepared(index)
 
 
@@ -324,64 +328,3 @@ class _Rows:
         """Makes `rows` unknown."""
         self.gain[rows] = np.nan
         self.light[rows] = self.remaining_variance[rows] = self.exposure[rows] = None
-
-
-class _SceneLight:
-    """The blurred light of one scene, in memory that is used again.
-
-    Unlike `simulator.capture.blurred_light.BlurredLight`, which serves sweeps, it only says what
-    must be blurred, so that many scenes are blurred side by side. The latest light is cached,
-    because an agent that has settled repeats its state.
-
-    Args:
-        prepared: The scene in its own light.
-        free: Images that may be written to; they are put back here.
-        cache: Whether the defocused light of every f-number is cached.
-    """
-
-    def __init__(self, prepared: PreparedScene, free: list[torch.Tensor], cache: bool) -> None:
-        self.prepared, self._free, self._cache = prepared, free, cache
-        self._defocused: dict[tuple[Any, ...], torch.Tensor] = {}  # by aperture
-        self._blurred: tuple[tuple[Any, ...], torch.Tensor] | None = None  # by all blur
-        self._streak: torch.Tensor | None = None
-
-    def blurred(self, exposure: Exposure) -> tuple[torch.Tensor, Blur | None]:
-        """The light (4, H, W) with the blur of `exposure`, valid until the next call.
-
-        Returns:
-            The light, and the blur (`simulator.optics.blur_kernels.blur_many`) that fills it; None
-            where that was done before.
-        """
-        if self._blurred is not None and self._blurred[0] == exposure.blur:
-            return self._blurred[1], None
-        light = self._defocused.get(exposure.lens_blur)
-        source = defocused = moved = None
-        if light is None:
-            light = source = self.prepared.source_light(exposure).contiguous()
-            if exposure.defocus_px:
-                if not self._cache:
-                    self._drop_defocused()
-                light = defocused = self._defocused[exposure.lens_blur] = self._take(light)
-        if exposure.motion_px:
-            source = light if source is None else source
-            if self._streak is None:
-                self._streak = self._take(light)
-            light = moved = self._streak
-        self._blurred = (exposure.blur, light)
-        if defocused is None and moved is None:
-            return light, None
-        assert source is not None
-        return light, Blur(source, exposure.defocus_px, defocused, exposure.motion_px, moved)
-
-    def _take(self, like: torch.Tensor) -> torch.Tensor:
-        return self._free.pop() if self._free else torch.empty(like.shape)
-
-    def give_back(self) -> None:
-        """Puts all memory back; the light must not be used afterwards."""
-        self._drop_defocused()
-        if self._streak is not None:
-            self._free.append(self._streak)
-
-    def _drop_defocused(self) -> None:
-        self._free.extend(self._defocused.values())
-        self._defocused.clear()

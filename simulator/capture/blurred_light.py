@@ -11,6 +11,7 @@ from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import Exposure
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.residual import ResidualStatistics
+from simulator.capture.scene_blur import SceneBlur, moved
 from simulator.capture.sensor import defocused_light
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.blur import motion_blur
@@ -83,6 +84,7 @@ class BlurredLight:
         self.residuals = ResidualStatistics(light, nlf)
         self._added: dict[float, float] = {}
         self._cache: LruCache[torch.Tensor] = LruCache(cache_bytes)
+        self._scene_blur = SceneBlur()
 
     def copy(self, cache_bytes: int) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
@@ -139,18 +141,28 @@ class BlurredLight:
     def blurred(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""
         if exposure.motion_px:
-            return self._cached(
-                exposure.blur, lambda: motion_blur(self._defocused(exposure), exposure.motion_px)
-            )
+            return self._cached(exposure.blur, lambda: self._moved(exposure))
         return self._defocused(exposure) if exposure.defocus_px else self.source(exposure)
+
+    def _moved(self, exposure: Exposure) -> torch.Tensor:
+        light = self._defocused(exposure)
+        if exposure.path is None:
+            return motion_blur(light, exposure.motion_px)
+        return moved(light, exposure)
 
     def _defocused(self, exposure: Exposure) -> torch.Tensor:
         if not exposure.defocus_px:
             return defocused_light(self.source(exposure), 0.0)  # limited, as blur needs it
         return self._cached(
             exposure.lens_blur,
-            lambda: defocused_light(self.source(exposure), exposure.defocus_px),
+            lambda: self._behind_lens(exposure),
         )
+
+    def _behind_lens(self, exposure: Exposure) -> torch.Tensor:
+        source = self.source(exposure)
+        if exposure.layout is None:
+            return defocused_light(source, exposure.defocus_px)
+        return self._scene_blur.defocused(source, exposure)
 
     def _cached(self, key: tuple[object, ...], make: Callable[[], torch.Tensor]) -> torch.Tensor:
         light = self._cache.get(key)

@@ -11,8 +11,10 @@ import numpy as np
 import torch
 
 from simulator.capture.denoised import Denoised
+from simulator.capture.layout import Layout
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.noise.top_up import top_up_table
+from simulator.optics.motion_path import Path
 from simulator.optics.shapes import kernel_energy
 
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
@@ -57,8 +59,14 @@ class Exposure:
         ratio: Exposure ratio from the prepared scene's reference to the capture.
         source: Noise in the prepared scene at its reference settings.
         target: Noise of the camera at the capture's settings.
-        motion_px: How far the image moves while the shutter is open [pixel].
-        defocus_px: Diameter of the defocus disc [pixel].
+        motion_px: How far the image moves while the shutter is open [pixel], at most.
+        defocus_px: Diameter of the defocus disc [pixel], of the largest one.
+        layout: What is out of focus and what is the subject; None for one disc everywhere, and
+            where all of the frame moves together.
+        path: Of the background; None for a streak along the rows, as long as `motion_px`.
+        subject_path: Of the layout's subject where it moves of its own.
+        energy: Share of the source's noise variance that these blurs leave; None for what a disc
+            and a streak leave.
         denoised: The noise-reduced light that it starts from; `source` is zero then. None for the
             light as it was recorded.
         opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
@@ -73,6 +81,10 @@ class Exposure:
     target: NoiseLevelFunction
     motion_px: float = 0.0
     defocus_px: float = 0.0
+    layout: Layout | None = None
+    path: Path | None = None
+    subject_path: Path | None = None
+    energy: float | None = None
     denoised: Denoised | None = None
     opened_to: float | None = None
     remaining_variance: torch.Tensor | None = None
@@ -83,19 +95,26 @@ class Exposure:
         """Noise that the source brings to the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
-        return self.source.exposed(self.ratio).scaled(
-            kernel_energy(self.motion_px, self.defocus_px)
-        )
+        energy = self.energy
+        if energy is None:
+            energy = kernel_energy(self.motion_px, self.defocus_px)
+        return self.source.exposed(self.ratio).scaled(energy)
 
     @property
-    def lens_blur(self) -> tuple[Denoised | None, float | None, float]:
+    def is_uniform(self) -> bool:
+        """Whether its blur is a disc and a streak along the rows, the same everywhere."""
+        return self.layout is None and self.path is None
+
+    @property
+    def lens_blur(self) -> tuple[object, ...]:
         """Key of the light behind the lens, before motion and exposure."""
-        return self.denoised, self.opened_to, self.defocus_px
+        layout = self.layout if self.defocus_px else None
+        return self.denoised, self.opened_to, self.defocus_px, layout
 
     @property
-    def blur(self) -> tuple[Denoised | None, float | None, float, float]:
+    def blur(self) -> tuple[object, ...]:
         """Key of the light on the sensor, before exposure."""
-        return self.denoised, self.opened_to, self.defocus_px, self.motion_px
+        return (*self.lens_blur, self.motion_px, self.path, self.subject_path)
 
 
 def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Real
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
 from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import RATIO_LIMIT, Exposure
+from simulator.capture.layout import Layout
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.plan import (
     DEFAULT_TOLERANCE,
@@ -28,10 +29,12 @@ from simulator.capture.plan import (
     decide,
     make_plan,
 )
+from simulator.capture.scene_blur import remaining_noise
 from simulator.capture.sensor import Transitions, exposed_light, noise_balance, record
 from simulator.noise.generator import Noise, check_noise, sweep_keys
 from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
 from simulator.noise.read_noise import ReadNoise
+from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.optics.shapes import kernel_energy
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
@@ -65,9 +68,13 @@ class PreparedScene:
         saturated: (H, W) bool, pixels whose light is only known to be at least this; None if none.
         white_balance: Gains of R, G, B of the scene's light.
         box_factor: Sensor pixels averaged per side into one pixel of `light`.
-        image_speed: Speed of the image along the rows [frame heights per second], at most 1000.
-        defocus: Diameter of the defocus disc at f/4 [pixel of `light`]; 0 for a scene that is far
-            or in focus throughout. No disc may be wider than both the frame and 512 pixel.
+        image_speed: Speed of the image [frame heights per second], at most 1000; along the rows,
+            unless `movement` says otherwise.
+        defocus: Diameter of the defocus disc at f/4 [pixel of `light`], with a `layout` that of the
+            largest; 0 for a scene that is far or in focus throughout. No disc may be wider than
+            both the frame and 512 pixel; with a `layout`, it stays at 32.
+        movement: In which directions the image moves, and the subject of `layout` of its own.
+        layout: What is out of focus, and what is the subject; None for one disc everywhere.
         gain: Light relative to `light`, where it changes over time.
         denoised: `light` with its noise removed by each noise module, the cheapest first, for
             targets that are cleaner than the source; none where there is no module or no noise.
@@ -91,6 +98,8 @@ class PreparedScene:
     gain: float = 1.0
     denoised: tuple[Denoised, ...] = ()
     aperture_blur: ApertureBlur | None = None
+    movement: Movement = ALONG_ROWS
+    layout: Layout | None = None
     tolerance: float = DEFAULT_TOLERANCE
     blurred_light: BlurredLight = field(default=cast(BlurredLight, None))
 
@@ -122,6 +131,11 @@ class PreparedScene:
         self._disc(4.0)
         if not 0.0 <= self.gain < float("inf"):
             raise ValueError(f"`gain` (={self.gain!r}) must be finite and >= 0")
+        if self.layout is not None and self.layout.defocus.shape != self.light.shape[-2:]:
+            raise ValueError(
+                f"`layout` (shape {tuple(self.layout.defocus.shape)}) must have the height and "
+                f"width of `light`, {tuple(self.light.shape[-2:])}"
+            )
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
 
     def _check_denoised(self) -> None:
@@ -173,8 +187,8 @@ class PreparedScene:
         defocus_px = motion_px = 0.0  # where there is none, this is called in sweeps for each state
         if self.defocus:
             defocus_px = self._disc(f_number)
-        if self.image_speed:
-            motion_px = self.image_speed * settings.exposure_time * self.light.shape[-2]
+        if self.image_speed or self._subject_moves:
+            motion_px = self._motion(settings)
         aperture_px, opens, opens_denoised = None, False, False
         if self.aperture_blur is not None:
             aperture_px = self.blurred_light.added_blur(f_number)
@@ -194,7 +208,23 @@ class PreparedScene:
             aperture_px,
             opens,
             opens_denoised,
+            self.movement.along_rows and not self._subject_moves,
         )
+
+    @property
+    def _subject_moves(self) -> bool:
+        """Whether there is a subject that moves apart from the rest."""
+        subject = None if self.layout is None else self.layout.subject
+        return subject is not None and self.movement.subject_speed > 0.0
+
+    def _motion(self, settings: CameraSettings) -> float:
+        """Length of the longest path at `settings` [pixel]."""
+        height = self.light.shape[-2]
+        length = self.image_speed * settings.exposure_time * height
+        if not self._subject_moves:
+            return length
+        own = self.movement.subject_path(self.image_speed, settings.exposure_time, height)
+        return max(length, own.length)
 
     def _disc(self, f_number: float) -> float:
         """Diameter of the defocus disc at `f_number` [pixel]."""
@@ -213,13 +243,8 @@ class PreparedScene:
         defocus_px = defocus.extent if defocus.runs else 0.0
         motion_px = motion_blur.extent if motion_blur.runs else 0.0
         opened_to = settings.effective_f_number if aperture.runs else None
-        denoised, remaining_variance = noise_reduction.network, None
-        if opened_to is not None and denoised is None and not self.nlf.is_zero:
-            # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
-            # it further. Both together leave about what the larger leaves alone.
-            energy = kernel_energy(motion_px, defocus_px)
-            remaining_variance = self.blurred_light.remaining_variance(opened_to, energy)
-        return Exposure(
+        denoised = noise_reduction.network
+        exposure = Exposure(
             ratio=given.ratio,
             source=self.nlf if denoised is None else NoiseLevelFunction.zero(),
             target=given.target,
@@ -227,9 +252,43 @@ class PreparedScene:
             defocus_px=defocus_px,
             denoised=denoised,
             opened_to=opened_to,
-            remaining_variance=remaining_variance,
             steps=steps,
+            **self._paths(settings, motion_px, defocus_px),
         )
+        if exposure.source.is_zero:
+            return exposure
+        return self._with_remaining_noise(exposure)
+
+    def _paths(
+        self, settings: CameraSettings, motion_px: float, defocus_px: float
+    ) -> dict[str, Any]:
+        """Layout and paths of an exposure that has these blurs; what it does not need is None."""
+        if not motion_px and (self.layout is None or not defocus_px):
+            return {}
+        given = self.image_speed, settings.exposure_time, self.light.shape[-2]
+        own = motion_px > 0.0 and self._subject_moves
+        follows = motion_px > 0.0 and (own or not self.movement.along_rows)
+        return {
+            "layout": self.layout if own or defocus_px else None,
+            "path": self.movement.path(*given) if follows else None,
+            "subject_path": self.movement.subject_path(*given) if own else None,
+        }
+
+    def _with_remaining_noise(self, exposure: Exposure) -> Exposure:
+        """`exposure` with the shares of the source's noise variance that its blurs leave."""
+        energy = kernel_energy(exposure.motion_px, exposure.defocus_px)
+        left: torch.Tensor | None = None
+        if not exposure.is_uniform:
+            energy, left = remaining_noise(exposure, *self.light.shape[-2:])
+        if exposure.opened_to is not None:
+            # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
+            # it further. Both together leave about what the larger leaves alone.
+            opened = self.blurred_light.remaining_variance(exposure.opened_to, energy)
+            if left is None or opened is None:
+                left = opened if left is None else left
+            else:
+                left = torch.minimum(left.to(opened), opened)
+        return replace(exposure, energy=energy, remaining_variance=left)
 
     def plan(
         self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0

@@ -15,9 +15,11 @@ from collections.abc import Iterator, Mapping
 import numba
 import numpy as np
 import torch
+from scipy.signal import fftconvolve
 from torch import Tensor
 
 from simulator.optics.blur import disc_blur
+from simulator.optics.motion_path import Taps
 from simulator.optics.shapes import disc_kernel
 from simulator.raw.image import new_frame
 from simulator.utils.jit import addresses, as_pointer, kernel
@@ -61,6 +63,8 @@ class DiscBank:
 
     def _blur(self, indices: list[int]) -> None:
         """Makes several levels side by side, which wakes the other threads once."""
+        if not indices:
+            return
         from simulator.optics.blur_kernels import Blur, blur_many
 
         image = self._levels[0].contiguous()
@@ -68,18 +72,20 @@ class DiscBank:
         blur_many([Blur(image, DIAMETERS[index], level) for index, level in made.items()])
         self._levels |= made
 
-    def blurred(self, diameter: Tensor) -> Tensor:
+    def blurred(self, diameter: Tensor, out: Tensor | None = None) -> Tensor:
         """The image blurred by `diameter`, differentiable in it.
 
         Args:
             diameter: (..., H, W) blur diameter of each pixel [pixel], >= 0, broadcast against the
                 image; beyond the largest disc of the bank it stays there.
+            out: Contiguous float32 tensor like the image to write to, instead of a new one, where
+                image and diameters are on the CPU.
         """
         image, frame = self._levels[0], _frame_of(diameter)
         if frame is not None and frame.shape == image.shape[-2:] and _has_kernels(image):
             indices = needed(frame, _KNOTS)
             self._blur([index for index in indices if index not in self._levels])
-            return blend({index: self._levels[index] for index in indices}, frame, _KNOTS)
+            return blend({index: self._levels[index] for index in indices}, frame, _KNOTS, out)
         return self._blended(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
 
     def _blended(self, squared: Tensor) -> Tensor:
@@ -92,21 +98,26 @@ class DiscBank:
         return total
 
 
-def remaining_variance(diameter: Tensor) -> Tensor:
+def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
     """Share of white noise's variance that `DiscBank.blurred` leaves, per pixel of `diameter`.
 
     The sum of squared weights of the blended kernel,
     ``(1 - t)^2 E_aa + 2 t (1 - t) E_ab + t^2 E_bb`` between discs a and b.
+
+    Args:
+        diameter: (..., H, W) blur diameter of each pixel [pixel].
+        taps: Of a motion behind the discs; None for none.
     """
+    products = _kernel_products() if taps is None else _moved_products(taps, diameter)
     frame = _frame_of(diameter)
     if frame is not None:
-        return piecewise(frame, _KNOTS, _kernel_products()).reshape(diameter.shape)
-    return _remaining(diameter)
+        return piecewise(frame, _KNOTS, products).reshape(diameter.shape)
+    return _remaining(diameter, products)
 
 
-def _remaining(diameter: Tensor) -> Tensor:
+def _remaining(diameter: Tensor, products: np.ndarray) -> Tensor:
     """`remaining_variance` on any device."""
-    energy = torch.from_numpy(_kernel_products()).to(diameter)
+    energy = torch.from_numpy(products).to(diameter)
     knots = torch.from_numpy(_KNOTS).to(diameter)
     squared = diameter.square().clamp(max=DIAMETERS[-1] ** 2)
     index = torch.searchsorted(knots[1:-1], squared, right=True)  # of the smaller disc
@@ -161,6 +172,32 @@ def _kernel_products() -> np.ndarray:
             margin = (larger.shape[0] - disc.shape[0]) // 2
             inner = larger[margin : margin + disc.shape[0], margin : margin + disc.shape[0]]
             products[i, i + 1] = (disc * inner).sum()
+    return products
+
+
+@functools.cache
+def _correlations() -> np.ndarray:
+    """(K, 2, R, R) correlations of each disc with itself and its successor; shift 0 is amid."""
+    kernels = [disc_kernel(d) for d in DIAMETERS]
+    size = 2 * kernels[-1].shape[0] - 1
+    found = np.zeros((len(kernels), 2, size, size))
+    for i, disc in enumerate(kernels):
+        for j, other in enumerate(kernels[i : i + 2]):
+            # Discs are symmetric: their convolution is their correlation.
+            both = fftconvolve(disc, other)
+            margin = (size - len(both)) // 2
+            inner = slice(margin, margin + len(both))
+            found[i, j, inner, inner] = both
+    return found
+
+
+def _moved_products(taps: Taps, diameter: Tensor) -> np.ndarray:
+    """`_kernel_products` of discs behind which there is a motion, up to the largest `diameter`."""
+    largest = float(diameter.max())
+    count = min(int(np.searchsorted(DIAMETERS, largest)) + 1, len(DIAMETERS))
+    products = np.zeros((len(DIAMETERS), len(DIAMETERS)))
+    weights = taps.weights.astype(np.float64)
+    _sum_products(_correlations()[:count], taps.rows, taps.columns, weights, products)
     return products
 
 
@@ -267,6 +304,22 @@ def _evaluate(first, last, diameter, knots, ends, out):  # type: ignore[no-untyp
             out[y, x] = rest * rest * ends[index, 0] + share * both
 
 
+@_jit()
+def _sum_products(correlations, rows, columns, weights, products):  # type: ignore[no-untyped-def]
+    """Sums of correlations over all pairs of taps, by their products of weights."""
+    count, _, size, _ = correlations.shape
+    middle = size // 2
+    for k in range(len(weights)):
+        for n in range(len(weights)):
+            y, x = rows[k] - rows[n] + middle, columns[k] - columns[n] + middle
+            if 0 <= y < size and 0 <= x < size:
+                for i in range(count):
+                    both = weights[k] * weights[n]
+                    products[i, i] += both * correlations[i, 0, y, x]
+                    if i + 1 < len(products):
+                        products[i, i + 1] += both * correlations[i, 1, y, x]
+
+
 def needed(diameter: torch.Tensor, knots: np.ndarray) -> list[int]:
     """Indexes of the images that a blend reads, ascending: none far from every pixel's diameter.
 
@@ -280,7 +333,10 @@ def needed(diameter: torch.Tensor, knots: np.ndarray) -> list[int]:
 
 
 def blend(
-    images: Mapping[int, torch.Tensor], diameter: torch.Tensor, knots: np.ndarray
+    images: Mapping[int, torch.Tensor],
+    diameter: torch.Tensor,
+    knots: np.ndarray,
+    out: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Interpolates between images in the squared diameter; see `DiscBank.blurred`.
 
@@ -288,11 +344,12 @@ def blend(
         images: (..., H, W) float32 on the CPU, by index, as many as are `needed`.
         diameter: (H, W) float32 [pixel].
         knots: (K,) squared diameters of the images, ascending.
+        out: See `DiscBank.blurred`.
     """
     whole = {index: image.contiguous() for index, image in images.items()}
     anything = next(iter(whole.values()))  # images without a share are read too, times 0
     table = addresses([whole.get(index, anything) for index in range(len(knots))])
-    out = new_frame(anything)
+    out = new_frame(anything) if out is None else out
     fixed = (diameter.contiguous().numpy(), knots.astype(np.float32), table, out.numel())
     result = out.numpy().reshape(-1, *out.shape[-2:])
     in_shares(

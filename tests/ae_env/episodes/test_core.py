@@ -67,9 +67,8 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
             episode, raw = core.episode(i), observation["raw"][i]
             state = core.grid[episode.state]
             gain = core.lighting.gain(episode.frame, state.exposure_time, episode.phase)
-            blur = {"speed": episode.speed, "defocus": episode.defocus}
             scene = core.scenes[episode.scene]
-            prepared = prepare_scene(scene, core.camera, **blur, gain=gain)
+            prepared = prepare_scene(scene, core.camera, **episode.moves, gain=gain)
             prepared = replace(prepared, tolerance=tolerance)
             exposure = prepared.exposure(state)
             light = exposed_light(prepared.blurred_light.blurred(exposure), exposure)
@@ -163,7 +162,7 @@ def test_expected_rewards_are_those_of_the_running_episodes(arguments: dict[str,
         for i in range(8):
             episode = core.episode(i)
             scene = core.scenes[episode.scene]
-            wanted = core.tables.table(scene, speed=episode.speed, defocus=episode.defocus)
+            wanted = core.tables.table(scene, **episode.moves)
             for name, scores in wanted.parts.items():
                 assert info["rewards"][name][i] == pytest.approx(scores[episode.state], abs=1e-12)
             score = wanted.mean[episode.state]

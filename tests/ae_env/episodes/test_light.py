@@ -67,7 +67,7 @@ def test_scores_of_all_states_have_their_own_exposures_light(scorer: Any) -> Non
         captures = describe_captures([scene], [settings], CAMERA, **blur, **gains, noisy=False)
         images = clip_and_quantise(captures.light, CAMERA).clamp(0.0, 1.0)
         wanted = float(make_scorer(scorer)(images, captures))
-        assert q[state] == pytest.approx(wanted, abs=5e-4)  # rows at the edge of a code
+        assert q[state] == pytest.approx(wanted, abs=2e-3)  # rows at the edge of a code
     assert reward == pytest.approx(q[18], abs=1e-9)
     assert info["regret"] == pytest.approx(q.max() - q[18], abs=1e-6)
 
