@@ -132,7 +132,7 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
     if spec == "polyhaven":
         return polyhaven_scenes(request)
     if spec == "mixed":
-        bundled = _by_name("bundled", split, request)
+        bundled = _by_name("bundled:large", split, request)
         return mixed_scenes(request, [scene for scene in bundled if scene.kind != "photograph"])
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):

@@ -173,8 +173,7 @@ class CodeScores:
             height * width if row_gain is None else width,
             table[:, 0].astype(np.float32),
             rows.astype(np.float32),
-            np.stack(tables),
-            np.array([numbers[key] for key in keys]),
+            np.array([tables[numbers[key]].ctypes.data for key in keys], np.uintp),
         )
         means = np.empty((len(table), 3))
         least = max(1, _WORTH_A_THREAD // (4 * height * width))
@@ -182,14 +181,14 @@ class CodeScores:
         return means
 
     def _tabulated(self, key: bytes, missing: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """(4, G, 3) float32 expectations by light: above the last code, blocked, and `noise`."""
+        """(4, 3, G) float32 expectations by light: above the last code, blocked, and `noise`."""
         found = self._tables.get(key)
         if found is None:
-            found = np.empty((4, _FINE * _LAST_CODE, 3), np.float32)
+            found = np.empty((4, 3, _FINE * _LAST_CODE), np.float32)
             white = np.zeros(256, np.float32)
             white[255] = 1.0
             for plane in range(4):
-                values = np.stack([white, self._dark, shares[plane]], axis=1)
+                values = np.stack([white, self._dark, shares[plane]])
                 shot, read = missing[:, plane]
                 expect_codes(values, self._edges[plane], shot, read, found[plane])
             self._tables.put(key, found, found.nbytes)
@@ -297,14 +296,14 @@ def expect_codes(values, edges, shot, read, out):  # type: ignore[no-untyped-def
     """Expectations of functions of the code that noisy light is recorded as.
 
     Args:
-        values: (256, F) float32, the functions.
+        values: (F, 256) float32, the functions.
         edges: (256,) signals from which each code is recorded, or one above.
         shot: Shot noise that is added.
         read: Read noise that is added.
-        out: (G, F) float32 to write to, at `_FINE` values of light between two codes.
+        out: (F, G) float32 to write to, at `_FINE` values of light between two codes.
     """
     unit = (1.0 + PEDESTAL) / 255.0**2
-    for i in range(len(out)):
+    for i in range(out.shape[1]):
         light = unit * (i / _FINE) ** 2 - PEDESTAL
         variance = max(light, 0.0) * shot + read
         spread = math.sqrt(max(variance, 1e-30))
@@ -312,20 +311,30 @@ def expect_codes(values, edges, shot, read, out):  # type: ignore[no-untyped-def
         code = 0
         while code < 255 and edges[code + 1] <= lowest:
             code += 1
-        for f in range(out.shape[1]):
-            out[i, f] = values[code, f]
+        for f in range(len(out)):
+            out[f, i] = values[f, code]
         while code < 255:
             code += 1
             if edges[code] > highest:
                 break
             above = 0.5 * math.erfc((edges[code] - light) / (spread * math.sqrt(2.0)))
-            for f in range(out.shape[1]):
-                out[i, f] += above * (values[code, f] - values[code - 1, f])
+            for f in range(len(out)):
+                out[f, i] += above * (values[f, code] - values[f, code - 1])
+
+
+@_jit
+def _interpolated(table, places, shares):  # type: ignore[no-untyped-def]
+    """Sum of a function between `places` and the next ones."""
+    total = _ZERO
+    for i in range(len(places)):
+        low, high = table[places[i]], table[places[i] + 1]
+        total += low + shares[i] * (high - low)
+    return total
 
 
 @_jit
 def expect_means(  # type: ignore[no-untyped-def]
-    first, last, light, rows, columns, ratio, row_gain, tables, which, means
+    first, last, light, rows, columns, ratio, row_gain, tables, means
 ):
     """Expected means of the frames `first` to `last`.
 
@@ -337,40 +346,43 @@ def expect_means(  # type: ignore[no-untyped-def]
         columns: C.
         ratio: (B, 4) float32, what the light is multiplied by.
         row_gain: (B, R) float32.
-        tables: (K, 4, G, 3) float32 of `expect_codes`.
-        which: (B,) which of them each frame has.
+        tables: (B,) addresses of (4, 3, G) float32 of `expect_codes`.
         means: (B, 3) float64 to write to.
     """
-    kept = np.empty(_BLOCK, np.float32)
+    kept, shares = np.empty((2, _BLOCK), np.float32)
+    places = np.empty(_BLOCK, np.int32)
     size = rows * columns
     for frame in range(first, last):
         pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
         signal = numba.carray(pointer, (4, size))
+        own = numba.carray(as_pointer(tables[frame]), (4, 3, _FINE * _LAST_CODE))
         blown = blocked = clean = 0.0
         for row in range(rows):
             gain = row_gain[frame, row]
             for start in range(row * columns, (row + 1) * columns, _BLOCK):
                 end = min(start + _BLOCK, (row + 1) * columns)
-                kept[:] = _ONE
-                dark = bright = _ZERO
+                number = end - start
+                kept[:number] = _ONE
                 for plane in range(4):
-                    factor = ratio[frame, plane] * gain
-                    table = tables[which[frame], plane]
-                    for i in range(start, end):
-                        x = signal[plane, i] * factor + _PEDESTAL
+                    factor, part = ratio[frame, plane] * gain, signal[plane, start:end]
+                    brightest = np.int32(0)
+                    for i in range(number):
+                        x = part[i] * factor + _PEDESTAL
                         place = min(np.sqrt(x if x > _ZERO else _ZERO) * _SCALE, _END)
-                        index = np.int32(place)
-                        share = place - np.float32(index)
-                        low, high = table[index], table[index + 1]
-                        kept[i - start] *= _ONE - (low[0] + share * (high[0] - low[0]))
-                        dark += low[1] + share * (high[1] - low[1])
-                        bright += low[2] + share * (high[2] - low[2])
-                blocked += dark
-                clean += bright
+                        places[i] = np.int32(place)
+                        shares[i] = place - np.float32(places[i])
+                        brightest = max(brightest, places[i])
+                    table = own[plane]
+                    blocked += _interpolated(table[1], places[:number], shares)
+                    clean += _interpolated(table[2], places[:number], shares)
+                    if table[0, brightest + 1] > _ZERO:
+                        for i in range(number):
+                            low, high = table[0, places[i]], table[0, places[i] + 1]
+                            kept[i] *= _ONE - (low + shares[i] * (high - low))
                 left = _ZERO
-                for i in range(end - start):
+                for i in range(number):
                     left += kept[i]
-                blown += end - start - left
+                blown += number - left
         means[frame, 0] = blown / size
         means[frame, 1] = blocked / (4 * size)
         means[frame, 2] = clean / (4 * size)
