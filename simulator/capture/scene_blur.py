@@ -100,17 +100,18 @@ def _remaining_noise(
 ) -> torch.Tensor:
     height, width = layout.defocus.shape
     diameter = layout.defocus * defocus_px
-    taps = None if path is None else path_taps(path, height, width)
+    if path is None:
+        return remaining_variance(diameter)
+    taps = path_taps(path, height, width)
     left = remaining_variance(diameter, taps)
     if own is None or layout.subject is None:
-        return left
-    # Where the subject has part of a pixel, both parts are independent: the smeared mask of squared
-    # weights says how much of the subject's noise is there.
-    taps = path_taps(own, height, width)
-    squared = taps._replace(weights=taps.weights**2)
-    covered, noise = (path_blur(layout.mask, t)[0].clamp(max=1.0) for t in (taps, squared))
-    subject = noise * (remaining_variance(diameter, taps) / taps.energy)
-    return ((1.0 - covered).square() * left + subject).clamp(max=1.0)
+        return path_blur(left[None], taps)[0]
+    # Taps of pixels that differ leave the mean of what each of these would leave alone.
+    taps_own = path_taps(own, height, width)
+    left = path_blur(left.flatten()[layout.behind][None], taps)
+    subject = path_blur(layout.mask * remaining_variance(diameter, taps_own), taps_own)
+    seen = 1.0 - path_blur(layout.mask, taps_own)
+    return (seen.square() * left + subject)[0].clamp(max=1.0)
 
 
 @functools.lru_cache(maxsize=4096)
