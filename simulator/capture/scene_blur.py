@@ -14,7 +14,8 @@ import torch
 from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
 from simulator.capture.layout import Layout
-from simulator.capture.sensor import defocused_light
+from simulator.capture.sensor import defocused_light, exposed_light, sensor_light
+from simulator.optics.blur import motion_blur
 from simulator.optics.disc_bank import DiscBank, remaining_variance
 from simulator.optics.motion_path import Path, Taps, path_blur, path_blur_apart, path_taps
 from simulator.utils.tiles import TILE
@@ -68,6 +69,18 @@ def moved(light: torch.Tensor, exposure: Exposure, out: torch.Tensor | None = No
         return path_blur(light, taps, out, limit=LIGHT_LIMIT)
     own, layout = path_taps(exposure.subject_path, height, width), exposure.layout
     return path_blur_apart(light, layout.mask, layout.behind, taps, own, out, limit=LIGHT_LIMIT)
+
+
+def scene_light(source: torch.Tensor, exposure: Exposure) -> torch.Tensor:
+    """`sensor_light` of any `exposure`, also one with a layout or a path."""
+    if exposure.is_uniform:
+        return sensor_light(source, exposure)
+    light = SceneBlur().defocused(source, exposure)
+    if exposure.path is None:
+        light = motion_blur(light, exposure.motion_px)
+    else:
+        light = moved(light, exposure)
+    return exposed_light(light, exposure)
 
 
 # -- noise of the source ------------------------------------------------------------------------

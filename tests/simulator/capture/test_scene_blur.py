@@ -12,7 +12,7 @@ from scipy.ndimage import correlate
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture.batch import CaptureBatch
 from simulator.capture.layout import Layout
-from simulator.capture.scene_blur import remaining_noise
+from simulator.capture.scene_blur import remaining_noise, scene_light
 from simulator.optics.blur import disc_blur
 from simulator.optics.disc_bank import DIAMETERS
 from simulator.optics.motion_path import Movement, path_blur, path_taps
@@ -109,6 +109,12 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
         ratio = ratio[:, :4]
     assert float(ratio.median()) == pytest.approx(1.0, abs=0.06)  # of the draws
     assert float(ratio.quantile(0.95)) < 1.2
+
+
+@pytest.mark.parametrize("movement", [MOVEMENT, Movement(0.6), Movement()])
+def test_light_without_a_cache_is_the_same(movement: Movement) -> None:
+    scene = _prepared(defocus=3.0, image_speed=0.2, movement=movement)
+    assert torch.equal(scene_light(LIGHT, scene.exposure(SLOW)), scene.expected(SLOW))
 
 
 @pytest.mark.parametrize("cache_light", [True, False])
