@@ -132,7 +132,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     |---|---|---|
     | `raw` | `Box(0, 255, (4, R, R), uint8)` | planes R, G1, G2, B, `255 sqrt((x + p) / (1 + p))`, x clipped to [-p, 1], p = 1/1024 |
     | `settings` | `Box(-1, 1, (3,), float32)` | Av, Tv, Sv of the current state, from [0, 10], [-5, 15], [4, 17] |
-    | `sensors` | `Box(-1, 1, (2,), float32)` | log2 image speed [frame heights/s] from [-9, 3] and log2 defocus [pixel of a 64-pixel frame at f/4] from [-4, 4], each with 15 % noise |
+    | `sensors` | `Box(-1, 1, (2,), float32)` | log2 speed of the camera's shake [frame heights/s] from [-9, 3] and log2 of the largest defocus [pixel of a 64-pixel frame at f/4] from [-4, 4], each with 15 % noise |
 
     ## Rewards
 
@@ -157,10 +157,14 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     ## Starting State
 
-    `reset` draws a scene, a start state, an image speed (0 for a third of the episodes, else
-    log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3) and a
-    defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma 0.9,
-    in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). `reset(options={"scene": id, "state": index, "frame": 0})` chooses; in a recorded sequence, `frame` is the raw to begin with.
+    `reset` draws a scene, a start state, an image speed (nothing moves in a third of the episodes,
+    else it is log-normal around the scene's median, usually 1/8 frame height per second, sigma 1.3)
+    and a defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma
+    0.9, in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). The shake has any
+    direction, which turns by a normal rate of pi rad/s. In half of the moving episodes the subject
+    of a scene moves of its own besides, drawn likewise; in 15 % nothing but the subject moves.
+    Where a scene has a `layout`, the defocus drawn is that of what is least in focus; the other
+    pixels have less. `reset(options={"scene": id, "state": index, "frame": 0})` chooses; in a recorded sequence, `frame` is the raw to begin with.
 
     ## Episode End
 
@@ -179,8 +183,8 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `sensors` | `True` | whether `sensors` is observed |
     | `resolution` | 64 | height and width R of the packed frame, >= 36 |
     | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |
-    | `motion` | `"random"` | `"random"`, `"none"`, or a speed [frame heights/s] |
-    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4 |
+    | `motion` | `"random"` | `"random"`, `"none"`, or a speed of the whole image [frame heights/s], in a drawn direction |
+    | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4, of what is least in focus |
     | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
     | `delay` | 0 | frames between an action and the first capture that has it |
     | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |

@@ -138,7 +138,7 @@ def _cache_key(
     return cache_key(
         {
             "generator": GENERATOR_VERSION,
-            "format": 5,
+            "format": 7,
             "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
             "photographs": [p.name for p in PHOTOGRAPHS],
             "camera": camera.name,

@@ -39,7 +39,7 @@ FOCUSES = ("everything", "front", "back", "middle")
 #: Range that the largest blur of a picture with defocus is drawn from [packed pixels].
 _LARGEST_RANGE = (1.0, 7.0)
 #: Focus of the layouts that pictures are draped over: mostly on the nearest thing.
-_LAYOUT_FOCUSES, _LAYOUT_SHARES = ("front", "middle", "back"), (0.7, 0.2, 0.1)
+_LAYOUT_FOCUSES, _LAYOUT_SHARES = ("front", "middle", "back"), (0.8, 0.1, 0.1)
 #: Side at which they are drawn [pixel], and the least share of the frame that a subject has.
 _LAYOUT_SIDE, _LEAST_SUBJECT = 128, 0.02
 #: Sides of things relative to that of the frame: of pictures, and of layouts.
@@ -102,7 +102,7 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
 def drape(scene: Scene, seed: int = 0) -> Scene:
     """`scene` with a `Layout`, as if it lay over procedural depth.
 
-    The subject is the nearest thing. Focus is on it in seven of ten scenes, in the others on
+    The subject is the nearest thing. Focus is on it in eight of ten scenes, in the others on
     something behind it.
 
     Args:
@@ -123,6 +123,7 @@ def _draw_layout(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     focus = str(rng.choice(_LAYOUT_FOCUSES, p=_LAYOUT_SHARES))
     while True:
         levels = _levels(rng, int(rng.integers(1, 4)), focus)
+        levels *= LARGEST_BLUR / np.abs(levels).max()  # only what is relative to it matters
         blur = _background(rng, _LAYOUT_SIDE, levels[0], levels[0] - levels[-1])
         surface = np.zeros(blur.shape, np.int32)
         for number, level in enumerate(levels[1:], start=1):

@@ -73,7 +73,7 @@ _CELL = 4
 #: Luminance of linear sRGB.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Raised when the views change.
-_VERSION = 2
+_VERSION = 4
 
 
 class Asset(Configuration):

@@ -65,7 +65,7 @@ class Layout:
         object.__setattr__(self, "subject", known)
 
     @classmethod
-    def from_depth(cls, depth: torch.Tensor, distance: float, *, depth_of_field: float) -> Layout:
+    def from_depth(cls, depth: torch.Tensor, distance: float, *, in_focus: float) -> Layout:
         """The layout of a scene whose depth is known; the subject is what is in focus.
 
         The circle of confusion goes with the difference of the inverse distances.
@@ -73,11 +73,11 @@ class Layout:
         Args:
             depth: (H, W) distance [m], above 0.
             distance: At which the lens is focused [m].
-            depth_of_field: Largest relative circle of confusion that counts as in focus.
+            in_focus: Largest relative circle of confusion of the subject.
         """
         apart = (1.0 / depth.double() - 1.0 / distance).abs()
         relative = (apart / apart.max().clamp(min=1e-12)).float()
-        return cls(relative, relative <= depth_of_field)
+        return cls(relative, relative <= in_focus)
 
     def averaged(self, factor: int) -> Layout:
         """Means over `factor` x `factor` pixels; the subject is where it has most of them."""

@@ -14,7 +14,8 @@ import torch
 from simulator.capture.denoised import Denoised
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure
 from simulator.capture.layout import Layout
-from simulator.capture.sensor import defocused_light
+from simulator.capture.sensor import defocused_light, exposed_light, sensor_light
+from simulator.optics.blur import motion_blur
 from simulator.optics.disc_bank import DiscBank, remaining_variance
 from simulator.optics.motion_path import Path, Taps, path_blur, path_blur_apart, path_taps
 from simulator.utils.tiles import TILE
@@ -70,6 +71,18 @@ def moved(light: torch.Tensor, exposure: Exposure, out: torch.Tensor | None = No
     return path_blur_apart(light, layout.mask, layout.behind, taps, own, out, limit=LIGHT_LIMIT)
 
 
+def scene_light(source: torch.Tensor, exposure: Exposure) -> torch.Tensor:
+    """`sensor_light` of any `exposure`, also one with a layout or a path."""
+    if exposure.is_uniform:
+        return sensor_light(source, exposure)
+    light = SceneBlur().defocused(source, exposure)
+    if exposure.path is None:
+        light = motion_blur(light, exposure.motion_px)
+    else:
+        light = moved(light, exposure)
+    return exposed_light(light, exposure)
+
+
 # -- noise of the source ------------------------------------------------------------------------
 
 
@@ -100,17 +113,18 @@ def _remaining_noise(
 ) -> torch.Tensor:
     height, width = layout.defocus.shape
     diameter = layout.defocus * defocus_px
-    taps = None if path is None else path_taps(path, height, width)
+    if path is None:
+        return remaining_variance(diameter)
+    taps = path_taps(path, height, width)
     left = remaining_variance(diameter, taps)
     if own is None or layout.subject is None:
-        return left
-    # Where the subject has part of a pixel, both parts are independent: the smeared mask of squared
-    # weights says how much of the subject's noise is there.
-    taps = path_taps(own, height, width)
-    squared = taps._replace(weights=taps.weights**2)
-    covered, noise = (path_blur(layout.mask, t)[0].clamp(max=1.0) for t in (taps, squared))
-    subject = noise * (remaining_variance(diameter, taps) / taps.energy)
-    return ((1.0 - covered).square() * left + subject).clamp(max=1.0)
+        return path_blur(left[None], taps)[0]
+    # Taps of pixels that differ leave the mean of what each of these would leave alone.
+    taps_own = path_taps(own, height, width)
+    left = path_blur(left.flatten()[layout.behind][None], taps)
+    subject = path_blur(layout.mask * remaining_variance(diameter, taps_own), taps_own)
+    seen = 1.0 - path_blur(layout.mask, taps_own)
+    return (seen.square() * left + subject)[0].clamp(max=1.0)
 
 
 @functools.lru_cache(maxsize=4096)

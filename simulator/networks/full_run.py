@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions, record, sensor_light
+from simulator.capture.scene_blur import scene_light
+from simulator.capture.sensor import Transitions, record
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
@@ -83,7 +84,7 @@ class FullRun:
                 )
                 opened = self.aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        light = sensor_light(opened[0], at_target)
+        light = scene_light(opened[0], at_target)
         capture = torch.empty_like(light)[None]
         transition = Transitions.of([light], [at_target])
         record(transition, prepared.camera, keys=keys, signals=capture)

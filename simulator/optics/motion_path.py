@@ -191,7 +191,7 @@ def _positions(extent, direction, turn, drift_x, drift_y, count):  # type: ignor
 
 @_jit()
 def _widened(points):  # type: ignore[no-untyped-def]
-    """`points` along an axis, scaled to the second moment of the path.
+    """`points` along an axis, scaled such that their taps have the path's second moment.
 
     That of the path is that of the points, and of the straight piece that each stands for. A point
     between two pixels has a share of each, which alone widens it: below a pixel by more than the

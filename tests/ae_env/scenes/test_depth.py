@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
 from ae_env.scenes import depth
 from ae_env.scenes.dead_leaves import dead_leaves
 from ae_env.scenes.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
+from ae_env.scenes.measured_depth import depth_scenes
+from tests.ae_env.scorer_images import CAMERA, make_scene
 
 PITCH = 11.88e-6  # packed pixels of the Nikon Z6
 
@@ -65,3 +68,45 @@ def test_errors_name_the_argument() -> None:
         draw_depth(rng, 32, "fron")
     with pytest.raises(ValueError, match=r"`size` \(=8\)"):
         draw_depth(rng, 8)
+
+
+def test_draped_pictures_are_laid_out() -> None:
+    """Most are focused on the nearest thing, and none without a subject that can be seen."""
+    scenes = [make_scene(np.ones((4, 40, 48)), 100.0, scene_id=f"{i}") for i in range(60)]
+    layouts = [depth.drape(scene).layout for scene in scenes]
+    in_focus = 0
+    for layout in layouts:
+        assert layout is not None
+        assert layout.subject is not None
+        assert layout.defocus.shape == layout.subject.shape == (40, 48)
+        assert float(layout.defocus.max()) > 0.7  # the cut may miss the largest
+        in_focus += float(layout.defocus[layout.subject].median()) < 0.2
+    assert 0.6 * len(layouts) < in_focus < 0.95 * len(layouts)
+    shares = [float(layout.subject.float().mean()) for layout in layouts]
+    assert min(shares) > 0.0
+    assert 0.05 < np.mean(shares) < 0.5
+
+
+def test_layouts_depend_on_the_name_alone() -> None:
+    """One scene has one layout at every resolution: the finer, averaged."""
+    light = np.random.default_rng(0).random((4, 128, 128))
+    fine = depth.drape(make_scene(light, 100.0, scene_id="a"))
+    again = depth.drape(make_scene(light * 0.5, 200.0, scene_id="a"))
+    other = depth.drape(make_scene(light, 100.0, scene_id="b"))
+    small = depth.drape(make_scene(light[:, :64, :64], 100.0, scene_id="a"))
+    resized = fine.resized(64).layout
+    assert None not in (fine.layout, again.layout, other.layout, small.layout, resized)
+    assert torch.equal(fine.layout.defocus, again.layout.defocus)
+    assert not torch.equal(fine.layout.defocus, other.layout.defocus)
+    torch.testing.assert_close(resized.defocus, small.layout.defocus)
+
+
+def test_scenes_with_measured_depth_have_its_layout() -> None:
+    front, middle, *_ = depth_scenes(CAMERA)
+    for scene in (front, middle):
+        assert scene.layout is not None
+        assert scene.layout.defocus.shape == scene.light.shape[1:]
+        assert scene.layout.subject is not None
+        assert scene.resized(64).layout is not None
+    assert front.scene_id == "motorcycle-front"
+    assert float(front.layout.defocus.max()) > 0.9
