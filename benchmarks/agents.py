@@ -1,10 +1,11 @@
-"""The long training: both agents over several seeds, against every light meter, on unseen scenes.
+"""The long training: both agents over several seeds, against every light meter, where none was.
 
     ae-env bench agents
 
 Trained agents lie under ``runs/bench_agents``, so that a second run continues where the first was
-stopped. It writes the report of an evaluation to ``agents/`` under the output folder. Trainings run
-side by side and show their own progress, so this one is no `benchmarks.harness.Benchmark`.
+stopped. It writes the report of an evaluation on each set of scenes to ``agents/`` under the output
+folder. Real places are looked for in the folder of real files and in the cache. Trainings run side
+by side and show their own progress, so this one is no `benchmarks.harness.Benchmark`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,10 @@ from benchmarks.isolated import ROOT
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}
 SEEDS = (0, 1, 2)
 EPISODES = 8
+#: Unseen scenes of the generators that agents learnt from, and unseen real places.
+SETS = ("bundled", "polyhaven")
+#: Scorers that no agent was trained on.
+OTHER_SCORERS = ("fidelity", "shin", "defects")
 QUICK = {"regression": {"frames": 2_000}, "ppo": {"total_timesteps": 2_048}}
 
 
@@ -51,8 +56,8 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
     _train(jobs)
     seconds = time.perf_counter() - began
 
-    test = {"scenes": "bundled", "split": "test", "resolution": 64}
-    envs = make_envs(test, num_envs=1, frames=1)
+    sets = SETS[:1] if quick else SETS
+    envs = make_envs({"split": "test", "resolution": 64}, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
     programs = [program for program in PROGRAMS if program != "M"]
     meters = [f"{meter}:{program}" for meter in CLASSIC_METERS for program in programs]
@@ -65,22 +70,31 @@ def run(out: Path, *, seed: int = 0, quick: bool = False) -> None:
         for name, own in jobs.items():
             policies[name] = [make_policy(f"{name}:{job.out}", context) for job in own]
         policies["oracle"] = make_policy("oracle", context)
-        episodes = 1 if quick else EPISODES
-        with progress("evaluation") as task:
-            result = evaluate(policies, test, episodes_per_scene=episodes, seed=seed, progress=task)
-    files = write_report(
-        result,
-        out / "agents",
-        command="ae-env bench agents" + (" --quick" if quick else ""),
-        source="bundled",
-        split="test",
-        extra_meta={
-            "training_seeds": list(SEEDS),
-            "training": {name: own[0].config.card() for name, own in jobs.items()},
-            "training_seconds_this_run": seconds,
-        },
-    )
-    print_files(files)
+        for scenes in sets:
+            test = {"scenes": scenes, "split": "test", "resolution": 64}
+            with progress(f"evaluation on {scenes}") as task:
+                result = evaluate(
+                    policies,
+                    test,
+                    episodes_per_scene=1 if quick else EPISODES,
+                    seed=seed,
+                    other_scorers=OTHER_SCORERS,
+                    progress=task,
+                )
+            print_files(
+                write_report(
+                    result,
+                    out / "agents" / scenes,
+                    command="ae-env bench agents" + (" --quick" if quick else ""),
+                    source=scenes,
+                    split="test",
+                    extra_meta={
+                        "training_seeds": list(SEEDS),
+                        "training": {name: own[0].config.card() for name, own in jobs.items()},
+                        "training_seconds_this_run": seconds,
+                    },
+                )
+            )
 
 
 def _train(jobs: dict[str, list[TrainingJob]]) -> None:

@@ -26,6 +26,7 @@ from agents.evaluation.evaluation_plan import (
     plan_episodes,
     plan_scenes,
 )
+from agents.evaluation.other_scorers import other_scores
 from agents.evaluation.result import EvaluationResult, Track
 from agents.evaluation.running import (
     TIMED_FRAMES,
@@ -60,6 +61,7 @@ def evaluate(
     frames: int = 8,
     seed: int = 0,
     batch: int = BATCH,
+    other_scorers: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> EvaluationResult:
     """Run every policy over the same episodes, from starts that are drawn.
@@ -76,6 +78,8 @@ def evaluate(
         frames: Actions per episode.
         seed: Decides the episodes.
         batch: Episodes at a time, at most.
+        other_scorers: Names of scorers that no policy was trained on; states that were chosen in
+            some of the scenes are also rated by these.
         progress: Called with frames done, frames in all, and the name of the policy.
 
     Raises:
@@ -96,9 +100,9 @@ def evaluate(
         raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
     for member, policy in members:
         check_captures(member.name, policy)
-    run = EvaluationRun(
-        _plan_of(env_options, frames, range(seed, seed + episodes_per_scene)), batch=batch
-    )
+    plan = _plan_of(env_options, frames, range(seed, seed + episodes_per_scene))
+    plan = plan.model_copy(update={"other_scorers": tuple(other_scorers)})
+    run = EvaluationRun(plan, batch=batch)
     (condition,) = run.plan.all_conditions.values()
     total = run.plan.frames * (run.num_tables + len(members) * len(run.episodes))
     done = 0.0
@@ -119,7 +123,8 @@ def evaluate(
         for member, policy in members:
             follow = run.follow(member.name, policy, condition, light, reporter(member.name))
             start_states, tracks[member] = follow
-    return run.result(condition, light, start_states, tracks)
+    result = run.result(condition, light, start_states, tracks)
+    return replace(result, other_scores=other_scores(result, plan))
 
 
 def _plan_of(env_options: Mapping[str, Any], frames: int, seeds: Sequence[int]) -> EvaluationPlan:

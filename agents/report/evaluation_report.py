@@ -25,6 +25,7 @@ from agents.report.result_table import (
     ranking_rows,
     result_rows,
     scenes_csv,
+    scores_by_kind,
     static_condition,
     training_seed_rows,
 )
@@ -133,6 +134,7 @@ def _meta(
         "scenes": len(set(result.scene_ids.tolist())),
         "frames": result.scores.shape[1],
         "ranking": ranking_rows(ranking),
+        "by_kind": scores_by_kind(result),
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
         "differences_to_best_meter": (
@@ -187,6 +189,7 @@ class _Report:
             *self._conditions(),
             *self._cost(),
             *self._clipping(),
+            *self._kinds(),
             *self._other_scorers(),
             *self._paths(),
             *self._differences(),
@@ -322,6 +325,18 @@ class _Report:
         head = ["policy", f"white, {self.static}", "white, worst", f"black, {self.static}"]
         text = "Share of the pixels at white and at black."
         return ["## Clipping", text, markdown_table([*head, "black, worst"], body)]
+
+    def _kinds(self) -> list[str]:
+        kinds = self.meta["by_kind"]
+        if len(kinds) < 2:
+            return []
+        head = [f"{escape(kind)} ({values['groups']})" for kind, values in kinds.items()]
+        body = [
+            [escape(name), *(f"{values[name]:.3f}" for values in kinds.values())]
+            for name in self.result.tracks
+        ]
+        text = f"Normalised score ({self.static}); in brackets the source groups of each kind."
+        return ["## By kind of scene", text, markdown_table(["policy", *head], body)]
 
     def _other_scorers(self) -> list[str]:
         table, plan = self.meta["other_scorers"], self.result.plan

@@ -268,6 +268,21 @@ def oracle_histogram(result: EvaluationResult) -> dict[str, dict[str, float]]:
     }
 
 
+def scores_by_kind(result: EvaluationResult) -> dict[str, dict[str, float]]:
+    """Normalised score by kind of scene and policy; of a kind, ``groups`` counts source groups."""
+    found: dict[str, dict[str, float]] = {}
+    for kind in dict.fromkeys(result.kinds.tolist()):
+        own = result.kinds == kind
+        groups = result.groups[own]
+        span = metrics.group_means((result.oracle - result.random)[own], groups)[0]
+        found[kind] = {"groups": len(span)}
+        for name in result.tracks:
+            score = result.episode_metrics(name)["score"].mean(axis=0)
+            gain = metrics.group_means((score - result.random)[own], groups)[0]
+            found[kind][name] = float(gain.sum() / span.sum())
+    return found
+
+
 def group_values(result: EvaluationResult) -> tuple[list[str], list[list[str]]]:
     """Mean score of every source group: the header, and a row of cells per group."""
     columns = {"oracle q": result.oracle, "random q": result.random}
