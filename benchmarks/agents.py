@@ -1,4 +1,4 @@
-"""The long training: both agents over several seeds, against every light meter, where none was.
+"""The long training: both agents over several seeds, and every light meter, on unseen scenes.
 
     ae-env bench agents
 
