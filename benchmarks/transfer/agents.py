@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,14 +81,19 @@ def training_jobs(plan: TransferPlan, folder: Path) -> Jobs:
 
 def _config(plan: TransferPlan, agent: str, world: str) -> AgentConfig:
     config = load_config(ROOT / "configs" / f"{agent}.yaml")
-    options = WORLDS[world].options(training_set(plan), plan.crop) | {"crop": plan.crop}
+    options = WORLDS[world].options(training_set(plan), plan.crop) | common_options(plan)
     return AgentConfig.model_validate(
         {
             **config.model_dump(),
-            "environment": {**config.environment, "resolution": RESOLUTION, **options},
+            "environment": {**config.environment, **options},
             "training": {**config.training, _FRAMES[agent]: plan.frames},
         }
     )
+
+
+def common_options(plan: TransferPlan) -> dict[str, Any]:
+    """Arguments of the environment that are the same in training and judging."""
+    return {"resolution": RESOLUTION, "crop": plan.crop, "scorer": plan.scorer}
 
 
 def train(jobs: Jobs) -> None:
@@ -141,7 +147,7 @@ def _seconds_file(out: Path) -> Path:
 def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult:
     """Every agent on the same episodes on held-out scenes, in the truth."""
     scenes = held_out(plan, plan.judged_scenes, plan.crop)
-    options = {"scenes": scenes, "split": "test", "resolution": RESOLUTION, "crop": plan.crop}
+    options = {"scenes": scenes, "split": "test", **common_options(plan)}
     envs = make_envs(options, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
     envs.close()
@@ -183,6 +189,7 @@ def result_rows(
         errors = result.episode_metrics(policy_name(agent, world))
         row: Row = {"agent": agent, "world": world, "high_iso": WORLDS[world].high_iso}
         row |= {"simulator": WORLDS[world].simulator, "frames": plan.frames}
+        row |= {"crop": plan.crop, "scorer": plan.scorer}
         row |= comparison(gains, spans[agent], agent, world)
         row |= {"num_scenes": len(set(result.scene_ids.tolist()))}
         row |= {"regret": float(errors["regret"].mean())}

@@ -55,10 +55,11 @@ def agents_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
         origin(meta),
         f"{first['frames']} frames of training, {first['num_seeds']} training seeds, judged on "
         f"{first['num_scenes']} held-out scenes ({first['num_groups']} source groups) in the "
-        "truth. In brackets: 95 % intervals, differences paired over source groups, training seeds "
-        "drawn too. *More than in `EXP`*: the score less that of the agent trained in EXP on "
-        "sources of the same ISO. Minutes are those of one training with the loading of its scenes "
-        "and their networks, the median over the seeds.",
+        f"truth; scorer `{first['scorer']}`, frames {_CROPS[first['crop']]}. In brackets: 95 % "
+        "intervals, differences paired over source groups, training seeds drawn too. *More than in "
+        "`EXP`*: the score less that of the agent trained in EXP on sources of the same ISO. "
+        "Minutes are those of one training with the loading of its scenes and their networks, the "
+        "median over the seeds.",
         bullets(verdicts(rows)),
     ]
     for agent in dict.fromkeys(row["agent"] for row in rows):
@@ -124,7 +125,7 @@ def tables_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
     ]
     for crop in dict.fromkeys(row["crop"] for row in rows):
         own = [row for row in rows if row["crop"] == crop]
-        blocks += [f"### {_CROPS[crop]}", "Time of a table with the networks:", _times(own)]
+        blocks += [f"### Frames {_CROPS[crop]}", "Time of a table with the networks:", _times(own)]
         for heading, content in _MEASURES.items():
             blocks += [f"{heading}, by ISO and exposure of the source:", _pivot(own, content)]
         blocks += ["Where the error enters:", _terms(own)]
@@ -132,8 +133,8 @@ def tables_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
 
 
 _CROPS = {
-    "box": "Averaged to 64 x 64 pixels, as in training",
-    "native": "64 x 64 native pixels, with all of their noise",
+    "box": "averaged to 64 x 64 pixels",
+    "native": "of 64 x 64 native pixels, with all of their noise",
 }
 _MEASURES: dict[str, Cell] = {
     "Rank correlation": "{rank_correlation:.4f}",

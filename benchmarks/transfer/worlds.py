@@ -167,7 +167,7 @@ class TransferPlan:
         evs: Exposure of their sources relative to the meter [EV].
         crops: ``"box"`` averages the held-out scenes' pixels to a frame, and their noise with them;
             ``"native"`` cuts a frame of native pixels out, with all of their noise.
-        scorer: What tables are of.
+        scorer: What agents are trained for and judged by, and tables are of.
     """
 
     scenes: str = "mixed"
