@@ -14,7 +14,15 @@ from agents.cli.bench import BENCHMARKS
 from benchmarks import transfer
 from benchmarks.transfer import agents, tables
 from benchmarks.transfer.report import verdicts, with_ends
-from benchmarks.transfer.worlds import HIGH_ISO, PAPER, WORLDS, TransferPlan, World, has_weights
+from benchmarks.transfer.worlds import (
+    HIGH_ISO,
+    PAPER,
+    WORLDS,
+    TableSet,
+    TransferPlan,
+    World,
+    has_weights,
+)
 
 TINY = TransferPlan(
     scenes="bundled:small",
@@ -24,11 +32,10 @@ TINY = TransferPlan(
     frames=128,
     episodes=1,
     judged_scenes=4,
-    table_scenes=3,
-    simulators=("EXP", "compact"),
-    isos=(6400,),
-    evs=(-3, 3),
-    crops=("native",),
+    tables=(
+        TableSet("balanced", 3, ("EXP", "compact"), (6400,), (-3, 3), ("native",)),
+        TableSet("shadows", 2, ("compact",), (100,), (0,), ("box",)),
+    ),
 )
 
 
@@ -165,3 +172,4 @@ def test_a_tiny_run_trains_judges_predicts_and_trains_nothing_twice(
     page = (out / "transfer.md").read_text()
     assert "## Agents" in page
     assert "| ISO 6400, -3 EV |" in page
+    assert "### `shadows`, frames averaged" in page

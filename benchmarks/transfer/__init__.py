@@ -69,7 +69,8 @@ def run(
     print_files({"page": write_page(out)})
 
 
-def _left_out(plan: TransferPlan, part: str) -> list[str]:
+def _left_out(plan: TransferPlan, half: str) -> list[str]:
     """Worlds or simulators whose networks are not there."""
-    names = plan.worlds if part == "agents" else plan.simulators
+    used = (name for part in plan.tables for name in part.simulators)
+    names = plan.worlds if half == "agents" else dict.fromkeys(used)
     return [name for name in names if not has_weights(name)]

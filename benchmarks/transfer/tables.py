@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -28,6 +29,7 @@ from benchmarks.harness import FinishedParts, Row
 from benchmarks.transfer.worlds import (
     EXP,
     RESOLUTION,
+    TableSet,
     TransferPlan,
     has_weights,
     held_out,
@@ -49,41 +51,46 @@ def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) ->
         seed: Of motion and defocus, and of the photographs.
     """
     rows: list[Row] = []
-    settings = [(crop, iso) for crop in plan.crops for iso in plan.isos]
+    sets = [(part, crop, iso) for part in plan.tables for crop in part.crops for iso in part.isos]
     with progress_bars() as progress, progress("score tables") as task:
-        for number, (crop, iso) in enumerate(settings):
-
-            def measure(crop: Crop = crop, iso: int = iso) -> list[list[Measured]]:
-                return Predictions(plan, crop, seed=seed).at(iso, plan.evs)
-
-            task(number, len(settings), f"{crop}, ISO {iso}")
-            found = finished.get(f"tables {crop} {iso} {plan}", measure)
-            for ev, measured in zip(plan.evs, found, strict=True):
-                common = {"crop": crop, "iso": iso, "ev": ev, "scorer": plan.scorer}
+        for number, (part, crop, iso) in enumerate(sets):
+            name = f"{part.scorer} {crop} ISO {iso}"
+            task(number, len(sets), name)
+            measure = partial(_measure, plan, part, crop, iso, seed)
+            found = finished.get(f"{name} {part} {plan.scenes}", measure)
+            for ev, measured in zip(part.evs, found, strict=True):
+                common = {"scorer": part.scorer, "crop": crop, "iso": iso, "ev": ev}
                 rows += [common | row for row in summary(measured)]
         task(1, 1)
     return rows
+
+
+def _measure(
+    plan: TransferPlan, part: TableSet, crop: Crop, iso: int, seed: int
+) -> list[list[Measured]]:
+    return Predictions(plan, part, crop, seed=seed).at(iso, part.evs)
 
 
 class Predictions:
     """Held-out scenes with their true tables, and what simulators make of photographs of them.
 
     Args:
-        plan: The plan.
-        crop: See `TransferPlan`.
+        plan: Names the scenes.
+        part: The scorer, how many scenes, and the simulators.
+        crop: See `TableSet`.
         seed: Of motion and defocus, and of the photographs.
     """
 
-    def __init__(self, plan: TransferPlan, crop: Crop, *, seed: int = 0) -> None:
-        options = EnvOptions(scorer=plan.scorer, resolution=RESOLUTION)
-        self.seed, self.scenes = seed, held_out(plan, plan.table_scenes, crop)
+    def __init__(self, plan: TransferPlan, part: TableSet, crop: Crop, *, seed: int = 0) -> None:
+        options = EnvOptions(scorer=part.scorer, resolution=RESOLUTION)
+        self.seed, self.scenes = seed, held_out(plan, part.scenes, crop)
         self._tables = ScoreTables(
             options.make_grid(), options.make_camera(), options.make_scorer(), use_cache=False
         )
         self._blurs = drawn_blurs(self.scenes, seed)
         self._true = [self._table(i, scene) for i, scene in enumerate(self.scenes)]
         self._simulators: dict[str, SceneNetworks | None] = {}
-        for name in filter(has_weights, plan.simulators):
+        for name in filter(has_weights, part.simulators):
             given = simulator_argument(name)
             self._simulators[name] = None if given is None else SceneNetworks(given, cache=False)
 

@@ -149,6 +149,32 @@ def has_weights(name: str) -> bool:
 
 
 @dataclass(frozen=True)
+class TableSet:
+    """Score tables that are predicted.
+
+    Args:
+        scorer: What they are of.
+        scenes: Held-out scenes.
+        simulators: Those that predict; the ones whose networks are not there are left out.
+        isos: Of the sources.
+        evs: Exposure of the sources relative to the meter [EV].
+        crops: ``"box"`` averages a scene's pixels to a frame, and their noise with them;
+            ``"native"`` cuts a frame of native pixels out, with all of their noise.
+    """
+
+    scorer: str = "balanced"
+    scenes: int = 96
+    simulators: tuple[str, ...] = (*SIMULATORS, PAPER)
+    isos: tuple[int, ...] = (100, 400, 1600, 6400)
+    evs: tuple[int, ...] = (-3, -1, 0, 1, 3)
+    crops: tuple[Crop, ...] = ("box", "native")
+
+
+#: Tables of a scorer that looks at the captures themselves, noise and all: 0.3 s each.
+SEEN = TableSet("fidelity", 20, (EXP, "compact", PAPER), (1600, 6400), (-1, 0, 1))
+
+
+@dataclass(frozen=True)
 class TransferPlan:
     """How much is trained and measured.
 
@@ -158,32 +184,23 @@ class TransferPlan:
         agents: Names of configurations.
         seeds: Training seeds.
         frames: Frames of each training; PPO takes whole updates of 1024.
-        crop: Of the scenes that agents are trained and judged on, see `crops`.
+        crop: Of the scenes that agents are trained and judged on, see `TableSet`.
         episodes: Episodes on each held-out scene that agents are judged in.
         judged_scenes: Held-out scenes that agents are judged on, groups in turn; None for all.
-        table_scenes: Held-out scenes whose tables are predicted.
-        simulators: Those that predict tables.
-        isos: Of their sources.
-        evs: Exposure of their sources relative to the meter [EV].
-        crops: ``"box"`` averages the held-out scenes' pixels to a frame, and their noise with them;
-            ``"native"`` cuts a frame of native pixels out, with all of their noise.
-        scorer: What agents are trained for and judged by, and tables are of.
+        scorer: What agents are trained for and judged by.
+        tables: What is measured of score tables.
     """
 
     scenes: str = "mixed"
     worlds: tuple[str, ...] = tuple(WORLDS)
     agents: tuple[str, ...] = ("regression", "ppo")
     seeds: tuple[int, ...] = (0, 1, 2)
-    frames: int = 61_440
+    frames: int = 49_152
     crop: Crop = "box"
     episodes: int = 2
     judged_scenes: int | None = None
-    table_scenes: int = 96
-    simulators: tuple[str, ...] = (*SIMULATORS, PAPER)
-    isos: tuple[int, ...] = (100, 400, 1600, 6400)
-    evs: tuple[int, ...] = (-3, -1, 0, 1, 3)
-    crops: tuple[Crop, ...] = ("box", "native")
     scorer: str = "balanced"
+    tables: tuple[TableSet, ...] = (TableSet(), SEEN)
 
     def __post_init__(self) -> None:
         if TRUTH not in self.worlds:
@@ -197,10 +214,10 @@ QUICK = TransferPlan(
     frames=2048,
     episodes=1,
     judged_scenes=16,
-    table_scenes=16,
-    simulators=(EXP, "compact"),
-    isos=(100, 6400),
-    evs=(-3, 0, 3),
+    tables=(
+        TableSet(scenes=16, simulators=(EXP, "compact"), isos=(100, 6400), evs=(-3, 0, 3)),
+        TableSet("fidelity", 2, (EXP, "compact"), (6400,), (0,), ("native",)),
+    ),
 )
 
 
