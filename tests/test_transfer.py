@@ -1,6 +1,6 @@
 """The transfer benchmark: its measures against numbers worked out by hand, and a tiny run."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,32 +45,46 @@ def score_table(mean: Sequence[float], allowed: Sequence[bool] | None = None) ->
     return ScoreTable(values, np.zeros(len(values)), {"term": values / 2.0}, mask)
 
 
+def twice(parts: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Of a scorer whose only part is half of the score."""
+    return 2.0 * parts["term"]
+
+
+def test_an_error_is_that_of_the_term_that_makes_it() -> None:
+    """Score a^2 b: a part wrong where the other is 0 makes no error."""
+    parts = {"a": np.array([0.5, 1.0]), "b": np.array([0.0, 0.5])}
+    predicted = {"a": np.array([0.9, 0.8]), "b": np.array([0.1, 0.5])}
+    true, table = (ScoreTable(np.zeros(2), np.zeros(2), own) for own in (parts, predicted))
+    found = tables.errors(table, true, lambda own: own["a"] ** 2 * own["b"])["terms"]
+    assert found == pytest.approx({"a": 0.5 * (0.5 - 0.32), "b": 0.5 * 0.025})
+
+
 def test_a_table_predicted_by_the_truth_itself_has_no_error() -> None:
     true = score_table([0.1, 0.7, 0.4, 0.9])
-    found = tables.errors(true, true)
+    found = tables.errors(true, true, twice)
     assert found["rank_correlation"] == pytest.approx(1.0)
     assert (found["regret"], found["absolute_error"], found["terms"]) == (0.0, 0.0, {"term": 0.0})
 
 
 def test_errors_of_a_table_by_hand() -> None:
     """Ranks 1 3 2 against 1 2 3: 1 - 6 * 2 / (3 * 8) = 0.5; the state chosen has 0.5, not 0.9."""
-    found = tables.errors(score_table([0.2, 0.9, 0.5]), score_table([0.1, 0.5, 0.9]))
+    found = tables.errors(score_table([0.2, 0.9, 0.5]), score_table([0.1, 0.5, 0.9]), twice)
     assert found["rank_correlation"] == pytest.approx(0.5)
     assert found["regret"] == pytest.approx(0.4)
     assert found["absolute_error"] == pytest.approx(0.3)
-    assert found["terms"]["term"] == pytest.approx(0.15)
+    assert found["terms"]["term"] == pytest.approx(0.3)
 
 
 def test_states_that_a_scene_forbids_do_not_count() -> None:
     allowed = (True, True, True, False)
     predicted = score_table([0.2, 0.9, 0.5, 1.0], allowed)
-    found = tables.errors(predicted, score_table([0.1, 0.5, 0.9, 0.0], allowed))
+    found = tables.errors(predicted, score_table([0.1, 0.5, 0.9, 0.0], allowed), twice)
     assert found["rank_correlation"] == pytest.approx(0.5)
     assert found["regret"] == pytest.approx(0.4)
 
 
 def test_a_table_that_tells_no_states_apart_has_no_correlation() -> None:
-    found = tables.errors(score_table([0.5, 0.5, 0.5]), score_table([0.1, 0.5, 0.9]))
+    found = tables.errors(score_table([0.5, 0.5, 0.5]), score_table([0.1, 0.5, 0.9]), twice)
     assert found["rank_correlation"] == 0.0
 
 

@@ -118,8 +118,8 @@ def tables_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
         "its own light. *Rank correlation*: Spearman's, of the 64 predicted scores with the true "
         "ones. *Regret*: what the state that looks best loses in the true table. *Error*: mean "
         "absolute error of a score. Means over source groups; intervals are in the JSON file. A "
-        "star: the interval leaves out zero. *Worst term*: the part of the scorer with the largest "
-        "mean error.",
+        "star: the interval leaves out zero. *Where the error enters*: the error if only that part "
+        "of the scorer is predicted, and all others are true.",
     ]
     for scorer, crop in dict.fromkeys((row["scorer"], row["crop"]) for row in rows):
         own = [row for row in rows if (row["scorer"], row["crop"]) == (scorer, crop)]
@@ -131,7 +131,7 @@ def tables_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
         for heading, content in _MEASURES.items():
             blocks += [f"{heading}, by ISO and exposure of the source:", _pivot(own, content)]
         if len(own[0]["terms"]) > 1:
-            blocks += ["Where the error enters:", _terms(own)]
+            blocks += ["*Where the error enters*:", _terms(own)]
     return [*blocks, *_left_out(meta)]
 
 
@@ -167,7 +167,7 @@ def _source(row: Row) -> str:
 
 
 def _terms(rows: Sequence[Row]) -> str:
-    """Mean error of each term, of every simulator, at the ends of the source's exposure."""
+    """Error that each term makes, of every simulator, at the ends of the source's exposure."""
     columns: dict[str, Cell] = {
         "source": _source,
         "simulator": "`{simulator}`",

@@ -38,8 +38,10 @@ from benchmarks.transfer.worlds import (
 
 #: What is measured of a predicted table, each the better the smaller but the first.
 MEASURES = ("rank_correlation", "regret", "absolute_error")
-#: Of every scene: its measures, milliseconds, and mean absolute error of each term.
+#: Of every scene: its measures, milliseconds, and the error that each term makes.
 Measured = dict[str, Any]
+#: Of the parts of a scorer, by name.
+Totals = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
 def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) -> list[Row]:
@@ -85,7 +87,7 @@ class Predictions:
         options = EnvOptions(scorer=part.scorer, resolution=RESOLUTION)
         self.seed, self.scenes = seed, held_out(plan, part.scenes, crop)
         self._tables = ScoreTables(
-            options.make_grid(), options.make_camera(), options.make_scorer(), use_cache=False
+            options.make_grid(), options.make_camera(), options.make_scorer()
         )
         self._blurs = drawn_blurs(self.scenes, seed)
         self._true = [self._table(i, scene) for i, scene in enumerate(self.scenes)]
@@ -114,7 +116,7 @@ class Predictions:
             table = self._table(index, _simulated(networks, taken))
             row: Measured = {"simulator": name, "group": scene.group, "saturated": saturated}
             row["ms"] = 1000.0 * (time.perf_counter() - began)
-            found.append(row | errors(table, true))
+            found.append(row | errors(table, true, self._tables.scorer.totals))
         return found
 
 
@@ -135,22 +137,24 @@ def drawn_blurs(scenes: Sequence[Scene], seed: int) -> list[tuple[float, float]]
     return [(episode.speed, episode.defocus) for episode in drawn]
 
 
-def errors(table: ScoreTable, true: ScoreTable) -> Measured:
+def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:
     """Measures of a predicted table, over the states that the scene allows.
 
     Args:
         table: Predicted.
         true: Of the scene's own light.
+        totals: Scores (S,) from those of the scorer's parts.
 
     Returns:
         ``rank_correlation``: Spearman's; ``regret``: what the state that looks best loses in the
-        true table; ``absolute_error``: mean over the states; ``terms``: that of each part of the
-        scorer.
+        true table; ``absolute_error``: mean over the states; ``terms``: how much of it there is if
+        only that part of the scorer is the predicted one.
     """
     allowed = np.ones(len(true.mean), bool) if true.allowed is None else true.allowed
+    right = totals(true.parts)
     terms = {
-        name: float(np.abs(table.parts[name] - part)[allowed].mean())
-        for name, part in true.parts.items()
+        name: float(np.abs(totals({**true.parts, name: part}) - right)[allowed].mean())
+        for name, part in table.parts.items()
     }
     return {
         "rank_correlation": _spearman(table.mean[allowed], true.mean[allowed]),
