@@ -34,6 +34,7 @@ bench: $(STAMP)
 	$(BIN)/ae-env bench stability
 	@echo "error against time (about 20 minutes, and an hour once for the networks to compare with): $(BIN)/ae-env bench work-precision"
 	@echo "the simulator against the reference camera (trains the networks to compare with: about 1.5 hours): $(BIN)/ae-env bench simulator"
+	@echo "agents trained on the simulator, judged in the truth (about an hour): $(BIN)/ae-env bench transfer"
 	@echo "the agents' long training (about an hour): $(BIN)/ae-env bench agents"
 
 $(VENV): $(STAMP)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +14,7 @@ from agents.cli.console import Seed, make_folder
 
 BENCHMARKS = (
     *("agents", "brackets", "colour_checker", "convergence", "defects", "denoising", "ptc"),
-    *("scorers", "simulator", "stability", "throughput", "work_precision"),
+    *("scorers", "simulator", "stability", "throughput", "transfer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -31,6 +31,9 @@ def bench(
     against: Annotated[
         Path | None, typer.Option(help="Of throughput: another checkout, timed in turns with this.")
     ] = None,
+    part: Annotated[
+        str | None, typer.Option(help="Of transfer: agents or tables; by default both.")
+    ] = None,
 ) -> None:
     """Run one of the measurements whose results are in docs/results.
 
@@ -42,6 +45,10 @@ def bench(
         raise ValueError(f"`against` (={str(against)!r}) is an option of throughput only")
     if against is not None and not (against / "simulator" / "__init__.py").is_file():
         raise ValueError(f"`against` (={str(against)!r}) must be a checkout of this project")
+    if part is not None:
+        if name != "transfer":
+            raise ValueError(f"`part` (={part!r}) is an option of transfer only")
+        check_word("part", part, ("agents", "tables"))
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
         raise ValueError(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
@@ -51,5 +58,6 @@ def bench(
     make_folder(out)
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name)
-    options: dict[str, Path] = {} if against is None else {"against": against}
+    given: dict[str, Any] = {"against": against, "part": part}
+    options = {option: value for option, value in given.items() if value is not None}
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)

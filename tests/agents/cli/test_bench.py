@@ -36,3 +36,13 @@ def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, m
     assert code == 2
     assert "the benchmarks are not part of the installed package" in error
     assert "pip install -e ." in error
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "words"),
+    [("throughput", "agents", "an option of transfer only"), ("transfer", "table", "tables")],
+)
+def test_parts_are_those_of_transfer(ae_env, name, part, words):
+    code, _, error = ae_env("bench", name, "--part", part)
+    assert code == 2
+    assert words in error

@@ -1,0 +1,242 @@
+"""The worlds that agents are trained in, and the sizes of a run."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ae_env.options import EnvOptions
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.bundled import Split
+from ae_env.scenes.photographed import photographed
+from ae_env.scenes.polyhaven import list_assets
+from ae_env.scenes.scene import Crop
+from agents.evaluation.evaluation_plan import groups_in_turn
+from benchmarks.fidelity.models import weights
+from simulator import CameraProfile
+
+#: Range of the ISO of the sources that the claim about noisy ones is about.
+HIGH_ISO = (1600.0, 6400.0)
+#: Packed pixels a side, of every training and every table.
+RESOLUTION = 64
+#: Simulators by name: the environment's argument. EXP has no network: exposure ratio and noise
+#: level function only. `paper` is the path of weights that were trained here.
+SIMULATORS: dict[str, str | None] = {
+    "EXP": None,
+    "nano": "nano",
+    "compact": "compact",
+    "large": "large",
+}
+TRUTH, EXP, PAPER = "truth", "EXP", "paper"
+
+
+# -- sources of high ISO --------------------------------------------------------------------------
+
+
+def at_high_iso(
+    name: str, crop: Crop, split: Split, camera: CameraProfile, resolution: int | None
+) -> list[Scene]:
+    """Scenes of a set, each photographed once at an ISO of 1600 to 6400, drawn by its name.
+
+    What `source="raw"` makes of them but for the ISO: exposure and noise are drawn alike.
+
+    Args:
+        name: Of the set, see `load_scenes`.
+        crop: See `Scene.resized`.
+        split: ``"train"``, ``"test"`` or ``"all"``.
+        camera: The body.
+        resolution: Packed pixels a side.
+    """
+    scenes = load_scenes(name, split, camera=camera, resolution=resolution, crop=crop)
+    return [photographed(scene, iso=_drawn_iso(scene.scene_id)) for scene in scenes]
+
+
+def _drawn_iso(scene_id: str) -> float:
+    rng = np.random.default_rng([zlib.crc32(scene_id.encode()), 1600])
+    return float(np.exp(rng.uniform(*np.log(HIGH_ISO))))
+
+
+#: What the environment's `scenes` names, as ``"benchmarks.transfer.worlds:high_iso_mixed_box"``.
+high_iso_mixed_box: Callable[..., list[Scene]] = partial(at_high_iso, "mixed", "box")
+high_iso_mixed_native: Callable[..., list[Scene]] = partial(at_high_iso, "mixed", "native")
+high_iso_bundled_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled", "box")
+high_iso_bundled_native: Callable[..., list[Scene]] = partial(at_high_iso, "bundled", "native")
+high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small", "box")
+high_iso_small_native: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small", "native")
+
+
+# -- worlds ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class World:
+    """What an agent is trained in.
+
+    Args:
+        simulator: ``"truth"``, or what simulates from one raw of each scene: a name of
+            `SIMULATORS`, or ``"paper"``.
+        high_iso: Whether those raws are of ISO 1600 to 6400, instead of 100 to 6400.
+    """
+
+    simulator: str
+    high_iso: bool = False
+
+    @property
+    def name(self) -> str:
+        """In tables and file names."""
+        return f"{self.simulator}-iso1600" if self.high_iso else self.simulator
+
+    def options(self, scenes: str, crop: Crop = "box") -> dict[str, Any]:
+        """Arguments of the environment that differ between the worlds.
+
+        Args:
+            scenes: The set of scenes.
+            crop: See `Scene.resized`.
+
+        Raises:
+            FileNotFoundError: If the world needs weights that were not trained.
+        """
+        if self.simulator == TRUTH:
+            return {"scenes": scenes, "source": "light"}
+        if self.high_iso:
+            scenes = f"{__name__}:high_iso_{scenes.split(':')[-1]}_{crop}"
+        return {"scenes": scenes, "source": "raw", "simulator": simulator_argument(self.simulator)}
+
+
+def simulator_argument(name: str) -> str | None:
+    """The environment's argument for a simulator's name.
+
+    Raises:
+        FileNotFoundError: If it needs weights that were not trained.
+    """
+    if name != PAPER:
+        return SIMULATORS[name]
+    found = weights(PAPER)
+    if found is None:
+        raise FileNotFoundError(
+            "the paper's networks do not come with the package: train them with "
+            "`ae-env train-simulator configs/simulator/paper.yaml` (1.5 hours on one core)"
+        )
+    return str(found)
+
+
+#: All of them by name; the truth comes first: the others are compared with it.
+WORLDS: dict[str, World] = {
+    world.name: world
+    for world in (
+        World(TRUTH),
+        World(EXP),
+        World("compact"),
+        World("large"),
+        World(PAPER),
+        World(EXP, high_iso=True),
+        World("compact", high_iso=True),
+    )
+}
+
+
+def has_weights(name: str) -> bool:
+    """Whether the networks of a simulator, or of a world's, are there."""
+    return not name.startswith(PAPER) or weights(PAPER) is not None
+
+
+# -- sizes of a run -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TableSet:
+    """Score tables that are predicted.
+
+    Args:
+        scorer: What they are of.
+        scenes: Held-out scenes.
+        simulators: Those that predict; the ones whose networks are not there are left out.
+        isos: Of the sources.
+        evs: Exposure of the sources relative to the meter [EV].
+        crops: ``"box"`` averages a scene's pixels to a frame, and their noise with them;
+            ``"native"`` cuts a frame of native pixels out, with all of their noise.
+    """
+
+    scorer: str = "balanced"
+    scenes: int = 96
+    simulators: tuple[str, ...] = (*SIMULATORS, PAPER)
+    isos: tuple[int, ...] = (100, 400, 1600, 6400)
+    evs: tuple[int, ...] = (-3, -1, 0, 1, 3)
+    crops: tuple[Crop, ...] = ("box", "native")
+
+
+#: Tables of a scorer that looks at the captures themselves, noise and all: 0.3 s each.
+SEEN = TableSet("fidelity", 20, (EXP, "compact", PAPER), (1600, 6400), (-1, 0, 1))
+
+
+@dataclass(frozen=True)
+class TransferPlan:
+    """How much is trained and measured.
+
+    Args:
+        scenes: Set to train on: ``"mixed"``, ``"bundled"`` or ``"bundled:small"``.
+        worlds: Names of `WORLDS`, the truth among them.
+        agents: Names of configurations.
+        seeds: Training seeds.
+        frames: Frames of each training; PPO takes whole updates of 1024.
+        crop: Of the scenes that agents are trained and judged on, see `TableSet`.
+        episodes: Episodes on each held-out scene that agents are judged in.
+        judged_scenes: Held-out scenes that agents are judged on, groups in turn; None for all.
+        scorer: What agents are trained for and judged by.
+        tables: What is measured of score tables.
+    """
+
+    scenes: str = "mixed"
+    worlds: tuple[str, ...] = tuple(WORLDS)
+    agents: tuple[str, ...] = ("regression", "ppo")
+    seeds: tuple[int, ...] = (0, 1, 2)
+    frames: int = 49_152
+    crop: Crop = "box"
+    episodes: int = 2
+    judged_scenes: int | None = None
+    scorer: str = "balanced"
+    tables: tuple[TableSet, ...] = (TableSet(), SEEN)
+
+    def __post_init__(self) -> None:
+        if TRUTH not in self.worlds:
+            raise ValueError(f"`worlds` (={self.worlds}) must have {TRUTH!r} to compare with")
+
+
+QUICK = TransferPlan(
+    scenes="bundled:small",
+    worlds=(TRUTH, EXP, "compact", "EXP-iso1600", "compact-iso1600"),
+    seeds=(0,),
+    frames=2048,
+    episodes=1,
+    judged_scenes=16,
+    tables=(
+        TableSet(scenes=16, simulators=(EXP, "compact"), isos=(100, 6400), evs=(-3, 0, 3)),
+        TableSet("fidelity", 2, (EXP, "compact"), (6400,), (0,), ("native",)),
+    ),
+)
+
+
+def training_set(plan: TransferPlan) -> str:
+    """The plan's scenes; the bundled ones where it asks for panoramas and there are none."""
+    has_panoramas = all(asset.path is not None for asset in list_assets())
+    return "bundled" if plan.scenes == "mixed" and not has_panoramas else plan.scenes
+
+
+def held_out(plan: TransferPlan, count: int | None, crop: Crop) -> list[Scene]:
+    """Test scenes of the truth: the bundled ones and, where they are, views into panoramas.
+
+    Args:
+        plan: The plan.
+        count: How many, kinds and source groups in turn; None for all.
+        crop: See `Scene.resized`.
+    """
+    name = training_set(plan)
+    names = ("bundled", "polyhaven") if name == "mixed" else (name,)
+    common: dict[str, Any] = {"split": "test", "resolution": RESOLUTION, "crop": crop}
+    found = (EnvOptions.from_kwargs({**common, "scenes": name}).load_scenes() for name in names)
+    return groups_in_turn([scene for scenes in found for scene in scenes], count)
