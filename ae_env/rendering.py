@@ -148,7 +148,7 @@ def contact_sheet(
     prepared = prepare_scene(scene, camera, **moves)
     frames = prepared.stream(grid.states, seed=seed)
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
-    title = _title(scene, speed, defocus, grid, table)
+    title = _title(scene, moves, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)
 
 
@@ -193,12 +193,16 @@ def _focus(scene: Scene, defocus: float) -> str:
 
 
 def _title(
-    scene: Scene, speed: float, defocus: float, grid: ExposureGrid, table: ScoreTable
+    scene: Scene, moves: dict[str, Any], grid: ExposureGrid, table: ScoreTable
 ) -> tuple[str, str]:
     light = "light unknown" if scene.illuminance is None else f"{scene.illuminance:,.4g} lux"
     parts = [scene.scene_id, f"{light} (EV100 {scene.ev100:.1f})"]
-    parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
-    parts.append(_focus(scene, defocus))
+    speed, own = moves["speed"], moves["movement"].subject_speed
+    if speed or not own:
+        parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
+    if own and scene.layout is not None:
+        parts.append(f"subject {own:.3g}")
+    parts.append(_focus(scene, moves["defocus"]))
     best = f"best state: {grid[table.oracle]}, expected score {table.mean[table.oracle]:.3f}"
     return "   ·   ".join(parts), best
 

@@ -31,8 +31,8 @@ _PARTS = {
 _COLUMNS = 4
 #: Paths on one contact sheet, and frames of a path.
 _PATHS, _PATH_FRAMES = 5, 8
-#: The kind of scene whose contact sheet is shown, where there is one.
-_KIND = "back_light"
+#: The kinds of scene whose contact sheet is shown, the first that there is: pictures, not drawings.
+_KINDS = ("photograph", "backlit")
 
 
 def plot_scores(path: Path, rows: Sequence[Mapping[str, Any]], title: str = "") -> Path:
@@ -194,7 +194,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
     if result.plan is None or not result.scenes or len(result.grid) > MAX_SHEET_STATES:
         return {}
     kinds = result.kinds.tolist()
-    episode = kinds.index(_KIND) if _KIND in kinds else 0
+    episode = next((kinds.index(kind) for kind in _KINDS if kind in kinds), 0)
     options = result.plan.options()
     files = {}
     for k, first in enumerate(range(0, len(order), _PATHS)):

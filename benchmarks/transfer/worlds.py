@@ -195,7 +195,7 @@ class TransferPlan:
     worlds: tuple[str, ...] = tuple(WORLDS)
     agents: tuple[str, ...] = ("regression", "ppo")
     seeds: tuple[int, ...] = (0, 1, 2)
-    frames: int = 32_768
+    frames: int = 24_576
     crop: Crop = "box"
     episodes: int = 2
     judged_scenes: int | None = None
