@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.evaluation import metrics
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest
@@ -22,6 +23,8 @@ from simulator.utils.files import write_atomically
 from simulator.utils.results import machine, versions
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from ae_env.scenes import Scene
 
 logger = logging.getLogger(__name__)
@@ -29,6 +32,9 @@ logger = logging.getLogger(__name__)
 #: The scenes' light is hashed as means of so many blocks a side, to so many EV: a scene that was
 #: made otherwise is noticed, the last bit of another processor's arithmetic is not.
 BLOCKS, STEP_EV = 4, 0.1
+#: Raised when an episode or its score is made otherwise. 2: depth and motion of each pixel, terms
+#: that are measured on the capture.
+RULES = 2
 #: Kinds of policies whose names have a file's or folder's path behind the colon.
 _WITH_FILES = ("ppo", "regression", "recorded")
 COLUMNS = (
@@ -58,32 +64,42 @@ Its row replaces the one of the same policy and author, where there is one, and 
 as a pull request with the two files that the command changes, `{table}` and `{page}`, and, if it \
 may be public, the policy's file.
 
-The plan and the light of its scenes have the hash `{hash}`, which every row carries; a run under \
-another one is refused.
+The plan, its scenes and the rules of the environment have the hash `{hash}`, which every row \
+carries; a run under another one is refused.
 
 {rows}
 """
 
 
 def scene_signature(scene: Scene) -> list[Any]:
-    """JSON values that identify a scene: its names, its right exposure, its light in blocks.
+    """JSON values that identify a scene: names, right exposure, light and defocus in blocks.
 
     Args:
         scene: At the resolution of the plan.
     """
-    light = scene.light.double().clamp(min=2.0**-20).numpy()  # (4, H, W)
-    height, width = (size // BLOCKS * BLOCKS for size in light.shape[1:])
-    shape = (4, BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS)
-    means = light[:, :height, :width].reshape(shape).mean(axis=(2, 4))
+    means = _blocks(scene.light.double().clamp(min=2.0**-20))
     exposed = np.log2(means) - scene.reference.log2_exposure
     codes = np.rint(exposed / STEP_EV).astype(int)
-    ev = round(scene.ev100, 2)
-    return [scene.scene_id, scene.group, scene.kind, bool(scene.hard), ev, codes.tolist()]
+    ev, lies = round(scene.ev100, 2), []
+    if scene.layout is not None:
+        lies = [np.rint(_blocks(scene.layout.defocus[None]) / 0.1).astype(int).tolist()]
+        lies += [
+            None if scene.layout.subject is None else round(float(scene.layout.mask.mean()), 2)
+        ]
+    return [scene.scene_id, scene.group, scene.kind, bool(scene.hard), ev, codes.tolist(), lies]
+
+
+def _blocks(planes: Tensor) -> NDArray[Any]:
+    """Means over blocks of each plane (P, H, W), (P, BLOCKS, BLOCKS)."""
+    height, width = (size // BLOCKS * BLOCKS for size in planes.shape[1:])
+    shape = (len(planes), BLOCKS, height // BLOCKS, BLOCKS, width // BLOCKS)
+    means: NDArray[Any] = planes[:, :height, :width].numpy().reshape(shape).mean(axis=(2, 4))
+    return means
 
 
 def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
-    """sha256 of the plan and of its scenes' light."""
-    return digest(plan.protocol(), [scene_signature(scene) for scene in scenes])
+    """sha256 of the plan, of its scenes, and of `RULES`."""
+    return digest(RULES, plan.protocol(), [scene_signature(scene) for scene in scenes])
 
 
 def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:

@@ -9,6 +9,7 @@ from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
 from agents.evaluation.plan_run import run_plan
 from agents.report import ae_bench
 from agents.report.result_table import overall_ranking
+from simulator.capture.layout import Layout
 
 PLAN = EvaluationPlan(
     name="Bench",
@@ -40,6 +41,8 @@ def test_hash_notices_the_plan_and_the_light(plan, scenes):
         [replace(scenes[0], light=light), *scenes[1:]]
         for light in (scenes[0].light * 1.15, corner)  # 0.2 EV
     ]
+    assert scenes[0].layout is not None
+    changed.append([replace(scenes[0], layout=Layout(1.0 - scenes[0].layout.defocus)), *scenes[1:]])
     for other, own in ((plan.changed(frames=4), scenes), *((plan, own) for own in changed)):
         with pytest.raises(ValueError, match="has changed, so results would not"):
             ae_bench.check_hash(other, own)
@@ -50,7 +53,7 @@ def test_signature_of_known_light(scenes):
     light = torch.full((4, 36, 36), 0.25)
     light[:, :9, :9] = 1.0  # the first of 4 x 4 blocks
     found = ae_bench.scene_signature(replace(scene, light=light))
-    codes = np.array(found[-1])
+    codes = np.array(found[-2])
     assert codes.shape == (4, 4, 4)
     assert (codes[:, 0, 0] - codes[:, 3, 3] == 20).all()  # two stops in tenths
 
