@@ -35,7 +35,20 @@ SIMULATORS: dict[str, str | None] = {
 TRUTH, EXP, PAPER = "truth", "EXP", "paper"
 
 
-# -- sources of high ISO --------------------------------------------------------------------------
+#: Bundled scenes and views of real places together.
+BOTH = "both"
+
+
+# -- scenes ---------------------------------------------------------------------------------------
+
+
+def scenes_of(
+    name: str, crop: Crop, split: Split, camera: CameraProfile, resolution: int | None
+) -> list[Scene]:
+    """Scenes of a set: `BOTH`, or a name that `load_scenes` knows; see there for the arguments."""
+    names = ("bundled", "polyhaven") if name == BOTH else (name,)
+    common: dict[str, Any] = {"camera": camera, "resolution": resolution, "crop": crop}
+    return [scene for one in names for scene in load_scenes(one, split, **common)]
 
 
 def at_high_iso(
@@ -52,7 +65,7 @@ def at_high_iso(
         camera: The body.
         resolution: Packed pixels a side.
     """
-    scenes = load_scenes(name, split, camera=camera, resolution=resolution, crop=crop)
+    scenes = scenes_of(name, crop, split, camera, resolution)
     return [photographed(scene, iso=_drawn_iso(scene.scene_id)) for scene in scenes]
 
 
@@ -61,9 +74,11 @@ def _drawn_iso(scene_id: str) -> float:
     return float(np.exp(rng.uniform(*np.log(HIGH_ISO))))
 
 
-#: What the environment's `scenes` names, as ``"benchmarks.transfer.worlds:high_iso_mixed_box"``.
-high_iso_mixed_box: Callable[..., list[Scene]] = partial(at_high_iso, "mixed", "box")
-high_iso_mixed_native: Callable[..., list[Scene]] = partial(at_high_iso, "mixed", "native")
+#: What the environment's `scenes` names, as ``"benchmarks.transfer.worlds:high_iso_both_box"``.
+both_box: Callable[..., list[Scene]] = partial(scenes_of, BOTH, "box")
+both_native: Callable[..., list[Scene]] = partial(scenes_of, BOTH, "native")
+high_iso_both_box: Callable[..., list[Scene]] = partial(at_high_iso, BOTH, "box")
+high_iso_both_native: Callable[..., list[Scene]] = partial(at_high_iso, BOTH, "native")
 high_iso_bundled_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled", "box")
 high_iso_bundled_native: Callable[..., list[Scene]] = partial(at_high_iso, "bundled", "native")
 high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small", "box")
@@ -101,10 +116,12 @@ class World:
         Raises:
             FileNotFoundError: If the world needs weights that were not trained.
         """
-        if self.simulator == TRUTH:
-            return {"scenes": scenes, "source": "light"}
         if self.high_iso:
             scenes = f"{__name__}:high_iso_{scenes.split(':')[-1]}_{crop}"
+        elif scenes == BOTH:
+            scenes = f"{__name__}:{BOTH}_{crop}"
+        if self.simulator == TRUTH:
+            return {"scenes": scenes, "source": "light"}
         return {"scenes": scenes, "source": "raw", "simulator": simulator_argument(self.simulator)}
 
 
@@ -179,7 +196,7 @@ class TransferPlan:
     """How much is trained and measured.
 
     Args:
-        scenes: Set to train on: ``"mixed"``, ``"bundled"`` or ``"bundled:small"``.
+        scenes: Set to train on: `BOTH`, ``"bundled"`` or ``"bundled:small"``.
         worlds: Names of `WORLDS`, the truth among them.
         agents: Names of configurations.
         seeds: Training seeds.
@@ -191,11 +208,11 @@ class TransferPlan:
         tables: What is measured of score tables.
     """
 
-    scenes: str = "mixed"
+    scenes: str = BOTH
     worlds: tuple[str, ...] = tuple(WORLDS)
     agents: tuple[str, ...] = ("regression", "ppo")
     seeds: tuple[int, ...] = (0, 1, 2)
-    frames: int = 24_576
+    frames: int = 16_384
     crop: Crop = "box"
     episodes: int = 2
     judged_scenes: int | None = None
@@ -224,7 +241,7 @@ QUICK = TransferPlan(
 def training_set(plan: TransferPlan) -> str:
     """The plan's scenes; the bundled ones where it asks for panoramas and there are none."""
     has_panoramas = all(asset.path is not None for asset in list_assets())
-    return "bundled" if plan.scenes == "mixed" and not has_panoramas else plan.scenes
+    return "bundled" if plan.scenes == BOTH and not has_panoramas else plan.scenes
 
 
 def held_out(plan: TransferPlan, count: int | None, crop: Crop) -> list[Scene]:
@@ -235,8 +252,6 @@ def held_out(plan: TransferPlan, count: int | None, crop: Crop) -> list[Scene]:
         count: How many, kinds and source groups in turn; None for all.
         crop: See `Scene.resized`.
     """
-    name = training_set(plan)
-    names = ("bundled", "polyhaven") if name == "mixed" else (name,)
-    common: dict[str, Any] = {"split": "test", "resolution": RESOLUTION, "crop": crop}
-    found = (EnvOptions.from_kwargs({**common, "scenes": name}).load_scenes() for name in names)
-    return groups_in_turn([scene for scenes in found for scene in scenes], count)
+    options = EnvOptions(split="test", resolution=RESOLUTION, crop=crop)
+    found = scenes_of(training_set(plan), crop, "test", options.make_camera(), RESOLUTION)
+    return groups_in_turn(found, count)
