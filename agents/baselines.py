@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 #: Episodes per scene from which the best constant state is taken.
 FIT_EPISODES = 4
+#: Scenes that they are of, at most.
+FIT_SCENES = 400
 
 
 class Random(Policy):
@@ -55,7 +57,9 @@ class BestFixed(Policy):
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
         """Average the expected scores of all states over the scenes of `envs`."""
-        episodes = Episodes.of_each_scene(scenes_of(envs), count=FIT_EPISODES, seed=seed)
+        episodes = Episodes.of_each_scene(
+            scenes_of(envs), count=FIT_EPISODES, seed=seed, most=FIT_SCENES
+        )
         scores = [expected_scores(envs)[batch.valid] for batch in episodes.batches(envs)]
         self.mean_scores = np.concatenate(scores).mean(axis=0)
 

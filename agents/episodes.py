@@ -119,9 +119,19 @@ class Episodes:
     starts: Sequence[int | None]
 
     @classmethod
-    def of_each_scene(cls, scenes: Sequence[Scene], *, count: int, seed: int) -> Episodes:
-        """All scenes, `count` times in a row; episode i has the seed ``seed + i``."""
-        scene = np.tile(np.arange(len(scenes)), count)
+    def of_each_scene(
+        cls, scenes: Sequence[Scene], *, count: int, seed: int, most: int | None = None
+    ) -> Episodes:
+        """All scenes, `count` times in a row; episode i has the seed ``seed + i``.
+
+        Args:
+            scenes: The scenes.
+            count: Episodes of each.
+            seed: Of the first.
+            most: Use so many scenes at most, evenly over the list; None for all.
+        """
+        used = len(scenes) if most is None else min(most, len(scenes))
+        scene = np.tile(np.arange(used) * len(scenes) // used, count)
         seeds = range(seed, seed + len(scene))
         return cls(scenes, seeds, scene, [None] * len(scene))
 

@@ -218,7 +218,9 @@ class MeteringPolicy(Policy):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
         """Readings after the meter has settled, scores of all states, source groups."""
         features, scores, groups = [], [], []
-        drawn = Episodes.of_each_scene(scenes_of(envs), count=per_scene, seed=seed)
+        drawn = Episodes.of_each_scene(
+            scenes_of(envs), count=per_scene, seed=seed, most=FIT_EPISODES // 2
+        )
         for batch in drawn.batches(envs):
             self.reset(envs.num_envs)
             observations, masks = batch.observations, batch.action_masks
