@@ -337,7 +337,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "## Cost",
         f"Milliseconds per batch of {BATCH} captures, median and half the range, on "
         f"{meta['machine']['threads']} threads. Scorers of sRGB need developing, which is in their "
-        "times. Those with a closed form on noise-free light are computed once per scene and state "
+        "times. Those with a closed form on noise-free light are computed once per episode "
         "in an environment whose light is static, not per frame.",
         pivot(
             results["milliseconds"],

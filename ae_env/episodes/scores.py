@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.protocol import Captures, reads_pixels
 from ae_env.scorers.score_table import ScoreTables
 from simulator.capture.batch import CaptureBatch, FrameStatistics
+from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
 
@@ -26,6 +27,7 @@ class PartScores:
         scenes: Scenes that are photographed.
         episodes: The episodes that photograph them.
         batch: What photographs them.
+        prepared: The scene of a `Episodes.light_index` in its episode.
         static: Whether the light never changes.
         expected: Whether the parts that are measured on frames are replaced by their expectation.
 
@@ -41,11 +43,13 @@ class PartScores:
         scenes: Sequence[Scene],
         episodes: Episodes,
         batch: CaptureBatch,
+        prepared: Callable[[int], PreparedScene],
         *,
         static: bool,
         expected: bool,
     ) -> None:
         self.tables, self.grid, self.batch = tables, tables.grid, batch
+        self._prepared = prepared
         self.scenes, self.episodes, self._static = scenes, episodes, static
         self._code_scores, self._others = tables.code_scores, tables.others
         others = self._others
@@ -169,7 +173,9 @@ class PartScores:
         lights, first = lights[missing], first[missing]
         for light, env_index in zip(lights.tolist(), env_indices[first].tolist(), strict=True):
             episode = self.episodes[env_index]
-            parts = self.tables.known_parts(self.scenes[episode.scene], **episode.moves)
+            parts = self.tables.known_parts(
+                self.scenes[episode.scene], **episode.moves, prepared=self._prepared(light)
+            )
             for column, name in enumerate(self._known):
                 self._scores[light, :, column] = parts[name]
         self._scored[lights] = True

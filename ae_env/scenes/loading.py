@@ -16,7 +16,7 @@ import torch
 
 from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
-from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes
+from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest
 from ae_env.utils.checks import did_you_mean
 from ae_env.utils.user_code import load_attribute
@@ -132,6 +132,7 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
     if spec == "polyhaven":
         return polyhaven_scenes(request)
     if spec == "mixed":
+        split_assets("mixed", split)  # raises before anything is drawn
         bundled = _by_name("bundled:large", split, request)
         return mixed_scenes(request, [scene for scene in bundled if scene.kind != "photograph"])
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names

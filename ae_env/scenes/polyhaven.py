@@ -23,7 +23,6 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ae_env.scenes.bundled import Split
 from ae_env.scenes.depth import drape
 from ae_env.scenes.radiance import native_size, perspective, read_radiance
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
@@ -128,6 +127,27 @@ def list_assets() -> tuple[Asset, ...]:
     return load_yaml(find_preset("polyhaven", "scenes"), _AssetList).assets
 
 
+def split_assets(name: str, split: str) -> list[Asset]:
+    """The assets of a split, whose maps are there.
+
+    Args:
+        name: What the scenes are called in the error.
+        split: ``"train"``, ``"test"`` or ``"all"``.
+
+    Raises:
+        FileNotFoundError: If maps are missing; the message names the command that fetches them.
+    """
+    assets = [a for a in list_assets() if split in ("all", a.split)]
+    missing = [asset.name for asset in assets if asset.path is None]
+    if missing:
+        raise FileNotFoundError(
+            f"`scenes` (={name!r}): {len(missing)} of {len(assets)} maps are missing "
+            f"({', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}), "
+            "`ae-env scenes download` fetches them; or set AE_ENV_DATA to a folder that has them"
+        )
+    return assets
+
+
 def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0) -> list[Scene]:
     """Views into the panoramas of a split, of each map one after the other.
 
@@ -139,14 +159,7 @@ def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0
     Raises:
         FileNotFoundError: If maps are missing; the message names the command that fetches them.
     """
-    assets = [a for a in list_assets() if request.split in ("all", a.split)]
-    missing = [asset.name for asset in assets if asset.path is None]
-    if missing:
-        raise FileNotFoundError(
-            f"`scenes` (='polyhaven'): {len(missing)} of {len(assets)} maps are missing "
-            f"({', '.join(missing[:3])}{' ...' if len(missing) > 3 else ''}), "
-            "`ae-env scenes download` fetches them; or set AE_ENV_DATA to a folder that has them"
-        )
+    assets = split_assets("polyhaven", request.split)
     camera, plain = request.camera, request.resize is Scene.resized
     resolution = request.resolution if plain else None
     crop: Crop = request.crop if plain else "box"
@@ -313,9 +326,7 @@ def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene]) -> list[Sce
 
     Of whichever there are more, some are left out, evenly over the maps or the list.
     """
-    splits: tuple[Split, ...] = ("train", "test")
-    maps = sum(a.split == request.split or request.split not in splits for a in list_assets())
-    views = math.ceil(len(procedural) / maps)
+    views = math.ceil(len(procedural) / len(split_assets("mixed", request.split)))
     real = polyhaven_scenes(request, views=views)
     by_view = sorted(range(len(real)), key=lambda i: (i % views, i // views))
     kept = sorted(by_view[: len(procedural)])

@@ -45,9 +45,8 @@ _WORTH_A_THREAD = 2**15
 #: Column of the means for each term; and the terms that need none.
 _COLUMNS = {Highlights: 0, Shadows: 1, Noise: 2}
 _WITHOUT_PIXELS = (Banding, Brightness, Sharpness)
-#: Expectations are tabulated at this many values between two codes, up to a code beyond white that
-#: noise does not bring back.
-_FINE, _LAST_CODE = 8, 288
+#: Expectations are tabulated at this many values between two codes.
+_FINE = 8
 _SIGNALS = code_signals()
 
 
@@ -83,6 +82,12 @@ class CodeScores:
         self._shares = self._noise_shares(np.array([[n.shot, n.read] for n in noises]))
         self._dark = Shadows.shares(_SIGNALS).numpy()
         self._edges = _code_edges(camera)
+        # Up to light beyond white that even the most noise does not bring back.
+        shot, read = (max(max(getattr(n, name)) for n in noises) for name in ("shot", "read"))
+        light = 1.0
+        for _ in range(100):
+            light = 1.0 + _FAR * math.sqrt(shot * light + read)
+        self._size = int(_FINE * (2.0 + 255.0 * math.sqrt(light + PEDESTAL)))
         self._tables: LruCache[np.ndarray] = LruCache(_BYTES)
 
     def _noise_shares(self, shot_read: np.ndarray, brought: np.ndarray | None = None) -> np.ndarray:
@@ -159,7 +164,9 @@ class CodeScores:
             record(transitions, self.camera, row_gain=row_gain, codes=codes)
             return self.measured(codes, states, brought)
         shares, which = self._of_frames(states, brought)
-        keys = [table[i, 1:].tobytes() + states[i].tobytes() for i in range(len(table))]
+        # What the noise shares depend on, too.
+        kinds = np.stack([self._which[states], box_factors], axis=1)
+        keys = [table[i, 1:].tobytes() + kinds[i].tobytes() for i in range(len(table))]
         numbers: dict[bytes, int] = {}
         tables: list[np.ndarray] = []
         for i, key in enumerate(keys):
@@ -174,6 +181,7 @@ class CodeScores:
             height * width if row_gain is None else width,
             table[:, 0].astype(np.float32),
             rows.astype(np.float32),
+            self._size,
             np.array([tables[numbers[key]].ctypes.data for key in keys], np.uintp),
         )
         means = np.empty((len(table), 3))
@@ -185,7 +193,7 @@ class CodeScores:
         """(4, 3, G) float32 expectations by light: above the last code, blocked, and `noise`."""
         found = self._tables.get(key)
         if found is None:
-            found = np.empty((4, 3, _FINE * _LAST_CODE), np.float32)
+            found = np.empty((4, 3, self._size), np.float32)
             for plane in range(4):
                 noise = self._edges[plane], *missing[:, plane]
                 expect_codes(self._dark, shares[plane], *noise, found[plane])
@@ -243,7 +251,6 @@ _PER_DEVIATION = 128
 _NORMAL = ndtr(np.arange(-_FAR * _PER_DEVIATION, _FAR * _PER_DEVIATION + 1) / _PER_DEVIATION)
 _PEDESTAL = np.float32(PEDESTAL)
 _SCALE = np.float32(255.0 * _FINE / math.sqrt(1.0 + PEDESTAL))
-_END = np.float32(_FINE * _LAST_CODE - 1.001)
 _BLOCK = 256
 _jit = kernel(fastmath={"nsz", "contract", "reassoc"}, boundscheck=False)
 
@@ -355,7 +362,7 @@ def _interpolated(table, places, shares):  # type: ignore[no-untyped-def]
 
 @_jit
 def expect_means(  # type: ignore[no-untyped-def]
-    first, last, light, rows, columns, ratio, row_gain, tables, means
+    first, last, light, rows, columns, ratio, row_gain, grid, tables, means
 ):
     """Expected means of the frames `first` to `last`.
 
@@ -367,16 +374,17 @@ def expect_means(  # type: ignore[no-untyped-def]
         columns: C.
         ratio: (B, 4) float32, what the light is multiplied by.
         row_gain: (B, R) float32.
+        grid: G.
         tables: (B,) addresses of (4, 3, G) float32 of `expect_codes`.
         means: (B, 3) float64 to write to.
     """
     kept, shares = np.empty((2, _BLOCK), np.float32)
     places = np.empty(_BLOCK, np.int32)
-    size = rows * columns
+    size, end_of_grid = rows * columns, np.float32(grid - 1.001)
     for frame in range(first, last):
         pointer = as_pointer(light[frame])  # type: ignore[call-arg, var-annotated]
         signal = numba.carray(pointer, (4, size))
-        own = numba.carray(as_pointer(tables[frame]), (4, 3, _FINE * _LAST_CODE))
+        own = numba.carray(as_pointer(tables[frame]), (4, 3, grid))
         blown = blocked = clean = 0.0
         for row in range(rows):
             gain = row_gain[frame, row]
@@ -389,7 +397,7 @@ def expect_means(  # type: ignore[no-untyped-def]
                     brightest = np.int32(0)
                     for i in range(number):
                         x = part[i] * factor + _PEDESTAL
-                        place = min(np.sqrt(x if x > _ZERO else _ZERO) * _SCALE, _END)
+                        place = min(np.sqrt(x if x > _ZERO else _ZERO) * _SCALE, end_of_grid)
                         places[i] = np.int32(place)
                         shares[i] = place - np.float32(places[i])
                         brightest = max(brightest, places[i])

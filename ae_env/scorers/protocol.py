@@ -17,8 +17,8 @@ ColourMatrix = tuple[tuple[float, float, float], ...]
 Domain = Literal["raw", "srgb"]
 #: Input that decides a score: ``"image"``, the recorded image with its noise; ``"light"``, the
 #: noise-free light on the sensor; ``"blur"``, also (or only) the extent of the blur, which changes
-#: from episode to episode. The last two have a closed form and need no noise seeds; ``"light"`` is
-#: computed once per scene and state.
+#: from episode to episode. The last two have a closed form and need no noise seeds; in static light
+#: they are computed once per episode.
 DependsOn = Literal["image", "light", "blur"]
 
 

@@ -240,8 +240,8 @@ def _short(name: str) -> str:
 def scorer_fingerprint(scorer: CompositeScorer) -> str | None:
     """A hash of everything that decides the scores of `scorer`, or None where that is unknown.
 
-    A user's class may call anything, so its scores are stored on disk only if it has a ``version``
-    (a string or number that its author changes with the class).
+    A user's class may call anything, so it is known only if it has a ``version`` (a string or
+    number that its author changes with the class).
     """
     digest = hashlib.sha256()
     for path, part in _nested(scorer):

@@ -1,7 +1,8 @@
 """Expected scores of every exposure state of a scene.
 
 ``q(s)`` is the expectation, over noise, of the score of a capture at state s. Where a part of the
-scorer has that in closed form it is used; other parts are averaged over common noise seeds, with
+scorer has that in closed form it is used (of the terms that are measured on frames, to the first
+order: see `ae_env.scorers.code_terms`); other parts are averaged over common noise seeds, with
 their standard error.
 """
 
@@ -109,9 +110,13 @@ def source_noises(
     """`Captures.source_noise` of captures of `prepared`; `gains` (S,) are those of their light."""
     if prepared.nlf.is_zero:
         return None
-    pairs = zip(states, gains.tolist(), strict=True)
-    exposures = [prepared.exposure(state, gain=gain) for state, gain in pairs]
-    return [e.source_noise.scaled(float(prepared.box_factor**2)) for e in exposures]
+    found = []
+    for state, gain in zip(states, gains.tolist(), strict=True):
+        exposure = prepared.exposure(state, gain=gain)
+        left = exposure.remaining_variance
+        share = prepared.box_factor**2 * (1.0 if left is None else float(left.mean()))
+        found.append(exposure.source_noise.scaled(share))
+    return found
 
 
 class ScoreTables:
@@ -184,7 +189,7 @@ class ScoreTables:
             prepared = replace(prepared, tolerance=self.tolerance)
         light: Any = {"gain": gain, "row_gain": row_gain}
         episode: Any = {**moves, **light}
-        parts = self.known_parts(scene, **episode)
+        parts = self.known_parts(scene, **episode, prepared=prepared)
         if self.code_scores.parts:
             captures = self._captures.describe(scene, self.grid.states, **episode)
             means = self._expected_means(prepared, **light)
@@ -213,9 +218,11 @@ class ScoreTables:
         movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
+        prepared: PreparedScene,
     ) -> dict[str, np.ndarray]:
         """Scores (S,) of those parts that look at no frame; see `table`."""
         others = self.others
+        gains = np.broadcast_to(gain, len(self.grid))
         names = [] if others is None else others.names("light", "blur")
         if others is None or not names:
             return {}
@@ -231,6 +238,8 @@ class ScoreTables:
                 gain=gain[part] if isinstance(gain, np.ndarray) else gain,
                 row_gain=None if row_gain is None else row_gain[part],
             )
+            noises = source_noises(prepared, self.grid.states[part], gains[part])
+            captures = replace(captures, source_noise=noises, noisy=self.noise)
             scores = others.score_parts(None, captures, ("light", "blur"))
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}

@@ -12,7 +12,7 @@ from agents.cli.console import console
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all of it.")] = False,
 ) -> None:
-    """Show what is cached between runs (scenes, score tables, networks' outputs), or clear it.
+    """Show what is cached between runs (scenes, networks' outputs), or clear it.
 
     Example: `ae-env cache --clear`; the folder is another one where AE_ENV_CACHE names it.
     """

@@ -109,7 +109,7 @@ def run_quickstart(
     device: str = "cpu",
     on_error: str = "stop",
 ) -> QuickstartResult:
-    """Score tables, trainings, evaluation, report; a second run resumes the first.
+    """Trainings, evaluation, report; a second run resumes the first.
 
     Args:
         scenes: ``"bundled"``, or a folder of raws or radiance maps.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE
 from ae_env.utils.checks import check_integer
 from agents.episodes import Episodes, action_masks, expected_scores, make_envs, training_scenes
@@ -100,6 +101,8 @@ def evaluate(
         raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
     for member, policy in members:
         check_captures(member.name, policy)
+    for name in other_scorers:
+        make_scorer(name)  # raises before any work
     plan = _plan_of(env_options, frames, range(seed, seed + episodes_per_scene))
     plan = plan.model_copy(update={"other_scorers": tuple(other_scorers)})
     run = EvaluationRun(plan, batch=batch)

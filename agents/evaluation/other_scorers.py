@@ -25,7 +25,7 @@ def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, di
     scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first
     chosen = groups_in_turn(scenes, plan.other_scorer_scenes)
     options = plan.options()
-    made = {name: make_scorer(name) for name in plan.other_scorers}  # raises before any work
+    made = {name: make_scorer(name) for name in plan.other_scorers}
     found: dict[str, dict[str, float]] = {}
     for name, scorer in made.items():
         tables = ScoreTables(

@@ -80,13 +80,12 @@ def scene_signature(scene: Scene) -> list[Any]:
     means = _blocks(scene.light.double().clamp(min=2.0**-20))
     exposed = np.log2(means) - scene.reference.log2_exposure
     codes = np.rint(exposed / STEP_EV).astype(int)
-    ev, lies = round(scene.ev100, 2), []
-    if scene.layout is not None:
-        lies = [np.rint(_blocks(scene.layout.defocus[None]) / 0.1).astype(int).tolist()]
-        lies += [
-            None if scene.layout.subject is None else round(float(scene.layout.mask.mean()), 2)
-        ]
-    return [scene.scene_id, scene.group, scene.kind, bool(scene.hard), ev, codes.tolist(), lies]
+    ev, layout = round(scene.ev100, 2), scene.layout
+    planes = [] if layout is None else [layout.defocus[None]]
+    if layout is not None and layout.subject is not None:
+        planes.append(layout.mask)
+    places = [np.rint(_blocks(plane) / 0.1).astype(int).tolist() for plane in planes]
+    return [scene.scene_id, scene.group, scene.kind, bool(scene.hard), ev, codes.tolist(), places]
 
 
 def _blocks(planes: Tensor) -> NDArray[Any]:

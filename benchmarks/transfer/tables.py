@@ -34,6 +34,7 @@ from benchmarks.transfer.worlds import (
     has_weights,
     held_out,
     simulator_argument,
+    training_set,
 )
 
 #: What is measured of a predicted table, each the better the smaller but the first.
@@ -59,7 +60,7 @@ def table_rows(plan: TransferPlan, finished: FinishedParts, *, seed: int = 0) ->
             name = f"{part.scorer} {crop} ISO {iso}"
             task(number, len(sets), name)
             measure = partial(_measure, plan, part, crop, iso, seed)
-            found = finished.get(f"{name} {part} {plan.scenes}", measure)
+            found = finished.get(f"{name} {part} {training_set(plan)}", measure)
             for ev, measured in zip(part.evs, found, strict=True):
                 common = {"scorer": part.scorer, "crop": crop, "iso": iso, "ev": ev}
                 rows += [common | row for row in summary(measured)]
@@ -89,7 +90,7 @@ class Predictions:
         self._tables = ScoreTables(
             options.make_grid(), options.make_camera(), options.make_scorer()
         )
-        self._blurs = drawn_blurs(self.scenes, seed)
+        self._moves = drawn_moves(self.scenes, seed)
         self._true = [self._table(i, scene) for i, scene in enumerate(self.scenes)]
         self._simulators: dict[str, SceneNetworks | None] = {}
         for name in filter(has_weights, part.simulators):
@@ -97,8 +98,7 @@ class Predictions:
             self._simulators[name] = None if given is None else SceneNetworks(given, cache=False)
 
     def _table(self, index: int, scene: Scene) -> ScoreTable:
-        speed, defocus = self._blurs[index]
-        return self._tables.table(scene, speed=speed, defocus=defocus)
+        return self._tables.table(scene, **self._moves[index])
 
     def at(self, iso: float, evs: Sequence[float]) -> list[list[Measured]]:
         """What is measured of every scene and simulator: a list for each source exposure."""
@@ -124,17 +124,16 @@ def _simulated(networks: SceneNetworks | None, taken: Scene) -> Scene:
     return taken if networks is None else networks.denoised(taken)
 
 
-def drawn_blurs(scenes: Sequence[Scene], seed: int) -> list[tuple[float, float]]:
-    """Image speed and defocus of an episode on each scene, as the environment draws them."""
+def drawn_moves(scenes: Sequence[Scene], seed: int) -> list[dict[str, Any]]:
+    """Motion and defocus of an episode on each scene, as the environment draws them."""
     options = {"scenes": list(scenes), "resolution": RESOLUTION, "scorer": "sharpness"}
     with closing(make_envs(options, num_envs=min(64, len(scenes)), frames=1)) as envs:
         base: Any = envs.unwrapped
-        drawn = [
-            base.episode(int(i))
+        return [
+            base.episode(int(i)).moves
             for batch in Episodes.of_each_scene(scenes, count=1, seed=seed).batches(envs)
             for i in np.flatnonzero(batch.valid)
         ]
-    return [(episode.speed, episode.defocus) for episode in drawn]
 
 
 def errors(table: ScoreTable, true: ScoreTable, totals: Totals) -> Measured:

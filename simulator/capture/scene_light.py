@@ -75,6 +75,8 @@ class SceneLight:
         """Blurs `source` into `defocused` by the lens and into `streak` by motion, where given."""
         if defocused is not None:
             source = self._scene_blur.defocused(source, exposure, defocused)
+            if not self._cache:
+                self._scene_blur.forget()
         if streak is not None:
             if exposure.path is None:
                 motion_streak(source, exposure.motion_px, streak, limit=LIGHT_LIMIT)

@@ -66,11 +66,11 @@ class Transitions:
         """The same where rows have light of their own: the bands of flickering light.
 
         The light of each row multiplies the blurred light before there is noise, so that the noise
-        is that of the banded signal. (Motion runs along the rows, and defocus is complete before a
-        row is read.) Noise that the source itself brings is multiplied with its light: its variance
-        by the square of the row's gain, r^2. What the top-up takes away for it has the variance
-        times r: exact for shot noise, whose variance is worked out from the banded signal, and off
-        by r (1 - r) of the source's read noise.
+        is that of the banded signal: exact for motion along the rows; other motion blurs across
+        rows that do not share their light. Noise that the source itself brings is multiplied with
+        its light: its variance by the square of the row's gain, r^2. What the top-up takes away for
+        it has the variance times r: exact for shot noise, whose variance is worked out from the
+        banded signal, and off by r (1 - r) of the source's read noise.
 
         Args:
             row_gain: (B, H) light of each row relative to the frame's.

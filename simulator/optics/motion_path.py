@@ -144,11 +144,6 @@ class Taps(NamedTuple):
     columns: np.ndarray
     weights: np.ndarray
 
-    @property
-    def energy(self) -> float:
-        """Sum of squared weights: the share of white noise's variance that is left."""
-        return float((self.weights.astype(np.float64) ** 2).sum())
-
 
 @functools.lru_cache(maxsize=256)
 def path_taps(path: Path, height: int, width: int) -> Taps:

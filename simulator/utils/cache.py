@@ -27,8 +27,8 @@ from simulator.utils.results import package_version
 _LOGGER = logging.getLogger(__name__)
 #: Environment variable that names another cache folder.
 CACHE_VARIABLE = "AE_ENV_CACHE"
-#: The cache's folders; files elsewhere are never removed.
-CACHE_KINDS = ("scenes", "denoised", "defocus_maps", "opened")
+#: The cache's folders (score tables are of earlier versions); files elsewhere are never removed.
+CACHE_KINDS = ("scenes", "score_tables", "denoised", "defocus_maps", "opened")
 #: Most bytes that the files take together.
 DISK_BYTES = 4 * 2**30
 #: Names of the cache's files, finished and half-written, of earlier versions as well; no other

@@ -162,6 +162,8 @@ def test_missing_maps_name_the_command(tmp_path, monkeypatch):
     monkeypatch.setenv("AE_ENV_CACHE", str(tmp_path / "none"))
     with pytest.raises(FileNotFoundError, match=r"19 of 19 maps .*ae-env scenes download"):
         load_scenes("polyhaven", "test", camera=CAMERA)
+    with pytest.raises(FileNotFoundError, match=r"'mixed'\): 21 of 21 maps"):
+        load_scenes("mixed", "train", camera=CAMERA)
 
 
 # -- downloads ------------------------------------------------------------------------------------

@@ -13,8 +13,11 @@ from ae_env.scorers import CompositeScorer, make_scorer
 from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.score_table import ScoreTables, prepare_scene, source_noises
 from ae_env.scorers.terms import Highlights, Noise, Shadows
+from simulator.capture.layout import Layout
 from simulator.capture.sensor import clip_and_quantise
-from tests.ae_env.scorer_images import CAMERA, GRID, make_captures, make_scene
+from simulator.optics.motion_path import Movement
+from tests.ae_env.environments import make_env
+from tests.ae_env.scorer_images import CAMERA, GRID, Own, make_captures, make_scene
 
 TERMS = dict.fromkeys(("brightness", "highlights", "shadows", "noise", "sharpness"), 1.0)
 NOTHING = np.zeros((64, 2, 4))
@@ -76,6 +79,33 @@ def test_tables_are_the_means_over_many_captures(make: Any, blurred: bool) -> No
         error = np.std(values, axis=0, ddof=1) / np.sqrt(40)
         off = np.abs(np.mean(values, axis=0) - found) - 5.0 * error
         assert (off < (one_pixel if name == "highlights" else 1e-3)).all(), name
+
+
+class OwnNoise(Noise):
+    """A user's: it is averaged over captures, and reads the noise that is stated of them."""
+
+
+def test_the_noise_that_is_stated_is_that_of_the_capture() -> None:
+    """Of a noisy source whose blur, a different one at each pixel, averages its noise."""
+    rng = np.random.default_rng(2)
+    layout = Layout(torch.from_numpy(rng.random((40, 40)).astype(np.float32)))
+    scene = replace(_noisy(), layout=layout)
+    blur: dict[str, Any] = {"speed": 0.5, "defocus": 8.0, "movement": Movement(1.0, 2.0)}
+    found, wanted = (
+        ScoreTables(GRID, CAMERA, CompositeScorer({"noise": part})).table(scene, **blur).mean
+        for part in (OwnNoise(), Noise())
+    )
+    np.testing.assert_allclose(found, wanted, atol=0.01)
+
+
+@pytest.mark.parametrize("lighting", ["static", "sine"])
+def test_scorers_of_light_know_whether_there_is_noise(lighting: str) -> None:
+    told = Own(
+        lambda _, captures: torch.full((len(captures),), float(captures.noisy)), depends_on="light"
+    )
+    for noise in (False, True):
+        env = make_env(scorer=told, noise=noise, lighting=lighting)
+        assert env.reset(seed=0)[1]["rewards"]["score"] == noise
 
 
 def test_without_noise_the_table_is_the_frame() -> None:

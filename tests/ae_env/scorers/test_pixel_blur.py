@@ -55,7 +55,7 @@ def _wanted(scene: Scene, speed: float, defocus: float, movement: Movement) -> n
 @pytest.mark.parametrize("defocus", [0.0, 6.0])
 @pytest.mark.parametrize("movement", [MOVEMENT, Movement(1.0, -3.0)])
 def test_sharpness_is_the_mean_over_the_pixels(defocus: float, movement: Movement) -> None:
-    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
+    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
     table = tables.table(_scene(), speed=0.2, defocus=defocus, movement=movement)
     wanted = _wanted(_scene(), 0.2, defocus, movement)
     np.testing.assert_allclose(table.parts["sharpness"], wanted, rtol=2e-3)
@@ -83,7 +83,7 @@ def test_captures_of_several_scenes_are_those_of_each() -> None:
 def test_the_extent_is_the_root_mean_square() -> None:
     scene = _scene()
     assert scene.layout is not None
-    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"), use_cache=False)
+    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
     captures = tables._captures.describe(scene, GRID.states, defocus=5.0)
     wanted = 5.0 * SIZE / 64.0 * float(scene.layout.defocus.double().square().mean().sqrt())
     assert captures.blur_px[0] == pytest.approx(wanted, rel=2e-3)
