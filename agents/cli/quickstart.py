@@ -45,7 +45,7 @@ EPISODES = 2
 Progress = Callable[[str], AbstractContextManager[Callable[..., None]]]
 
 Scenes = Annotated[
-    str, typer.Option(help="'bundled', or a folder or file of raws or .hdr/.exr radiance maps.")
+    str, typer.Option(help="'bundled', 'polyhaven', or a folder or file of raws or .hdr/.exr maps.")
 ]
 
 
