@@ -180,7 +180,7 @@ class TableSet:
     """
 
     scorer: str = "balanced"
-    scenes: int = 96
+    scenes: int = 32
     simulators: tuple[str, ...] = (*SIMULATORS, PAPER)
     isos: tuple[int, ...] = (100, 400, 1600, 6400)
     evs: tuple[int, ...] = (-3, -1, 0, 1, 3)
@@ -188,7 +188,7 @@ class TableSet:
 
 
 #: Tables of a scorer that looks at the captures themselves, noise and all: 0.3 s each.
-SEEN = TableSet("fidelity", 20, (EXP, "compact", PAPER), (1600, 6400), (-1, 0, 1))
+SEEN = TableSet("fidelity", 10, (EXP, "compact", PAPER), (1600, 6400), (-1, 0, 1))
 
 
 @dataclass(frozen=True)
