@@ -275,11 +275,7 @@ def measure_codes(  # type: ignore[no-untyped-def]
     counts = np.empty((4, 256), np.int32)
     whole = size // 4 * 4
     for frame in range(first, last):
-        blown, blocked, clean = 0, 0.0, 0.0
-        red, green, other, blue = codes[frame]
-        for i in range(size):
-            brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
-            blown += brightest == 255
+        blown, planes, blocked, clean = 0, 0, 0.0, 0.0
         for plane in range(4):
             samples = codes[frame, plane]
             counts[:] = 0
@@ -294,6 +290,14 @@ def measure_codes(  # type: ignore[no-untyped-def]
                 count = counts[0, code] + counts[1, code] + counts[2, code] + counts[3, code]
                 blocked += count * np.float64(dark[code])
                 clean += count * np.float64(shares[which[frame], plane, code])
+            white = counts[0, 255] + counts[1, 255] + counts[2, 255] + counts[3, 255]
+            blown, planes = blown + white, planes + (white > 0)
+        if planes > 1:  # else no pixel was counted twice
+            blown = 0
+            red, green, other, blue = codes[frame]
+            for i in range(size):
+                brightest = max(max(red[i], green[i]), max(other[i], blue[i]))
+                blown += brightest == 255
         means[frame, 0] = blown / size
         means[frame, 1] = blocked / (4 * size)
         means[frame, 2] = clean / (4 * size)
