@@ -162,7 +162,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     and a defocus spread (blur diameter at f/4, log-normal around 1 pixel of a 64-pixel frame, sigma
     0.9, in [0.1, 8]; with `depth="unknown"` the scene's own is found instead). The shake has any
     direction, which turns by a normal rate of pi rad/s. In half of the moving episodes the subject
-    of a scene moves of its own besides, drawn likewise; in 15 % nothing but the subject moves.
+    of a scene moves on its own besides, drawn likewise; in 15 % nothing but the subject moves.
     Where a scene has a `layout`, the defocus drawn is that of what is least in focus; the other
     pixels have less. `reset(options={"scene": id, "state": index, "frame": 0})` chooses; in a recorded sequence, `frame` is the raw to begin with.
 

@@ -221,8 +221,8 @@ class CameraSimulator:
 
         Args:
             source: A raw, a prepared scene, or a scene.
-            image_speed: Speed of the image along the rows [frame heights per second]; by default
-                the source's own, 0 for a raw.
+            image_speed: Speed of the image [frame heights per second], along the rows unless the
+                source has a movement; by default the source's own, 0 for a raw.
             defocus: Diameter of the defocus disc at f/4 [pixel]; by default the source's own. 0
                 takes the scene as far or in focus throughout, where every aperture is exact.
             depth: ``"unknown"`` lets the aperture module find what is out of focus, and blur that

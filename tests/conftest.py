@@ -46,7 +46,7 @@ def data_dir() -> Path:
 
 @pytest.fixture(autouse=True, scope="session")
 def cache_in_tmp(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Cached scenes and score tables of the tests live in the test run's own folder."""
+    """Cached scenes of the tests live in the test run's own folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AE_ENV_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
         yield

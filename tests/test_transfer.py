@@ -116,23 +116,23 @@ def test_the_drop_by_hand() -> None:
     assert row["by_seed"] == pytest.approx([0.7, 0.6])
     assert row["drop"] == pytest.approx(0.15)
     assert row["drop_ci95"] == pytest.approx([0.1, 0.2])  # both seeds the one, or the other
-    assert row["less_than_exp"] == pytest.approx(0.15)
+    assert row["more_than_exp"] == pytest.approx(0.15)
     truth, exp = (agents.comparison(gains, span, "ppo", world) for world in ("truth", "EXP"))
     assert "drop" not in truth
     assert exp["drop"] == pytest.approx(0.3)
-    assert "less_than_exp" not in exp
+    assert "more_than_exp" not in exp
 
 
 def test_what_was_asked_for_is_answered() -> None:
     common: dict[str, Any] = {"agent": "ppo", "simulator": "compact"}
     every = common | {"world": "compact", "high_iso": False, "drop": 0.01, "drop_ci95": [0.0, 0.02]}
     high = common | {"world": "compact-iso1600", "high_iso": True, "drop": 0.0}
-    high |= {"less_than_exp": 0.02, "less_than_exp_ci95": [-0.01, 0.05]}
+    high |= {"more_than_exp": 0.02, "more_than_exp_ci95": [-0.01, 0.05]}
     assert with_ends(every, "drop") == "+0.010 [+0.000, +0.020]"
     first, second = verdicts([every, high])
     assert "**yes**" in first
     assert "**no**" in second
-    assert "**yes**" in verdicts([high | {"less_than_exp_ci95": [0.001, 0.05]}])[0]
+    assert "**yes**" in verdicts([high | {"more_than_exp_ci95": [0.001, 0.05]}])[0]
 
 
 def test_sources_of_high_iso_differ_from_others_in_nothing_else() -> None:

@@ -112,6 +112,8 @@ class EpisodeCore:
             noise=_NOISES[options.noise],
             cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
         )
+        #: Whether rewards are those of the tables, as some expectation has no closed form.
+        self._reads_tables = options.reward == "expected" and not self.tables.closed_form
         self._part_scores = PartScores(
             self.tables,
             self.scenes,
@@ -310,7 +312,8 @@ class EpisodeCore:
             columns["sensor_normals"] = frames.sensor_normals(2)
         codes = outputs.get("codes") if self._part_scores.reads_codes else None
         images = outputs.get("signals") if self._part_scores.reads_images else None
-        columns |= self._part_scores.of(env_indices, frames, codes, images, gains, rows)
+        if not self._reads_tables:
+            columns |= self._part_scores.of(env_indices, frames, codes, images, gains, rows)
         if self.options.observation == "linear":
             np.clip(raw, np.float32(-PEDESTAL), np.float32(1.0), out=raw)
         if "flicker" in costs:
@@ -345,10 +348,8 @@ class EpisodeCore:
 
         Takes the scores and the image means out of `columns`.
         """
-        if self.options.reward == "expected" and not self.tables.closed_form:
+        if self._reads_tables:
             rewards = self._from_tables(env_indices)
-            for name in self.scorer.parts:
-                columns.pop(f"score:{name}", None)
         else:
             rewards = {name: columns.pop(f"score:{name}") for name in self.scorer.parts}
             rewards["score"] = self.scorer.totals(rewards)

@@ -19,7 +19,7 @@ STATIC_SHARE = 1.0 / 3.0
 SPEED_SIGMA = 1.3
 #: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
 DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
-#: Share of the moving episodes in which the subject moves of its own, in some of them alone.
+#: Share of the moving episodes in which the subject moves on its own, in some of them alone.
 SUBJECT_SHARE, ALONE_SHARE = 0.5, 0.15
 #: Standard deviation of the rate at which the direction of the shake turns [rad/s].
 TURN_SIGMA = math.pi

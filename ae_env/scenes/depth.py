@@ -99,17 +99,16 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
 
 
-def drape(scene: Scene, seed: int = 0) -> Scene:
+def drape(scene: Scene) -> Scene:
     """`scene` with a `Layout`, as if it lay over procedural depth.
 
     The subject is the nearest thing. Focus is on it in eight of ten scenes, in the others on
     something behind it.
 
     Args:
-        scene: A scene without depth, of any size.
-        seed: Of the layout, which also depends on the scene's name.
+        scene: A scene without depth, of any size. Its name decides the layout.
     """
-    rng = np.random.default_rng([zlib.crc32(f"layout {scene.scene_id}".encode()), seed])
+    rng = np.random.default_rng([zlib.crc32(f"layout {scene.scene_id}".encode()), 0])
     blur, subject = _draw_layout(rng)
     height, width = scene.light.shape[-2:]
     side = max(height, width)

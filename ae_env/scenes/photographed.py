@@ -25,7 +25,12 @@ EV_RANGE = (-1.0, 1.0)
 
 
 def photographed(
-    scene: Scene, *, seed: int = 0, iso: float | None = None, ev: float | None = None
+    scene: Scene,
+    *,
+    seed: int = 0,
+    iso: float | None = None,
+    ev: float | None = None,
+    iso_range: tuple[float, float] = ISO_RANGE,
 ) -> Scene:
     """`scene` as one raw of it tells; its illuminance stays known, as from an incident-light meter.
 
@@ -35,6 +40,7 @@ def photographed(
         iso: ISO of the photograph; drawn by default.
         ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
             default.
+        iso_range: What the ISO is drawn from, log-uniformly.
 
     Raises:
         ValueError: If the scene carries noise, as a raw does: it is a photograph already.
@@ -42,7 +48,7 @@ def photographed(
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise to be photographed")
     rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed])
-    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log(ISO_RANGE))), rng.uniform(*EV_RANGE)
+    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log(iso_range))), rng.uniform(*EV_RANGE)
     iso, ev = float(drawn_iso if iso is None else iso), float(drawn_ev if ev is None else ev)
     ratio = mean_anchor(scene.light[1:3]) * 2.0**ev
     unit = CameraSettings(iso, 1.0, F_NUMBER)

@@ -101,8 +101,8 @@ class Scene:
         median_speed: Median image speed of a moving episode [frame heights / s].
         box_factor: Sensor pixels averaged per side into one pixel of `light`.
         source: Provenance and licence in one line.
-        saturated: (H, W) bool, pixels whose light is only a lower bound because the source raw
-            was saturated there; None if there are none.
+        saturated: (H, W) bool, pixels whose light is a guess because the source raw was saturated
+            there (`simulator.raw.highlights`); None if there are none.
         denoised: (4, H, W) `light` with its noise removed by a noise module; None where there is
             no noise, or no such module.
         defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
@@ -194,6 +194,8 @@ class Scene:
                     f"{tuple(size)}"
                 )
             object.__setattr__(self, "defocus_map", found.float())
+        if not isinstance(self.layout, Layout | None):
+            raise ValueError(f"`layout` (={type(self.layout).__name__}) must be a Layout or None")
         if self.layout is not None and self.layout.defocus.shape != size:
             raise ValueError(
                 f"`layout` (shape {tuple(self.layout.defocus.shape)}) must be of shape "

@@ -73,7 +73,7 @@ def describe_captures(
         ratio=torch.from_numpy(np.array(ratios) * gain),
         nlf=[camera.nlf(s.iso) for s in settings],
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
-        blur_px=torch.from_numpy(blur) if pixel_blur is None else pixel_blur.mean_px,
+        blur_px=torch.from_numpy(blur) if pixel_blur is None else pixel_blur.rms_px,
         white_balance=torch.tensor([c.white_balance for c in scenes]),
         colour_matrices=[c.camera.colour_matrix for c in scenes],
         row_gain=None if row_gain is None else torch.from_numpy(row_gain),
@@ -137,7 +137,7 @@ class SceneCaptures:
         if pixel_blur is None:
             blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
         else:
-            blur = pixel_blur.mean_px.numpy()
+            blur = pixel_blur.rms_px.numpy()
         captures = replace(
             known.captures,
             scene_light=self._light(scene, len(states)),

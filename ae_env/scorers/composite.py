@@ -142,8 +142,7 @@ class Balanced(CompositeScorer):
     """The default scorer: a photograph is as good as its worst fault allows.
 
     Product of the five terms, each to its weight, times ``(1 - fh^4) (1 - fs^4)``, fh and fs the
-    shares of blown and blocked pixels: a frame that is all white or all black scores near 0. It is
-    computed on the noise-free light before blur and clip, so its expectation is exact.
+    shares of blown and blocked pixels: a frame that is all white or all black scores near 0.
     """
 
     def __init__(self) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ae_env.scenes.scene import Scene
+from simulator.optics.disc_bank import DIAMETERS
 from simulator.optics.motion_path import Movement
 
 
@@ -24,7 +25,7 @@ class PixelBlur(NamedTuple):
     shares: torch.Tensor
 
     @property
-    def mean_px(self) -> torch.Tensor:
+    def rms_px(self) -> torch.Tensor:
         """(B,) root mean square extent over the pixels [pixel of the frame]."""
         return (self.levels.square() * self.shares).sum(dim=1).sqrt()
 
@@ -56,7 +57,8 @@ def layout_blur(
     if movement.subject_speed:
         extent = movement.subject_extent(speed, times) * height
         motion = np.where(counted.subject, extent[:, None], motion)
-    squares = motion**2 + (discs[:, None] * counted.defocus) ** 2 + own[:, None] ** 2  # (S, K)
+    defocus = np.minimum(discs[:, None] * counted.defocus, DIAMETERS[-1])  # as in the frame
+    squares = motion**2 + defocus**2 + own[:, None] ** 2  # (S, K)
     shares = torch.from_numpy(counted.share).expand(len(times), -1)
     return PixelBlur(torch.from_numpy(np.sqrt(squares)), shares)
 

@@ -97,15 +97,6 @@ class Captures:
             return light
         return light * self.row_gain.to(light.dtype)[:, None, :, None]
 
-    @cached_property
-    def log2_light(self) -> torch.Tensor:
-        """log2 of `light`, with 2**-40 in place of zero."""
-        base = self.scene_light.clamp(min=2.0**-40).log2()
-        light = base + self.ratio.log2().to(base.dtype)[:, None, None, None]
-        if self.row_gain is None:
-            return light
-        return light + self.row_gain.log2().to(base.dtype)[:, None, :, None]
-
     def noise_variance(self, signal: torch.Tensor) -> torch.Tensor:
         """Variance of a native pixel's noise in the captures, at the recorded `signal`.
 

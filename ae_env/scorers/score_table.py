@@ -75,7 +75,6 @@ def prepare_scene(
     speed: float = 0.0,
     defocus: float = 0.0,
     movement: Movement = ALONG_ROWS,
-    gain: float = 1.0,
 ) -> PreparedScene:
     """`scene` as `camera` sees it in an episode.
 
@@ -85,10 +84,9 @@ def prepare_scene(
         speed: Image speed [frame heights per second].
         defocus: Blur diameter at f/4 [pixel of a 64-pixel frame], of what is least in focus.
         movement: Directions of the image's motion, and the subject's own.
-        gain: Light relative to the scene's own.
     """
     prepared = replace(scene.prepared, camera=camera)
-    return in_episode(prepared, speed=speed, defocus=defocus, movement=movement, gain=gain)
+    return in_episode(prepared, speed=speed, defocus=defocus, movement=movement)
 
 
 def in_episode(
@@ -97,11 +95,10 @@ def in_episode(
     speed: float = 0.0,
     defocus: float = 0.0,
     movement: Movement = ALONG_ROWS,
-    gain: float = 1.0,
 ) -> PreparedScene:
     """A scene's `prepared` in an episode; the arguments are those of `prepare_scene`."""
     pixels = defocus * prepared.light.shape[-2] / 64.0
-    return replace(prepared, image_speed=speed, defocus=pixels, movement=movement, gain=gain)
+    return replace(prepared, image_speed=speed, defocus=pixels, movement=movement)
 
 
 def source_noises(

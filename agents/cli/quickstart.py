@@ -112,7 +112,7 @@ def run_quickstart(
     """Trainings, evaluation, report; a second run resumes the first.
 
     Args:
-        scenes: ``"bundled"``, or a folder of raws or radiance maps.
+        scenes: ``"bundled"``, ``"polyhaven"``, or a folder of raws or radiance maps.
         out: Folder for everything that is written.
         seed: Of trainings and evaluation.
         progress: Opens progress bars.

@@ -25,11 +25,14 @@ def other_scores(result: EvaluationResult, plan: EvaluationPlan) -> dict[str, di
     scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first
     chosen = groups_in_turn(scenes, plan.other_scorer_scenes)
     options = plan.options()
-    made = {name: make_scorer(name) for name in plan.other_scorers}
     found: dict[str, dict[str, float]] = {}
-    for name, scorer in made.items():
+    for name in plan.other_scorers:
         tables = ScoreTables(
-            options.make_grid(), options.make_camera(), scorer, tolerance=options.tolerance
+            options.make_grid(),
+            options.make_camera(),
+            make_scorer(name),
+            noise=bool(options.noise),
+            tolerance=options.tolerance,
         )
         means: dict[str, dict[str, list[float]]] = {policy: {} for policy in result.tracks}
         for scene in chosen:

@@ -44,8 +44,8 @@ SEARCH_METERS = ("skewness", "entropy", "shim", "zhang")
 #: Advantage of the last state in a tuned program [score], and in program P; there the square of a
 #: stop counts 1/4 to 1.
 HYSTERESIS_SCORE, HYSTERESIS_COST = 0.002, 0.1
-#: Episodes (in all, at least one per scene and pass) and frames per episode from which a tuned
-#: program learns; three times as many take 35 s and did not score higher on unseen scenes.
+#: Episodes (of both passes, over as many scenes as that allows) and frames per episode from which a
+#: tuned program learns; three times as many take 35 s and did not score higher on unseen scenes.
 FIT_EPISODES, FIT_FRAMES = 1600, 4
 #: Episodes of one scene in a pass, at most.
 FIT_PER_SCENE = 4

@@ -41,7 +41,7 @@ from benchmarks.transfer.worlds import (
 
 #: Name of the hyperparameter that counts frames, by agent.
 _FRAMES = {"regression": "frames", "ppo": "total_timesteps"}
-#: Training seeds of each agent and world.
+#: The trainings of each agent and world, one for each seed.
 Jobs = dict[tuple[str, str], list[TrainingJob]]
 
 
@@ -201,7 +201,7 @@ def result_rows(
 def comparison(
     gains: Mapping[tuple[str, str], np.ndarray], span: np.ndarray, agent: str, world: str
 ) -> Row:
-    """Normalised score of an agent, its drop against the truth, and how much less than EXP's it is.
+    """Normalised score of an agent, its drop against the truth, and by how much it beats EXP's.
 
     Args:
         gains: ``q - q_random`` by agent and world, (K, G) per training seed and source group.
@@ -218,7 +218,7 @@ def comparison(
     row |= _named("drop", difference_interval(truth, own, span))
     exp = World(EXP, high_iso=WORLDS[world].high_iso).name
     if world != exp and (agent, exp) in gains:
-        row |= _named("less_than_exp", difference_interval(own, gains[agent, exp], span))
+        row |= _named("more_than_exp", difference_interval(own, gains[agent, exp], span))
     return row
 
 

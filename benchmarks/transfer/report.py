@@ -45,7 +45,7 @@ def agents_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
         "trained in": "`{world}`",
         "normalised score": lambda r: with_ends(r, "normalised_score", "ci95", sign=""),
         "drop against `truth`": lambda r: with_ends(r, "drop"),
-        "more than in `EXP`": lambda r: with_ends(r, "less_than_exp"),
+        "more than in `EXP`": lambda r: with_ends(r, "more_than_exp"),
         "within 1/3 EV": "{ev_within_third:.0%}",
         "minutes to train": "{minutes:.1f}",
     }
@@ -83,10 +83,10 @@ def verdicts(rows: Sequence[Row]) -> list[str]:
         if not row["high_iso"]:
             answer = "yes" if drop < MOST_DROP else "no"
             lines.append(f"{name}: drop below {MOST_DROP}: **{answer}** ({with_ends(row, 'drop')})")
-        elif row.get("less_than_exp") is not None:
-            ends = row["less_than_exp_ci95"]
+        elif row.get("more_than_exp") is not None:
+            ends = row["more_than_exp_ci95"]
             answer = "yes" if ends is not None and ends[0] > 0.0 else "no"
-            more = with_ends(row, "less_than_exp")
+            more = with_ends(row, "more_than_exp")
             lines.append(
                 f"{name}: drop smaller than EXP's beyond the interval: **{answer}** ({more})"
             )

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
-
-import numpy as np
 
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
@@ -25,7 +22,7 @@ HIGH_ISO = (1600.0, 6400.0)
 #: Packed pixels a side, of every training and every table.
 RESOLUTION = 64
 #: Simulators by name: the environment's argument. EXP has no network: exposure ratio and noise
-#: level function only. `paper` is the path of weights that were trained here.
+#: level function only. `PAPER` is none of them: its weights have a path.
 SIMULATORS: dict[str, str | None] = {
     "EXP": None,
     "nano": "nano",
@@ -66,12 +63,7 @@ def at_high_iso(
         resolution: Packed pixels a side.
     """
     scenes = scenes_of(name, crop, split, camera, resolution)
-    return [photographed(scene, iso=_drawn_iso(scene.scene_id)) for scene in scenes]
-
-
-def _drawn_iso(scene_id: str) -> float:
-    rng = np.random.default_rng([zlib.crc32(scene_id.encode()), 1600])
-    return float(np.exp(rng.uniform(*np.log(HIGH_ISO))))
+    return [photographed(scene, iso_range=HIGH_ISO) for scene in scenes]
 
 
 #: What the environment's `scenes` names, as ``"benchmarks.transfer.worlds:high_iso_both_box"``.

@@ -203,6 +203,7 @@ class CaptureBatch:
             exposure = prepared.exposure(settings, gain=gain)
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
             columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
+            columns.remaining_variance[row] = None  # `_begin_blur` knows it
             columns.any_blurs |= bool(blurs)
             if not blurs:
                 columns.light[row] = prepared.source_light(exposure).contiguous()

@@ -12,9 +12,7 @@ from simulator.capture.exposure import Exposure
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.residual import ResidualStatistics
 from simulator.capture.scene_blur import SceneBlur, moved
-from simulator.capture.sensor import defocused_light
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.optics.blur import motion_blur
 from simulator.utils.cache import LruCache
 
 #: Memory that the cached blurred light of one scene may take [byte].
@@ -141,28 +139,14 @@ class BlurredLight:
     def blurred(self, exposure: Exposure) -> torch.Tensor:
         """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""
         if exposure.motion_px:
-            return self._cached(exposure.blur, lambda: self._moved(exposure))
+            return self._cached(exposure.blur, lambda: moved(self._defocused(exposure), exposure))
         return self._defocused(exposure) if exposure.defocus_px else self.source(exposure)
 
-    def _moved(self, exposure: Exposure) -> torch.Tensor:
-        light = self._defocused(exposure)
-        if exposure.path is None:
-            return motion_blur(light, exposure.motion_px)
-        return moved(light, exposure)
-
     def _defocused(self, exposure: Exposure) -> torch.Tensor:
-        if not exposure.defocus_px:
-            return defocused_light(self.source(exposure), 0.0)  # limited, as blur needs it
-        return self._cached(
-            exposure.lens_blur,
-            lambda: self._behind_lens(exposure),
-        )
+        def make() -> torch.Tensor:
+            return self._scene_blur.defocused(self.source(exposure), exposure)
 
-    def _behind_lens(self, exposure: Exposure) -> torch.Tensor:
-        source = self.source(exposure)
-        if exposure.layout is None:
-            return defocused_light(source, exposure.defocus_px)
-        return self._scene_blur.defocused(source, exposure)
+        return self._cached(exposure.lens_blur, make) if exposure.defocus_px else make()
 
     def _cached(self, key: tuple[object, ...], make: Callable[[], torch.Tensor]) -> torch.Tensor:
         light = self._cache.get(key)

@@ -64,15 +64,15 @@ class Exposure:
         layout: What is out of focus and what is the subject; None for one disc everywhere, and
             where all of the frame moves together.
         path: Of the background; None for a streak along the rows, as long as `motion_px`.
-        subject_path: Of the layout's subject where it moves of its own.
+        subject_path: Of the layout's subject where it moves on its own.
         energy: Share of the source's noise variance that these blurs leave; None for what a disc
             and a streak leave.
         denoised: The noise-reduced light that it starts from; `source` is zero then. None for the
             light as it was recorded.
         opened_to: Effective f-number whose wider aperture blurs what the source shows out of focus;
             None where it does not.
-        remaining_variance: (H, W) share that this blur leaves of the noise variance which the other
-            blurs have left; None for all.
+        remaining_variance: (H, W) share of the source's noise variance that the blurs leave, beyond
+            `energy`: of all of them with a layout, else of `opened_to`; None for all.
         steps: Why each optional step runs or is left out.
     """
 

@@ -50,7 +50,8 @@ class Layout:
         found, mask = self.defocus, self.subject
         if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
             raise ValueError(
-                f"`defocus` (shape {tuple(found.shape)}) of a layout must be (H, W) in [0, 1]"
+                f"`defocus` (shape {tuple(found.shape)}, {float(found.min()):g} to "
+                f"{float(found.max()):g}) of a layout must be (H, W) in [0, 1]"
             )
         object.__setattr__(self, "defocus", found.detach().float().cpu().contiguous())
         if mask is None:

@@ -65,7 +65,8 @@ class PreparedScene:
         reference: Settings at which `light` is on the scale where sensor white is 1.
         camera: The body that takes the captures.
         nlf: Noise left in `light`, at the reference settings.
-        saturated: (H, W) bool, pixels whose light is only known to be at least this; None if none.
+        saturated: (H, W) bool, pixels that were white in the source: their light is a guess; None
+            if there are none.
         white_balance: Gains of R, G, B of the scene's light.
         box_factor: Sensor pixels averaged per side into one pixel of `light`.
         image_speed: Speed of the image [frame heights per second], at most 1000; along the rows,
@@ -276,10 +277,12 @@ class PreparedScene:
 
     def _with_remaining_noise(self, exposure: Exposure) -> Exposure:
         """`exposure` with the shares of the source's noise variance that its blurs leave."""
-        energy = kernel_energy(exposure.motion_px, exposure.defocus_px)
         left: torch.Tensor | None = None
-        if not exposure.is_uniform:
+        if exposure.is_uniform:
+            energy = kernel_energy(exposure.motion_px, exposure.defocus_px)
+        else:
             energy, left = remaining_noise(exposure, *self.light.shape[-2:])
+            left = None if left is None else left.to(self.light.device)
         if exposure.opened_to is not None:
             # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
             # it further. Both together leave about what the larger leaves alone.
@@ -287,7 +290,7 @@ class PreparedScene:
             if left is None or opened is None:
                 left = opened if left is None else left
             else:
-                left = torch.minimum(left.to(opened), opened)
+                left = torch.minimum(left, opened)
         return replace(exposure, energy=energy, remaining_variance=left)
 
     def plan(

@@ -55,14 +55,16 @@ class SceneBlur:
 
 
 def moved(light: torch.Tensor, exposure: Exposure, out: torch.Tensor | None = None) -> torch.Tensor:
-    """`light` (4, H, W), behind the lens already, as it moves along the paths of `exposure`.
+    """`light` (4, H, W), behind the lens already, as it moves in `exposure`.
 
     Args:
         light: Light; limited to `LIGHT_LIMIT`.
-        exposure: An exposure with a path.
+        exposure: An exposure; without a path, the motion is along the rows.
         out: See `SceneBlur.defocused`.
     """
-    assert exposure.path is not None
+    if exposure.path is None:
+        streak = motion_blur(light, exposure.motion_px)
+        return streak if out is None else out.copy_(streak)
     height, width = light.shape[-2:]
     taps = path_taps(exposure.path, height, width)
     if exposure.subject_path is None or exposure.layout is None:
@@ -75,12 +77,7 @@ def scene_light(source: torch.Tensor, exposure: Exposure) -> torch.Tensor:
     """`sensor_light` of any `exposure`, also one with a layout or a path."""
     if exposure.is_uniform:
         return sensor_light(source, exposure)
-    light = SceneBlur().defocused(source, exposure)
-    if exposure.path is None:
-        light = motion_blur(light, exposure.motion_px)
-    else:
-        light = moved(light, exposure)
-    return exposed_light(light, exposure)
+    return exposed_light(moved(SceneBlur().defocused(source, exposure), exposure), exposure)
 
 
 # -- noise of the source ------------------------------------------------------------------------
@@ -117,7 +114,7 @@ def _remaining_noise(
         return remaining_variance(diameter)
     taps = path_taps(path, height, width)
     left = remaining_variance(diameter, taps)
-    if own is None or layout.subject is None:
+    if own is None:
         return path_blur(left[None], taps)[0]
     # Taps of pixels that differ leave the mean of what each of these would leave alone.
     taps_own = path_taps(own, height, width)

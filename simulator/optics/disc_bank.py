@@ -177,7 +177,7 @@ def _kernel_products() -> np.ndarray:
 
 @functools.cache
 def _correlations() -> np.ndarray:
-    """(K, 2, R, R) correlations of each disc with itself and its successor; shift 0 is amid."""
+    """(K, 2, R, R) correlations of a disc with itself and its successor; the middle is no shift."""
     kernels = [disc_kernel(d) for d in DIAMETERS]
     size = 2 * kernels[-1].shape[0] - 1
     found = np.zeros((len(kernels), 2, size, size))

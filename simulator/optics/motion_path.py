@@ -1,6 +1,6 @@
 """Motion along a path: how an image moves while the shutter is open, and the blur that this makes.
 
-The shake of a camera has a direction that turns; a subject may move of its own besides. The part of
+The shake of a camera has a direction that turns; a subject may move on its own besides. The part of
 the path that is traversed during an exposure is rasterised into a few weighted shifts (taps), whose
 sum is the blurred image. Taps are widened as the streaks of `simulator.optics.shapes` are: along
 both axes their second moment is that of the path. Borders are replicated.

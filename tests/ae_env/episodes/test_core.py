@@ -68,7 +68,7 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
             state = core.grid[episode.state]
             gain = core.lighting.gain(episode.frame, state.exposure_time, episode.phase)
             scene = core.scenes[episode.scene]
-            prepared = prepare_scene(scene, core.camera, **episode.moves, gain=gain)
+            prepared = replace(prepare_scene(scene, core.camera, **episode.moves), gain=gain)
             prepared = replace(prepared, tolerance=tolerance)
             exposure = prepared.exposure(state)
             light = exposed_light(prepared.blurred_light.blurred(exposure), exposure)

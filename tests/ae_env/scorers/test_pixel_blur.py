@@ -87,3 +87,12 @@ def test_the_extent_is_the_root_mean_square() -> None:
     captures = tables._captures.describe(scene, GRID.states, defocus=5.0)
     wanted = 5.0 * SIZE / 64.0 * float(scene.layout.defocus.double().square().mean().sqrt())
     assert captures.blur_px[0] == pytest.approx(wanted, rel=2e-3)
+
+
+def test_sharpness_knows_that_discs_end_where_the_frame_has_them_end() -> None:
+    # 64 of 256 packed pixels at f/4; the bank's largest disc has 32.
+    layout = Layout(torch.ones(256, 256))
+    scene = make_scene(np.full((4, 256, 256), 0.12), 640.0, scene_id="large", layout=layout)
+    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
+    sharp = tables.table(scene, defocus=16.0).parts["sharpness"]
+    np.testing.assert_allclose(sharp, 1.0 / (1.0 + (32.0 / 256.0 * 64.0) ** 2), rtol=1e-2)

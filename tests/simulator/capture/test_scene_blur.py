@@ -90,6 +90,7 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
     scene = _prepared(noisy=True, defocus=defocus, image_speed=speed, movement=movement)
     exposure = scene.exposure(SLOW)
     if exposure.is_uniform:
+        assert exposure.remaining_variance is None
         return
     energy, left = remaining_noise(exposure, SIZE, SIZE)
     share = torch.full((SIZE, SIZE), energy) if left is None else left * energy
@@ -99,7 +100,7 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
         made = PreparedScene(planes, REFERENCE, Z6, NoiseLevelFunction.zero(), tolerance=0.0)
         same = replace(made, defocus=defocus, image_speed=speed, movement=movement)
         same = replace(same, layout=scene.layout)
-        blurred.append(same.blurred_light.blurred(replace(exposure, denoised=None)))
+        blurred.append(same.blurred_light.blurred(exposure))
     measured = torch.cat(blurred).double().square().mean(dim=0)
     ratio = (measured / share)[6:-6, 6:-6]  # replicated borders average less
     assert float(ratio.min()) > 0.75
@@ -127,22 +128,31 @@ def test_batches_have_the_light_of_sweeps(cache_light: bool, noisy: bool) -> Non
         _prepared(noisy, defocus=4.0, image_speed=0.2, layout=None),
         _prepared(noisy, defocus=3.0, image_speed=0.2, movement=Movement()),
         _prepared(noisy),
+        _prepared(noisy, defocus=3.0, tolerance=0.1),
     ]
     states = [CameraSettings(iso, t, n) for iso in (100, 6400) for t in (0.5, 1e-3) for n in (4, 8)]
     batch = CaptureBatch(
         scenes.__getitem__, len(scenes), states, Z6, noise="bank", cache_light=cache_light
     )
     indices, rng = np.arange(len(scenes)), np.random.default_rng(0)
-    for _ in range(6):
-        chosen = rng.integers(len(states), size=len(scenes))
+    for step in range(8):
+        if step % 2 == 0:
+            chosen = rng.integers(len(states), size=len(scenes))
+        gain = (1.0, 1e-6)[step % 2]  # in little light, blur is left out where it may be
         frames = np.empty((len(scenes), 4, SIZE, SIZE), np.float32)
-        batch.prepare(indices, chosen, np.ones(len(scenes)))
+        batch.prepare(indices, chosen, np.full(len(scenes), gain))
         found = batch.record(indices, chosen, indices, indices, signals=frames)
         assert np.isfinite(found.excess_variance).all()
         for i, scene in enumerate(scenes):
-            exposure = scene.exposure(states[chosen[i]])
+            exposure, row = (
+                scene.exposure(states[chosen[i]], gain=gain),
+                i * len(states) + chosen[i],
+            )
             light = scene.blurred_light.blurred(exposure)
-            assert torch.equal(batch._rows.light[i * len(states) + chosen[i]], light)
+            assert torch.equal(batch._rows.light[row], light)
+            left, expected = batch._rows.remaining_variance[row], exposure.remaining_variance
+            assert (left is None) == (expected is None)
+            assert expected is None or torch.equal(left, expected.float())
 
 
 def test_whole_captures_by_hand() -> None:
