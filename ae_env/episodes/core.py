@@ -416,7 +416,6 @@ class EpisodeCore:
                 gain, rows = self._light.of_states(env_index, self._bounds[1])
             table = self.tables.table(
                 self.scenes[episode.scene],
-                **episode.moves,
                 gain=gain,
                 row_gain=rows,
                 prepared=self._prepared(int(self.episodes.light_index[env_index])),

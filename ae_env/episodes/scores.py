@@ -173,9 +173,7 @@ class PartScores:
         lights, first = lights[missing], first[missing]
         for light, env_index in zip(lights.tolist(), env_indices[first].tolist(), strict=True):
             episode = self.episodes[env_index]
-            parts = self.tables.known_parts(
-                self.scenes[episode.scene], **episode.moves, prepared=self._prepared(light)
-            )
+            parts = self.tables.known_parts(self.scenes[episode.scene], self._prepared(light))
             for column, name in enumerate(self._known):
                 self._scores[light, :, column] = parts[name]
         self._scored[lights] = True

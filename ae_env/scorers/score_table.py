@@ -21,7 +21,7 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import SceneCaptures
 from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.composite import CompositeScorer, is_own
-from ae_env.scorers.protocol import reads_pixels
+from ae_env.scorers.protocol import Captures, reads_pixels
 from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
@@ -178,24 +178,25 @@ class ScoreTables:
             gain: Light relative to the scene's own; (S,) where it depends on the state, as in
                 flickering light.
             row_gain: (S, H) light of each row relative to that, see `Captures`.
-            prepared: The scene in this episode, where that is at hand: `prepare_scene` makes it.
+            prepared: The scene in this episode, where that is at hand, in place of the three above.
         """
-        moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
         if prepared is None:
-            prepared = prepare_scene(scene, self.camera, **moves)
+            prepared = prepare_scene(
+                scene, self.camera, speed=speed, defocus=defocus, movement=movement
+            )
             prepared = replace(prepared, tolerance=self.tolerance)
-        light: Any = {"gain": gain, "row_gain": row_gain}
-        episode: Any = {**moves, **light}
-        parts = self.known_parts(scene, **episode, prepared=prepared)
+        parts = self.known_parts(scene, prepared, gain=gain, row_gain=row_gain)
         if self.code_scores.parts:
-            captures = self._captures.describe(scene, self.grid.states, **episode)
-            means = self._expected_means(prepared, **light)
+            captures = None
+            if self.code_scores.reads_captures:
+                captures = self._described(scene, prepared, slice(None), gain, row_gain)
+            means = self._expected_means(prepared, gain, row_gain)
             parts |= self.code_scores.scores(captures, means)
         error = np.zeros(len(self.grid))
         if self.closed_form:
             mean = self.scorer.totals(parts)
         else:
-            samples = self._samples(scene, prepared, moves, gain, row_gain)
+            samples = self._samples(scene, prepared, gain, row_gain)
             totals = self.scorer.totals({**parts, **samples})  # (seeds, S)
             mean = totals.mean(axis=0)
             if self.noise_seeds > 1:
@@ -209,37 +210,46 @@ class ScoreTables:
     def known_parts(
         self,
         scene: Scene,
+        prepared: PreparedScene,
         *,
-        speed: float = 0.0,
-        defocus: float = 0.0,
-        movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
-        prepared: PreparedScene,
     ) -> dict[str, np.ndarray]:
         """Scores (S,) of those parts that look at no frame; see `table`."""
         others = self.others
-        gains = np.broadcast_to(gain, len(self.grid))
         names = [] if others is None else others.names("light", "blur")
         if others is None or not names:
             return {}
         looks = any(reads_pixels(others.parts[name]) for name in names)
         chunks = []
         for part in _slices(len(self.grid), _CHUNK if looks else len(self.grid)):
-            captures = self._captures.describe(
-                scene,
-                self.grid.states[part],
-                speed=speed,
-                defocus=defocus,
-                movement=movement,
-                gain=gain[part] if isinstance(gain, np.ndarray) else gain,
-                row_gain=None if row_gain is None else row_gain[part],
-            )
-            noises = source_noises(prepared, self.grid.states[part], gains[part])
-            captures = replace(captures, source_noise=noises, noisy=self.noise)
+            captures = self._described(scene, prepared, part, gain, row_gain)
             scores = others.score_parts(None, captures, ("light", "blur"))
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}
+
+    def _described(
+        self,
+        scene: Scene,
+        prepared: PreparedScene,
+        part: slice,
+        gain: float | np.ndarray,
+        row_gain: np.ndarray | None,
+    ) -> Captures:
+        """Facts of the captures of the states `part` of the grid."""
+        states = self.grid.states[part]
+        gains = np.broadcast_to(gain, len(self.grid))[part]
+        captures = self._captures.describe(
+            scene,
+            states,
+            speed=prepared.image_speed,
+            defocus=prepared.defocus * 64.0 / prepared.light.shape[-2],
+            movement=prepared.movement,
+            gain=gains,
+            row_gain=None if row_gain is None else row_gain[part],
+        )
+        noises = source_noises(prepared, states, gains)
+        return replace(captures, source_noise=noises, noisy=self.noise)
 
     def _expected_means(
         self, prepared: PreparedScene, gain: float | np.ndarray, row_gain: np.ndarray | None
@@ -268,7 +278,6 @@ class ScoreTables:
         self,
         scene: Scene,
         prepared: PreparedScene,
-        moves: dict[str, Any],
         gain: float | np.ndarray,
         row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
@@ -280,9 +289,7 @@ class ScoreTables:
         for part in _slices(len(self.grid), _CHUNK):
             states, rows = self.grid.states[part], None if row_gain is None else row_gain[part]
             light: Any = {"gain": gains[part], "row_gain": rows}
-            captures = self._captures.describe(scene, states, **moves, **light)
-            noises = source_noises(prepared, states, gains[part])
-            captures = replace(captures, source_noise=noises, noisy=self.noise)
+            captures = self._described(scene, prepared, part, gain, row_gain)
             for seed, images in enumerate(self._images(prepared, states, **light)):
                 for name, values in self.others.score_parts(images, captures, ("image",)).items():
                     samples[name][seed, part] = values.numpy()
