@@ -63,7 +63,7 @@ def load_scenes(
               ``"bundled:large"``: four times the training groups, the same test groups;
               ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
             - ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`); ``"mixed"``:
-              such views and bundled procedural scenes, as many of each;
+              such views and the procedural scenes of ``"bundled:large"``, as many of each;
             - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
             - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
               given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
@@ -132,9 +132,10 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
     if spec == "polyhaven":
         return polyhaven_scenes(request)
     if spec == "mixed":
-        split_assets("mixed", split)  # raises before anything is drawn
+        maps = len(split_assets("mixed", split))  # raises before anything is drawn
         bundled = _by_name("bundled:large", split, request)
-        return mixed_scenes(request, [scene for scene in bundled if scene.kind != "photograph"])
+        procedural = [scene for scene in bundled if scene.kind != "photograph"]
+        return mixed_scenes(request, procedural, maps)
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
         if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")

@@ -5,8 +5,8 @@ kind and split. Each is looked for in the folder of real files and in the user's
 `download` puts it; nothing of it comes with the package.
 
 A map is linear but relative. How much light there is is drawn by its kind (`ILLUMINANCE`,
-log-uniform), once for each map, as the illuminance of a surface that is turned to where it gets the
-most. Every view then has the light that the map itself casts on a subject in it
+log-uniform), for each view anew, as the illuminance of a surface that is turned to where it gets
+the most. The view then has the light that the map itself casts on a subject in it
 (`incident_light`), which is less where the light comes from behind.
 """
 
@@ -35,7 +35,7 @@ from simulator.utils.files import data_folder
 
 logger = logging.getLogger(__name__)
 
-#: Illuminance by kind [lux], where it is most: the range that a map's is drawn from.
+#: Illuminance by kind [lux], where it is most: the range that a view's is drawn from.
 ILLUMINANCE = {
     "night": (0.5, 20.0),
     "twilight": (10.0, 500.0),
@@ -72,7 +72,7 @@ _CELL = 4
 #: Luminance of linear sRGB.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Raised when the views change.
-_VERSION = 4
+_VERSION = 5
 
 
 class Asset(Configuration):
@@ -204,13 +204,13 @@ def asset_views(
     seen = _cells(panorama)
     rng = np.random.default_rng([zlib.crc32(asset.name.encode()), seed])
     low, high = np.log(ILLUMINANCE[asset.kind])
-    lux = math.exp(rng.uniform(low, high))
     most = max(incident_light(seen, a, p) for p in _TURNED for a in range(0, 360, 30))
     cut = "".join(f"; {where} in the map" for where in cut_values(panorama))
     for index in range(views):
         azimuth = (index + rng.random()) * 360.0 / views - 180.0
         pitch = float(np.clip(_PITCH * rng.standard_normal(), -_LARGEST_PITCH, _LARGEST_PITCH))
         angle = rng.uniform(*_FIELDS_OF_VIEW)
+        lux = math.exp(rng.uniform(low, high))
         light = incident_light(seen, azimuth + 180.0, -pitch)
         view = perspective(panorama, azimuth, 2 * size, angle, pitch)
         yield Scene.from_radiance(
@@ -321,12 +321,12 @@ def download(
     return fetched
 
 
-def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene]) -> list[Scene]:
-    """Real views and `procedural` scenes of the same split in equal parts.
+def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene], maps: int) -> list[Scene]:
+    """`procedural` scenes and as many views of the `maps` maps of the same split.
 
-    Of whichever there are more, some are left out, evenly over the maps or the list.
+    Where the scenes are no multiple of the maps, some of these have a view less.
     """
-    views = math.ceil(len(procedural) / len(split_assets("mixed", request.split)))
+    views = math.ceil(len(procedural) / maps)
     real = polyhaven_scenes(request, views=views)
     by_view = sorted(range(len(real)), key=lambda i: (i % views, i // views))
     kept = sorted(by_view[: len(procedural)])

@@ -13,12 +13,26 @@ from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES
 _LUMINANCE_CENTRE, _LUMINANCE_SCALE = 3.0, 8.0
 #: Blocks are averaged so that the planes are about this large.
 _PLANE_SIZE = 16
+#: Channels of the CNN; their means over quarters of the frame and their maxima are features.
+_CHANNELS, _QUARTERS = 48, 2
 #: Zones of the meter a side.
 _ZONES = 4
 #: A code at or above this share of full scale counts as clipped.
 _CLIPPED = 0.995
 #: The smallest signal that the absolute plane shows.
 _SIGNAL_FLOOR = 2.0**-12
+#: Samples a side, about, that the histogram of a frame's light counts.
+_COUNTED = 32
+#: Centres of the histogram's bins: log2 luminance, in stops of EV100.
+_BINS = torch.arange(-16.0, 24.0, 0.5)
+#: Histograms of a frame: of all samples, and of the brightest of each pixel.
+_HISTOGRAMS = 2
+#: Levels above which a state would put how much of the light [stops from white].
+_LEVELS = torch.tensor([1.0, 0.0, -1.0, -2.0, -3.0, -4.5, -6.0, -7.5, -9.0])
+#: Width of the steps at these levels [stops].
+_SOFTNESS = 0.25
+#: Numbers that describe the light of a frame to a `StateHead`.
+LIGHT_NUMBERS = _HISTOGRAMS * len(_BINS)
 
 
 class ExposureFeatures(nn.Module):
@@ -27,43 +41,47 @@ class ExposureFeatures(nn.Module):
     The raw alone does not tell a bright scene from a long exposure. A plane of absolute log
     luminance, log2 of the decoded green plus the EV100 of the frame's settings, does; it is the one
     input that made the difference in trials. The planes are first averaged to about 16 x 16, with
-    the maximum of the luminance as another plane: exposure is decided on coarse structure. The
-    readings of a light meter, mean luminance and clipped share of 4 x 4 zones, are added to the
-    CNN's features.
+    the maximum of the luminance as another plane: exposure is decided on coarse structure. What
+    the CNN finds is averaged over the quarters of the frame, with its maxima over the whole frame:
+    a network that sees where everything is memorises the training places. The readings of a light
+    meter, mean luminance and clipped share of 4 x 4 zones, are added.
 
     Args:
         observation_space: Observation of a single environment, with a uint8 ``raw``.
         width: Output features.
+        dropout: Share of the CNN's channels that a training step leaves out.
 
     Raises:
         ValueError: If the raw is not observed as uint8.
     """
 
-    def __init__(self, observation_space: gym.spaces.Dict, width: int = 256) -> None:
+    def __init__(
+        self, observation_space: gym.spaces.Dict, width: int = 256, dropout: float = 0.0
+    ) -> None:
         super().__init__()
         raw = observation_space["raw"]
         if raw.dtype != "uint8" or raw.shape is None:
             raise ValueError(f"`observation_space['raw']` (={raw}) must be a uint8 image")
         self.has_sensors = "sensors" in observation_space.spaces
         self.numbers = 3 + (2 if self.has_sensors else 0) + 2 * _ZONES**2
-        height, width_px = raw.shape[1:]
-        self.block = max(1, min(height, width_px) // _PLANE_SIZE)
+        self.block = max(1, min(raw.shape[1:]) // _PLANE_SIZE)
         self.cnn = nn.Sequential(
             nn.Conv2d(6, 24, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(24, 32, 3, stride=2, padding=1),
             nn.ReLU(),
-            nn.Conv2d(32, 48, 3, stride=2, padding=1),
+            nn.Conv2d(32, _CHANNELS, 3, stride=2, padding=1),
             nn.ReLU(),
-            nn.Flatten(),
+            nn.Dropout2d(dropout),
         )
-        with torch.no_grad():
-            planes = torch.zeros(1, 6, height // self.block, width_px // self.block)
-            flat = self.cnn(planes).shape[1]
-        self.head = nn.Sequential(nn.Linear(flat + self.numbers, width), nn.ReLU())
+        pooled = _CHANNELS * (_QUARTERS**2 + 1)
+        self.head = nn.Sequential(nn.Linear(pooled + self.numbers, width), nn.ReLU())
         self.ranges: torch.Tensor
         ranges = torch.tensor(SETTINGS_RANGES, dtype=torch.float32)
         self.register_buffer("ranges", ranges, persistent=False)
+        self.log2_signal: torch.Tensor
+        signals = _decode(torch.arange(256) / 255.0).clamp(min=_SIGNAL_FLOOR)
+        self.register_buffer("log2_signal", signals.log2(), persistent=False)
 
     def forward(
         self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
@@ -75,10 +93,7 @@ class ExposureFeatures(nn.Module):
             settings: (B, 3) float in [-1, 1].
             sensors: (B, 2) float in [-1, 1]; None where they are not observed.
         """
-        low, high = self.ranges.unbind(dim=1)
-        apex = low + (settings + 1.0) * 0.5 * (high - low)  # Av, Tv, Sv
-        ev100 = apex[:, 0] + apex[:, 1] - apex[:, 2] + 5.0
-        exposure = ev100[:, None, None, None]
+        exposure = self._ev100(settings)[:, None, None, None]
         pooled = nn.functional.avg_pool2d(codes, self.block)  # (B, 4, ~16, ~16)
         peak = nn.functional.max_pool2d(codes[:, 1:2], self.block)  # of one green
         signal = _decode(pooled[:, 1:3].mean(dim=1, keepdim=True))
@@ -86,10 +101,31 @@ class ExposureFeatures(nn.Module):
         pool = nn.functional.adaptive_avg_pool2d
         zones = _absolute(pool(signal, _ZONES), exposure)
         clipped = pool((peak >= _CLIPPED).to(codes.dtype), _ZONES)
-        features = [self.cnn(torch.cat(planes, dim=1)), zones.flatten(1), clipped.flatten(1)]
+        found = self.cnn(torch.cat(planes, dim=1))
+        features = [pool(found, _QUARTERS).flatten(1), found.amax(dim=(2, 3))]
+        features += [zones.flatten(1), clipped.flatten(1)]
         numbers = [settings] if sensors is None else [settings, sensors]
         joint: torch.Tensor = self.head(torch.cat([*features, *numbers], dim=1))
         return joint
+
+    def light(self, codes: torch.Tensor, settings: torch.Tensor) -> torch.Tensor:
+        """Histograms of the frame's luminance, ``(B, LIGHT_NUMBERS)``, for a `StateHead`.
+
+        Args:
+            codes: As for `forward`.
+            settings: As for `forward`.
+        """
+        step = max(1, min(codes.shape[2:]) // _COUNTED)
+        counted = (codes[:, :, ::step, ::step] * 255.0).round().long()
+        luminance = self.log2_signal + self._ev100(settings)[:, None]  # (B, 256), of each code
+        every = _spread(_count(counted), luminance)
+        return torch.cat([every, _spread(_count(counted.amax(dim=1)), luminance)], dim=1)
+
+    def _ev100(self, settings: torch.Tensor) -> torch.Tensor:
+        """EV100 (B,) of settings (B, 3)."""
+        low, high = self.ranges.unbind(dim=1)
+        apex = low + (settings + 1.0) * 0.5 * (high - low)  # Av, Tv, Sv
+        return apex[:, 0] + apex[:, 1] - apex[:, 2] + 5.0
 
 
 def _decode(codes: torch.Tensor) -> torch.Tensor:
@@ -103,6 +139,24 @@ def _absolute(signal: torch.Tensor, ev100: torch.Tensor) -> torch.Tensor:
     return (luminance - _LUMINANCE_CENTRE) / _LUMINANCE_SCALE
 
 
+def _count(codes: torch.Tensor) -> torch.Tensor:
+    """Shares (B, 256) of the codes (B, ...) int64 of each frame."""
+    flat = codes.flatten(1)
+    flat = flat + 256 * torch.arange(len(flat), device=flat.device)[:, None]
+    counts = torch.bincount(flat.flatten(), minlength=256 * len(flat))
+    return counts.view(len(flat), 256).float() / flat.shape[1]
+
+
+def _spread(shares: torch.Tensor, luminance: torch.Tensor) -> torch.Tensor:
+    """Shares (B, 256) of values at log2 `luminance` (B, 256) over `_BINS`, by linear weights."""
+    place = ((luminance - _BINS[0]) / (_BINS[1] - _BINS[0])).clamp(0.0, len(_BINS) - 1.001)
+    below = place.long()
+    weight = place - below
+    bins = shares.new_zeros(len(shares), len(_BINS))
+    bins.scatter_add_(1, below, shares * (1.0 - weight))
+    return bins.scatter_add_(1, below + 1, shares * weight)
+
+
 def _apex_table(grid: ExposureGrid) -> torch.Tensor:
     """EV100, Av, Tv and Sv of every state, (S, 4)."""
     apex = [[s.aperture_value, s.time_value, s.speed_value] for s in grid]
@@ -113,8 +167,11 @@ def _apex_table(grid: ExposureGrid) -> torch.Tensor:
 class StateHead(nn.Module):
     """Values of every exposure state, by one small network that all states share.
 
-    A state enters as its EV100, Av, Tv and Sv, and as the blur that the sensors predict for it.
-    So what is learnt about one state serves its neighbours, and any grid within the same ranges.
+    A state enters as its EV100, Av, Tv and Sv, the blur that the sensors predict for it, and the
+    histogram of the frame as the state would expose it: which share of the light it puts above
+    white and above so many stops below. So what is learnt about one state serves its neighbours,
+    and any grid within the same ranges; and what a capture's own light decides need not be learnt
+    place by place.
 
     Args:
         grid: The states.
@@ -147,16 +204,23 @@ class StateHead(nn.Module):
         self.register_buffer("states", normalised, persistent=False)
         self.register_buffer("log2_time", -table[:, 2], persistent=False)
         self.register_buffer("log2_opening", 2.0 - 0.5 * table[:, 1], persistent=False)
+        over = (_BINS[:, None, None] - table[:, :1] - _LEVELS) / _SOFTNESS  # (bins, S, levels)
+        self.exposed: torch.Tensor
+        self.register_buffer("exposed", torch.sigmoid(over), persistent=False)
         self.from_features = nn.Linear(features, width)
+        self.from_light = nn.Linear(_HISTOGRAMS * len(_LEVELS), width, bias=False)
         self.from_state = nn.Linear(table.shape[1] + (2 if has_sensors else 0), width, bias=False)
         self.hidden = nn.Linear(width, width)
         self.values = nn.Linear(width, outputs)
 
-    def forward(self, features: torch.Tensor, sensors: torch.Tensor | None) -> torch.Tensor:
+    def forward(
+        self, features: torch.Tensor, light: torch.Tensor, sensors: torch.Tensor | None
+    ) -> torch.Tensor:
         """Values (B, S, outputs).
 
         Args:
             features: (B, features) of the frame.
+            light: (B, LIGHT_NUMBERS) histograms of it, see `ExposureFeatures.light`.
             sensors: (B, 2) in [-1, 1]; None where they are not observed.
         """
         states = self.states.expand(len(features), -1, -1)  # (B, S, 4)
@@ -164,7 +228,10 @@ class StateHead(nn.Module):
             if sensors is None:
                 raise ValueError("`sensors` must be given: the network was made for them")
             states = torch.cat([states, self._blur(sensors)], dim=2)
-        hidden = torch.relu(self.from_features(features)[:, None] + self.from_state(states))
+        histograms = light.view(len(light), _HISTOGRAMS, len(_BINS))
+        shares = torch.einsum("bhi,isl->bshl", histograms, self.exposed).flatten(2)
+        of_state = self.from_state(states) + self.from_light(shares)  # (B, S, width)
+        hidden = torch.relu(self.from_features(features)[:, None] + of_state)
         values: torch.Tensor = self.values(torch.relu(self.hidden(hidden)))
         return values
 

@@ -24,34 +24,34 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from agents.learning.agent_weights import MAX_WIDTH, NetworkPolicy
-from agents.learning.networks import ExposureFeatures, StateHead
-from agents.learning.sb3_adapter import SB3VectorAdapter
+from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead
+from agents.learning.sb3_adapter import MovedFrames, SB3VectorAdapter
 from agents.policy import Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
 
 
 class ExposureExtractor(BaseFeaturesExtractor):
-    """`ExposureFeatures` as SB3 wants it, followed by the sensors, which the `StateHead` needs.
+    """`ExposureFeatures` as SB3 wants it, followed by what the `StateHead` needs beside it.
 
-    SB3 has divided the raw by 255 already.
+    That is the light's histograms and the sensors. SB3 has divided the raw by 255 already.
 
     Args:
         observation_space: Observation of a single environment.
-        width: Features without the sensors.
+        width: Features without these.
     """
 
     def __init__(self, observation_space: gym.spaces.Dict, width: int = 256) -> None:
         sensors = 2 if "sensors" in observation_space.spaces else 0
-        super().__init__(observation_space, width + sensors)
+        super().__init__(observation_space, width + LIGHT_NUMBERS + sensors)
         self.features = ExposureFeatures(observation_space, width)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Features (B, features_dim)."""
+        raw, settings = observations["raw"], observations["settings"]
         sensors = observations.get("sensors")
-        features = self.features(observations["raw"], observations["settings"], sensors)
-        joint: torch.Tensor = features if sensors is None else torch.cat([features, sensors], dim=1)
-        return joint
+        parts = [self.features(raw, settings, sensors), self.features.light(raw, settings)]
+        return torch.cat(parts if sensors is None else [*parts, sensors], dim=1)
 
 
 class _StateLogits(nn.Module):
@@ -61,15 +61,15 @@ class _StateLogits(nn.Module):
         self, grid: ExposureGrid, width: int, has_sensors: bool, trained_on: ExposureGrid | None
     ) -> None:
         super().__init__()
-        self.width = width
+        self.sizes = [width, LIGHT_NUMBERS, 2 if has_sensors else 0]
         self.head = StateHead(grid, width, has_sensors, trained_on=trained_on)
         nn.init.orthogonal_(self.head.values.weight, 0.01)  # all states start alike
         nn.init.zeros_(self.head.values.bias)
 
     def forward(self, extracted: torch.Tensor) -> torch.Tensor:
         """Logits (B, S)."""
-        features, sensors = extracted[:, : self.width], extracted[:, self.width :]
-        values: torch.Tensor = self.head(features, sensors if sensors.shape[1] else None)
+        features, light, sensors = torch.split(extracted, self.sizes, dim=1)
+        values: torch.Tensor = self.head(features, light, sensors if sensors.shape[1] else None)
         return values[..., 0]
 
 
@@ -112,7 +112,7 @@ class ExposureActorCritic(MultiInputActorCriticPolicy):
     def _build(self, lr_schedule: Callable[[float], float]) -> None:
         super()._build(lr_schedule)
         # SB3 has made a plain linear layer for the logits, and an optimiser that knows only that.
-        has_sensors = self.features_dim > self.width
+        has_sensors = self.features_dim > self.width + LIGHT_NUMBERS
         self.action_net = _StateLogits(self.grid, self.width, has_sensors, self.trained_on)
         rate = lr_schedule(1)
         self.optimizer = self.optimizer_class(self.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore[call-arg]
@@ -224,7 +224,7 @@ def train_ppo(
     done = 0 if past is None else int(past["timesteps"])
     model = PPO(
         ExposureActorCritic,
-        SB3VectorAdapter(envs),
+        MovedFrames(SB3VectorAdapter(envs), np.random.default_rng([training.seed, done])),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
         n_steps=training.n_steps,
         batch_size=training.batch_size,

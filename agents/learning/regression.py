@@ -22,6 +22,8 @@ from agents.metering.meters import make_meter
 from agents.metering.reading import Meter
 from agents.policy import Observations, PolicyContext, masked_argmax
 
+#: Dropout of the CNN's channels, relative to that of the features.
+_OF_CHANNELS = 0.4
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
@@ -36,7 +38,8 @@ class ScoreRegressor(nn.Module):
         observation_space: Observation of a single environment.
         grid: The exposure states.
         width: Features that describe a frame.
-        dropout: Share of the features that a training step leaves out.
+        dropout: Share of the features that a training step leaves out; of the CNN's channels it
+            leaves out 0.4 times as many.
         trained_on: See `StateHead`.
     """
 
@@ -50,7 +53,7 @@ class ScoreRegressor(nn.Module):
     ) -> None:
         super().__init__()
         self.width = width
-        self.features = ExposureFeatures(observation_space, width)
+        self.features = ExposureFeatures(observation_space, width, _OF_CHANNELS * dropout)
         self.dropout = nn.Dropout(dropout)
         has_sensors = "sensors" in observation_space.spaces
         self.states = StateHead(grid, width, has_sensors, outputs=2, trained_on=trained_on)
@@ -60,7 +63,7 @@ class ScoreRegressor(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Expected score and log variance of the prediction, both (B, S)."""
         features = self.dropout(self.features(codes, settings, sensors))
-        values = self.states(features, sensors)
+        values = self.states(features, self.features.light(codes, settings), sensors)
         scores, log_variance = values.unbind(dim=2)
         return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE)
 

@@ -16,10 +16,14 @@ from pydantic import Field
 from torch import nn
 
 from agents.learning.agent_weights import MAX_WIDTH
+from agents.learning.augmentation import moved
 from agents.learning.regression import RegressionPolicy, ScoreRegressor, observation_tensors
 from agents.policy import Observations, PolicyContext
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
+
+#: Past frames come in so many parts, each from another step.
+_CHUNKS = 4
 
 
 class RegressionTraining(Configuration):
@@ -34,7 +38,7 @@ class RegressionTraining(Configuration):
         explore: Share of random actions; the others are the agent's own, so that it learns from
             the frames it will meet.
         width: Hidden features of the network.
-        dropout: Share of the features that an optimiser step leaves out.
+        dropout: Share of the features that an optimiser step leaves out; see `ScoreRegressor`.
         seed: Seed of scenes, noise and weights.
 
     Raises:
@@ -162,7 +166,7 @@ class Rollout:
 
 
 class Replay:
-    """The last frames and their scores, to be seen again, mirrored half of the time.
+    """The last frames and their scores, to be seen again, `moved`.
 
     Args:
         training: Hyperparameters.
@@ -179,15 +183,11 @@ class Replay:
         """The new frames and some old ones; remembers the new ones and forgets the oldest."""
         new = {**observations, "target": target}
         parts = [new]
-        for _ in range(min(self.training.replay, len(self.memory))):
-            chosen = [self.memory[i] for i in self.rng.integers(len(self.memory), size=4)]
-            rows = self.rng.integers(len(target), size=(4, max(1, len(target) // 4)))
-            mixed = {
-                k: np.concatenate([c[k][r] for c, r in zip(chosen, rows, strict=True)]) for k in new
-            }
-            if self.rng.random() < 0.5:
-                mixed["raw"] = mixed["raw"][..., ::-1]
-            parts.append(mixed)
+        for _ in range(_CHUNKS * min(self.training.replay, len(self.memory))):
+            past = self.memory[self.rng.integers(len(self.memory))]
+            rows = self.rng.integers(len(target), size=max(1, len(target) // _CHUNKS))
+            seen = {name: values[rows] for name, values in past.items()}
+            parts.append({**seen, "raw": moved(seen["raw"], self.rng)})
         steps = max(1, self.training.memory // len(target))
         self.memory = [*self.memory, new][-steps:]
         merged = {key: np.concatenate([p[key] for p in parts]) for key in new}

@@ -1,4 +1,4 @@
-"""Adapter from a Gymnasium vector environment to Stable-Baselines3's `VecEnv`."""
+"""From a Gymnasium vector environment to Stable-Baselines3's `VecEnv`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from ae_env.env import single_info
+from agents.learning.augmentation import moved
 
 
 class SB3VectorAdapter(VecEnv):
@@ -120,3 +121,28 @@ class SB3VectorAdapter(VecEnv):
         if indices is None:
             return list(range(self.num_envs))
         return [int(i) for i in np.atleast_1d(indices)]
+
+
+class MovedFrames(VecEnvWrapper):
+    """Shows `moved` frames, those of each step otherwise.
+
+    Args:
+        venv: SB3's view of the environments.
+        rng: Draws the shifts.
+    """
+
+    def __init__(self, venv: VecEnv, rng: np.random.Generator) -> None:
+        super().__init__(venv)
+        self.rng = rng
+
+    def reset(self) -> Any:
+        """Begins an episode in every environment."""
+        return self._shown(self.venv.reset())
+
+    def step_wait(self) -> Any:
+        """Takes the step."""
+        observations, *rest = self.venv.step_wait()
+        return self._shown(observations), *rest
+
+    def _shown(self, observations: Any) -> dict[str, np.ndarray]:
+        return {**observations, "raw": moved(observations["raw"], self.rng)}

@@ -6,7 +6,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_sensors
-from agents.learning.networks import ExposureFeatures, StateHead
+from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead
 from agents.learning.regression import observation_tensors
 
 
@@ -35,7 +35,9 @@ def test_other_observations_are_refused() -> None:
     with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`.*must be a uint8 image"):
         ExposureFeatures(space(36, dtype=np.float32))
     with pytest.raises(ValueError, match="`sensors` must be given"):
-        StateHead(ExposureGrid.default(), 6, True)(torch.randn(3, 6), None)
+        StateHead(ExposureGrid.default(), 6, True)(
+            torch.randn(3, 6), torch.zeros(3, LIGHT_NUMBERS), None
+        )
 
 
 def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> None:
@@ -78,3 +80,32 @@ def test_foretold_blur_is_that_of_the_scorer() -> None:
     blur = np.hypot(64.0 * speed[:, None] * times, defocus[:, None] * aperture_blurs)
     np.testing.assert_allclose(foretold[..., 0].numpy() * 4.0, np.log2(blur), atol=0.05)
     np.testing.assert_allclose(foretold[..., 1].numpy() * 2.0, np.log1p(blur**2), atol=0.05)
+
+
+def test_foretold_shares_are_those_of_the_captures(make_tiny_envs) -> None:
+    # What each state would put above white, from one frame that is not clipped.
+    envs = make_tiny_envs(num_envs=1, noise=False, motion="none", depth="far", split="test")
+    base = envs.unwrapped
+    scene = next(s for s in base.scenes if s.kind == "dead_leaves")
+    grid = base.grid
+    ev100 = np.array(grid.ev100)
+    state = int(np.argmin(np.abs(ev100 - scene.ev100 - 1.5)))
+    frames, _ = envs.reset(seed=0, options={"scene": scene.scene_id, "state": [state]})
+    assert frames["raw"].max() < 255
+    features, head = ExposureFeatures(base.single_observation_space), StateHead(grid, 6, True)
+    codes, settings, sensors = observation_tensors(frames)
+    given: list[torch.Tensor] = []
+    head.from_light.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
+    with torch.no_grad():
+        head(torch.zeros(1, 6), features.light(codes, settings), sensors)
+    shares = given[0].view(len(grid), 2, -1)  # of all samples, of the brightest of each pixel
+    exposures = 2.0 ** (-scene.reference.log2_exposure - ev100)  # of each state, to the scene's
+    signal = scene.light[None] * torch.from_numpy(exposures).float()[:, None, None, None]
+    for level, stops in enumerate((1.0, 0.0, -1.0, -2.0, -3.0)):
+        above = signal >= 2.0**stops
+        for row, expected in ((0, above.float().mean(dim=(1, 2, 3))), (1, above.any(dim=1))):
+            expected = expected if row == 0 else expected.float().mean(dim=(1, 2))
+            # The steps are half a stop wide, marked settings a few hundredths off.
+            error = (shares[:, row, level] - expected).abs()
+            assert error.max() < 0.15
+            assert error.mean() < 0.03

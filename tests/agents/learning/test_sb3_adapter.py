@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from agents.learning.sb3_adapter import SB3VectorAdapter
+from agents.learning.sb3_adapter import MovedFrames, SB3VectorAdapter
 from tests.ae_env.environments import assert_equal, make_env
 
 STEPS = 3  # of an episode
@@ -88,3 +88,21 @@ def test_wrappers_of_the_batch_and_pictures(make_tiny_envs) -> None:
     assert envs.render("rgb_array").ndim == 3  # SB3 tiles them
     silent = SB3VectorAdapter(make_tiny_envs(num_envs=2))
     assert list(silent.get_images()) == [None, None]
+
+
+def test_moved_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
+    plain = SB3VectorAdapter(make_tiny_envs(num_envs=2))
+    moving = MovedFrames(SB3VectorAdapter(make_tiny_envs(num_envs=2)), np.random.default_rng(0))
+    for envs in (plain, moving):
+        envs.seed(3)
+    pairs, rewards = [(plain.reset(), moving.reset())], []
+    for action in (5, 17, 40):
+        stepped = [envs.step(np.full(2, action)) for envs in (plain, moving)]
+        pairs.append((stepped[0][0], stepped[1][0]))
+        rewards.append([step[1] for step in stepped])
+    for one, other in pairs:
+        assert not np.array_equal(one["raw"], other["raw"])
+        assert one["raw"].mean() == pytest.approx(other["raw"].mean(), rel=0.2)
+        for name in ("settings", "sensors"):
+            np.testing.assert_array_equal(one[name], other[name])
+    np.testing.assert_array_equal(*zip(*rewards, strict=True))
