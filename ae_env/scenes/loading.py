@@ -137,7 +137,8 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
         procedural = [scene for scene in bundled if scene.kind != "photograph"]
         return mixed_scenes(request, procedural, maps)
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
-        if _ATTRIBUTE.fullmatch(spec) and not spec.startswith("bundled:"):
+        ours = spec.partition(":")[0] in NAMED
+        if _ATTRIBUTE.fullmatch(spec) and not ours:
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
             if callable(found):
                 known = {"split": split, "camera": camera, "resolution": resolution}
@@ -145,7 +146,7 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
                 found = found(**{name: given for name, given in known.items() if name in names})
             return [request.sized(scene) for scene in _checked(found, spec)]
         hint = did_you_mean(spec, NAMED, cutoff=0.7)
-        if hint or spec.startswith("bundled:"):
+        if hint or ours:
             raise ValueError(
                 f"`scenes` (={spec!r}) must be one of {[*NAMED]}, an existing file, folder or "
                 f"glob, or 'pkg.mod:attr'{hint}"
@@ -237,7 +238,8 @@ class SceneNetworks:
 
         shape = scene.light.shape
         denoised = self._cached("denoised", scene, make, shape=shape, everywhere=True)
-        return replace(scene, denoised=denoised)
+        noise = self._simulator.noise
+        return replace(scene, denoised=denoised, residual=None if noise is None else noise.residual)
 
     def resized(self, scene: Scene, resolution: int | None, crop: Crop = "box") -> Scene:
         """As `Scene.resized`, with `Scene.defocus_map` estimated before any pixels are averaged.

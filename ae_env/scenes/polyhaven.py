@@ -107,14 +107,24 @@ class Asset(Configuration):
         return f"{self.name}_1k.hdr"
 
     @property
-    def path(self) -> Path | None:
-        """The file, in the folder of real files or in the cache; None where it is in neither."""
+    def cached(self) -> Path:
+        """Where `download` puts the file."""
+        return cache_dir() / _FOLDER / self.file_name
+
+    @property
+    def given(self) -> Path | None:
+        """The file in the folder of real files; None where it is not there."""
         data, own = data_folder(), self.file or f"hdri_pool/{self.name}.hdr"
         known = [] if data is None else [data / own, data / _FOLDER / self.file_name]
-        for path in (*known, cache_dir() / _FOLDER / self.file_name):
-            if path.is_file() and path.stat().st_size == self.bytes:
-                return path
-        return None
+        return next((path for path in known if self._is_at(path)), None)
+
+    @property
+    def path(self) -> Path | None:
+        """The file, in the folder of real files or in the cache; None where it is in neither."""
+        return self.given or (self.cached if self._is_at(self.cached) else None)
+
+    def _is_at(self, path: Path) -> bool:
+        return path.is_file() and path.stat().st_size == self.bytes
 
 
 class _AssetList(Configuration):
@@ -270,7 +280,7 @@ def _cells(panorama: np.ndarray) -> np.ndarray:
 def download(
     *, url: str = URL, timeout: float = _TIMEOUT, progress: Callable[[int, int, str], None] | None
 ) -> list[Path]:
-    """Fetches the maps that are missing into the cache; those that are there stay.
+    """Fetches the maps that are missing or damaged into the cache; those that are there stay.
 
     A file is put in place when it is complete and its hash is the list's, so a download that was
     stopped goes on where it was. The environment's proxy (``HTTPS_PROXY``) is used.
@@ -285,6 +295,7 @@ def download(
 
     Raises:
         ImportError: If the extra ``hdr`` is not installed.
+        ValueError: If `url` is no address.
         ConnectionError: If a map cannot be fetched, or is not the one of the list.
     """
     try:
@@ -292,6 +303,8 @@ def download(
         from requests import RequestException
     except ImportError:
         raise ImportError("downloading scenes needs: pip install 'ae-env[hdr]'") from None
+    if not url.startswith(("http://", "https://")):
+        raise ValueError(f"`url` (={url!r}) must begin with http:// or https://")
     pooch.get_logger().setLevel("ERROR")
     assets = list_assets()
     folder = cache_dir() / _FOLDER
@@ -307,7 +320,7 @@ def download(
     for asset in assets:
         if progress is not None:
             progress(done, total, asset.name)
-        if asset.path is None:
+        if asset.given is None and not _is_whole(asset, pooch.file_hash):
             try:
                 fetched.append(Path(store.fetch(asset.file_name, downloader=fetch)))
             except (RequestException, ValueError) as error:
@@ -319,6 +332,11 @@ def download(
     if progress is not None:
         progress(done, total, "")
     return fetched
+
+
+def _is_whole(asset: Asset, file_hash: Callable[[str], str]) -> bool:
+    """Whether the cache has the file, with the hash of the list."""
+    return asset.cached.is_file() and file_hash(str(asset.cached)) == asset.sha256
 
 
 def mixed_scenes(request: SceneRequest, procedural: Sequence[Scene], maps: int) -> list[Scene]:

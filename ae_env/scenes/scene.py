@@ -19,6 +19,7 @@ from simulator.capture.denoised import Denoised
 from simulator.capture.layout import Layout
 from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.residual import Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
@@ -105,6 +106,7 @@ class Scene:
             there (`simulator.raw.highlights`); None if there are none.
         denoised: (4, H, W) `light` with its noise removed by a noise module; None where there is
             no noise, or no such module.
+        residual: What the network that made `denoised` gets wrong; None where that is not known.
         defocus_map: (H, W) circle of confusion at the reference's f-number [pixel of `light`], of a
             scene whose own defocus is to grow as the aperture opens; None where all is far.
         layout: What is out of focus, by how much relative to an episode's defocus, and what is the
@@ -135,6 +137,7 @@ class Scene:
     source: str = ""
     saturated: torch.Tensor | None = None
     denoised: torch.Tensor | None = None
+    residual: Residual | None = None
     defocus_map: torch.Tensor | None = None
     layout: Layout | None = None
     sampled: bool = False
@@ -215,7 +218,9 @@ class Scene:
     @property
     def prepared(self) -> PreparedScene:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        denoised = () if self.denoised is None else (Denoised(self.denoised),)
+        denoised: tuple[Denoised, ...] = ()
+        if self.denoised is not None:
+            denoised = (Denoised(self.denoised, residual=self.residual),)
         aperture_blur = None
         if self.defocus_map is not None:
             f_number = self.reference.effective_f_number
@@ -474,6 +479,7 @@ class Scene:
             box_factor=self.box_factor * k,
             saturated=mask,
             denoised=None if self.denoised is None else averaged(self.denoised).float(),
+            residual=None,  # of the finer pixels
             defocus_map=None if found is None else averaged(found.square()).sqrt().float() / k,
             layout=layout,
         )

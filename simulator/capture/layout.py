@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -48,6 +49,10 @@ class Layout:
 
     def __post_init__(self) -> None:
         found, mask = self.defocus, self.subject
+        for name, value in (("defocus", found), ("subject", mask)):
+            if not isinstance(value, torch.Tensor) and (name == "defocus" or value is not None):
+                kind = type(value).__name__
+                raise ValueError(f"`{name}` (={kind}) of a layout must be a torch tensor")
         if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
             raise ValueError(
                 f"`defocus` (shape {tuple(found.shape)}, {float(found.min()):g} to "
@@ -75,7 +80,16 @@ class Layout:
             depth: (H, W) distance [m], above 0.
             distance: At which the lens is focused [m].
             in_focus: Largest relative circle of confusion of the subject.
+
+        Raises:
+            ValueError: If an argument is out of range.
         """
+        if not isinstance(depth, torch.Tensor) or not bool((depth > 0.0).all()):
+            raise ValueError("`depth` must be a torch tensor with every value above 0 and not NaN")
+        if not 0.0 < distance < math.inf:
+            raise ValueError(f"`distance` (={distance}) must be above 0 and finite")
+        if not 0.0 <= in_focus <= 1.0:
+            raise ValueError(f"`in_focus` (={in_focus}) must be in [0, 1]")
         apart = (1.0 / depth.double() - 1.0 / distance).abs()
         relative = (apart / apart.max().clamp(min=1e-12)).float()
         return cls(relative, relative <= in_focus)

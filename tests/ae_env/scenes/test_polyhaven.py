@@ -109,8 +109,9 @@ def test_a_white_wall_under_an_even_sky_is_white_at_the_incident_light(an_asset)
         assert scene.box_factor == 1
 
 
-def test_a_view_towards_the_light_has_less_on_its_subject(an_asset):
+def test_a_view_towards_the_light_has_less_on_its_subject(an_asset, monkeypatch):
     """A bright half of the world: the view into it is lit from behind."""
+    monkeypatch.setitem(ILLUMINANCE, "overcast", (1e4, 1e4))
     half = panorama(lambda lon, lat: np.where(np.abs(lon) < np.pi / 2, 1.0, 0.05) + 0.0 * lat)
     lux, seen = [], []
     for scene in asset_views(an_asset(half), CAMERA, size=16, views=16):
@@ -119,6 +120,15 @@ def test_a_view_towards_the_light_has_less_on_its_subject(an_asset):
     order = np.argsort(lux)
     assert lux[order[-1]] / lux[order[0]] == pytest.approx(20, rel=0.3)
     assert seen[order[0]] > 100 * seen[order[-1]]  # 20 in the light, 20 in the exposure
+
+
+def test_each_view_has_a_level_of_its_own(an_asset):
+    even = panorama(lambda lon, lat: 3.0 + 0.0 * lat + 0.0 * lon)
+    views = asset_views(an_asset(even), CAMERA, size=16, views=50)
+    low, high = np.log(ILLUMINANCE["overcast"])
+    levels = (np.log([scene.illuminance for scene in views]) - low) / (high - low)
+    assert levels.mean() == pytest.approx(0.5, abs=0.15)  # log-uniform
+    assert levels.std() == pytest.approx(12**-0.5, abs=0.08)
 
 
 def test_the_seed_draws_views_and_level(an_asset):
@@ -255,6 +265,21 @@ def test_what_stays_broken_is_said_and_nothing_is_lost(
         download(url=url, progress=None)
     assert set(stored(tmp_path)) == {"map_0_1k.hdr"}  # no half of a file either
     assert len(download(url=url, progress=None)) == 2
+
+
+def test_a_damaged_file_of_the_right_length_is_fetched_again(server, tmp_path):
+    url, _, asked = server
+    download(url=url, progress=None)
+    (damaged,) = tmp_path.rglob("map_1_1k.hdr")
+    damaged.write_bytes(bytes(len(CONTENT["map_1"])))
+    assert download(url=url, progress=None) == [damaged]
+    assert asked[3:] == ["map_1"]
+    assert stored(tmp_path) == {f"{name}_1k.hdr": content for name, content in CONTENT.items()}
+
+
+def test_an_address_must_be_one():
+    with pytest.raises(ValueError, match=r"`url` \(='ftp://a'\) must begin with http"):
+        download(url="ftp://a", progress=None)
 
 
 def test_a_proxy_is_honoured(server, monkeypatch):

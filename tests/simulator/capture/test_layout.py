@@ -71,3 +71,19 @@ def test_averages_and_windows() -> None:
     assert float(small.defocus[1, 0]) == pytest.approx(float(layout.defocus[tile].mean()))
     wanted = bool(layout.subject[tile].double().mean() > 0.5)
     assert (False if small.subject is None else bool(small.subject[1, 0])) == wanted
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Layout([[0.0]]), r"`defocus` \(=list\)"),
+        (lambda: Layout(torch.full((2, 2), 1.5)), r"1.5 to 1.5\) .*\[0, 1\]"),
+        (lambda: Layout(torch.zeros(2, 2), [[True]]), r"`subject` \(=list\)"),
+        (lambda: Layout.from_depth(torch.zeros(2, 2), 1.0, in_focus=0.1), "`depth` must"),
+        (lambda: Layout.from_depth(torch.ones(2, 2), 0.0, in_focus=0.1), r"`distance` \(=0.0\)"),
+        (lambda: Layout.from_depth(torch.ones(2, 2), 1.0, in_focus=5.0), r"`in_focus` \(=5.0\)"),
+    ],
+)
+def test_errors_name_argument_and_rule(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
