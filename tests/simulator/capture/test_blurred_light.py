@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from simulator.capture import blurred_light as optics_module
+from simulator.capture import scene_blur as optics_module
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import BlurredLight
 from simulator.capture.denoised import Denoised
