@@ -89,7 +89,7 @@ class Scene:
         group: Source group: the photograph, panorama or physical subject. All scenes of a group
             stay in one split and are resampled together.
         light: (4, H, W) float32 packed light at `reference`, planes R, G1, G2, B, 1.0 at sensor
-            white; not clipped, so lamps exceed 1. At least 0 where noise-free.
+            white; not clipped, so lamps exceed 1.
         reference: Settings at which `light` is. With `illuminance` known, an 18 % grey card under
             it has 0.119 of white in green there.
         camera: Camera in whose colour space `light` is.
@@ -147,6 +147,11 @@ class Scene:
         for name in ("scene_id", "group", "kind"):
             if not isinstance(getattr(self, name), str) or not getattr(self, name):
                 raise ValueError(f"`{name}` (={getattr(self, name)!r}) must be a non-empty string")
+        types = {"camera": CameraProfile, "reference": CameraSettings, "nlf": NoiseLevelFunction}
+        for name, kind in types.items():
+            if not isinstance(getattr(self, name), kind):
+                found = getattr(self, name)
+                raise ValueError(f"`{name}` (={found!r}) must be a {kind.__name__}")
         object.__setattr__(self, "light", check_packed("light", self.light).contiguous())
         if self.illuminance is not None:
             incident_ev100(self.illuminance)  # raises unless it is positive and finite

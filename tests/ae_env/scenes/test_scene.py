@@ -201,3 +201,12 @@ def test_averaging_a_scene_down_keeps_its_mean(
     cut = light[:, top : top + resolution, left : left + resolution]
     assert torch.equal(native.light, cut)
     assert native.box_factor == 1
+
+
+@pytest.mark.parametrize("name", ["camera", "reference", "nlf"])
+def test_fields_of_another_type_are_named(name: str) -> None:
+    scene = Scene.from_array(
+        torch.zeros(4, 8, 8), CameraSettings(100, 1.0, 4.0), get_camera("nikon_z6"), scene_id="a"
+    )
+    with pytest.raises(ValueError, match=rf"`{name}` \(='nikon_z6'\) must be a "):
+        replace(scene, **{name: "nikon_z6"})
