@@ -91,6 +91,9 @@ def load_scenes(
     """
     if split not in get_args(Split):
         raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
+    if not isinstance(camera, CameraProfile):
+        hint = "; `simulator.get_camera` gives one by name"
+        raise ValueError(f"`camera` (={camera!r}) must be a CameraProfile{hint}")
     request = SceneRequest(split, camera, resolution, crop, resize)
     if isinstance(spec, Mapping):
         load = sequence_scenes if is_sequence(spec) else folder_scenes

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ae_env.scenes.scene import Scene, mean_anchor
+from ae_env.utils.checks import check_number
 from simulator.noise.generator import noise_generator
 from simulator.raw.image import RawImage
 from simulator.reference.reference_camera import ReferenceCamera
@@ -43,14 +44,29 @@ def photographed(
         iso_range: What the ISO is drawn from, log-uniformly.
 
     Raises:
-        ValueError: If the scene carries noise, as a raw does: it is a photograph already.
+        ValueError: If the scene carries noise, as a raw does: it is a photograph already; if it
+            is black nearly everywhere, so that no meter can expose it; or for settings out of
+            range.
     """
+    low, high = (check_number(f"iso_range[{i}]", iso_range[i], 1.0, 1e7) for i in (0, 1))
+    if low > high:
+        raise ValueError(f"`iso_range` (={iso_range!r}) must be ascending")
+    if iso is not None:
+        check_number("iso", iso, 1.0, 1e7)
+    if ev is not None:
+        check_number("ev", ev, -20.0, 20.0)
     if not scene.noise_free:
         raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise to be photographed")
     rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed])
-    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log(iso_range))), rng.uniform(*EV_RANGE)
+    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log((low, high)))), rng.uniform(*EV_RANGE)
     iso, ev = float(drawn_iso if iso is None else iso), float(drawn_ev if ev is None else ev)
-    ratio = mean_anchor(scene.light[1:3]) * 2.0**ev
+    try:
+        ratio = mean_anchor(scene.light[1:3]) * 2.0**ev
+    except ValueError as error:
+        raise ValueError(
+            f"`scene` (={scene.scene_id!r}) is too dark for the meter of `photographed`: its green "
+            "is 0 nearly everywhere"
+        ) from error
     unit = CameraSettings(iso, 1.0, F_NUMBER)
     exposure = scene.reference.log2_exposure + np.log2(ratio)
     settings = replace(unit, exposure_time=float(2.0 ** (exposure - unit.log2_exposure)))

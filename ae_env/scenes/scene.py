@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ae_env.scenes.colour import camera_from_srgb, check_rgb
+from ae_env.utils.checks import check_number
 from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import BlurredLight
@@ -153,7 +154,12 @@ class Scene:
                 found = getattr(self, name)
                 raise ValueError(f"`{name}` (={found!r}) must be a {kind.__name__}")
         object.__setattr__(self, "light", check_packed("light", self.light).contiguous())
+        for name in ("saturated", "defocus_map"):
+            found = getattr(self, name)
+            if not isinstance(found, torch.Tensor | None):
+                raise ValueError(f"`{name}` (={type(found).__name__}) must be a Tensor or None")
         if self.illuminance is not None:
+            check_number("illuminance", self.illuminance, 0.0, math.inf)
             incident_ev100(self.illuminance)  # raises unless it is positive and finite
         gains = tuple(float(gain) for gain in self.white_balance)
         if len(gains) != 3 or not all(math.isfinite(gain) and gain > 0 for gain in gains):

@@ -1,5 +1,7 @@
 """One photograph in place of a scene: metered, as noisy as the camera, and in the environment."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -47,6 +49,25 @@ def test_iso_and_exposure_are_drawn_by_name_and_seed():
     assert photographed(scenes[3], seed=1).reference != drawn[3].reference
     with pytest.raises(ValueError, match=r"`scene` \(='scene-0'\) must be free of noise"):
         photographed(drawn[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"iso_range": (6400.0, 100.0)}, r"`iso_range` \(=\(6400.0, 100.0\)\) must be ascending"),
+        ({"iso": 0.0}, r"`iso` \(=0.0\) must be a number in"),
+        ({"ev": float("nan")}, r"`ev` \(=nan\) must be a number in"),
+    ],
+)
+def test_settings_that_no_camera_has_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        photographed(random_scene(), **options)
+
+
+def test_a_scene_too_dark_for_the_meter_is_named():
+    black = replace(random_scene(scene_id="cellar"), light=torch.zeros(4, 8, 8))
+    with pytest.raises(ValueError, match=r"'cellar'.* is too dark for the meter"):
+        photographed(black)
 
 
 def test_in_the_environment_everything_comes_from_the_raw():

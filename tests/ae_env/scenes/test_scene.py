@@ -118,6 +118,8 @@ def test_own_blur_grows_with_the_aperture_and_never_shrinks() -> None:
     ("fields", "words"),
     [
         ({"illuminance": 0.0}, "`illuminance` (=0.0)"),
+        ({"illuminance": "500"}, "`illuminance` (='500')"),
+        ({"saturated": np.zeros((2, 2), bool)}, "`saturated` (=ndarray) must be a Tensor"),
         ({"white_balance": (1.0, -1.0, 1.0)}, "`white_balance`"),
         ({"median_speed": -1.0}, "`median_speed` (=-1.0)"),
         ({"box_factor": 0}, "`box_factor` (=0)"),
