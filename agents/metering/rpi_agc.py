@@ -1,19 +1,25 @@
-"""A camera's own AGC: a model of libcamera's for the Raspberry Pi.
-
-Written from its published behaviour ("Raspberry Pi Camera Algorithm and Tuning Guide", libcamera
-and its tuning of the imx477). The numbers of that tuning come first.
-"""
+"""libcamera's AGC for the Raspberry Pi, on the states of a grid."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.utils.checks import check_integer, check_number, check_word
+from agents.metering.libcamera_agc import (
+    CONSTRAINTS,
+    LADDERS,
+    SPEED,
+    STARTUP_FRAMES,
+    ZONE_WEIGHTS,
+    Floats,
+    Ladder,
+    LibcameraAgc,
+    signal_histogram,
+)
 from agents.metering.programs import (
     PRIORITY_TIME,
     ProgramOptions,
@@ -24,76 +30,7 @@ from agents.metering.programs import (
 from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 
-Floats = NDArray[np.float64]
-
-#: Weights of the 15 zones (see `zone_map`) in each metering mode.
-ZONE_WEIGHTS = {
-    "centre_weighted": (3, 3, 3, 2, 2, 2, 2, 1, 1, 1, 1, 0, 0, 0, 0),
-    "spot": (2, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0),
-    "matrix": (1,) * 15,
-}
-
-
-@dataclass(frozen=True)
-class Ladder:
-    """How an exposure mode splits an exposure: the shutter up to a rung, then the gain, and so on.
-
-    Args:
-        shutter: Rungs of the exposure time [s].
-        gain: Rungs of the gain, 1 at ISO 100.
-    """
-
-    shutter: tuple[float, ...]
-    gain: tuple[float, ...]
-
-
-LADDERS = {
-    "normal": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-    "short": Ladder((100e-6, 5e-3, 10e-3, 20e-3, 66.666e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-    "long": Ladder((100e-6, 10e-3, 30e-3, 60e-3, 120e-3), (1.0, 2.0, 4.0, 6.0, 16.0)),
-}
-
-
-@dataclass(frozen=True)
-class Constraint:
-    """The mean of the pixels between two quantiles must not be below, or above, a target.
-
-    Args:
-        lower: Whether the target is a lower bound.
-        quantiles: Between which the pixels are averaged.
-        target: Signal, white is 1.
-    """
-
-    lower: bool
-    quantiles: tuple[float, float]
-    target: float
-
-
-_TOP = Constraint(True, (0.98, 1.0), 0.3)
-CONSTRAINTS = {
-    "normal": (_TOP,),
-    "highlight": (_TOP, Constraint(False, (0.98, 1.0), 0.8)),
-    "shadows": (Constraint(True, (0.0, 0.5), 0.17),),
-}
-
-#: Illuminance [lux] and the mean signal aimed at; linear between, constant outside.
-TARGET_LUX, TARGET_SIGNALS = (0.0, 1000.0, 10000.0), (0.16, 0.165, 0.17)
-#: No target is above this, whatever the compensation: close to white a mean says nothing.
-TARGET_LIMIT = 0.9
-#: Share of the distance to the target that the filter goes per frame.
-SPEED = 0.2
-#: Within this of the target the filter goes with the square root of its speed.
-NEAR = 0.2
-#: Within this of the target it stays.
-STABLE = 0.02
-#: Frames of the start, in which it goes all of the way.
-STARTUP_FRAMES = 10
-#: A target above this that the picture exceeds is approached from below, at this part of the
-#: exposure.
-FAST_REDUCE = 0.4
-#: Passes in which the gain is found (zones saturate), the most that one may add, and when to stop.
-GAIN_PASSES, GAIN_LIMIT, GAIN_DONE = 8, 10.0, 1.01
-#: Least signal by which a target is divided.
+#: Least signal from which the light is estimated.
 _LEAST_SIGNAL = 1e-3
 #: How near to whole periods a flicker-free exposure time is, as a part of it.
 _PERIOD_TOLERANCE = 0.02
@@ -105,12 +42,7 @@ _FLICKERS, _NEARBY_EV = 1e5, 0.5
 
 
 class RpiAgc(Policy):
-    """The Raspberry Pi's AGC on the states of a grid.
-
-    Each frame: the mean of 15 weighted zones gives a gain, which the constraints on the brightest
-    or darkest pixels may change; the gain and the exposure *of that frame* give the target; a
-    filter moves a continuous exposure towards it; the ladder of the exposure mode splits that into
-    shutter and gain; the nearest state of the grid is taken.
+    """The Raspberry Pi's AGC (`LibcameraAgc`): the state of the grid that is nearest to it.
 
     Args:
         context: The camera, the grid and the observation.
@@ -170,18 +102,29 @@ class RpiAgc(Policy):
             flicker_period = check_number("flicker_period", flicker_period, 1e-6, 10.0)
         self.flicker_period = flicker_period
         self.name = f"rpi_agc:{program}"
-        self._weights = np.array(ZONE_WEIGHTS[metering], np.float64)
-        self._constraints = CONSTRAINTS[constraint]
         ladder = LADDERS[mode]
         gains = (*ladder.gain[:-1], max(max_gain, 1.0))
         self._ladder = Ladder(ladder.shutter, tuple(min(g, max_gain) for g in gains))
+        by_hand = self.program in ("S", "M")
+        self._settings: dict[str, Any] = {
+            "metering": metering,
+            "constraint": constraint,
+            "ladder": self._ladder,
+            "compensation": compensation,
+            "max_exposure_time": shutter_cap,
+            "exposure_time": time if by_hand else None,
+            "gain": None if iso is None else iso / 100.0,
+            "flicker_period": flicker_period,
+            "speed": self.speed,
+            "startup_frames": self.startup_frames,
+        }
         self._chooser = StateChooser(context.grid, program, self.options)
         self.reset(0)
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Begin the start-up frames of `num_envs` cameras."""
         super().reset(num_envs, seed)
-        self._filter = ExposureFilter(num_envs, self.speed, self.startup_frames)
+        self._agc = LibcameraAgc(num_envs, **self._settings)
         self._damped = np.full(num_envs, np.nan)
         self._previous: NDArray[np.int64] | None = None
 
@@ -190,12 +133,17 @@ class RpiAgc(Policy):
     ) -> NDArray[np.int64]:
         """Meter the frames, filter the exposure, split it."""
         self.check_reset(observations)
-        gain, target_signal = self._gain(observations)
-        # Exposures are relative to that of EV100 0.
-        target = np.exp2(-frame_ev100(observations)) * gain
-        filtered = self._filter.update(np.minimum(target, self._most_exposure()))
-        reduce = (target_signal > FAST_REDUCE) & (gain < np.sqrt(target_signal))
-        ev = -np.log2(filtered * np.where(reduce, FAST_REDUCE, 1.0))
+        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
+        signal = np.maximum(signal, 0.0).reshape(len(signal), -1)
+        zones = signal @ _zone_matrix(*observations["raw"].shape[2:])
+        frame_ev = frame_ev100(observations)
+        brightness = zones @ self._agc.weights / self._agc.weights.sum()
+        light = np.log2(np.maximum(brightness, _LEAST_SIGNAL) / TARGET_SIGNAL)
+        lux = 2.5 * np.exp2(frame_ev + light)
+        # As exposure time x gain at the lens's own f-number, which may not be the frame's.
+        area = self.options.f_number**2
+        exposure = self._agc.update(zones, signal_histogram(signal), area * np.exp2(-frame_ev), lux)
+        ev = -np.log2(exposure / area)
         states = self.context.grid.ev100
         before = np.clip(self._damped, states.min(), states.max())
         distance = self.options.damping * (before - ev)
@@ -203,64 +151,9 @@ class RpiAgc(Policy):
         self._previous = masked_argmax(self._utility(self._damped), action_masks)
         return self._previous.copy()
 
-    def _gain(self, observations: Observations) -> tuple[Floats, Floats]:
-        """Factor by which the exposure of the frames must change, and the signal it aims at."""
-        signal = linear_signal(observations["raw"], self.context.camera, GREEN).mean(axis=1)
-        signal = np.maximum(signal, 0.0)
-        zones = _zone_matrix(*signal.shape[1:]) @ signal.reshape(len(signal), -1).T  # (15, N)
-        brightness = self._weights @ zones / self._weights.sum()
-        light = frame_ev100(observations) + np.log2(
-            np.maximum(brightness, _LEAST_SIGNAL) / TARGET_SIGNAL
-        )
-        lux = 2.5 * np.exp2(light)
-        wanted = self._compensated(np.interp(lux, TARGET_LUX, TARGET_SIGNALS))
-        gain = zone_gain(zones, self._weights, wanted)
-        pixels = signal.reshape(len(signal), -1)
-        for constraint in self._constraints:
-            bound = self._compensated(np.full(len(gain), constraint.target))
-            mean = quantile_mean(pixels, *constraint.quantiles)
-            other = bound / np.maximum(mean, _LEAST_SIGNAL)
-            adopted = other > gain if constraint.lower else other < gain
-            gain, wanted = np.where(adopted, other, gain), np.where(adopted, bound, wanted)
-        return gain, wanted
-
-    def _compensated(self, signal: Floats) -> Floats:
-        target: Floats = np.minimum(signal * 2.0**self.options.compensation, TARGET_LIMIT)
-        return target
-
-    def _most_exposure(self) -> float:
-        """The most that the ladder allows, relative to EV100 0."""
-        times, gains = self._ladder.shutter, self._ladder.gain
-        time = self.options.exposure_time if self.program in ("S", "M") else times[-1]
-        gain = gains[-1] if self.options.iso is None else self.options.iso / 100.0
-        return float(self._limited(time) * gain / self.options.f_number**2)
-
-    def _limited(self, time: float) -> float:
-        cap = self.options.shutter_cap
-        return time if cap is None else min(time, cap)
-
     def split(self, exposure: Floats) -> tuple[Floats, Floats]:
-        """Shutter [s] and gain for exposures `time * gain` [s], ``(N,)`` each, by the ladder.
-
-        A rung at a time: the shutter goes up to its next value, then the gain. With a flicker
-        period, a shutter of a period or more is floored to whole periods.
-        """
-        by_hand = self.program in ("S", "M")
-        first = self.options.exposure_time if by_hand else self._ladder.shutter[0]
-        time = np.full_like(exposure, self._limited(first))
-        gain = np.full_like(exposure, self._ladder.gain[0])
-        for shutter_rung, gain_rung in zip(
-            self._ladder.shutter[1:], self._ladder.gain[1:], strict=True
-        ):
-            if not by_hand:
-                wanted = np.minimum(exposure / gain, self._limited(shutter_rung))
-                time = np.maximum(time, wanted)
-            gain = np.maximum(gain, np.minimum(exposure / time, gain_rung))
-        if self.flicker_period is not None and not by_hand:
-            periods = np.floor(time / self.flicker_period + 1e-9)
-            whole = np.where(periods > 0, periods * self.flicker_period, time)
-            time, gain = whole, gain * time / whole
-        return time, gain
+        """Exposure time [s] and gain of `exposure` [s], ``(N,)`` each, by the ladder."""
+        return self._agc.split(exposure)
 
     def _utility(self, ev: Floats) -> Floats:
         """How well each state fits the exposures and the ladder, ``(N, S)``."""
@@ -292,84 +185,6 @@ class RpiAgc(Policy):
         steady = self._chooser.nearby(target, _NEARBY_EV) & whole
         found = (time >= self.flicker_period) & steady.any(axis=1)
         return (found[:, None] & ~steady).astype(np.float64)
-
-
-class ExposureFilter:
-    """The AGC's filter: a continuous exposure that goes a part of the way at every frame.
-
-    Args:
-        num_envs: Cameras.
-        speed: Part of the (linear) distance that it goes; the square root of it within 20 % of the
-            target, nothing within 2 %.
-        startup_frames: Frames at first in which it goes all of the way.
-
-    >>> follow = ExposureFilter(1, startup_frames=0)
-    >>> [round(float(follow.update(np.array([x]))[0]), 3) for x in (1.0, 16.0, 16.0)]
-    [1.0, 4.0, 6.4]
-    """
-
-    def __init__(
-        self,
-        num_envs: int,
-        speed: float = SPEED,
-        startup_frames: int = STARTUP_FRAMES,
-    ) -> None:
-        self.exposure = np.full(num_envs, np.nan)
-        self.speed, self.startup_frames = speed, startup_frames
-        self._frames = 0
-
-    def update(self, target: Floats) -> Floats:
-        """Take in the target of a frame, ``(N,)``; returns the exposures."""
-        self._frames += 1
-        old = self.exposure
-        if self._frames <= self.startup_frames:
-            new = target.copy()
-        else:
-            near = (old < (1.0 + NEAR) * target) & (old > (1.0 - NEAR) * target)
-            speed = np.where(near, np.sqrt(self.speed), self.speed)
-            new = speed * target + (1.0 - speed) * old
-            stable = (old * (1.0 - STABLE) < target) & (old * (1.0 + STABLE) > target)
-            new = np.where(np.isnan(old), target, np.where(stable, old, new))
-        self.exposure = new
-        return new.copy()
-
-
-def zone_gain(zones: Floats, weights: Floats, wanted: Floats) -> Floats:
-    """Gain that brings the weighted mean of the zones to `wanted`, ``(N,)``.
-
-    A zone that saturates gives no more, so the gain is raised in several passes.
-
-    Args:
-        zones: Mean signal of each zone, ``(15, N)``.
-        weights: ``(15,)``.
-        wanted: ``(N,)``.
-    """
-    gain = np.ones(zones.shape[1])
-    done = np.zeros(zones.shape[1], bool)
-    for _ in range(GAIN_PASSES):
-        mean = weights @ np.minimum(zones * gain, 1.0) / weights.sum()
-        extra = np.minimum(GAIN_LIMIT, wanted / (mean + _LEAST_SIGNAL))
-        gain = np.where(done, gain, gain * extra)
-        done |= extra < GAIN_DONE
-        if done.all():
-            break
-    return gain
-
-
-def quantile_mean(values: NDArray[Any], low: float, high: float) -> Floats:
-    """Mean of the values between two quantiles, ``(N,)``.
-
-    Args:
-        values: ``(N, P)``.
-        low: Lower quantile.
-        high: Upper quantile; at least one value is averaged.
-    """
-    count = values.shape[1]
-    begin = min(int(np.ceil(low * count - 1e-9)), count - 1)
-    end = max(int(np.floor(high * count + 1e-9)), begin + 1)
-    ordered = np.partition(values, (begin, end - 1), axis=1)
-    mean: Floats = ordered[:, begin:end].mean(axis=1, dtype=np.float64)
-    return mean
 
 
 def zone_map(height: int, width: int) -> NDArray[np.int64]:
@@ -404,8 +219,8 @@ def zone_map(height: int, width: int) -> NDArray[np.int64]:
 
 @functools.lru_cache(maxsize=8)
 def _zone_matrix(height: int, width: int) -> Floats:
-    """Weights of the pixels in the mean of each zone, ``(15, height * width)``."""
+    """Weights of the pixels in the mean of each zone, ``(height * width, 15)``."""
     zones = zone_map(height, width).ravel()
-    matrix: Floats = (zones[None] == np.arange(15)[:, None]).astype(np.float64)
-    matrix /= np.maximum(matrix.sum(axis=1, keepdims=True), 1.0)
+    matrix: Floats = (zones[:, None] == np.arange(15)).astype(np.float64)
+    matrix /= np.maximum(matrix.sum(axis=0), 1.0)
     return matrix

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from agents.metering.rpi_agc import ZONE_WEIGHTS, ExposureFilter, zone_map
+from agents.metering.libcamera_agc import ZONE_WEIGHTS, ExposureFilter
+from agents.metering.rpi_agc import zone_map
 from agents.policy import make_policy
 
 GREY = np.ones((64, 64))
@@ -63,19 +64,22 @@ def test_mean_is_put_at_the_target_of_its_illuminance(context, photograph, scene
 
 def test_constraints(context, photograph):
     """Wide range: half of the frame dark, 4 % of it highlights in the corners."""
-    light = np.full((64, 64), 1.0)
-    light[:, 32:] = 0.25
+    light = np.full((64, 64), 1.3)
+    light[:, 32:] = 0.2
     light[[0, 1, -1]] = 10.0
-    frame = photograph(light, 9.0, context.grid.nearest(12.0))
+    state = context.grid.nearest(12.0)
+    frame = photograph(light, 9.0, state)
     evs = {
         name: _exposure(make_policy(f"rpi_agc?constraint={name}&metering=spot", context), frame)
         for name in ("normal", "highlight", "shadows")
     }
-    # 0.12 * 10 * 2^(9 - EV) = 0.8 of white. Of the darker half, 61 x 32 pixels are at 0.25 and 96
-    # at 1: their mean at 0.17.
+    # 0.12 * 10 * 2^(9 - EV) = 0.8 of white.
     assert evs["highlight"] == pytest.approx(9.0 - math.log2(0.8 / 1.2), abs=0.03)
-    shade = 0.12 * (61 * 32 * 0.25 + 96 * 1.0) / 2048
-    assert evs["shadows"] == pytest.approx(9.0 - math.log2(0.17 / shade), abs=0.06)
+    # Of the darker half, 61 x 32 pixels have 0.12 * 0.2 / 8 of white, in the first bin of 128, and
+    # 96 have 0.12 * 1.3 / 8, in the third: their mean shall be at 0.17.
+    shade = (61 * 32 * 0.5 + 96 * 2.5) / 128 / 2048
+    ev = context.grid.ev100[state]
+    assert evs["shadows"] == pytest.approx(ev - math.log2(0.17 / shade), abs=0.01)
     assert evs["highlight"] > evs["normal"] > evs["shadows"]
 
 
