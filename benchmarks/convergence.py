@@ -19,7 +19,7 @@ from agents import PolicyContext, evaluate, make_policy
 from agents.episodes import make_envs
 from agents.evaluation.metrics import THIRD_EV
 from agents.evaluation.result import EvaluationResult
-from agents.metering.rpi_agc import ExposureFilter
+from agents.metering.libcamera_agc import ExposureFilter
 from agents.policy import METERS
 from benchmarks.harness import Benchmark, Part, Report, Row, table
 
