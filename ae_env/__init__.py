@@ -1,6 +1,6 @@
 """A Gymnasium environment for camera auto-exposure on simulated raw sensor data.
 
-Importing it registers ``ae_env/AutoExposure-v0`` and loads nothing heavy.
+Importing it registers the tasks, such as ``ae_env/AutoExposure-v0``, and loads nothing heavy.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ae_env.lighting import FlickerLighting as FlickerLighting
     from ae_env.lighting import LensCapLighting as LensCapLighting
     from ae_env.lighting import Lighting as Lighting
+    from ae_env.lighting import MovingLighting as MovingLighting
     from ae_env.lighting import RampLighting as RampLighting
     from ae_env.lighting import ScheduleLighting as ScheduleLighting
     from ae_env.lighting import SineLighting as SineLighting
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from ae_env.utils.presets import list_presets as list_presets
     from ae_env.utils.presets import load_preset as load_preset
     from ae_env.vector_env import AutoExposureVectorEnv as AutoExposureVectorEnv
+    from ae_env.video import AutoExposureVideoEnv as AutoExposureVideoEnv
+    from ae_env.video import AutoExposureVideoVectorEnv as AutoExposureVideoVectorEnv
     from ae_env.wrappers import ContinuousActions as ContinuousActions
     from ae_env.wrappers import ControlActions as ControlActions
     from ae_env.wrappers import RelativeActions as RelativeActions
@@ -56,8 +59,8 @@ _NAMES_BY_MODULE = {
     "env": "AutoExposureEnv",
     "grid": "ExposureGrid",
     "lighting": (
-        "FlickerLighting LensCapLighting Lighting RampLighting ScheduleLighting SineLighting "
-        "StepLighting TunnelLighting make_lighting"
+        "FlickerLighting LensCapLighting Lighting MovingLighting RampLighting ScheduleLighting "
+        "SineLighting StepLighting TunnelLighting make_lighting"
     ),
     "observation": "decode_observation decode_sensors decode_settings",
     "rendering": "contact_sheet",
@@ -67,6 +70,7 @@ _NAMES_BY_MODULE = {
     "utils.checks": "UserCodeError",
     "utils.presets": "list_presets load_preset",
     "vector_env": "AutoExposureVectorEnv",
+    "video": "AutoExposureVideoEnv AutoExposureVideoVectorEnv",
     "wrappers": (
         "ContinuousActions ControlActions RelativeActions VectorContinuousActions "
         "VectorControlActions VectorRelativeActions"

@@ -67,7 +67,7 @@ class AutoExposureBase(SpecProperty):
 
     @property
     def delay(self) -> int:
-        """Frames between an action and the first capture that has it."""
+        """Frames between an action and the first capture that has all of it."""
         return self.core.delay
 
     def episode(self, env_index: int = 0) -> Episode:
@@ -176,7 +176,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     |---|---|---|
     | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene`; `"polyhaven"`: views of real places, `"mixed"`: as many real as procedural ones |
     | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
-    | `grid` | `"default"` | `"default"`, `"third_stop"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
+    | `grid` | `"default"` | `"default"`, `"third_stop"`, `"video"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
     | `costs` | `None` | mapping to the weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
     | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
@@ -186,7 +186,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `motion` | `"random"` | `"random"`, `"none"`, or a speed of the whole image [frame heights/s], in a drawn direction |
     | `depth` | `"random"` | `"random"`, `"far"` (all in focus), `"unknown"` (networks find what is out of focus in the scene itself; it grows as the aperture opens), or a blur diameter at f/4, of what is least in focus |
     | `lighting` | `"static"` | how the light changes: `"static"`, `"step"`, `"ramp"`, `"sine"`, `"tunnel"`, `"lens_cap"`, `"flicker"`, or a mapping with a `kind` and its options, such as `{"kind": "schedule", "ev": [0, -1]}` |
-    | `delay` | 0 | frames between an action and the first capture that has it |
+    | `delay` | 0 | frames between an action and the first capture that has it; a mapping by control, such as `{"exposure_time": 2, "iso": 1}`, where some are slower |
     | `source` | `"light"` | `"light"`: each scene's light is known; `"raw"`: it was photographed once, metered by its mean and up to a stop off, at an ISO between 100 and 6400, and all captures are simulated from that raw; a scene that is a raw already stays it |
     | `camera` | `"nikon_z6"` | built-in camera or a `CameraProfile` |
     | `simulator` | `"compact"` | name or path of the trained networks, loaded only if a scene carries noise or `depth="unknown"`; `None`: noise is only ever added |
@@ -219,7 +219,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         motion: Motion | float = "random",
         depth: Depth | float = "random",
         lighting: str | Mapping[str, Any] | Lighting = "static",
-        delay: int = 0,
+        delay: int | Mapping[str, int] = 0,
         source: Source = "light",
         camera: str | CameraProfile = "nikon_z6",
         simulator: str | None = DEFAULT_SIMULATOR,

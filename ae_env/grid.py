@@ -82,11 +82,16 @@ class ExposureGrid:
         return cls(isos, times, (4, 5.6, 8, 11))
 
     @classmethod
+    def video(cls) -> ExposureGrid:
+        """64 states whose exposures fit into a frame at 30 Hz, EV100 2 to 17, in whole stops."""
+        return cls((100, 400, 1600, 6400), (1 / 2000, 1 / 500, 1 / 125, 1 / 30), (2.8, 4, 5.6, 8))
+
+    @classmethod
     def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Iterable[float]]) -> ExposureGrid:
-        """A grid from a name, ``"default"`` or ``"third_stop"``, or a mapping of its lists."""
+        """A grid from ``"default"``, ``"third_stop"`` or ``"video"``, or a mapping of its lists."""
         if isinstance(spec, ExposureGrid):
             return spec
-        named = {"default": cls.default, "third_stop": cls.third_stop}
+        named = {"default": cls.default, "third_stop": cls.third_stop, "video": cls.video}
         if isinstance(spec, str) and spec in named:
             return named[spec]()
         names = ("isos", "exposure_times", "f_numbers")
@@ -130,6 +135,12 @@ class ExposureGrid:
     def controls(self, states: np.ndarray | int) -> np.ndarray:
         """(..., 3) int64: positions of `states` in the three lists, ISO, time, aperture."""
         return np.stack(np.unravel_index(np.asarray(states), self.shape), axis=-1).astype(np.int64)
+
+    def mixed(self, iso: np.ndarray, time: np.ndarray, aperture: np.ndarray) -> np.ndarray:
+        """(...) int64: states with the ISO of the states `iso`, the exposure time of `time`, ..."""
+        sources = np.broadcast_arrays(iso, time, aperture)
+        controls = [self.controls(states)[..., i] for i, states in enumerate(sources)]
+        return np.ravel_multi_index(tuple(controls), self.shape).astype(np.int64)
 
     def nearest(self, ev100: float) -> int:
         """Index of the state nearest to `ev100`; ties to the lower ISO."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
 from ae_env.grid import ExposureGrid
-from ae_env.lighting import Lighting, make_lighting
+from ae_env.lighting import Lighting, MovingLighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
 from ae_env.scenes import Scene, SceneSpec, load_scenes
 from ae_env.scenes.bundled import Split as Split
@@ -41,8 +41,8 @@ Noise = Literal["bank", "exact", "sensor"]
 Reward = Literal["capture", "expected"]
 #: What is known of a scene: its light, or one photograph of it.
 Source = Literal["light", "raw"]
-#: Longest delay [frame].
-MAX_DELAY = 16
+#: Longest delay [frame], and the names of what may have its own.
+MAX_DELAY, CONTROLS = 16, ("iso", "exposure_time", "f_number")
 #: Relative tolerance of the range of settings, because nominal ones are rounded: 1/30 s for 1/32 s.
 _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
@@ -67,7 +67,7 @@ class EnvOptions:
     motion: Motion | float = "random"
     depth: Depth | float = "random"
     lighting: str | Mapping[str, Any] | Lighting = "static"
-    delay: int = 0
+    delay: int | Mapping[str, int] = 0
     source: Source = "light"
     camera: str | CameraProfile = "nikon_z6"
     simulator: str | None = DEFAULT_SIMULATOR
@@ -90,9 +90,8 @@ class EnvOptions:
         check_tolerance(self.tolerance)
         why = ": the default CNNs of RL libraries take no smaller image"
         resolution = check_integer("resolution", self.resolution, MIN_RESOLUTION, 4096, more=why)
-        delay = check_integer("delay", self.delay, 0, MAX_DELAY, more=" frames")
         object.__setattr__(self, "resolution", resolution)  # NumPy's integers as an int
-        object.__setattr__(self, "delay", delay)
+        object.__setattr__(self, "delay", _checked_delay(self.delay))
         # A blur diameter in pixels of a 64-pixel frame.
         widest = 64.0 * max(1.0, MAX_DISC_PX / resolution)
         for name, words, most in (
@@ -133,6 +132,14 @@ class EnvOptions:
                 raise ValueError(f"unknown argument `{name}`: the arguments are {known}{hint}")
         return cls(**kwargs)
 
+    @property
+    def delays(self) -> tuple[int, int, int]:
+        """Frames until an action's ISO, exposure time and f-number are in effect."""
+        if isinstance(self.delay, Mapping):
+            iso, time, aperture = (self.delay.get(name, 0) for name in CONTROLS)
+            return iso, time, aperture
+        return self.delay, self.delay, self.delay
+
     def make_grid(self) -> ExposureGrid:
         """The exposure grid.
 
@@ -156,8 +163,13 @@ class EnvOptions:
         return make_scorer(self.scorer)
 
     def make_lighting(self) -> Lighting:
-        """The change of the light during an episode."""
-        return make_lighting(self.lighting)
+        """The change of the light during an episode; moving light is of the kinds of the split."""
+        lighting = self.lighting
+        if lighting == MovingLighting.name:
+            lighting = {"kind": lighting}
+        if isinstance(lighting, Mapping) and lighting.get("kind") == MovingLighting.name:
+            lighting = {"kinds": self.split, **lighting}
+        return make_lighting(lighting)
 
     @property
     def in_sequences(self) -> bool:
@@ -207,6 +219,21 @@ class EnvOptions:
         if networks is not None:
             scene = networks.denoised(scene)
         return scene if self.noise else without_noise(scene)
+
+
+def _checked_delay(delay: Any) -> int | dict[str, int]:
+    """`delay` with Python's integers; a mapping of equal ones, of all controls, as one."""
+    if not isinstance(delay, Mapping):
+        more = f" frames, or a mapping of them by {list(CONTROLS)}"
+        return check_integer("delay", delay, 0, MAX_DELAY, more=more)
+    for name in delay:
+        check_word("delay", name, CONTROLS)
+    given = {
+        name: check_integer(f"delay[{name!r}]", frames, 0, MAX_DELAY, more=" frames")
+        for name, frames in delay.items()
+    }
+    alike = {given.get(name, 0) for name in CONTROLS}
+    return alike.pop() if len(alike) == 1 else given
 
 
 def _check_shown(grid: ExposureGrid) -> None:

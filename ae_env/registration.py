@@ -15,19 +15,32 @@ from gymnasium.envs.registration import EnvSpec
 from ae_env.utils.checks import did_you_mean
 
 P = ParamSpec("P")
-ENV_IDS = ("ae_env/AutoExposure-v0",)
+#: The tasks: module and class, for one episode and for many, and the actions of an episode.
+TASKS = {
+    "ae_env/AutoExposure-v0": (
+        "ae_env.env:AutoExposureEnv",
+        "ae_env.vector_env:AutoExposureVectorEnv",
+        8,
+    ),
+    "ae_env/AutoExposureVideo-v0": (
+        "ae_env.video:AutoExposureVideoEnv",
+        "ae_env.video:AutoExposureVideoVectorEnv",
+        96,
+    ),
+}
+ENV_IDS = tuple(TASKS)
 
 
 def register_envs() -> None:
     """Registers every id once; calling it again changes nothing."""
-    if ENV_IDS[0] in gym.registry:
-        return
-    gym.register(
-        id=ENV_IDS[0],
-        entry_point="ae_env.env:AutoExposureEnv",
-        vector_entry_point="ae_env.vector_env:AutoExposureVectorEnv",
-        max_episode_steps=8,
-    )
+    for name, (entry_point, vector_entry_point, steps) in TASKS.items():
+        if name not in gym.registry:
+            gym.register(
+                id=name,
+                entry_point=entry_point,
+                vector_entry_point=vector_entry_point,
+                max_episode_steps=steps,
+            )
 
 
 def names_nearest(init: Callable[P, None]) -> Callable[P, None]:
@@ -48,6 +61,25 @@ def names_nearest(init: Callable[P, None]) -> Callable[P, None]:
         init(*args, **kwargs)
 
     return checked
+
+
+def with_defaults(init: Callable[..., None], **defaults: Any) -> Callable[..., None]:
+    """The constructor `init` with other defaults, for a task that is the same environment.
+
+    Its signature shows them.
+    """
+    signature = inspect.signature(init)
+    parameters = [
+        given.replace(default=defaults.get(name, given.default))
+        for name, given in signature.parameters.items()
+    ]
+
+    @functools.wraps(init)
+    def made(self: Any, *args: Any, **kwargs: Any) -> None:
+        init(self, *args, **{**defaults, **kwargs})
+
+    made.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return made
 
 
 class InProcessSpec(EnvSpec):

@@ -75,7 +75,7 @@ class AutoExposureVectorEnv(
         motion: Motion | float = "random",
         depth: Depth | float = "random",
         lighting: str | Mapping[str, Any] | Lighting = "static",
-        delay: int = 0,
+        delay: int | Mapping[str, int] = 0,
         source: Source = "light",
         camera: str | CameraProfile = "nikon_z6",
         simulator: str | None = DEFAULT_SIMULATOR,

@@ -71,7 +71,7 @@ class EpisodeCore:
     """
 
     def __init__(self, options: EnvOptions, num_envs: int) -> None:
-        self.options, self.delay = options, int(options.delay)
+        self.options, self.delay = options, max(options.delays)
         self.grid = options.make_grid()
         self.camera = options.make_camera()
         self.scorer = options.make_scorer()
@@ -84,7 +84,7 @@ class EpisodeCore:
             noise=bool(options.noise),
             tolerance=options.tolerance,
         )
-        self.episodes = Episodes(num_envs, self.delay)
+        self.episodes = Episodes(num_envs, self.grid, options.delays)
         # First and last frame of the sequence that each scene is a frame of.
         self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
         self._allowed = np.stack([allowed_states(scene, len(self.grid)) for scene in self.scenes])

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ae_env.grid import ExposureGrid
 from simulator.optics.motion_path import Movement
 
 
@@ -59,7 +60,9 @@ class Episodes:
 
     Args:
         count: Number of environments, n.
-        delay: Frames between an action and the first capture that has it.
+        grid: The states.
+        delays: Frames between an action and the first capture that has its ISO, its exposure time
+            and its aperture.
 
     Attributes:
         begun: (n,) bool, whether there is an episode.
@@ -67,19 +70,21 @@ class Episodes:
             index of its scene where all episodes that show it at rest share that, else one of its
             own, behind those of the scenes.
         previous: (n,) int64, state in the frame before; -1 in the first.
-        pending: (n, delay + 1) int64, the current state and those on their way to the camera.
+        pending: (n, longest delay + 1) int64, actions that are not wholly in effect yet and the
+            last that is, the oldest first.
         image_mean: (n,) float64, mean code of the latest frame / 255, where a cost needs it.
 
     The others, (n,) each, are those of `Episode`.
     """
 
-    def __init__(self, count: int, delay: int) -> None:
+    def __init__(self, count: int, grid: ExposureGrid, delays: tuple[int, int, int]) -> None:
+        self._grid, self._delays = grid, delays
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
         self.speed, self.defocus, self.focus_drive, self.phase = np.zeros((4, count))
         self.direction, self.turn, self.subject_speed, self.subject_direction = np.zeros((4, count))
         self.begun = np.zeros(count, bool)
         self.light_index, self.previous = np.zeros((2, count), np.int64)
-        self.pending = np.zeros((count, delay + 1), np.int64)
+        self.pending = np.zeros((count, max(delays) + 1), np.int64)
         self.image_mean = np.full(count, np.nan)
 
     def begin(self, env_indices: np.ndarray, drawn: Mapping[str, np.ndarray]) -> None:
@@ -96,7 +101,9 @@ class Episodes:
         self.previous[env_indices] = self.state[env_indices]
         self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
         self.pending[env_indices, -1] = actions
-        self.state[env_indices] = self.pending[env_indices, 0]
+        in_effect = [self.pending[env_indices, -1 - delay] for delay in self._delays]
+        alike = len(set(self._delays)) == 1
+        self.state[env_indices] = in_effect[0] if alike else self._grid.mixed(*in_effect)
         self.frame[env_indices] += 1
 
     def __getitem__(self, env_index: int) -> Episode:

@@ -13,6 +13,7 @@ from ae_env.lighting.changes import (
     TunnelLighting,
 )
 from ae_env.lighting.flicker import FlickerLighting
+from ae_env.lighting.moving import MovingLighting
 from ae_env.lighting.schedule import ScheduleLighting
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "FlickerLighting",
     "LensCapLighting",
     "Lighting",
+    "MovingLighting",
     "RampLighting",
     "RollingShutter",
     "ScheduleLighting",

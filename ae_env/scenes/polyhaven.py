@@ -259,6 +259,22 @@ def incident_light(panorama: np.ndarray, azimuth: float, pitch: float) -> float:
     return float((luminance * weight).sum(dtype=np.float64) * 2.0 * math.pi**2 / (height * width))
 
 
+def light_around(panorama: np.ndarray, views: int = 72, field_of_view: float = 60.0) -> np.ndarray:
+    """Mean light that a camera sees as it turns in a panorama, clipped at white [EV], (views,).
+
+    Clipped as the light meter of a camera is that exposes the whole turn: white is 6 times the mean
+    of all directions. Relative to the direction in which the map begins.
+    """
+    means = []
+    for azimuth in np.arange(views) * 360.0 / views - 180.0:
+        view = perspective(panorama, float(azimuth), 48, field_of_view, 0.0)
+        means.append(np.tensordot(_LUMINANCE, view, axes=1))
+    luminance = np.stack(means)
+    white = 6.0 * np.exp(np.log(np.maximum(luminance, 1e-6)).mean())
+    ev = np.log2(np.minimum(luminance, white).mean(axis=(1, 2)))
+    return np.asarray(ev - ev[0])
+
+
 def cut_values(panorama: np.ndarray) -> list[str]:
     """What a panorama (3, H, W) does not show: ``"highlights are cut"``, ``"shadows are cut"``."""
     found = []

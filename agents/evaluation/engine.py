@@ -135,7 +135,8 @@ def _plan_of(env_options: Mapping[str, Any], frames: int, seeds: Sequence[int]) 
 
     given = {k: v for k, v in env_options.items() if k not in ("with_oracle", "autoreset_mode")}
     options = EnvOptions.from_kwargs(given)  # its errors name the argument
-    condition = Condition(lighting=options.lighting, delay=options.delay)
+    delay = dict(options.delay) if isinstance(options.delay, Mapping) else options.delay
+    condition = Condition(lighting=options.lighting, delay=delay)
     environment = {k: v for k, v in given.items() if k not in CONDITION_ARGUMENTS}
     scenes = options.scenes if isinstance(options.scenes, str) else "given scenes"
     return EvaluationPlan(
@@ -355,7 +356,7 @@ class EvaluationRun:
                 for name in policies
             },
             seed=self.plan.seeds[0],
-            delay=condition.delay,
+            delays=self.plan.options(condition).delays,
             plan=self.plan,
             scenes=scenes,
             speed=light["speed"][table],

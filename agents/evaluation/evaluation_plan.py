@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -42,11 +42,12 @@ class Condition(Configuration):
 
     Args:
         lighting: As the environment's argument: a name, or a mapping with ``kind``.
-        delay: Frames from a decision to the first frame that has it.
+        delay: Frames from a decision to the first frame that has it, of all controls or by
+            control; as the environment's argument.
     """
 
     lighting: Any = "static"
-    delay: int = Field(default=0, ge=0, le=16)
+    delay: Annotated[int, Field(ge=0, le=16)] | dict[str, int] = 0
 
     @property
     def at_rest(self) -> bool:

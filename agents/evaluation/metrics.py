@@ -199,20 +199,10 @@ def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
     return total
 
 
-def delayed_oracle_score(
-    scores: Floats, allowed: NDArray[np.bool_], start_states: Ints, delay: int
-) -> Floats:
-    """q of the oracle whose decisions take effect `delay` frames later, ``(E, T)``.
-
-    Args:
-        scores: ``(E, T, S)``.
-        allowed: Action masks, broadcastable to `scores`.
-        start_states: State that is kept until the first decision takes effect, ``(E,)``.
-        delay: Frames.
-    """
-    best = np.where(allowed, scores, -np.inf).argmax(axis=-1)
-    waiting = np.repeat(start_states[:, None], min(delay, best.shape[1]), axis=1)
-    return score_of(scores, np.concatenate([waiting, best], axis=1)[:, : best.shape[1]])
+def delayed_states(states: Ints, start_states: Ints, delay: int) -> Ints:
+    """`states` (E, T) as they are in effect `delay` frames later; `start_states` (E,) before."""
+    waiting = np.repeat(start_states[:, None], min(delay, states.shape[1]), axis=1)
+    return np.concatenate([waiting, states], axis=1)[:, : states.shape[1]]
 
 
 def normalised_score(score: Floats, random: Floats, oracle: Floats) -> float:

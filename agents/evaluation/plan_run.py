@@ -108,7 +108,7 @@ class StoredRun(EvaluationRun):
             ValueError: If a policy is unknown, or does not fit the environment of some delay.
         """
         found = {}
-        for condition in {c.delay: c for c in self.plan.all_conditions.values()}.values():
+        for condition in {str(c.delay): c for c in self.plan.all_conditions.values()}.values():
             for member in self.members:
                 found[member] = bool(getattr(self.make(member, condition), "privileged", False))
         return found
@@ -166,7 +166,7 @@ class StoredRun(EvaluationRun):
                 ms = _STATIC_MS if conditions[name].lighting == "static" else _LIGHT_MS
                 found.append(Job((name,), None, ms * frames * self.num_tables))
         for member in self.members:
-            for delay in {c.delay: None for c in conditions.values()}:
+            for delay in {str(c.delay): c.delay for c in conditions.values()}.values():
                 left = tuple(
                     name
                     for name, c in conditions.items()

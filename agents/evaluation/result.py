@@ -82,7 +82,8 @@ class EvaluationResult:
         allowed: Action masks of every frame, ``(E, T, S)``.
         tracks: By policy.
         seed: The plan's first seed.
-        delay: Frames between a decision and the frame that it exposes.
+        delays: Frames between a decision and the frame that has its ISO, its exposure time and
+            its aperture.
         plan: The plan that the condition belongs to; None where a result was put together by hand,
             as everything below.
         scenes: Scene of each episode.
@@ -103,7 +104,7 @@ class EvaluationResult:
     allowed: NDArray[np.bool_]
     tracks: dict[str, Track]
     seed: int
-    delay: int = 0
+    delays: tuple[int, int, int] = (0, 0, 0)
     plan: EvaluationPlan | None = None
     scenes: Sequence[Scene] = ()
     speed: Floats | None = None
@@ -128,10 +129,10 @@ class EvaluationResult:
 
     @cached_property
     def delayed_oracle(self) -> Floats:
-        """Mean q of the oracle that decides `delay` frames earlier, ``(E,)``."""
-        per_frame = metrics.delayed_oracle_score(
-            self.scores, self.allowed, self.start_states, self.delay
-        )
+        """Mean q of the oracle whose decisions take effect after `delays`, ``(E,)``."""
+        best = np.where(self.allowed, self.scores, -np.inf).argmax(axis=-1)
+        late = (metrics.delayed_states(best, self.start_states, d) for d in self.delays)
+        per_frame = metrics.score_of(self.scores, self.grid.mixed(*late))
         mean: Floats = per_frame.mean(axis=-1)
         return mean
 

@@ -132,14 +132,11 @@ def test_flicker_counts_frames_of_the_same_light_only():
     np.testing.assert_allclose(once, [[0.3, 0.0]] * 2)
 
 
-def test_delayed_oracle_acts_on_what_it_saw_earlier():
-    # Best states 0, 1, 2, 2 with q 1, others 0; start state 2.
-    scores = np.eye(3)[[[0, 1, 2, 2]]]
-    for delay, expected in ((0, [1, 1, 1, 1]), (1, [0, 0, 0, 1]), (9, [0, 0, 1, 1])):
-        found = metrics.delayed_oracle_score(scores, np.ones((1, 3), bool), np.array([2]), delay)
+def test_delayed_states_are_the_start_until_the_first_is_in_effect():
+    states, start = np.array([[0, 1, 2, 3]]), np.array([7])
+    for delay, expected in ((0, [0, 1, 2, 3]), (1, [7, 0, 1, 2]), (9, [7, 7, 7, 7])):
+        found = metrics.delayed_states(states, start, delay)
         np.testing.assert_array_equal(found, [expected])
-    masked = metrics.delayed_oracle_score(scores, np.arange(3) > 0, np.array([2]), 1)
-    np.testing.assert_array_equal(masked, [[0, 1, 0, 1]])  # states 2, 1, 1, 2
 
 
 def test_normalised_score_at_its_ends_and_weighting():
