@@ -66,9 +66,9 @@ class AutoExposureBase(SpecProperty):
         return self.core.first_scenes
 
     @property
-    def delay(self) -> int:
-        """Frames between an action and the first capture that has all of it."""
-        return self.core.delay
+    def delays(self) -> tuple[int, int, int]:
+        """Frames after the next until an action's ISO, exposure time and f-number are in effect."""
+        return self.core.options.delays
 
     def episode(self, env_index: int = 0) -> Episode:
         """The drawn values of an environment's episode, and its current frame and state."""

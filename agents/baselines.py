@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.scenes.folder import find_files
+from ae_env.utils.checks import check_word
 from agents.episodes import Episodes, expected_scores, scenes_of
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 from simulator.raw.read import read_raw
@@ -20,6 +21,8 @@ from simulator.utils.files import RAW_SUFFIXES
 if TYPE_CHECKING:
     import gymnasium as gym
 
+#: What oracles know, and the entry of ``info`` that tells it.
+ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}
 #: Episodes per scene from which the best constant state is taken.
 FIT_EPISODES = 4
 #: Scenes that they are of, at most.
@@ -74,13 +77,22 @@ class BestFixed(Policy):
 
 
 class Oracle(Policy):
-    """Knows the expected score of every state: the ceiling that regret is measured from."""
+    """Knows the expected score of every state, in the light that it is told of.
+
+    Args:
+        context: The camera, the grid and the observation.
+        knows: ``"last_frame"``: the light of the frame that it has just seen, as a policy does
+            that measures light without error but foresees nothing; ``"clairvoyant"``: that of the
+            frames that its decision exposes, each control's own: the ceiling that regret is
+            measured from.
+    """
 
     privileged = True
 
-    def __init__(self, context: PolicyContext) -> None:
+    def __init__(self, context: PolicyContext, knows: str = "last_frame") -> None:
         super().__init__(context)
-        self.name = "oracle"
+        check_word("knows", knows, tuple(ORACLES))
+        self.name, self._told = f"oracle:{knows}", ORACLES[knows]
 
     def act(
         self,
@@ -88,10 +100,13 @@ class Oracle(Policy):
         action_masks: NDArray[np.bool_] | None = None,
         info: Mapping[str, Any] | None = None,
     ) -> NDArray[np.int64]:
-        """The best allowed state, which is ``info["oracle_state"]``."""
-        if info is None or "oracle_state" not in info:
-            raise ValueError("policy 'oracle' needs `info` of environments made with_oracle=True")
-        return np.asarray(info["oracle_state"], dtype=np.int64).copy()
+        """The best allowed state in the light that it knows."""
+        if info is None or self._told not in info:
+            needs = "environments made with_oracle=True"
+            if self._told != "oracle_state":
+                needs = "an evaluation, which knows the light to come"
+            raise ValueError(f"policy {self.name!r} needs `info` of {needs}")
+        return np.asarray(info[self._told], dtype=np.int64).copy()
 
 
 class Recorded(Policy):
@@ -119,7 +134,7 @@ class Recorded(Policy):
         ours = _coordinates(context.grid.states)
         #: Cost of every state, per raw, ``(T, S)``.
         self._cost = ((_coordinates(self.settings)[:, None] - ours[None]) ** 2).sum(axis=2)
-        self._frame = self._first = 1 + context.delay  # that the first decision exposes
+        self._frame = self._first = 1 + max(context.delays)  # that the first decision exposes
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Restart the sequence."""

@@ -43,9 +43,10 @@ _RECORDED = "recorded"
 #: Module and class by name; imported when the policy is made.
 _SIMPLE = {
     "best_fixed": ("agents.baselines", "BestFixed"),
-    "oracle": ("agents.baselines", "Oracle"),
     "random": ("agents.baselines", "Random"),
 }
+#: The oracle, and what it may know.
+_ORACLE, _KNOWN = "oracle", ("last_frame", "clairvoyant")
 _LEARNT = {
     "ppo": ("agents.learning.ppo", "PPOPolicy"),
     "regression": ("agents.learning.regression", "RegressionPolicy"),
@@ -65,20 +66,21 @@ class PolicyContext:
         observation_space: Observation of a single environment (a `Dict` with ``raw``,
             ``settings`` and, where the camera has them, ``sensors``).
         frame_rate: Frames per second.
-        delay: Frames between a decision and the frame that it exposes.
+        delays: Frames after the next until a decision's ISO, exposure time and aperture are in
+            effect.
     """
 
     grid: ExposureGrid
     camera: CameraProfile
     observation_space: gym.spaces.Dict
     frame_rate: float = 30.0
-    delay: int = 0
+    delays: tuple[int, int, int] = (0, 0, 0)
 
     @classmethod
     def from_envs(cls, envs: gym.vector.VectorEnv[Any, Any, Any]) -> PolicyContext:
         """The context of the environments that `envs` runs."""
         base: Any = envs.unwrapped
-        return cls(base.grid, base.camera, base.single_observation_space, delay=int(base.delay))
+        return cls(base.grid, base.camera, base.single_observation_space, delays=base.delays)
 
     @property
     def has_sensors(self) -> bool:
@@ -158,7 +160,9 @@ def masked_argmax(
 def list_policies() -> list[str]:
     """Names of the built-in policies that need no file."""
     metering = [f"{m}:{p}" for m in METERS for p in PROGRAMS]
-    return sorted([*_SIMPLE, *_LEARNT, *metering, *(f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS)])
+    oracles = [_ORACLE, *(f"{_ORACLE}:{knows}" for knows in _KNOWN)]
+    agc = [f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS]
+    return sorted([*_SIMPLE, *_LEARNT, *oracles, *metering, *agc])
 
 
 def is_metering(name: str) -> bool:
@@ -268,7 +272,8 @@ def make_policy(
     """The policy called `name`.
 
     Args:
-        name: ``"random"``, ``"best_fixed"``, ``"oracle"``; a meter and a program such as
+        name: ``"random"``, ``"best_fixed"``; ``"oracle"``, alone or with what it knows, such as
+            ``"oracle:clairvoyant"``; a meter and a program such as
             ``"centre_weighted:P"`` (the program defaults to P); ``"rpi_agc"``, alone or with a
             program; ``"recorded:FOLDER"``; ``"regression"`` and ``"ppo"``, the
             agents that come with the package, or ``"regression:PATH"`` and ``"ppo:PATH"`` with
@@ -294,6 +299,9 @@ def make_policy(
         cls = load_from_file(head, tail, f"`policy` (={name!r})", example="MyPolicy")
     elif head in _SIMPLE and not tail:
         cls = _import(*_SIMPLE[head])
+    elif head == _ORACLE and tail in ("", *_KNOWN):
+        cls = _import("agents.baselines", "Oracle")
+        fixed = {"knows": tail} if tail else {}
     elif head in METERS and tail in ("", *PROGRAMS):
         cls = _import("agents.metering.metering_policy", "MeteringPolicy")
         fixed = {"meter": head, "program": tail or "P"}
@@ -306,7 +314,7 @@ def make_policy(
     elif head in _LEARNT:
         cls = _import(*_LEARNT[head])
         options = _with_weights(name, head, tail, device, options)
-    elif tail and head not in (*METERS, *_SIMPLE, RPI_AGC):
+    elif tail and head not in (*METERS, *_SIMPLE, RPI_AGC, _ORACLE):
         cls = _class_in_module(head, tail, name)
     else:
         raise ValueError(_unknown(base))
@@ -404,7 +412,7 @@ def _unknown(name: str) -> str:
     near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return (
-        f"`policy` (={name!r}) must be one of {', '.join(_SIMPLE)}; a meter "
+        f"`policy` (={name!r}) must be one of {', '.join((*_SIMPLE, _ORACLE))}; a meter "
         f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
         f"{RPI_AGC}, alone or with {', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
         f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; "

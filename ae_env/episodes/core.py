@@ -71,7 +71,7 @@ class EpisodeCore:
     """
 
     def __init__(self, options: EnvOptions, num_envs: int) -> None:
-        self.options, self.delay = options, max(options.delays)
+        self.options = options
         self.grid = options.make_grid()
         self.camera = options.make_camera()
         self.scorer = options.make_scorer()

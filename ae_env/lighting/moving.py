@@ -23,83 +23,77 @@ Generator = np.random.Generator
 
 
 def ramps(rng: Generator) -> np.ndarray:
-    """The light goes 2 to 6 stops up or down at 0.05 to 1 stop a frame, and back, with pauses."""
-    speed, stops = _log_uniform(rng, 0.05, 1.0), rng.choice((-1, 1))
-    stops = stops * rng.uniform(2.0, 6.0)
-    length = int(np.ceil(abs(stops) / speed))
-    there = np.linspace(0.0, stops, length + 1)
-    parts = [np.zeros(rng.integers(4, 33))]
-    while sum(map(len, parts)) < FRAMES:
-        parts += [there, np.full(rng.integers(8, 49), stops)]
-        parts += [there[::-1], np.zeros(rng.integers(8, 49))]
-    return _cut(parts)
+    """The light goes 3 to 6 stops up or down at 0.3 to 1.5 stops a frame, rests, and comes back."""
+    speed, stops = _log_uniform(rng, 0.3, 1.5), rng.choice((-1, 1)) * rng.uniform(3.0, 6.0)
+    there = np.linspace(0.0, stops, int(np.ceil(abs(stops) / speed)) + 1)
+    return _repeated(rng, lambda: (there, _rest(rng, 12, stops), there[::-1], _rest(rng, 12)))
 
 
 def sines(rng: Generator) -> np.ndarray:
-    """The light swings by 0.5 to 3 stops with a period of 12 to 64 frames."""
-    stops, period = rng.uniform(0.5, 3.0), _log_uniform(rng, 12.0, 64.0)
-    turn = np.arange(FRAMES) / period + rng.random()
-    wave: np.ndarray = stops * np.sin(2.0 * np.pi * turn)
+    """The light swings by 1.5 to 3.5 stops with a period of 7 to 18 frames."""
+    stops, period = rng.uniform(1.5, 3.5), _log_uniform(rng, 7.0, 18.0)
+    wave: np.ndarray = stops * np.sin(2.0 * np.pi * (np.arange(FRAMES) / period + rng.random()))
     return wave
 
 
 def tunnels(rng: Generator) -> np.ndarray:
-    """Into a tunnel 3 to 7 stops darker within 1 to 8 frames, out of it after 12 to 48."""
-    parts = [np.zeros(rng.integers(6, 41))]
-    while sum(map(len, parts)) < FRAMES:
-        stops, edge = -rng.uniform(3.0, 7.0), rng.integers(1, 9)
-        down = np.linspace(0.0, stops, edge + 1)[1:]
-        parts += [down, np.full(rng.integers(12, 49), stops), down[::-1]]
-        parts.append(np.zeros(rng.integers(12, 49)))
-    return _cut(parts)
+    """Into a tunnel 4 to 7 stops darker within 3 to 8 frames, and out of it after up to 16."""
+
+    def tunnel() -> tuple[np.ndarray, ...]:
+        stops = -rng.uniform(4.0, 7.0)
+        down: np.ndarray = np.linspace(0.0, stops, rng.integers(3, 9) + 1)[1:]
+        return down, _rest(rng, 16, stops), down[::-1], _rest(rng, 16)
+
+    return _repeated(rng, tunnel)
 
 
 def steps(rng: Generator) -> np.ndarray:
     """The light jumps to another level within +- 3 stops, 10 to 60 frames apart."""
-    parts = [np.zeros(rng.integers(6, 33))]
-    while sum(map(len, parts)) < FRAMES:
-        parts.append(np.full(rng.integers(10, 61), rng.uniform(-3.0, 3.0)))
-    return _cut(parts)
+
+    def step() -> tuple[np.ndarray, ...]:
+        level = rng.uniform(-3.0, 3.0)
+        return np.full(10, level), _rest(rng, 50, level)
+
+    return _repeated(rng, step)
 
 
 def drifts(rng: Generator) -> np.ndarray:
     """The light drifts: its rate is a random walk that tends to nothing, as does its level."""
     rate, level, found = 0.0, 0.0, np.empty(FRAMES)
-    push = _log_uniform(rng, 0.01, 0.08)
+    push = _log_uniform(rng, 0.08, 0.3)
     for frame, normal in enumerate(rng.standard_normal(FRAMES)):
-        rate = 0.95 * rate + push * normal - 0.004 * level
-        level += rate
+        rate = np.clip(0.95 * rate + push * normal - 0.02 * level, -1.5, 1.5)
+        level = np.clip(level + rate, -6.0, 6.0)
         found[frame] = level
-    return np.clip(found, -6.0, 6.0)
+    return found
 
 
 def shadows(rng: Generator) -> np.ndarray:
-    """Passing shadows 1 to 4 stops deep, of trees or buildings beside the road, at any spacing."""
-    depth, mean = -rng.uniform(1.0, 4.0), _log_uniform(rng, 3.0, 20.0)
-    parts = [np.zeros(rng.integers(4, 25))]
-    while sum(map(len, parts)) < FRAMES:
-        own, edge = depth * rng.uniform(0.6, 1.0), rng.integers(1, 4)
-        down = np.linspace(0.0, own, edge + 1)[1:]
-        dark, lit = 1 + rng.poisson(mean, 2)
-        parts += [down, np.full(dark, own), down[::-1], np.zeros(lit)]
-    return _cut(parts)
+    """Passing shadows 3 to 5 stops deep, as of trees along a road: about evenly spaced, soft."""
+    depth, period = -rng.uniform(3.0, 5.0), _log_uniform(rng, 7.0, 16.0)
+    width, edge = rng.uniform(0.3, 0.6), rng.uniform(0.2, 0.4)
+    spacing = period * rng.uniform(0.85, 1.15, int(2 * FRAMES / period) + 2)
+    turn = np.interp(np.arange(FRAMES), np.cumsum(spacing), np.arange(len(spacing)))
+    from_middle = np.abs((turn + rng.random()) % 1.0 - 0.5)
+    shade = np.clip((width / 2.0 + edge / 2.0 - from_middle) / edge, 0.0, 1.0)
+    return np.asarray(depth * shade * shade * (3.0 - 2.0 * shade))
 
 
 def clouds(rng: Generator) -> np.ndarray:
-    """Clouds before the sun: up to 4 stops darker, soft edges, thicker and thinner at any pace."""
+    """Broken clouds, filmed quickly: up to 5 stops darker, thicker and thinner at any pace."""
     times = np.arange(FRAMES)[:, None]
-    periods = np.array([_log_uniform(rng, 40.0, 240.0) for _ in range(6)])
+    periods = np.array([_log_uniform(rng, 7.0, 30.0) for _ in range(6)])
     waves = np.sin(2.0 * np.pi * (times / periods + rng.random(6))) * rng.random(6)
     cover = 1.0 / (1.0 + np.exp(-2.0 * (waves.sum(axis=1) - rng.uniform(-1.0, 1.0))))
-    light: np.ndarray = -rng.uniform(2.0, 4.0) * cover
+    light: np.ndarray = -rng.uniform(3.0, 5.0) * cover
     return light - light[0]
 
 
 def pans(rng: Generator) -> np.ndarray:
-    """A camera that turns in a real place, to and fro: the mean light of what it sees."""
+    """A camera that turns quickly in a real place, to and fro: the mean light of what it sees."""
     names = sorted(PANS)
     turn = np.array(PANS[names[rng.integers(len(names))]])
-    speed = _log_uniform(rng, 0.1, 1.0) * rng.choice((-1, 1))
+    speed = _log_uniform(rng, 2.0, 6.0)
     swing = rng.uniform(20.0, 70.0)  # of 72 directions
     there = np.abs((np.arange(FRAMES) * speed / swing) % 2.0 - 1.0) * swing
     at = there + rng.uniform(0.0, len(turn))
@@ -206,10 +200,19 @@ def _drawn(kinds: tuple[str, ...], phase: float) -> tuple[str, np.ndarray, tuple
     return kind, stops, (float(rng.choice((100.0, 120.0))), float(rng.uniform(0.2, 0.8)))
 
 
-def _log_uniform(rng: Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+def _rest(rng: Generator, most: int, stops: float = 0.0) -> np.ndarray:
+    """Light of `stops` for up to `most` frames."""
+    return np.full(rng.integers(0, most + 1), stops)
 
 
-def _cut(parts: list[Any]) -> np.ndarray:
+def _repeated(rng: Generator, part: Callable[[], Sequence[Any]]) -> np.ndarray:
+    """(FRAMES,): up to 24 frames of the scene's own light, then `part` again and again."""
+    parts: list[Any] = [_rest(rng, 24)]
+    while sum(map(len, parts)) < FRAMES:
+        parts += part()
     found: np.ndarray = np.concatenate(parts)[:FRAMES].astype(np.float64)
     return found
+
+
+def _log_uniform(rng: Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

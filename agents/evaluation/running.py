@@ -95,7 +95,7 @@ def run_batch(
     for frame in range(frames):
         extra: dict[str, Any] = {}
         if getattr(policy, "privileged", False):
-            extra = {"info": info if oracle is None else {**info, "oracle_state": oracle[:, frame]}}
+            extra = {"info": info if oracle is None else {**info, **_told(base, oracle, frame)}}
         begin = time.perf_counter()
         with errors_of(name, "act"):
             actions = policy.act(observations, masks, **extra)
@@ -114,6 +114,13 @@ def run_batch(
         "start_states": start[batch.valid],
         "seconds": np.array(seconds),
     }
+
+
+def _told(base: Any, oracle: Ints, frame: int) -> dict[str, Ints]:
+    """What `info` tells oracles in `frame`: the best states of it, and of what they decide on."""
+    last = oracle.shape[1] - 1
+    decided = (oracle[:, min(frame + 1 + delay, last)] for delay in base.delays)
+    return {"oracle_state": oracle[:, frame], "clairvoyant_state": base.grid.mixed(*decided)}
 
 
 def milliseconds_alone(

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
+from ae_env.utils.checks import check_word
 from agents.episodes import Episodes, expected_scores, scenes_of
+from agents.foresight import Foresight
 from agents.metering.meters import make_meter
 from agents.metering.programs import (
     ProgramOptions,
@@ -51,6 +53,8 @@ FIT_EPISODES, FIT_FRAMES = 1600, 4
 FIT_PER_SCENE = 4
 #: Distance of the second pass's seeds from the first's: other episodes of the same scenes.
 SECOND_PASS = 1_000_000
+#: What a meter may foresee.
+FORESIGHTS = ("none", "trend", "model")
 #: Metered weight from which a frame is all white.
 ALL_SATURATED = 0.999
 #: Quantiles in which frames are compared.
@@ -78,6 +82,10 @@ class MeteringPolicy(Policy):
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
         weights: File of a tuned program, as `save` writes it.
+        foresight: ``"none"``; ``"trend"``: the program works on the EV that is expected in the
+            first frame that has all of the decision (an alpha-beta filter); ``"model"``, of a tuned
+            program: the trend is rolled through the delay of each control, and the state is taken
+            that promises most (`Foresight`).
 
     Raises:
         ValueError: If an argument is unknown, out of range or of another program.
@@ -96,9 +104,19 @@ class MeteringPolicy(Policy):
         exposure_time: float | None = None,
         iso: float | None = None,
         weights: str | os.PathLike[str] | None = None,
+        foresight: str = "none",
     ) -> None:
         super().__init__(context)
         self.program = check_program(program, PROGRAMS)
+        check_word("foresight", foresight, FORESIGHTS)
+        if foresight == "model" and program not in ("tuned", "tuned_blind"):
+            raise ValueError(
+                "`foresight` (='model') needs the scores that a tuned program predicts; program is "
+                f"{program}"
+            )
+        if foresight != "none" and damping:
+            raise ValueError(f"`damping` (={damping!r}) must be 0 with `foresight`")
+        self.foresight = foresight
         by_hand = {"f_number": f_number, "exposure_time": exposure_time, "iso": iso}
         check_used(program, **by_hand, weights=weights)
         given = {name: value for name, value in by_hand.items() if value is not None}
@@ -118,6 +136,8 @@ class MeteringPolicy(Policy):
         ev_range = (float(ev100.min()), float(ev100.max()))
         options = self.options
         self._tracker = EVTracker(num_envs, ev_range, options.damping, options.compensation)
+        foresees = self.foresight != "none"
+        self._foresight = Foresight(self.context, num_envs) if foresees else None
         searches = self._meter_name in SEARCH_METERS
         self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))
@@ -129,11 +149,19 @@ class MeteringPolicy(Policy):
     ) -> NDArray[np.int64]:
         """Meter the frames, then choose by the program."""
         readings = self.observe(observations)
-        if self.program in ("tuned", "tuned_blind"):
-            utility = self._tuned_utility(readings)
+        foresight = self._foresight
+        if foresight is not None and self.foresight == "model":
+            utility = foresight.utility(
+                lambda ev: self._tuned_utility(np.column_stack([ev, readings[:, 1:]]))
+            )
         else:
-            utility = self._program_utility(readings)
+            if foresight is not None:
+                readings[:, 0] = foresight.ev100(max(foresight.leads))
+            tuned = self.program in ("tuned", "tuned_blind")
+            utility = self._tuned_utility(readings) if tuned else self._program_utility(readings)
         self._previous = masked_argmax(utility, action_masks)
+        if foresight is not None:
+            foresight.decided(self._previous)
         return self._previous.copy()
 
     def observe(self, observations: Observations) -> NDArray[np.float64]:
@@ -145,7 +173,10 @@ class MeteringPolicy(Policy):
         self._frames += 1
         metered = observations if self._reference is None else self._reference.update(observations)
         held = np.clip(self._tracker.ev100, *self._tracker.ev_range)  # no farther than can be set
-        ev = self._tracker.update(self.meter(metered, held))
+        reading = self.meter(metered, held)
+        ev = self._tracker.update(reading)
+        if self._foresight is not None:
+            self._foresight.observe(reading, observations)
         if not self.uses_sensors:
             return ev[:, None]
         speed, defocus = decode_sensors(observations["sensors"])
@@ -194,6 +225,7 @@ class MeteringPolicy(Policy):
         if self.program not in ("tuned", "tuned_blind"):
             return
         tuned, self.program = self.program, "P"
+        foresight, self.foresight = self.foresight, "none"  # the light of these episodes stays
         per_scene = FIT_EPISODES // (2 * len(scenes_of(envs)))
         per_scene = min(max(per_scene, 1), FIT_PER_SCENE)
         first = self._gather(envs, seed, per_scene)
@@ -202,6 +234,7 @@ class MeteringPolicy(Policy):
         second = self._gather(envs, seed + SECOND_PASS, per_scene)
         both: Any = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
         self.regression = ScoreRegression.fit(*both)
+        self.foresight = foresight
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a tuned program; ``weights=path`` restores it.

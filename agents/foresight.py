@@ -1,0 +1,82 @@
+"""From what a state is worth in some light to what to choose for the light to come.
+
+Settings reach a sensor frames late, each control after its own delay. A policy with foresight knows
+what it has asked for already, expects what the light will be when its decision is in effect
+(`agents.metering.trend`), and asks what each state is worth in that light.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ae_env.observation import decode_settings
+from agents.metering.reading import Reading
+from agents.metering.trend import TrendTracker
+from agents.policy import Observations, PolicyContext
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Foresight:
+    """Rolls the light of each camera through the delays of its controls.
+
+    Args:
+        context: The grid and the delays.
+        num_envs: Cameras.
+    """
+
+    def __init__(self, context: PolicyContext, num_envs: int) -> None:
+        self.grid = context.grid
+        #: Frames from the one in hand to the first that has this decision's ISO, time, aperture.
+        self.leads = tuple(1 + delay for delay in context.delays)
+        ev100 = self.grid.ev100
+        self._tracker = TrendTracker(num_envs, (float(ev100.min()), float(ev100.max())))
+        self._asked: list[Ints] = []  # the newest last
+
+    def observe(self, reading: Reading, observations: Observations) -> None:
+        """Take in one frame of each camera, and what a light meter reads in it."""
+        self._tracker.update(reading)
+        if not self._asked:  # what the first frame was taken with stays until a decision is there
+            self._asked = [self._shown(observations)] * max(self.leads)
+
+    def ev100(self, frames: int) -> Floats:
+        """EV100 that a meter is expected to read `frames` after the frame in hand, ``(N,)``."""
+        return self._tracker.ahead(frames)
+
+    def utility(self, scores: Callable[[Floats], Floats]) -> Floats:
+        """What each state promises in the first frames that have its controls, ``(N, S)``.
+
+        A control that is in effect earlier than another is free in the other's frame, as the next
+        decision will choose it; one that is in effect later is that of an earlier decision there.
+
+        Args:
+            scores: From the metered EV100 of a frame to come, ``(N,)``, to the expected score of
+                every state in it, ``(N, S)``.
+        """
+        total: Floats = np.zeros((len(self._asked[0]), 1, 1, 1))
+        for frame in sorted(set(self.leads)):
+            promised = scores(self.ev100(frame)).reshape(-1, *self.grid.shape)
+            for axis, lead in enumerate(self.leads):
+                if lead < frame:
+                    promised = promised.max(axis=1 + axis, keepdims=True)
+                elif lead > frame:
+                    asked = self.grid.controls(self._asked[frame - lead])[:, axis]
+                    index = asked.reshape(-1, 1, 1, 1)
+                    promised = np.take_along_axis(promised, index, axis=1 + axis)
+            total = total + promised
+        return total.reshape(len(total), -1)
+
+    def decided(self, states: Ints) -> None:
+        """Remember what was asked for after the frame in hand, ``(N,)``."""
+        self._asked = [*self._asked[1:], states]
+
+    def _shown(self, observations: Observations) -> Ints:
+        """States that the frames in hand were taken with, ``(N,)``."""
+        shown = np.stack(decode_settings(observations["settings"]), axis=1)
+        apex = np.array([(s.aperture_value, s.time_value, s.speed_value) for s in self.grid])
+        found: Ints = np.abs(shown[:, None] - apex[None]).sum(axis=2).argmin(axis=1)
+        return found
