@@ -134,6 +134,10 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `settings` | `Box(-1, 1, (3,), float32)` | Av, Tv, Sv of the current state, from [0, 10], [-5, 15], [4, 17] |
     | `sensors` | `Box(-1, 1, (2,), float32)` | log2 speed of the camera's shake [frame heights/s] from [-9, 3] and log2 of the largest defocus [pixel of a 64-pixel frame at f/4] from [-4, 4], each with 15 % noise |
 
+    With `observation="statistics"`, `raw` is (4, 12, 16): the mean signals of 12 x 16 zones, encoded
+    alike, with `histogram`, `Box(0, 1, (128,), float32)`: shares of all samples by code, two codes a
+    bin; and `clipped`, `Box(0, 1, (2,), float32)`: shares at white and at black.
+
     ## Rewards
 
     Score of the capture in [0, 1] minus the weighted costs. The terms are in `info["rewards"]`:
@@ -179,7 +183,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | `grid` | `"default"` | `"default"`, `"third_stop"`, `"video"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
     | `costs` | `None` | mapping to the weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
-    | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]) or `"dn"` (the camera's uint16) |
+    | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]), `"dn"` (the camera's uint16), or `"statistics"`: what an image processor hands to its auto exposure, 18 times fewer numbers |
     | `sensors` | `True` | whether `sensors` is observed |
     | `resolution` | 64 | height and width R of the packed frame, >= 36 |
     | `crop` | `"box"` | `"box"` averages sensor pixels down to R; `"native"` crops R pixels |

@@ -29,6 +29,7 @@ __all__ = [
     "encode_observation",
     "encode_sensors",
     "encode_settings",
+    "frame_statistics",
 ]
 
 #: Fixed ranges of Av, Tv and Sv that map to [-1, 1].
@@ -37,6 +38,8 @@ SETTINGS_RANGES = np.array([[0.0, 10.0], [-5.0, 15.0], [4.0, 17.0]])
 SENSOR_RANGES = np.array([[-9.0, 3.0], [-4.0, 4.0]])
 #: Relative standard deviation of both sensors.
 SENSOR_NOISE = 0.15
+#: Zones of the statistics, rows and columns, and bins of their histogram.
+ZONES, HISTOGRAM_BINS = (12, 16), 128
 _LOG2_NOISE = SENSOR_NOISE / math.log(2.0)
 _TINY = sys.float_info.min
 
@@ -54,6 +57,39 @@ def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) ->
     codes = signal.clamp(-PEDESTAL, 1.0).add_(PEDESTAL).div_(1.0 + PEDESTAL)
     codes = codes.sqrt_().mul_(255.0).round_()
     return codes.byte() if out is None else out.copy_(codes)
+
+
+def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
+    """What an image processor hands to its auto exposure, from the 8-bit codes of frames.
+
+    Args:
+        codes: (N, 4, R, R) uint8.
+
+    Returns:
+        ``raw`` (N, 4, 12, 16) uint8: codes of the mean signal of each zone of each plane, in 12
+        rows and 16 columns; ``histogram`` (N, 128) float32: shares of all samples by code, two
+        codes a bin; ``clipped`` (N, 2) float32: shares at white and black, the first and the last
+        code.
+    """
+    height, width = codes.shape[-2:]
+    rows, columns = (_zone_starts(n, zones) for n, zones in ((height, ZONES[0]), (width, ZONES[1])))
+    sums = np.add.reduceat(decode_observation(codes), rows, axis=-2)
+    sums = np.add.reduceat(sums, columns, axis=-1)
+    area = np.diff(rows, append=height)[:, None] * np.diff(columns, append=width)
+    means = np.clip(sums / area, 0.0, 1.0)
+    zones = np.rint(255.0 * np.sqrt((means + PEDESTAL) / (1.0 + PEDESTAL))).astype(np.uint8)
+    flat = codes.reshape(len(codes), -1)
+    counts = np.stack([np.bincount(frame, minlength=256) for frame in flat])
+    shares = (counts / flat.shape[1]).astype(np.float32)
+    return {
+        "raw": zones,
+        "histogram": shares.reshape(len(codes), HISTOGRAM_BINS, -1).sum(axis=2),
+        "clipped": np.ascontiguousarray(shares[:, [255, 0]]),
+    }
+
+
+def _zone_starts(size: int, zones: int) -> np.ndarray:
+    return np.arange(zones) * size // zones
 
 
 def decode_observation(raw: np.ndarray) -> np.ndarray:

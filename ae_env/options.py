@@ -34,7 +34,7 @@ from simulator.utils.cache import LruCache
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36
 COSTS = ("flicker", "switch")
-ObservationKind = Literal["uint8", "linear", "dn"]
+ObservationKind = Literal["uint8", "linear", "dn", "statistics"]
 Motion = Literal["random", "none"]
 Depth = Literal["random", "far", "unknown"]
 Noise = Literal["bank", "exact", "sensor"]
@@ -165,7 +165,7 @@ class EnvOptions:
     def make_lighting(self) -> Lighting:
         """The change of the light during an episode; moving light is of the kinds of the split."""
         lighting = self.lighting
-        if lighting == MovingLighting.name:
+        if isinstance(lighting, str) and lighting == MovingLighting.name:
             lighting = {"kind": lighting}
         if isinstance(lighting, Mapping) and lighting.get("kind") == MovingLighting.name:
             lighting = {"kinds": self.split, **lighting}
@@ -226,6 +226,8 @@ def _checked_delay(delay: Any) -> int | dict[str, int]:
     if not isinstance(delay, Mapping):
         more = f" frames, or a mapping of them by {list(CONTROLS)}"
         return check_integer("delay", delay, 0, MAX_DELAY, more=more)
+    if not delay:
+        raise ValueError(f"`delay` (={delay!r}) must name one of {list(CONTROLS)} or more")
     for name in delay:
         check_word("delay", name, CONTROLS)
     given = {

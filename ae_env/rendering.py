@@ -52,7 +52,7 @@ def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
     Returns:
         (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
     """
-    raw = frames.observation["raw"][index]
+    raw = frames.raw[index]
     if raw.dtype == np.uint8:
         signal = decode_observation(raw)
     elif raw.dtype == np.uint16:

@@ -236,10 +236,11 @@ class AutoExposureVectorEnv(
         self._begin(finished)
         fresh = self.core.observe(finished)
         if whole:
-            frames = Frames(fresh.observation, fresh.info, frames.reward)
+            frames = Frames(fresh.observation, fresh.info, frames.reward, fresh.raw)
         else:
             _assign_rows(frames.observation, fresh.observation, finished)
             _assign_rows(frames.info, fresh.info, finished)
+            frames.raw[finished] = fresh.raw
         self._remember_frames(frames)
         return frames.observation, infos | self._vector_info(frames.info, self._all)
 
@@ -251,7 +252,7 @@ class AutoExposureVectorEnv(
             last = copy.deepcopy(self._last)  # the caller has its arrays
             _assign_rows(last.observation, frames.observation, env_indices)
             _assign_rows(last.info, frames.info, env_indices)
-            last.reward[env_indices] = frames.reward
+            last.reward[env_indices], last.raw[env_indices] = frames.reward, frames.raw
             frames = last
         self._last = frames
 

@@ -19,7 +19,14 @@ from ae_env.episodes.light import FrameLight
 from ae_env.episodes.scores import PartScores
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.lighting import Lighting
-from ae_env.observation import PEDESTAL, encode_sensors, encode_settings
+from ae_env.observation import (
+    HISTOGRAM_BINS,
+    PEDESTAL,
+    ZONES,
+    encode_sensors,
+    encode_settings,
+    frame_statistics,
+)
 from ae_env.options import COSTS, EnvOptions
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene
@@ -33,7 +40,7 @@ from simulator.optics.disc_bank import DIAMETERS
 CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
 LIGHT_CACHE_BYTES = 256 * 2**20
-_RAW_DTYPES = {"uint8": np.uint8, "linear": np.float32, "dn": np.uint16}
+_RAW_DTYPES = {"uint8": np.uint8, "statistics": np.uint8, "linear": np.float32, "dn": np.uint16}
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 #: How the noise is made, by the environment's argument.
 _NOISES: dict[bool | str, Noise | None] = {
@@ -44,7 +51,7 @@ _NOISES: dict[bool | str, Noise | None] = {
     "sensor": "sensor",
 }
 #: Name of each kind of observation in `CaptureBatch.record`.
-_OUTPUTS = {"uint8": "codes", "linear": "signals", "dn": "numbers"}
+_OUTPUTS = {"uint8": "codes", "statistics": "codes", "linear": "signals", "dn": "numbers"}
 
 
 @dataclass
@@ -55,11 +62,13 @@ class Frames:
         observation: Arrays by name, n long; new ones every time.
         info: Columns by name, n long; ``rewards`` is a dictionary of columns.
         reward: (n,) float64.
+        raw: (n, 4, R, R) the whole frames, also where less of them is observed.
     """
 
     observation: dict[str, np.ndarray]
     info: dict[str, Any]
     reward: np.ndarray
+    raw: np.ndarray
 
 
 class EpisodeCore:
@@ -138,16 +147,23 @@ class EpisodeCore:
 
     def observation_space(self) -> gym.spaces.Dict:
         """Space of one episode's observation."""
-        shape = (4, self.options.resolution, self.options.resolution)
+        size = (self.options.resolution,) * 2
+        if self.options.observation == "statistics":
+            size = ZONES
+        shape = (4, *size)
         low, high, dtype = {
             "uint8": (0.0, 255.0, np.uint8),
             "linear": (-PEDESTAL, 1.0, np.float32),
             "dn": (0.0, self.camera.white_level, np.uint16),
+            "statistics": (0.0, 255.0, np.uint8),
         }[self.options.observation]
         spaces: dict[str, gym.Space[Any]] = {
             "raw": gym.spaces.Box(low, high, shape, dtype),
             "settings": gym.spaces.Box(-1.0, 1.0, (3,), np.float32),
         }
+        if self.options.observation == "statistics":
+            spaces["histogram"] = gym.spaces.Box(0.0, 1.0, (HISTOGRAM_BINS,), np.float32)
+            spaces["clipped"] = gym.spaces.Box(0.0, 1.0, (2,), np.float32)
         if self.options.sensors:
             spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         return gym.spaces.Dict(spaces)
@@ -243,7 +259,8 @@ class EpisodeCore:
         episodes, options = self.episodes, self.options
         states = episodes.state[env_indices]
         raw, columns = self._photograph(env_indices)
-        observation = {"raw": raw, "settings": self._settings[states]}
+        shown = frame_statistics(raw) if options.observation == "statistics" else {"raw": raw}
+        observation = shown | {"settings": self._settings[states]}
         if options.sensors:
             speed, focus_drive = episodes.speed[env_indices], episodes.focus_drive[env_indices]
             normals = columns.pop("sensor_normals")
@@ -258,7 +275,7 @@ class EpisodeCore:
             best = np.array([t.mean[t.oracle] for t in tables])
             info["oracle_state"] = np.array([t.oracle for t in tables])
             info["regret"] = best - [t.mean[s] for t, s in zip(tables, states, strict=True)]
-        return Frames(observation, info, reward)
+        return Frames(observation, info, reward, raw)
 
     def _photograph(self, env_indices: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Observations of ``raw``, and columns: of `info`, scores by ``score:`` and part, and more.

@@ -8,6 +8,7 @@ each weighted by the network's own confidence.
 from __future__ import annotations
 
 from functools import cached_property
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +17,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from ae_env.grid import ExposureGrid
+from ae_env.observation import SETTINGS_RANGES
+from ae_env.utils.checks import check_word
+from agents.foresight import Floats, Foresight
 from agents.learning.agent_weights import NetworkPolicy
 from agents.learning.networks import ExposureFeatures, StateHead
 from agents.metering.meters import make_meter
@@ -26,6 +30,8 @@ from agents.policy import Observations, PolicyContext, masked_argmax
 _OF_CHANNELS = 0.4
 #: Bounds of the predicted log variance.
 _LOG_VARIANCE = (-8.0, 0.0)
+#: Frames that foresight shows to the network in the light to come.
+RECENT = 4
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
@@ -78,10 +84,43 @@ def observation_tensors(
     return codes, settings, None if sensors is None else torch.as_tensor(sensors, device=device)
 
 
+def as_if_at(settings: NDArray[np.floating], stops: Floats) -> NDArray[np.float32]:
+    """Settings (N, 3) of frames in `stops` (N,) more light that look alike: of a lower gain [EV].
+
+    The network reads the absolute light off a frame and its settings.
+    """
+    low, high = SETTINGS_RANGES[2]
+    shifted = np.array(settings, np.float32)
+    shifted[:, 2] -= 2.0 * stops / (high - low)
+    return shifted
+
+
 class RegressionPolicy(NetworkPolicy):
-    """Takes the state with the highest predicted score, accumulated over the frames so far."""
+    """Takes the state with the highest predicted score, accumulated over the frames so far.
+
+    Args:
+        context: The camera, the grid and the observation.
+        weights: As of `NetworkPolicy`.
+        network: As of `NetworkPolicy`.
+        device: As of `NetworkPolicy`.
+        foresight: ``"none"``: frames of the same light count together; ``"trend"``: the latest
+            frames are shown to the network as if taken in the light that is expected, and the state
+            is taken that promises most in the frames that its controls are in effect in.
+    """
 
     kind = "regression"
+
+    def __init__(
+        self,
+        context: PolicyContext,
+        weights: str | Path | None = None,
+        network: nn.Module | None = None,
+        device: str = "cpu",
+        foresight: str = "none",
+    ) -> None:
+        check_word("foresight", foresight, ("none", "trend"))
+        self.foresight = foresight
+        super().__init__(context, weights, network, device)
 
     @cached_property
     def _meter(self) -> Meter:
@@ -103,12 +142,17 @@ class RegressionPolicy(NetworkPolicy):
         self._weighted = np.zeros((num_envs, len(self.context.grid)))
         self._precision = np.zeros_like(self._weighted)
         self._light, self._frames = np.zeros(num_envs), np.zeros(num_envs)
+        foresees = self.foresight != "none"
+        self._foresight = Foresight(self.context, num_envs) if foresees else None
+        self._recent: list[tuple[Observations, Floats]] = []  # frames and their metered EV100
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """Best state (N,) after this frame and those before it in the same light."""
         self.check_reset(observations)
+        if self._foresight is not None:
+            return self._act_ahead(self._foresight, observations, action_masks)
         self._forget_other_light(observations)
         device = next(self.network.parameters()).device
         with torch.inference_mode():
@@ -118,6 +162,33 @@ class RegressionPolicy(NetworkPolicy):
         self._precision += precision
         return masked_argmax(self._weighted / self._precision, action_masks)
 
+    def _act_ahead(
+        self,
+        foresight: Foresight,
+        observations: Observations,
+        action_masks: NDArray[np.bool_] | None,
+    ) -> NDArray[np.int64]:
+        reading = self._meter(observations)
+        foresight.observe(reading, observations)
+        self._recent = [*self._recent, (observations, reading.ev100)][-RECENT:]
+        chosen = masked_argmax(foresight.utility(self._scores_in), action_masks)
+        foresight.decided(chosen)
+        return chosen
+
+    def _scores_in(self, ev100: Floats) -> Floats:
+        """Scores (N, S) in light that is metered at `ev100` (N,), from all recent frames."""
+        device = next(self.network.parameters()).device
+        weighted, precisions = np.zeros((2, len(ev100), len(self.context.grid)))
+        for observations, metered in self._recent:
+            settings = as_if_at(observations["settings"], ev100 - metered)
+            inputs = observation_tensors({**observations, "settings": settings}, device)
+            with torch.inference_mode():
+                scores, log_variance = self.network(*inputs)
+            precision = torch.exp(-log_variance).double().cpu().numpy()
+            weighted += precision * scores.double().cpu().numpy()
+            precisions += precision
+        return weighted / precisions
+
     def _forget_other_light(self, observations: Observations) -> None:
         """Forgets the earlier frames of those environments whose metered light has changed."""
         ev100 = self._meter(observations).ev100
@@ -126,6 +197,14 @@ class RegressionPolicy(NetworkPolicy):
         self._light += (ev100 - self._light) / self._frames
 
     def forget(self, done: NDArray[np.bool_]) -> None:
-        """Forgets the frames of the environments that `done` marks, such as ended episodes."""
+        """Forgets the frames of the environments that `done` marks, such as ended episodes.
+
+        Raises:
+            ValueError: With foresight, which forgets all of them only, in `reset`.
+        """
+        if self._foresight is not None and done.any():
+            raise ValueError(
+                "`forget` works without `foresight`; call reset() for all environments"
+            )
         for sums in (self._weighted, self._precision, self._light, self._frames):
             sums[done] = 0.0

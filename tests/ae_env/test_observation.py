@@ -18,7 +18,9 @@ from ae_env.observation import (
     encode_observation,
     encode_sensors,
     encode_settings,
+    frame_statistics,
 )
+from tests.ae_env.environments import make_envs
 from tests.strategies import LIGHT, lights, log_uniform
 
 
@@ -81,3 +83,41 @@ def test_sensors_are_decoded_as_they_read(
             assert found in (0.0, least)
         else:
             assert found == pytest.approx(2.0 ** min(reading, math.log2(most)), rel=1e-5)
+
+
+def test_statistics_are_means_and_shares_of_the_frame():
+    """Against sums over the decoded frame; 36 rows are 12 zones of 3, 36 columns 16 of 2 or 3."""
+    codes = np.random.default_rng(0).integers(0, 256, (2, 4, 36, 36), dtype=np.uint8)
+    codes[0, :, :3, :2] = 255
+    found = frame_statistics(codes)
+    assert {k: (v.shape, v.dtype.name) for k, v in found.items()} == {
+        "raw": ((2, 4, 12, 16), "uint8"),
+        "histogram": ((2, 128), "float32"),
+        "clipped": ((2, 2), "float32"),
+    }
+    assert (found["raw"][0, :, 0, 0] == 255).all()
+    signal = decode_observation(codes)[1, 2, 3:6, 2:4].mean()  # the second zone of each
+    assert abs(int(found["raw"][1, 2, 1, 1]) - 255 * ((signal + 2**-10) / (1 + 2**-10)) ** 0.5) < 1
+    assert found["histogram"].sum(axis=1) == pytest.approx(1.0)
+    assert found["histogram"][1, 5] == pytest.approx(np.isin(codes[1], (10, 11)).mean())
+    np.testing.assert_allclose(found["clipped"][:, 0], (codes == 255).mean(axis=(1, 2, 3)))
+    np.testing.assert_allclose(found["clipped"][:, 1], (codes == 0).mean(axis=(1, 2, 3)))
+
+
+@pytest.mark.parametrize("resolution", [36, 64])
+def test_environments_observe_the_statistics_of_their_frames(resolution: int) -> None:
+    pictured = {"render_mode": "rgb_array", "resolution": resolution}
+    envs = make_envs(3, observation="statistics", **pictured)
+    whole = make_envs(3, **pictured)
+    for found, frames in (
+        (envs.reset(seed=4), whole.reset(seed=4)),
+        (envs.step([1, 30, 60]), whole.step([1, 30, 60])),
+    ):
+        expected = frame_statistics(frames[0]["raw"])
+        assert envs.observation_space.contains(found[0])
+        for name, values in expected.items():
+            np.testing.assert_array_equal(found[0][name], values)
+        np.testing.assert_array_equal(found[0]["settings"], frames[0]["settings"])
+    np.testing.assert_array_equal(envs.render(), whole.render())  # the picture is the whole frame
+    numbers = sum(np.prod(space.shape) for space in envs.single_observation_space.values())
+    assert numbers == 4 * 12 * 16 + 128 + 2 + 3 + 2

@@ -40,7 +40,7 @@ def test_it_is_the_other_environment_with_its_defaults():
         shown = inspect.signature(kind).parameters
         assert {name: shown[name].default for name in VIDEO} == VIDEO
     changed = gym.make(ID, delay=0, grid="default", **SMALL)
-    assert changed.unwrapped.delay == 0
+    assert changed.unwrapped.delays == (0, 0, 0)
     assert changed.unwrapped.grid == ae_env.ExposureGrid.default()
     with pytest.raises(TypeError, match="did you mean 'lighting'"):
         gym.make(ID, lightning="moving")

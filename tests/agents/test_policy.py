@@ -18,7 +18,7 @@ from agents.policy import (
 
 def test_every_listed_name_makes_a_policy(context):
     names = list_policies()
-    assert len(names) == len(set(names)) == 5 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
+    assert len(names) == len(set(names)) == 7 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
     for name in set(names) - {"ppo", "regression"}:  # they come at one resolution: test_pretrained
         policy = make_policy(name, context)
         assert policy.name == name
@@ -40,7 +40,7 @@ def test_every_listed_name_makes_a_policy(context):
         ("mine.py", r"must name a class of the file"),
         ("spot?compensatio=1", r"'spot\?compensatio=1'\): .*the option 'compensatio'.*mean 'comp"),
         ("spot?meter=matrix", r"does not take the option 'meter'"),
-        ("oracle?state=3", r"does not take the option 'state'; it takes none"),
+        ("oracle?state=3", r"does not take the option 'state'; it takes knows"),
         ("spot?compensation=.nan", r"`compensation` \(=nan\) must be a number in \[-32, 32\]"),
         ("spot?damping=1", r"`damping` \(=1\) must be below 1"),
         ("spot:A?iso=100", r"`iso` \(=100(\.0)?\) is an option of program M only, not of A"),
