@@ -160,7 +160,7 @@ def masked_argmax(
 def list_policies() -> list[str]:
     """Names of the built-in policies that need no file."""
     metering = [f"{m}:{p}" for m in METERS for p in PROGRAMS]
-    oracles = [_ORACLE, *(f"{_ORACLE}:{knows}" for knows in _KNOWN)]
+    oracles = [f"{_ORACLE}:{knows}" for knows in _KNOWN]
     agc = [f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS]
     return sorted([*_SIMPLE, *_LEARNT, *oracles, *metering, *agc])
 

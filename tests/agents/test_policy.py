@@ -18,13 +18,14 @@ from agents.policy import (
 
 def test_every_listed_name_makes_a_policy(context):
     names = list_policies()
-    assert len(names) == len(set(names)) == 7 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
+    assert len(names) == len(set(names)) == 6 + len(METERS) * len(PROGRAMS) + 4  # and rpi_agc
     for name in set(names) - {"ppo", "regression"}:  # they come at one resolution: test_pretrained
         policy = make_policy(name, context)
         assert policy.name == name
         assert isinstance(policy, Policy)
-        assert policy.privileged == (name == "oracle")
+        assert policy.privileged == name.startswith("oracle:")
     assert make_policy("spot", context).name == "spot:P"
+    assert make_policy("oracle", context).name == "oracle:last_frame"
 
 
 @pytest.mark.parametrize(
