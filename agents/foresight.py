@@ -8,17 +8,27 @@ what it has asked for already, expects what the light will be when its decision 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import decode_settings
-from agents.metering.reading import Reading
-from agents.metering.trend import TrendTracker
+from agents.metering.reading import Reading, frame_ev100
 from agents.policy import Observations, PolicyContext
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+class LightTracker(Protocol):
+    """Expects the light of frames to come."""
+
+    def update(self, reading: Reading, exposed_at: Floats) -> None:
+        """Take in what a meter reads in one frame of each camera, taken at EV100 `exposed_at`."""
+
+    def ahead(self, frames: int) -> Floats:
+        """EV100 that the meter is expected to read `frames` after the last one, ``(N,)``."""
 
 
 class Foresight:
@@ -26,20 +36,18 @@ class Foresight:
 
     Args:
         context: The grid and the delays.
-        num_envs: Cameras.
+        tracker: What expects the light to come.
     """
 
-    def __init__(self, context: PolicyContext, num_envs: int) -> None:
-        self.grid = context.grid
+    def __init__(self, context: PolicyContext, tracker: LightTracker) -> None:
+        self.grid, self._tracker = context.grid, tracker
         #: Frames from the one in hand to the first that has this decision's ISO, time, aperture.
         self.leads = tuple(1 + delay for delay in context.delays)
-        ev100 = self.grid.ev100
-        self._tracker = TrendTracker(num_envs, (float(ev100.min()), float(ev100.max())))
         self._asked: list[Ints] = []  # the newest last
 
     def observe(self, reading: Reading, observations: Observations) -> None:
         """Take in one frame of each camera, and what a light meter reads in it."""
-        self._tracker.update(reading)
+        self._tracker.update(reading, frame_ev100(observations))
         if not self._asked:  # what the first frame was taken with stays until a decision is there
             self._asked = [self._shown(observations)] * max(self.leads)
 

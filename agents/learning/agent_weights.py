@@ -197,7 +197,7 @@ class NetworkPolicy(Policy, ABC):
         if network is None:
             tensors, card = load_agent(str(weights), self.kind)
             check_context(card, context)
-            network = self.make_network(context, card["width"], trained_grid(card))
+            network = self.make_network(context, card)
             load_into(network, tensors, str(weights))
             network.to(device)
         self.network: Any = network.eval()
@@ -205,13 +205,10 @@ class NetworkPolicy(Policy, ABC):
 
     @staticmethod
     @abstractmethod
-    def make_network(
-        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
-    ) -> nn.Module:
+    def make_network(context: PolicyContext, card: dict[str, Any]) -> nn.Module:
         """The untrained network that the weights of an agent of this kind fit.
 
         Args:
             context: The camera, the grid and the observation.
-            width: Hidden features.
-            trained_on: Grid that the weights come from; by default that of the context.
+            card: Description of the agent, see `load_agent`.
         """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gymnasium as gym
+import numpy as np
 import torch
 from torch import nn
 
@@ -63,7 +64,9 @@ class ExposureFeatures(nn.Module):
         if raw.dtype != "uint8" or raw.shape is None:
             raise ValueError(f"`observation_space['raw']` (={raw}) must be a uint8 image")
         self.has_sensors = "sensors" in observation_space.spaces
-        self.numbers = 3 + (2 if self.has_sensors else 0) + 2 * _ZONES**2
+        history = observation_space.spaces.get("history")
+        self.history = 0 if history is None else int(np.prod(history.shape or ()))
+        self.numbers = 3 + (2 if self.has_sensors else 0) + 2 * _ZONES**2 + self.history
         self.block = max(1, min(raw.shape[1:]) // _PLANE_SIZE)
         self.cnn = nn.Sequential(
             nn.Conv2d(6, 24, 3, padding=1),
@@ -84,7 +87,11 @@ class ExposureFeatures(nn.Module):
         self.register_buffer("log2_signal", signals.log2(), persistent=False)
 
     def forward(
-        self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
+        self,
+        codes: torch.Tensor,
+        settings: torch.Tensor,
+        sensors: torch.Tensor | None,
+        history: torch.Tensor | None = None,
     ) -> torch.Tensor:
         """Features (B, width).
 
@@ -92,6 +99,7 @@ class ExposureFeatures(nn.Module):
             codes: (B, 4, H, W) float, the observed raw divided by 255.
             settings: (B, 3) float in [-1, 1].
             sensors: (B, 2) float in [-1, 1]; None where they are not observed.
+            history: (B, ...) float of the frames before, where the space has it.
         """
         exposure = self._ev100(settings)[:, None, None, None]
         pooled = nn.functional.avg_pool2d(codes, self.block)  # (B, 4, ~16, ~16)
@@ -104,7 +112,7 @@ class ExposureFeatures(nn.Module):
         found = self.cnn(torch.cat(planes, dim=1))
         features = [pool(found, _QUARTERS).flatten(1), found.amax(dim=(2, 3))]
         features += [zones.flatten(1), clipped.flatten(1)]
-        numbers = [settings] if sensors is None else [settings, sensors]
+        numbers = [n for n in (settings, sensors, history) if n is not None]
         joint: torch.Tensor = self.head(torch.cat([*features, *numbers], dim=1))
         return joint
 

@@ -20,10 +20,12 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.agent_weights import MAX_WIDTH, NetworkPolicy
+from agents.learning.agent_weights import MAX_WIDTH, NetworkPolicy, trained_grid
+from agents.learning.history import NUMBERS, MeterHistory, WithHistory, with_history
 from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead
 from agents.learning.sb3_adapter import MovedFrames, SB3VectorAdapter
 from agents.policy import Observations, PolicyContext, masked_argmax
@@ -50,7 +52,8 @@ class ExposureExtractor(BaseFeaturesExtractor):
         """Features (B, features_dim)."""
         raw, settings = observations["raw"], observations["settings"]
         sensors = observations.get("sensors")
-        parts = [self.features(raw, settings, sensors), self.features.light(raw, settings)]
+        features = self.features(raw, settings, sensors, observations.get("history"))
+        parts = [features, self.features.light(raw, settings)]
         return torch.cat(parts if sensors is None else [*parts, sensors], dim=1)
 
 
@@ -134,6 +137,8 @@ class PPOTraining(Configuration):
         vf_coef: Weight of the value loss.
         max_grad_norm: Gradient clipping.
         width: Hidden features of the network.
+        history: Frames of which the network sees what a light meter read and what was asked for
+            (`MeterHistory`); 0 for none.
         seed: Seed of scenes, noise, weights and actions.
 
     Raises:
@@ -152,6 +157,7 @@ class PPOTraining(Configuration):
     vf_coef: float = Field(default=0.5, ge=0.0, le=1e6)
     max_grad_norm: float = Field(default=0.5, ge=1e-9, le=1e9)
     width: int = Field(default=256, ge=1, le=MAX_WIDTH)
+    history: int = Field(default=0, ge=0, le=256)
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
     def check_batch(self, num_envs: int) -> None:
@@ -165,28 +171,45 @@ class PPOTraining(Configuration):
 
 
 class PPOPolicy(NetworkPolicy):
-    """Takes the most probable state and remembers nothing between frames."""
+    """Takes the most probable state; remembers what its network was trained with, or nothing."""
 
     kind = "ppo"
 
     @staticmethod
-    def make_network(
-        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
-    ) -> ExposureActorCritic:
+    def make_network(context: PolicyContext, card: dict[str, Any]) -> ExposureActorCritic:
         """See `NetworkPolicy.make_network`."""
+        history = card["training"].get("training", {}).get("history", 0)
+        space = context.observation_space
         return ExposureActorCritic(
-            context.observation_space,
+            with_history(space, history) if history else space,
             gym.spaces.Discrete(len(context.grid)),
             lambda _: 0.0,
             grid=context.grid,
-            width=width,
-            trained_on=trained_on,
+            width=card["width"],
+            trained_on=trained_grid(card),
         )
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forgets the frames so far."""
+        super().reset(num_envs, seed)
+        frames = self.network.features_extractor.features.history // NUMBERS
+        self._history = MeterHistory(self.context, num_envs, frames) if frames else None
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """Most probable allowed state (N,)."""
+        if self._history is None:
+            return self._chosen(observations, action_masks)
+        self.check_reset(observations)
+        shown = {**observations, "history": self._history.observe(observations)}
+        states = self._chosen(shown, action_masks)
+        self._history.asked(states)
+        return states
+
+    def _chosen(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None
+    ) -> NDArray[np.int64]:
         with torch.inference_mode():
             tensors, _ = self.network.obs_to_tensor(dict(observations))
             distribution: Any = self.network.get_distribution(tensors).distribution
@@ -222,9 +245,12 @@ def train_ppo(
     store = Checkpoint(checkpoint, identity or training.model_dump(), lambda: callback.state())
     past = store.load()
     done = 0 if past is None else int(past["timesteps"])
+    seen: VecEnv = SB3VectorAdapter(envs)
+    if training.history:
+        seen = WithHistory(seen, context, training.history)
     model = PPO(
         ExposureActorCritic,
-        MovedFrames(SB3VectorAdapter(envs), np.random.default_rng([training.seed, done])),
+        MovedFrames(seen, np.random.default_rng([training.seed, done])),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
         n_steps=training.n_steps,
         batch_size=training.batch_size,

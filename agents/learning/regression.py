@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,13 +19,14 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
-from ae_env.utils.checks import check_word
-from agents.foresight import Floats, Foresight
-from agents.learning.agent_weights import NetworkPolicy
+from agents.foresight import Floats, Foresight, LightTracker
+from agents.learning.agent_weights import NetworkPolicy, trained_grid
+from agents.learning.forecaster import LearntTracker, LightForecaster, load_forecaster
 from agents.learning.networks import ExposureFeatures, StateHead
 from agents.metering.meters import make_meter
 from agents.metering.reading import Meter
-from agents.policy import Observations, PolicyContext, masked_argmax
+from agents.metering.trend import TrendTracker
+from agents.policy import PRETRAINED, Observations, PolicyContext, masked_argmax
 
 #: Dropout of the CNN's channels, relative to that of the features.
 _OF_CHANNELS = 0.4
@@ -103,9 +105,11 @@ class RegressionPolicy(NetworkPolicy):
         weights: As of `NetworkPolicy`.
         network: As of `NetworkPolicy`.
         device: As of `NetworkPolicy`.
-        foresight: ``"none"``: frames of the same light count together; ``"trend"``: the latest
-            frames are shown to the network as if taken in the light that is expected, and the state
-            is taken that promises most in the frames that its controls are in effect in.
+        foresight: ``"none"``: frames of the same light count together; else the latest frames are
+            shown to the network as if taken in the light that is expected, and the state is taken
+            that promises most in the frames that its controls are in effect in. ``"trend"``: an
+            alpha-beta filter expects it; ``"learnt"``: the forecaster that comes with the package
+            (`LightForecaster`); or the file of another one.
     """
 
     kind = "regression"
@@ -118,8 +122,11 @@ class RegressionPolicy(NetworkPolicy):
         device: str = "cpu",
         foresight: str = "none",
     ) -> None:
-        check_word("foresight", foresight, ("none", "trend"))
         self.foresight = foresight
+        self._forecaster: LightForecaster | None = None
+        if foresight not in ("none", "trend"):
+            path = PRETRAINED / "forecaster-0" if foresight == "learnt" else foresight
+            self._forecaster = load_forecaster(path, device)
         super().__init__(context, weights, network, device)
 
     @cached_property
@@ -128,11 +135,10 @@ class RegressionPolicy(NetworkPolicy):
         return make_meter("average", self.context.camera)
 
     @staticmethod
-    def make_network(
-        context: PolicyContext, width: int, trained_on: ExposureGrid | None = None
-    ) -> ScoreRegressor:
+    def make_network(context: PolicyContext, card: dict[str, Any]) -> ScoreRegressor:
         """See `NetworkPolicy.make_network`."""
-        return ScoreRegressor(context.observation_space, context.grid, width, trained_on=trained_on)
+        space, grid = context.observation_space, context.grid
+        return ScoreRegressor(space, grid, card["width"], trained_on=trained_grid(card))
 
     def reset(self, num_envs: int, seed: int | None = None) -> None:
         """Forgets the frames so far."""
@@ -142,9 +148,16 @@ class RegressionPolicy(NetworkPolicy):
         self._weighted = np.zeros((num_envs, len(self.context.grid)))
         self._precision = np.zeros_like(self._weighted)
         self._light, self._frames = np.zeros(num_envs), np.zeros(num_envs)
-        foresees = self.foresight != "none"
-        self._foresight = Foresight(self.context, num_envs) if foresees else None
+        self._foresight: Foresight | None = None
+        if self.foresight != "none":
+            self._foresight = Foresight(self.context, self._tracker(num_envs))
         self._recent: list[tuple[Observations, Floats]] = []  # frames and their metered EV100
+
+    def _tracker(self, num_envs: int) -> LightTracker:
+        if self._forecaster is not None:
+            return LearntTracker(num_envs, self._forecaster)
+        ev100 = self.context.grid.ev100
+        return TrendTracker(num_envs, (float(ev100.min()), float(ev100.max())))
 
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from agents.learning.agent_weights import describe_agent, load_agent, save_agent
+from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.regression_training import RegressionTraining, train_regression
 from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
@@ -38,14 +39,21 @@ class AgentConfig(Configuration):
     """A training of an agent.
 
     Args:
-        agent: ``"regression"`` or ``"ppo"``.
-        environment: Arguments of ``ae_env/AutoExposure-v0``.
+        agent: ``"regression"``, ``"ppo"`` or ``"forecaster"``, which needs no environment.
+        task: Id of the environment.
+        environment: Arguments of it.
+        max_episode_steps: Actions of an episode; by default those of the task.
         num_envs: Episodes side by side.
-        training: Hyperparameters, those of `RegressionTraining` or `PPOTraining`.
+        training: Hyperparameters, those of `RegressionTraining`, `PPOTraining` or
+            `ForecasterTraining`.
     """
 
-    agent: Literal["regression", "ppo"]
+    agent: Literal["regression", "ppo", "forecaster"]
+    task: Literal["ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0"] = (
+        "ae_env/AutoExposure-v0"
+    )
     environment: dict[str, Any] = Field(default_factory=dict)
+    max_episode_steps: int | None = Field(default=None, ge=1, le=10**6)
     num_envs: int = Field(default=64, ge=1, le=4096)
     training: dict[str, Any] = Field(default_factory=dict)
 
@@ -54,6 +62,8 @@ class AgentConfig(Configuration):
         from ae_env.options import EnvOptions
 
         hyperparameters = self.hyperparameters()
+        if self.agent == "forecaster" and self.environment:
+            raise ValueError("`environment` is not used by a forecaster, which sees no pictures")
         try:
             options = EnvOptions.from_kwargs(self.environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
@@ -65,19 +75,22 @@ class AgentConfig(Configuration):
                 f"environment: `observation` (={options.observation!r}) must be 'uint8', which is "
                 "what the agents' networks take"
             )
-        if not isinstance(hyperparameters, RegressionTraining):
-            hyperparameters.check_batch(self.num_envs)
+        check_batch = getattr(hyperparameters, "check_batch", None)
+        if check_batch is not None:
+            check_batch(self.num_envs)
         try:
             json.dumps(self.card())
         except TypeError as error:  # raises before the training, not when the agent is saved
             raise ValueError(f"every entry must be a JSON value: {error}") from error
         return self
 
-    def hyperparameters(self) -> RegressionTraining | PPOTraining:
+    def hyperparameters(self) -> RegressionTraining | PPOTraining | ForecasterTraining:
         """`training` as the hyperparameters of the agent, defaults filled in."""
-        kind: type[RegressionTraining | PPOTraining] = RegressionTraining
+        kind: type[RegressionTraining | PPOTraining | ForecasterTraining] = RegressionTraining
         if self.agent == "ppo":
             from agents.learning.ppo import PPOTraining as kind
+        elif self.agent == "forecaster":
+            kind = ForecasterTraining
         try:
             return kind.model_validate(self.training)
         except ValidationError as error:
@@ -114,8 +127,10 @@ def is_trained(config: AgentConfig, out: Path) -> bool:
         _, card = load_agent(out, config.agent)
     except (FileNotFoundError, ValueError):
         return False
-    # Through JSON, as the card was: a tuple comes back as a list.
-    return bool(card["training"] == json.loads(json.dumps(config.card())))
+    try:  # what an earlier version did not know has its default
+        return AgentConfig.model_validate(card["training"]).card() == config.card()
+    except ValueError:
+        return False
 
 
 def train_agent(
@@ -143,17 +158,30 @@ def train_agent(
     """
     if is_trained(config, out):
         return out
+    training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
+    if isinstance(training, ForecasterTraining):
+        with _logged(progress, tensorboard) as report:
+            network: Any = train_forecaster(
+                training,
+                checkpoint=checkpoint,
+                progress=report,
+                device=device,
+                identity=config.card(),
+            )
+        description = {"width": network.width, "context": {}, "training": config.card()}
+        save_agent(out, config.agent, network, description)
+        checkpoint.unlink(missing_ok=True)
+        return out
     import gymnasium as gym
 
     import ae_env  # noqa: F401  (registers the environment)
 
+    options = dict(config.environment)
+    if config.max_episode_steps is not None:
+        options["max_episode_steps"] = config.max_episode_steps
     envs = gym.make_vec(
-        "ae_env/AutoExposure-v0",
-        num_envs=config.num_envs,
-        autoreset_mode="SAME_STEP",
-        **config.environment,
+        config.task, num_envs=config.num_envs, autoreset_mode="SAME_STEP", **options
     )
-    training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
     with closing(envs), _logged(progress, tensorboard) as report:
         common: dict[str, Any] = {
             "checkpoint": checkpoint,
@@ -162,7 +190,7 @@ def train_agent(
             "identity": config.card(),
         }
         if isinstance(training, RegressionTraining):
-            network: Any = train_regression(envs, training, **common)
+            network = train_regression(envs, training, **common)
         else:
             from agents.learning.ppo import train_ppo
 

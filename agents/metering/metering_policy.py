@@ -29,6 +29,7 @@ from agents.metering.reading import (
     frame_ev100,
     signal_codes,
 )
+from agents.metering.trend import TrendTracker
 from agents.metering.tuned import ScoreRegression
 from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
 
@@ -136,8 +137,9 @@ class MeteringPolicy(Policy):
         ev_range = (float(ev100.min()), float(ev100.max()))
         options = self.options
         self._tracker = EVTracker(num_envs, ev_range, options.damping, options.compensation)
-        foresees = self.foresight != "none"
-        self._foresight = Foresight(self.context, num_envs) if foresees else None
+        self._foresight: Foresight | None = None
+        if self.foresight != "none":
+            self._foresight = Foresight(self.context, TrendTracker(num_envs, ev_range))
         searches = self._meter_name in SEARCH_METERS
         self._reference = ReferenceFrames(self.context.camera) if searches else None
         self._sensor_sum = np.zeros((num_envs, 2))

@@ -46,8 +46,8 @@ class TrendTracker:
         self.ev_range, self.alpha, self.beta, self.damping = ev_range, alpha, beta, damping
         self.ev100, self.rate = np.full(num_envs, np.nan), np.zeros(num_envs)
 
-    def update(self, reading: Reading) -> Floats:
-        """Take in one frame's reading; returns the level, ``(N,)``."""
+    def update(self, reading: Reading, exposed_at: Floats) -> None:
+        """Take in one frame's reading, and the EV100 that it was taken at, ``(N,)``."""
         low, high = self.ev_range
         expected = self.ev100 + self.damping * self.rate
         bound = reading.ev100 - SATURATED_STEP_EV * reading.saturated
@@ -63,7 +63,6 @@ class TrendTracker:
         self.ev100 = np.clip(np.where(first, metered, level), low - 4.0, high + 4.0)
         rate = np.where(first | jumped, 0.0, rate)
         self.rate = np.clip(rate, -MAX_RATE, MAX_RATE)
-        return self.ev100.copy()
 
     def ahead(self, frames: int) -> Floats:
         """EV100 expected `frames` after the last one, ``(N,)``."""

@@ -1,0 +1,275 @@
+"""A forecaster of light with a memory: a recurrent network over what a light meter reads.
+
+It learns from light that is drawn (`ae_env.lighting.moving`, the training kinds, mixed and bent),
+as a meter reads it on frames that are exposed for the light of some frames before: clipped where
+they are too bright, noisy where they are dark. No picture is needed, so it trains in minutes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import nn
+
+from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
+from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
+from agents.metering.reading import (
+    BLACK_SIGNAL,
+    TARGET_SIGNAL,
+    WHITE_SIGNAL,
+    Reading,
+    mean_reading,
+)
+from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.config_file import Configuration
+
+Floats = NDArray[np.float64]
+
+#: Frames ahead that are forecast, from the frame in hand (0) on.
+HORIZON = 4
+#: Kinds of light that it learns from; lamps have no light that goes anywhere.
+KINDS = tuple(kind for kind in KIND_SETS["train"] if kind != "lamps")
+#: Traces of light that a training draws from, and the frames of one sample.
+_TRACES, _LENGTH = 4096, 128
+#: Changes beyond this are not learnt from [EV].
+_LARGEST = 8.0
+#: Numbers that describe a frame.
+_INPUTS = 4
+
+
+class ForecasterTraining(Configuration):
+    """Hyperparameters of a forecaster.
+
+    Args:
+        steps: Optimiser steps.
+        batch_size: Sequences of a step.
+        learning_rate: At its highest, of a one-cycle schedule.
+        weight_decay: Of AdamW.
+        width: Units of the recurrent network.
+        mixed: Share of the light that is a sum of two kinds.
+        bent: Share of the light that is cut at a level, as light is that comes through gaps.
+        seed: Seed of light, frames and weights.
+
+    Raises:
+        ValueError: If a value is out of range or an entry is unknown; the message names it.
+    """
+
+    steps: int = Field(default=4000, ge=2, le=10**9)
+    batch_size: int = Field(default=64, ge=1, le=10**6)
+    learning_rate: float = Field(default=4e-3, ge=1e-9, le=1.0)
+    weight_decay: float = Field(default=1e-3, ge=0.0, le=1e3)
+    width: int = Field(default=64, ge=1, le=MAX_WIDTH)
+    mixed: float = Field(default=0.4, ge=0.0, le=1.0)
+    bent: float = Field(default=0.3, ge=0.0, le=1.0)
+    seed: int = Field(default=0, ge=0, le=2**32 - 1)
+
+
+class LightForecaster(nn.Module):
+    """Change of the light in the next frames, from the readings so far.
+
+    Args:
+        width: Units of the recurrent network.
+    """
+
+    def __init__(self, width: int = 64) -> None:
+        super().__init__()
+        self.width = width
+        self.inputs = nn.Sequential(nn.Linear(_INPUTS, width), nn.ReLU())
+        self.memory = nn.GRU(width, width, batch_first=True)
+        self.outputs = nn.Linear(width, HORIZON + 1)
+
+    def forward(
+        self, readings: torch.Tensor, state: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Changes (B, T, HORIZON + 1) [EV] from each frame's reading, and the state (1, B, width).
+
+        Args:
+            readings: (B, T, 4) of `describe`.
+            state: Of the frames before; None at the start.
+        """
+        found, state = self.memory(self.inputs(readings), state)
+        return self.outputs(found), state
+
+
+def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np.float32]:
+    """What the network sees of a frame, (..., 4): changes and exposure in stops, clipping.
+
+    Args:
+        reading: Of the frame.
+        before: Metered EV100 of the frame before it.
+        exposed_at: EV100 that the frame was taken at.
+    """
+    parts = [
+        (reading.ev100 - before) / 2.0,
+        (reading.ev100 - exposed_at) / 4.0,
+        reading.saturated,
+        np.asarray(reading.black, np.float64),
+    ]
+    return np.stack(parts, axis=-1).astype(np.float32)
+
+
+class LearntTracker:
+    """The forecast of a trained `LightForecaster`, as a tracker of `agents.foresight`.
+
+    Args:
+        num_envs: Cameras.
+        network: The trained network.
+    """
+
+    def __init__(self, num_envs: int, network: LightForecaster) -> None:
+        self.network = network
+        self._before: Floats | None = None
+        self._state: torch.Tensor | None = None
+        self._forecast: Floats = np.full((num_envs, HORIZON + 1), np.nan)
+
+    def update(self, reading: Reading, exposed_at: Floats) -> None:
+        """Take in one frame's reading."""
+        before = reading.ev100 if self._before is None else self._before
+        inputs = torch.from_numpy(describe(reading, before, exposed_at))[:, None]
+        inputs = inputs.to(next(self.network.parameters()).device)
+        with torch.inference_mode():
+            changes, self._state = self.network(inputs, self._state)
+        self._before = reading.ev100.copy()
+        self._forecast = reading.ev100[:, None] + changes[:, 0].double().cpu().numpy()
+
+    def ahead(self, frames: int) -> Floats:
+        """EV100 expected `frames` (at most `HORIZON`) after the last one, ``(N,)``."""
+        return self._forecast[:, frames]
+
+
+def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
+    """The forecaster that a training wrote.
+
+    Raises:
+        FileNotFoundError: If a file is missing.
+        ValueError: If a file is damaged, or holds another kind of agent.
+    """
+    tensors, card = load_agent(path, "forecaster")
+    network = LightForecaster(card["width"])
+    load_into(network, tensors, path)
+    return network.to(device).eval()
+
+
+# -- training -------------------------------------------------------------------------------------
+
+
+def train_forecaster(
+    training: ForecasterTraining,
+    *,
+    checkpoint: Path | None = None,
+    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    device: str = "cpu",
+    identity: Any = None,
+) -> LightForecaster:
+    """Trains a forecaster on light of the training kinds.
+
+    Args:
+        training: Hyperparameters.
+        checkpoint: File for the state of the training; a second run resumes from it.
+        progress: Called with steps done, steps in all, and the error [EV].
+        device: Torch device.
+        identity: JSON value; the checkpoint of a training with another one is not resumed. By
+            default the hyperparameters.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(training.seed)
+        network = LightForecaster(training.width).to(device)
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
+    )
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, max_lr=training.learning_rate, total_steps=training.steps + 1
+    )
+    parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
+    done = 0
+    store = Checkpoint(
+        checkpoint,
+        identity or training.model_dump(),
+        lambda: {"step": done, **{name: part.state_dict() for name, part in parts.items()}},
+    )
+    past = store.load()
+    if past is not None:
+        done = int(past["step"])
+        for name, part in parts.items():
+            part.load_state_dict(past[name])
+    rng = np.random.default_rng([training.seed, done])
+    traces = np.stack([MOVES[KINDS[i % len(KINDS)]](rng) for i in range(_TRACES)])
+    with store:
+        while done < training.steps:
+            readings, changes = sample(traces, training, rng)
+            found, _ = network(torch.from_numpy(readings).to(device))
+            target = torch.from_numpy(changes).to(device)
+            loss = nn.functional.smooth_l1_loss(found, target, beta=0.3)
+            if not math.isfinite(loss.item()):
+                raise ValueError(f"the loss (={loss.item()}) must be finite; lower `learning_rate`")
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimizer.step()
+            schedule.step()
+            done += 1
+            if progress is not None:
+                progress(done, training.steps, {"EV": (found - target).abs().mean().item()})
+            store.save_when_due()
+    return network.eval()
+
+
+def sample(
+    traces: Floats, training: ForecasterTraining, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Descriptions (B, T, 4) of frames in drawn light, and the changes (B, T, HORIZON + 1) [EV]."""
+    count = training.batch_size
+
+    def windows() -> Floats:
+        rows = rng.integers(len(traces), size=count)
+        starts = rng.integers(FRAMES - _LENGTH - HORIZON, size=count)
+        return traces[rows[:, None], starts[:, None] + np.arange(_LENGTH + HORIZON)]
+
+    light = windows()
+    mixed = rng.random(count) < training.mixed
+    weights = rng.uniform(0.4, 1.0, (2, count, 1))
+    light = np.where(mixed[:, None], weights[0] * light + weights[1] * windows(), light)
+    level = light.mean(axis=1, keepdims=True) + rng.normal(0.0, 1.0, (count, 1))
+    bent, up = rng.random((2, count, 1))
+    cut = np.where(up < 0.5, np.minimum(light, level), np.maximum(light, level))
+    light = np.where(bent < training.bent, cut, light)
+    light += rng.uniform(4.0, 14.0, (count, 1))
+    reading, exposed_at = metered(light, rng)
+    before = np.concatenate([reading.ev100[:, :1], reading.ev100[:, :-1]], axis=1)
+    described = describe(reading, before, exposed_at)[:, :_LENGTH]
+    ahead = np.stack([light[:, k : k + _LENGTH] for k in range(HORIZON + 1)], axis=-1)
+    changes = np.clip(ahead - reading.ev100[:, :_LENGTH, None], -_LARGEST, _LARGEST)
+    return described, changes.astype(np.float32)
+
+
+def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
+    """What an average meter reads on frames exposed for the light three frames before.
+
+    A frame is 64 luminances, normal in stops with a mean of 1; each exposure is off by about half a
+    stop, and of a grid of whole stops.
+
+    Args:
+        light: (B, T) EV100.
+        rng: Draws the scenes and the errors.
+
+    Returns:
+        The readings, and the EV100 of the exposures, (B, T) each.
+    """
+    count, frames = light.shape
+    spread = rng.uniform(0.8, 2.2, (count, 1))
+    luminance = np.exp2(np.minimum(rng.normal(0.0, spread, (count, 64)), 5.0))
+    luminance /= luminance.mean(axis=1, keepdims=True)
+    late = np.concatenate([np.repeat(light[:, :1], 3, axis=1), light], axis=1)[:, :frames]
+    off = rng.normal(0.0, 0.6, (count, 1)) + rng.normal(0.0, 0.3, light.shape)
+    exposed_at = np.round(late + off)
+    signal = TARGET_SIGNAL * np.exp2(light - exposed_at)[:, :, None] * luminance[:, None]
+    saturated = (signal >= WHITE_SIGNAL).mean(axis=2)
+    mean = np.minimum(signal, 1.0).mean(axis=2) + rng.normal(0.0, BLACK_SIGNAL, light.shape)
+    return mean_reading(mean, saturated, exposed_at), exposed_at
