@@ -21,14 +21,21 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+#: Points [mean absolute errors] and weights over which a forecast is averaged: those of Gauss and
+#: Hermite for a normal distribution, whose standard deviation is 1.25 of its mean absolute error.
+POINTS = (1.2533 * 3.0**0.5 * np.array([-1.0, 0.0, 1.0]), np.array([1.0, 4.0, 1.0]) / 6.0)
+
+
 class LightTracker(Protocol):
     """Expects the light of frames to come."""
 
     def update(self, reading: Reading, exposed_at: Floats) -> None:
         """Take in what a meter reads in one frame of each camera, taken at EV100 `exposed_at`."""
 
-    def ahead(self, frames: int) -> Floats:
-        """EV100 that the meter is expected to read `frames` after the last one, ``(N,)``."""
+    def ahead(self, frames: int) -> tuple[Floats, Floats]:
+        """EV100 that the meter is expected to read `frames` after the last one, ``(N,)``, and the
+        mean absolute error expected of that; 0 where it is not known.
+        """
 
 
 class Foresight:
@@ -53,7 +60,7 @@ class Foresight:
 
     def ev100(self, frames: int) -> Floats:
         """EV100 that a meter is expected to read `frames` after the frame in hand, ``(N,)``."""
-        return self._tracker.ahead(frames)
+        return self._tracker.ahead(frames)[0]
 
     def utility(self, scores: Callable[[Floats], Floats]) -> Floats:
         """What each state promises in the first frames that have its controls, ``(N, S)``.
@@ -67,7 +74,7 @@ class Foresight:
         """
         total: Floats = np.zeros((len(self._asked[0]), 1, 1, 1))
         for frame in sorted(set(self.leads)):
-            promised = scores(self.ev100(frame)).reshape(-1, *self.grid.shape)
+            promised = self._expected(scores, frame).reshape(-1, *self.grid.shape)
             for axis, lead in enumerate(self.leads):
                 if lead < frame:
                     promised = promised.max(axis=1 + axis, keepdims=True)
@@ -77,6 +84,16 @@ class Foresight:
                     promised = np.take_along_axis(promised, index, axis=1 + axis)
             total = total + promised
         return total.reshape(len(total), -1)
+
+    def _expected(self, scores: Callable[[Floats], Floats], frame: int) -> Floats:
+        """Mean of the scores over what the light of `frame` may be."""
+        ev100, spread = self._tracker.ahead(frame)
+        if not spread.any():
+            return scores(ev100)
+        found = [
+            weight * scores(ev100 + step * spread) for step, weight in zip(*POINTS, strict=True)
+        ]
+        return np.sum(found, axis=0)
 
     def decided(self, states: Ints) -> None:
         """Remember what was asked for after the frame in hand, ``(N,)``."""

@@ -37,9 +37,11 @@ HORIZON = 4
 #: Kinds of light that it learns from; lamps have no light that goes anywhere.
 KINDS = tuple(kind for kind in KIND_SETS["train"] if kind != "lamps")
 #: Traces of light that a training draws from, and the frames of one sample.
-_TRACES, _LENGTH = 4096, 128
+_TRACES, _LENGTH = 1024, 128
 #: Changes beyond this are not learnt from [EV].
 _LARGEST = 8.0
+#: Least spread of a forecast [EV].
+_LEAST_SPREAD = 0.02
 #: Numbers that describe a frame.
 _INPUTS = 4
 
@@ -53,21 +55,22 @@ class ForecasterTraining(Configuration):
         learning_rate: At its highest, of a one-cycle schedule.
         weight_decay: Of AdamW.
         width: Units of the recurrent network.
-        mixed: Share of the light that is a sum of two kinds.
-        bent: Share of the light that is cut at a level, as light is that comes through gaps.
+        mixed: Share of the light that is a sum of two to four kinds.
+        bent: Share of the light that is cut at a level above or below, as light is that comes
+            through gaps; likewise the share whose pace varies, and the share that is smoothed.
         seed: Seed of light, frames and weights.
 
     Raises:
         ValueError: If a value is out of range or an entry is unknown; the message names it.
     """
 
-    steps: int = Field(default=4000, ge=2, le=10**9)
+    steps: int = Field(default=10_000, ge=2, le=10**9)
     batch_size: int = Field(default=64, ge=1, le=10**6)
     learning_rate: float = Field(default=4e-3, ge=1e-9, le=1.0)
     weight_decay: float = Field(default=1e-3, ge=0.0, le=1e3)
     width: int = Field(default=64, ge=1, le=MAX_WIDTH)
-    mixed: float = Field(default=0.4, ge=0.0, le=1.0)
-    bent: float = Field(default=0.3, ge=0.0, le=1.0)
+    mixed: float = Field(default=0.5, ge=0.0, le=1.0)
+    bent: float = Field(default=0.4, ge=0.0, le=1.0)
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
 
@@ -83,19 +86,24 @@ class LightForecaster(nn.Module):
         self.width = width
         self.inputs = nn.Sequential(nn.Linear(_INPUTS, width), nn.ReLU())
         self.memory = nn.GRU(width, width, batch_first=True)
-        self.outputs = nn.Linear(width, HORIZON + 1)
+        self.outputs = nn.Linear(width, 2 * (HORIZON + 1))
 
     def forward(
         self, readings: torch.Tensor, state: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Changes (B, T, HORIZON + 1) [EV] from each frame's reading, and the state (1, B, width).
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """What is expected of the next frames, from each frame's reading on.
 
         Args:
             readings: (B, T, 4) of `describe`.
             state: Of the frames before; None at the start.
+
+        Returns:
+            Changes of the light (B, T, HORIZON + 1) [EV]; their spreads, the mean absolute error
+            expected; and the state (1, B, width).
         """
         found, state = self.memory(self.inputs(readings), state)
-        return self.outputs(found), state
+        changes, spreads = self.outputs(found).chunk(2, dim=-1)
+        return changes, nn.functional.softplus(spreads) + _LEAST_SPREAD, state
 
 
 def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np.float32]:
@@ -127,7 +135,7 @@ class LearntTracker:
         self.network = network
         self._before: Floats | None = None
         self._state: torch.Tensor | None = None
-        self._forecast: Floats = np.full((num_envs, HORIZON + 1), np.nan)
+        self._expected, self._spread = np.full((2, num_envs, HORIZON + 1), np.nan)
 
     def update(self, reading: Reading, exposed_at: Floats) -> None:
         """Take in one frame's reading."""
@@ -135,13 +143,14 @@ class LearntTracker:
         inputs = torch.from_numpy(describe(reading, before, exposed_at))[:, None]
         inputs = inputs.to(next(self.network.parameters()).device)
         with torch.inference_mode():
-            changes, self._state = self.network(inputs, self._state)
+            changes, spreads, self._state = self.network(inputs, self._state)
         self._before = reading.ev100.copy()
-        self._forecast = reading.ev100[:, None] + changes[:, 0].double().cpu().numpy()
+        self._expected = reading.ev100[:, None] + changes[:, 0].double().cpu().numpy()
+        self._spread = spreads[:, 0].double().cpu().numpy()
 
-    def ahead(self, frames: int) -> Floats:
-        """EV100 expected `frames` (at most `HORIZON`) after the last one, ``(N,)``."""
-        return self._forecast[:, frames]
+    def ahead(self, frames: int) -> tuple[Floats, Floats]:
+        """See `LightTracker.ahead`; at most `HORIZON` frames."""
+        return self._expected[:, frames], self._spread[:, frames]
 
 
 def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
@@ -204,19 +213,19 @@ def train_forecaster(
     with store:
         while done < training.steps:
             readings, changes = sample(traces, training, rng)
-            found, _ = network(torch.from_numpy(readings).to(device))
-            target = torch.from_numpy(changes).to(device)
-            loss = nn.functional.smooth_l1_loss(found, target, beta=0.3)
+            found, spread, _ = network(torch.from_numpy(readings).to(device))
+            error = (found - torch.from_numpy(changes).to(device)).abs()
+            loss = (error / spread + spread.log()).mean()  # likelihood of a Laplace distribution
             if not math.isfinite(loss.item()):
                 raise ValueError(f"the loss (={loss.item()}) must be finite; lower `learning_rate`")
             optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimizer.step()
             schedule.step()
             done += 1
             if progress is not None:
-                progress(done, training.steps, {"EV": (found - target).abs().mean().item()})
+                progress(done, training.steps, {"EV": error.mean().item()})
             store.save_when_due()
     return network.eval()
 
@@ -229,17 +238,26 @@ def sample(
 
     def windows() -> Floats:
         rows = rng.integers(len(traces), size=count)
-        starts = rng.integers(FRAMES - _LENGTH - HORIZON, size=count)
-        return traces[rows[:, None], starts[:, None] + np.arange(_LENGTH + HORIZON)]
+        starts = rng.integers(FRAMES // 4, size=count)
+        frames = np.arange(_LENGTH + HORIZON, dtype=np.float64)
+        varies = rng.random(count) < training.bent
+        turn = frames / rng.uniform(20.0, 80.0, (count, 1)) + rng.random((count, 1))
+        pace = 1.0 + 0.4 * varies[:, None] * np.sin(2.0 * np.pi * turn)
+        times = starts[:, None] + np.cumsum(pace * np.exp(rng.normal(0.0, 0.2, (count, 1))), axis=1)
+        times = np.minimum(times, FRAMES - 2)
+        below = times.astype(np.int64)
+        weight = times - below
+        known = traces[rows]
+        first = np.take_along_axis(known, below, axis=1)
+        return first + weight * (np.take_along_axis(known, below + 1, axis=1) - first)
 
     light = windows()
-    mixed = rng.random(count) < training.mixed
-    weights = rng.uniform(0.4, 1.0, (2, count, 1))
-    light = np.where(mixed[:, None], weights[0] * light + weights[1] * windows(), light)
-    level = light.mean(axis=1, keepdims=True) + rng.normal(0.0, 1.0, (count, 1))
-    bent, up = rng.random((2, count, 1))
-    cut = np.where(up < 0.5, np.minimum(light, level), np.maximum(light, level))
-    light = np.where(bent < training.bent, cut, light)
+    mixed = rng.random((count, 1)) < training.mixed
+    for _ in range(3):
+        share = rng.uniform(0.0, 0.8, (count, 1)) * (mixed & (rng.random((count, 1)) < 0.6))
+        light = light * np.where(share > 0.0, rng.uniform(0.4, 1.0, (count, 1)), 1.0)
+        light += share * windows()
+    light = _bent(light, training.bent, rng)
     light += rng.uniform(4.0, 14.0, (count, 1))
     reading, exposed_at = metered(light, rng)
     before = np.concatenate([reading.ev100[:, :1], reading.ev100[:, :-1]], axis=1)
@@ -247,6 +265,20 @@ def sample(
     ahead = np.stack([light[:, k : k + _LENGTH] for k in range(HORIZON + 1)], axis=-1)
     changes = np.clip(ahead - reading.ev100[:, :_LENGTH, None], -_LARGEST, _LARGEST)
     return described, changes.astype(np.float32)
+
+
+def _bent(light: Floats, share: float, rng: np.random.Generator) -> Floats:
+    """`light` (B, T), cut below or above a level, and smoothed, in `share` of the rows each."""
+    count = len(light)
+    middle, spread = light.mean(axis=1, keepdims=True), light.std(axis=1, keepdims=True)
+    for cut in (np.minimum, np.maximum):
+        level = middle + spread * rng.normal(0.0, 0.7, (count, 1))
+        light = np.where(rng.random((count, 1)) < share, cut(light, level), light)
+    smoothed = light.copy()
+    for lag in (1, 2):
+        smoothed[:, lag:] += light[:, :-lag]
+        smoothed[:, :lag] += light[:, :1]
+    return np.where(rng.random((count, 1)) < share, smoothed / 3.0, light)
 
 
 def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:

@@ -64,7 +64,7 @@ class TrendTracker:
         rate = np.where(first | jumped, 0.0, rate)
         self.rate = np.clip(rate, -MAX_RATE, MAX_RATE)
 
-    def ahead(self, frames: int) -> Floats:
-        """EV100 expected `frames` after the last one, ``(N,)``."""
+    def ahead(self, frames: int) -> tuple[Floats, Floats]:
+        """See `LightTracker.ahead`; how far off it may be is not known."""
         weight = sum(self.damping**k for k in range(1, frames + 1))
-        return self.ev100 + weight * self.rate
+        return self.ev100 + weight * self.rate, np.zeros_like(self.rate)

@@ -41,6 +41,8 @@ from benchmarks.transfer.worlds import (
 
 #: Name of the hyperparameter that counts frames, by agent.
 _FRAMES = {"regression": "frames", "ppo": "total_timesteps"}
+#: What the agents together are called.
+TOGETHER = "agents together"
 #: The trainings of each agent and world, one for each seed.
 Jobs = dict[tuple[str, str], list[TrainingJob]]
 
@@ -173,29 +175,50 @@ def policy_name(agent: str, world: str) -> str:
 def result_rows(
     result: EvaluationResult, minutes: Mapping[tuple[str, str], list[float]], plan: TransferPlan
 ) -> list[Row]:
-    """A row for each agent and world.
+    """A row for each agent and world, and for all agents of a world together.
 
     Args:
         result: Of `judged`.
         minutes: That each seed took to train, by agent and world.
         plan: The plan.
     """
-    gains, spans = {}, {}
-    for agent, world in minutes:
+    gains = {}
+    for agent, world in minutes:  # the span is the same for all
         gains[agent, world], span = result.group_gains(policy_name(agent, world))
-        spans[agent] = span
     rows = []
     for (agent, world), taken in minutes.items():
         errors = result.episode_metrics(policy_name(agent, world))
         row: Row = {"agent": agent, "world": world, "high_iso": WORLDS[world].high_iso}
         row |= {"simulator": WORLDS[world].simulator, "frames": plan.frames}
         row |= {"crop": plan.crop, "scorer": plan.scorer}
-        row |= comparison(gains, spans[agent], agent, world)
+        row |= comparison(gains, span, agent, world)
         row |= {"num_scenes": len(set(result.scene_ids.tolist()))}
         row |= {"regret": float(errors["regret"].mean())}
         row |= {"ev_within_third": float(errors["ev_within_third"].mean())}
         rows.append(row | {"minutes": float(np.median(taken)), "minutes_by_seed": taken})
-    return rows
+    return rows + _together(rows, gains, span)
+
+
+def _together(
+    rows: list[Row], gains: Mapping[tuple[str, str], np.ndarray], span: np.ndarray
+) -> list[Row]:
+    """A row for each world of the agents together, as so many training seeds."""
+    agents = tuple(dict.fromkeys(row["agent"] for row in rows))
+    worlds = tuple(dict.fromkeys(row["world"] for row in rows))
+    if len(agents) < 2:
+        return []
+    joint = {
+        (TOGETHER, world): np.concatenate([gains[agent, world] for agent in agents])
+        for world in worlds
+    }
+    means = ("minutes", "regret", "ev_within_third")
+    found = []
+    for world in worlds:
+        own = [row for row in rows if row["world"] == world]
+        row = own[0] | {"agent": TOGETHER} | {n: np.mean([r[n] for r in own]) for n in means}
+        row |= comparison(joint, span, TOGETHER, world)
+        found.append(row | {"minutes_by_seed": [m for r in own for m in r["minutes_by_seed"]]})
+    return found
 
 
 def comparison(

@@ -57,8 +57,9 @@ def agents_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
         f"truth; scorer `{first['scorer']}`, frames {_CROPS[first['crop']]}. In brackets: 95 % "
         "intervals, differences paired over source groups, training seeds drawn too. *More than in "
         "`EXP`*: the score less that of the agent trained in EXP on sources of the same ISO. "
-        "Minutes are those of one training with the loading of its scenes and their networks, the "
-        "median over the seeds.",
+        "*Agents together*: all trainings of a world as if they were seeds of one agent. Minutes "
+        "are those of one training with the loading of its scenes and their networks, the median "
+        "over the seeds.",
         bullets(verdicts(rows)),
     ]
     for agent in dict.fromkeys(row["agent"] for row in rows):
