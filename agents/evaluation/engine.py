@@ -47,7 +47,7 @@ Ints = NDArray[np.int64]
 Arrays = dict[str, NDArray[Any]]
 
 #: Arrays of a `Track`.
-TRACK_ARRAYS = ("states", "image_mean", "clipped_high", "clipped_low")
+TRACK_ARRAYS = ("states", "image_mean", "code_mean", "clipped_high", "clipped_low")
 #: Episodes at a time, at most.
 BATCH = 64
 #: The scorer of the environments that policies see: it costs next to nothing, and is not used.

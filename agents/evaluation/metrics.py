@@ -199,6 +199,21 @@ def flicker(image_means: Floats, static: NDArray[np.bool_]) -> Floats:
     return total
 
 
+def jump(code_means: Floats) -> Floats:
+    """Mean visible jump: the change of the mean companded code between successive frames.
+
+    Args:
+        code_means: Mean code of each frame after an action, in [0, 1], ``(..., T)``.
+
+    >>> float(jump(np.array([0.5, 0.5, 0.75])))
+    0.125
+    """
+    if code_means.shape[-1] < 2:
+        return np.zeros(code_means.shape[:-1])
+    found: Floats = np.abs(np.diff(code_means, axis=-1)).mean(axis=-1)
+    return found
+
+
 def delayed_states(states: Ints, start_states: Ints, delay: int) -> Ints:
     """`states` (E, T) as they are in effect `delay` frames later; `start_states` (E,) before."""
     waiting = np.repeat(start_states[:, None], min(delay, states.shape[1]), axis=1)

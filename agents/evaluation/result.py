@@ -34,6 +34,7 @@ class Track:
         states: States of the frames after each action, ``(K, E, T)``; with a delay those that
             were chosen earlier.
         image_mean: Mean linear signal of each frame after an action, ``(K, E, T)``.
+        code_mean: Mean of the companded frame, in [0, 1], ``(K, E, T)``.
         clipped_high: Share of saturated pixels, ``(K, E, T)``.
         clipped_low: Share of black pixels, ``(K, E, T)``.
         ms_per_decision: Time in `act` per camera and frame [ms], in batches.
@@ -44,6 +45,7 @@ class Track:
 
     states: Ints
     image_mean: Floats
+    code_mean: Floats
     clipped_high: Floats
     clipped_low: Floats
     ms_per_decision: float
@@ -58,6 +60,7 @@ class Track:
         return cls(
             states=np.concatenate([t.states for t in tracks]),
             image_mean=np.concatenate([t.image_mean for t in tracks]),
+            code_mean=np.concatenate([t.code_mean for t in tracks]),
             clipped_high=np.concatenate([t.clipped_high for t in tracks]),
             clipped_low=np.concatenate([t.clipped_low for t in tracks]),
             ms_per_decision=float(np.mean([t.ms_per_decision for t in tracks])),
@@ -190,6 +193,7 @@ class EvaluationResult:
             "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
             "reversals": metrics.reversals(evs),
             "flicker": metrics.flicker(track.image_mean, static),
+            "jump": metrics.jump(track.code_mean),
             "clipped_high": track.clipped_high.mean(axis=-1),
             "clipped_low": track.clipped_low.mean(axis=-1),
         }

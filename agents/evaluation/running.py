@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ae_env.utils.checks import UserCodeError, check_number
 from agents.episodes import EpisodeBatch, Episodes, action_masks, make_envs
-from agents.metering.reading import linear_signal
+from agents.metering.reading import linear_signal, signal_codes
 from agents.policy import Policy
 
 Ints = NDArray[np.int64]
@@ -79,7 +79,7 @@ def run_batch(
             policy's ``info`` gets.
 
     Returns:
-        Of the valid episodes ``states``, ``image_mean``, ``clipped_high`` and ``clipped_low``
+        Of the valid episodes ``states`` and the other entries of `TRACK_ARRAYS`
         (n, frames) after each action, and their ``start_states`` (n,); ``seconds`` (frames,) that
         `act` took for the batch.
 
@@ -91,7 +91,7 @@ def run_batch(
         policy.reset(envs.num_envs, seed=batch.seed)
     observations, info, masks = batch.observations, batch.info, batch.action_masks
     start = np.array(info["state"], dtype=np.int64)
-    states, means, high, low, seconds = [], [], [], [], []
+    states, means, codes, high, low, seconds = [], [], [], [], [], []
     for frame in range(frames):
         extra: dict[str, Any] = {}
         if getattr(policy, "privileged", False):
@@ -104,11 +104,14 @@ def run_batch(
         masks = action_masks(envs)  # the next frame of a sequence is another scene
         states.append(np.array(info["state"], dtype=np.int64))  # with a delay, an older choice
         means.append(linear_signal(observations["raw"], base.camera).mean(axis=(1, 2, 3)))
+        companded = signal_codes(observations["raw"], base.camera)
+        codes.append(companded.mean(axis=(1, 2, 3), dtype=np.float64) / 255.0)
         high.append(np.array(info["clipped_high"], dtype=np.float64))
         low.append(np.array(info["clipped_low"], dtype=np.float64))
     return {
         "states": np.stack(states, axis=1)[batch.valid],
         "image_mean": np.stack(means, axis=1)[batch.valid],
+        "code_mean": np.stack(codes, axis=1)[batch.valid],
         "clipped_high": np.stack(high, axis=1)[batch.valid],
         "clipped_low": np.stack(low, axis=1)[batch.valid],
         "start_states": start[batch.valid],

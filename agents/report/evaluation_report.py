@@ -284,6 +284,7 @@ class _Report:
                 ".1f",
             ),
             ("Overshoot [EV]", "overshoot", ".2f"),
+            ("Visible jump (mean change of the companded picture)", "jump", ".4f"),
         ):
             body = [[c, *(f"{self.by[p, c][key]:{form}}" for p in names)] for c in self.results]
             parts += [f"### {title}", markdown_table(head, body)]

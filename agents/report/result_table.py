@@ -26,13 +26,14 @@ Results = Mapping[str, EvaluationResult]
 
 #: Metrics that are averaged over the episodes of a source group, then over source groups.
 _AVERAGED = (
-    *("frames_to_converge", "overshoot", "reversals", "flicker", "clipped_high", "clipped_low"),
+    *("frames_to_converge", "overshoot", "reversals", "flicker", "jump"),
+    *("clipped_high", "clipped_low"),
 )
 SCENE_COLUMNS = (
     *("policy", "scene_id", "group", "kind", "hard", "episodes", "score", "oracle", "random"),
     *("regret", "regret_delayed", "regret_given_ev", "ev_error_median", "ev_error_p95"),
     *("ev_within_third", "frames_to_converge", "converged", "overshoot", "reversals", "flicker"),
-    *("clipped_high", "clipped_low", "final_state", "oracle_state"),
+    *("jump", "clipped_high", "clipped_low", "final_state", "oracle_state"),
 )
 
 

@@ -10,7 +10,7 @@ from agents.evaluation.result import Track
 COLUMNS = [
     *("policy", "condition", "source", "split", "num_groups", "seed", "mean_score"),
     *("normalised_score", "regret", "ci95", "ev_error_median", "ev_error_p95"),
-    *("ev_within_third", "frames_to_converge", "overshoot", "reversals", "flicker"),
+    *("ev_within_third", "frames_to_converge", "overshoot", "reversals", "flicker", "jump"),
     *("clipped_high", "clipped_low", "captures_per_decision", "ms_per_decision"),
 ]
 
@@ -24,7 +24,7 @@ def made_result(groups: int = 20) -> EvaluationResult:
 
     def track(states: np.ndarray, privileged: bool = False) -> Track:
         zeros = np.zeros(states.shape)
-        return Track(states, zeros, zeros + 0.25, zeros, 0.5, 1.0, privileged)
+        return Track(states, zeros, zeros, zeros + 0.25, zeros, 0.5, 1.0, privileged)
 
     def choose(seeds: int) -> np.ndarray:
         return rng.integers(64, size=(seeds, episodes, frames))
