@@ -108,6 +108,10 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     move and may be out of focus: only a shorter exposure or a smaller aperture helps, at the price
     of noise.
 
+    In light that stays, without delay, this is a contextual bandit: an action changes the next
+    frame and nothing else, two frames tell nearly all that an episode tells, and a discount of 0 is
+    the right one. `AutoExposureVideo-v0` is the task that asks for memory and foresight.
+
     ## Action Space
 
     `Discrete(64)`: index into `ExposureGrid.default()`,
