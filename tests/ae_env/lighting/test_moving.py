@@ -12,15 +12,15 @@ from ae_env.scenes.radiance import read_radiance
 PHASES = np.random.default_rng(0).random(60)
 #: Most stops away from where the light begins (sines begin anywhere), most stops between frames.
 BOUNDS = {
-    "ramps": (6.0, 1.0),
-    "sines": (3.0, 2.0 * np.pi * 3.0 / 12.0),
-    "tunnels": (7.0, 7.0),
+    "ramps": (6.0, 1.5),
+    "sines": (3.5, 2.0 * np.pi * 3.5 / 7.0),
+    "tunnels": (7.0, 7.0 / 3.0),
     "steps": (3.0, 6.0),
-    "drifts": (6.0, 1.0),
+    "drifts": (6.0, 1.5),
     "lamps": (0.0, 0.0),
-    "shadows": (4.0, 4.0),
-    "clouds": (4.0, 4.0 / 4.0 * 2.0 * 6.0 * 2.0 * np.pi / 40.0),
-    "pans": (4.0, 0.6),
+    "shadows": (5.0, 5.0),
+    "clouds": (5.0, 5.0),
+    "pans": (4.0, 6.0 * 0.6),
 }
 
 

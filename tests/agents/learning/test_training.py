@@ -48,7 +48,7 @@ def test_shipped_configs(path: Path) -> None:
     ("text", "message"),
     [
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
-        ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression' or 'ppo'"),
+        ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression', 'ppo' or 'forecaster'"),
         ("", r"is empty: it must map entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\): unknown.*mean `n_steps`"),
@@ -64,6 +64,10 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: ppo\nenvironment: {resolutoin: 64}", r"`resolutoin`.*mean `resolution`"),
         ("agent: ppo\nenvironment: {resolution: 8}", r"`resolution` \(=8\) must be an integer in"),
         ("agent: ppo\nenvironment: {scorer: balnced}", r"environment: .*balnced"),
+        ("agent: ppo\ntask: ae_env/Nothing-v0", r"task \(='ae_env/Nothing-v0'\)"),
+        ("agent: ppo\nmax_episode_steps: 0", r"max_episode_steps \(=0\)"),
+        ("agent: forecaster\ntraining: {mixed: 2}", r"training.mixed \(=2\)"),
+        ("agent: forecaster\nenvironment: {split: train}", r"`environment` is not used"),
         ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
     ],
 )
