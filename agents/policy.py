@@ -38,6 +38,8 @@ RPI_AGC = "rpi_agc"
 #: Agents that come with the package: the training seeds of ``ae-env bench agents``.
 PRETRAINED = Path(__file__).parent / "pretrained"
 PRETRAINED_SEEDS = (0, 1, 2)
+#: What follows the colon in the name of an agent that was trained for `AutoExposureVideo-v0`.
+VIDEO = "video"
 
 _RECORDED = "recorded"
 #: Module and class by name; imported when the policy is made.
@@ -179,7 +181,9 @@ def training_seeds(name: str) -> list[str]:
 
     Args:
         name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
-            ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself.
+            ``"ppo:video"`` or ``"regression:video"`` for those of `AutoExposureVideo-v0`;
+            ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself. Options
+            of the name are those of each.
 
     Raises:
         ValueError: If no file matches a pattern.
@@ -187,14 +191,26 @@ def training_seeds(name: str) -> list[str]:
     >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
     (['0', '1', '2'], ['spot:P'])
     """
-    head, _, tail = str(name).partition(":")
-    if head not in _LEARNT or (tail and "*" not in tail):
+    base, mark, options = str(name).partition("?")
+    head, _, tail = base.partition(":")
+    if head not in _LEARNT or (tail not in ("", VIDEO) and "*" not in tail):
         return [name]
-    pattern = Path(tail or PRETRAINED / f"{head}-*").expanduser()
-    files = sorted(pattern.parent.glob(f"{pattern.name.removesuffix('.safetensors')}.safetensors"))
+    files = weight_files(_shipped(head, tail) + "*" if tail in ("", VIDEO) else tail)
     if not files:
-        raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {str(pattern)!r}")
-    return [f"{head}:{file.with_suffix('')}" for file in files]
+        raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {tail!r}")
+    return [f"{head}:{file}{mark}{options}" for file in files]
+
+
+def weight_files(pattern: str) -> list[str]:
+    """Names, without suffix, of the .safetensors files that fit `pattern`, sorted."""
+    path = Path(pattern).expanduser()
+    found = sorted(path.parent.glob(f"{path.name.removesuffix('.safetensors')}.safetensors"))
+    return [str(file.with_suffix("")) for file in found]
+
+
+def _shipped(head: str, tail: str) -> str:
+    """The beginning of the names of weights that come with the package."""
+    return str(PRETRAINED / (f"{tail}-{head}-" if tail else f"{head}-"))
 
 
 def split_class(base: str) -> tuple[str, str]:
@@ -276,10 +292,10 @@ def make_policy(
             ``"oracle:clairvoyant"``; a meter and a program such as
             ``"centre_weighted:P"`` (the program defaults to P); ``"rpi_agc"``, alone or with a
             program; ``"recorded:FOLDER"``; ``"regression"`` and ``"ppo"``, the
-            agents that come with the package, or ``"regression:PATH"`` and ``"ppo:PATH"`` with
-            weights of one's own; ``"package.module:Class"`` or
-            ``"path/to/file.py:Class"`` for a policy of one's own. Options may follow:
-            ``"centre_weighted:P?compensation=-1&damping=0.5"``.
+            agents that come with the package, ``"regression:video"`` and ``"ppo:video"``, those for
+            `AutoExposureVideo-v0`, or ``"regression:PATH"`` and ``"ppo:PATH"`` with weights of
+            one's own; ``"package.module:Class"`` or ``"path/to/file.py:Class"`` for a policy of
+            one's own. Options may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
         context: The camera.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
@@ -339,7 +355,9 @@ def _with_weights(
         )
     if "network" in options:
         return options
-    weights = tail or str(PRETRAINED / f"{head}-{PRETRAINED_SEEDS[0]}")
+    weights = tail
+    if tail in ("", VIDEO):
+        weights = f"{_shipped(head, tail)}{PRETRAINED_SEEDS[0]}"
     return {"weights": weights, "device": device, **options}
 
 

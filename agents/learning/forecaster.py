@@ -8,7 +8,7 @@ they are too bright, noisy where they are dark. No picture is needed, so it trai
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,8 @@ Floats = NDArray[np.float64]
 HORIZON = 4
 #: Kinds of light that it learns from; lamps have no light that goes anywhere.
 KINDS = tuple(kind for kind in KIND_SETS["train"] if kind != "lamps")
-#: Traces of light that a training draws from, and the frames of one sample.
-_TRACES, _LENGTH = 1024, 128
+#: Frames of a sample.
+_LENGTH = 128
 #: Changes beyond this are not learnt from [EV].
 _LARGEST = 8.0
 #: Least spread of a forecast [EV].
@@ -55,6 +55,7 @@ class ForecasterTraining(Configuration):
         learning_rate: At its highest, of a one-cycle schedule.
         weight_decay: Of AdamW.
         width: Units of the recurrent network.
+        traces: Traces of light that are drawn.
         mixed: Share of the light that is a sum of two to four kinds.
         bent: Share of the light that is cut at a level above or below, as light is that comes
             through gaps; likewise the share whose pace varies, and the share that is smoothed.
@@ -69,6 +70,7 @@ class ForecasterTraining(Configuration):
     learning_rate: float = Field(default=4e-3, ge=1e-9, le=1.0)
     weight_decay: float = Field(default=1e-3, ge=0.0, le=1e3)
     width: int = Field(default=64, ge=1, le=MAX_WIDTH)
+    traces: int = Field(default=4096, ge=1, le=10**6)
     mixed: float = Field(default=0.5, ge=0.0, le=1.0)
     bent: float = Field(default=0.4, ge=0.0, le=1.0)
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
@@ -124,29 +126,34 @@ def describe(reading: Reading, before: Floats, exposed_at: Floats) -> NDArray[np
 
 
 class LearntTracker:
-    """The forecast of a trained `LightForecaster`, as a tracker of `agents.foresight`.
+    """The forecast of trained networks, as a tracker of `agents.foresight`.
 
     Args:
         num_envs: Cameras.
-        network: The trained network.
+        networks: Of one or more trainings, whose forecasts are averaged; where they differ, the
+            forecast is less sure.
     """
 
-    def __init__(self, num_envs: int, network: LightForecaster) -> None:
-        self.network = network
+    def __init__(self, num_envs: int, networks: Sequence[LightForecaster]) -> None:
+        self.networks = networks
         self._before: Floats | None = None
-        self._state: torch.Tensor | None = None
+        self._states: list[torch.Tensor | None] = [None] * len(networks)
         self._expected, self._spread = np.full((2, num_envs, HORIZON + 1), np.nan)
 
     def update(self, reading: Reading, exposed_at: Floats) -> None:
         """Take in one frame's reading."""
         before = reading.ev100 if self._before is None else self._before
         inputs = torch.from_numpy(describe(reading, before, exposed_at))[:, None]
-        inputs = inputs.to(next(self.network.parameters()).device)
+        inputs = inputs.to(next(self.networks[0].parameters()).device)
+        found = []
         with torch.inference_mode():
-            changes, spreads, self._state = self.network(inputs, self._state)
+            for i, network in enumerate(self.networks):
+                changes, spreads, self._states[i] = network(inputs, self._states[i])
+                found.append(torch.stack([changes[:, 0], spreads[:, 0]]).double().cpu().numpy())
+        changes, spreads = np.stack(found, axis=1)  # (networks, N, HORIZON + 1) each
         self._before = reading.ev100.copy()
-        self._expected = reading.ev100[:, None] + changes[:, 0].double().cpu().numpy()
-        self._spread = spreads[:, 0].double().cpu().numpy()
+        self._expected = reading.ev100[:, None] + changes.mean(axis=0)
+        self._spread = np.sqrt((spreads**2).mean(axis=0) + changes.var(axis=0))
 
     def ahead(self, frames: int) -> tuple[Floats, Floats]:
         """See `LightTracker.ahead`; at most `HORIZON` frames."""
@@ -209,7 +216,7 @@ def train_forecaster(
         for name, part in parts.items():
             part.load_state_dict(past[name])
     rng = np.random.default_rng([training.seed, done])
-    traces = np.stack([MOVES[KINDS[i % len(KINDS)]](rng) for i in range(_TRACES)])
+    traces = np.stack([MOVES[KINDS[i % len(KINDS)]](rng) for i in range(training.traces)])
     with store:
         while done < training.steps:
             readings, changes = sample(traces, training, rng)

@@ -26,7 +26,7 @@ from agents.learning.networks import ExposureFeatures, StateHead
 from agents.metering.meters import make_meter
 from agents.metering.reading import Meter
 from agents.metering.trend import TrendTracker
-from agents.policy import PRETRAINED, Observations, PolicyContext, masked_argmax
+from agents.policy import PRETRAINED, Observations, PolicyContext, masked_argmax, weight_files
 
 #: Dropout of the CNN's channels, relative to that of the features.
 _OF_CHANNELS = 0.4
@@ -108,8 +108,8 @@ class RegressionPolicy(NetworkPolicy):
         foresight: ``"none"``: frames of the same light count together; else the latest frames are
             shown to the network as if taken in the light that is expected, and the state is taken
             that promises most in the frames that its controls are in effect in. ``"trend"``: an
-            alpha-beta filter expects it; ``"learnt"``: the forecaster that comes with the package
-            (`LightForecaster`); or the file of another one.
+            alpha-beta filter expects it; ``"learnt"``: the forecasters that come with the package
+            (`LightForecaster`); or the file of another one, or a pattern of several.
     """
 
     kind = "regression"
@@ -123,10 +123,11 @@ class RegressionPolicy(NetworkPolicy):
         foresight: str = "none",
     ) -> None:
         self.foresight = foresight
-        self._forecaster: LightForecaster | None = None
+        self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):
-            path = PRETRAINED / "forecaster-0" if foresight == "learnt" else foresight
-            self._forecaster = load_forecaster(path, device)
+            pattern = str(PRETRAINED / "forecaster-*") if foresight == "learnt" else foresight
+            files = weight_files(pattern) or [pattern]  # where there is none, the error says so
+            self._forecasters = [load_forecaster(file, device) for file in files]
         super().__init__(context, weights, network, device)
 
     @cached_property
@@ -154,8 +155,8 @@ class RegressionPolicy(NetworkPolicy):
         self._recent: list[tuple[Observations, Floats]] = []  # frames and their metered EV100
 
     def _tracker(self, num_envs: int) -> LightTracker:
-        if self._forecaster is not None:
-            return LearntTracker(num_envs, self._forecaster)
+        if self._forecasters:
+            return LearntTracker(num_envs, self._forecasters)
         ev100 = self.context.grid.ev100
         return TrendTracker(num_envs, (float(ev100.min()), float(ev100.max())))
 

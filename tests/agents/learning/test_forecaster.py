@@ -26,7 +26,7 @@ def _light(kind: str, count: int, seed: int = 9) -> np.ndarray:
 def _forecasts(network: LightForecaster, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """EV100 expected three frames ahead, and the readings, both (B, 60)."""
     reading, exposed_at = metered(light, np.random.default_rng(1))
-    tracker, found = LearntTracker(len(light), network), []
+    tracker, found = LearntTracker(len(light), [network]), []
     for t in range(60):
         one = Reading(reading.ev100[:, t], reading.saturated[:, t], reading.black[:, t])
         tracker.update(one, exposed_at[:, t])
@@ -37,7 +37,7 @@ def _forecasts(network: LightForecaster, light: np.ndarray) -> tuple[np.ndarray,
 def test_it_learns_to_foresee_swinging_light():
     """After a short training nearer than the latest reading."""
     training = ForecasterTraining(
-        steps=220, batch_size=24, width=24, mixed=0.0, bent=0.0, learning_rate=1e-2
+        steps=220, batch_size=24, width=24, traces=300, mixed=0.0, bent=0.0, learning_rate=1e-2
     )
     network = train_forecaster(training)
     light = _light("sines", 40)
@@ -70,8 +70,20 @@ def test_cameras_do_not_see_each_other_and_frames_add_up():
     light = _light("ramps", 3)
     together, _ = _forecasts(network, light)
     reading, exposed_at = metered(light, np.random.default_rng(1))
-    tracker = LearntTracker(1, network)
+    tracker = LearntTracker(1, [network])
     for t in range(60):
         one = Reading(reading.ev100[1:2, t], reading.saturated[1:2, t], reading.black[1:2, t])
         tracker.update(one, exposed_at[1:2, t])
         assert tracker.ahead(3)[0] == pytest.approx(together[1, t : t + 1], abs=1e-4)
+
+
+def test_forecasts_of_several_trainings_are_averaged_and_less_sure_where_they_differ():
+    torch.manual_seed(1)
+    networks = [LightForecaster(8).eval() for _ in range(2)]
+    reading = Reading(np.array([9.0]), np.zeros(1), np.zeros(1, bool))
+    trackers = [LearntTracker(1, n) for n in ([networks[0]], [networks[1]], networks)]
+    for tracker in trackers:
+        tracker.update(reading, np.array([8.0]))
+    (a, s), (b, t), (mean, spread) = (tracker.ahead(2) for tracker in trackers)
+    assert mean == pytest.approx((a + b) / 2)
+    assert spread**2 == pytest.approx((s**2 + t**2) / 2 + ((a - b) / 2) ** 2)
