@@ -17,6 +17,7 @@ from ae_env.utils.checks import UserCodeError
 from agents.cli.bench import bench
 from agents.cli.cache_command import cache
 from agents.cli.evaluate import evaluate
+from agents.cli.film import film
 from agents.cli.quickstart import quickstart
 from agents.cli.scenes import scenes
 from agents.cli.scorers import convert_nima, scorers
@@ -34,7 +35,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    cache,
+    *(film, cache),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
