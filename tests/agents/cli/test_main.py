@@ -13,6 +13,7 @@ COMMANDS = [
     "cache",
     "convert-nima",
     "evaluate",
+    "film",
     "quickstart",
     "scenes",
     "scorers",
