@@ -40,6 +40,8 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 PRETRAINED_SEEDS = (0, 1, 2)
 #: What follows the colon in the name of an agent that was trained for `AutoExposureVideo-v0`.
 VIDEO = "video"
+#: Forecasters of light that come with the package, and what asks for them.
+FORECASTERS, LEARNT = str(PRETRAINED / "forecaster-*"), "learnt"
 
 _RECORDED = "recorded"
 #: Module and class by name; imported when the policy is made.

@@ -23,7 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation.evaluation_plan import digest
-from agents.policy import split_class, split_options, training_seeds
+from agents.policy import (
+    FORECASTERS,
+    LEARNT,
+    split_class,
+    split_options,
+    training_seeds,
+    weight_files,
+)
 from simulator.utils.files import sibling, write_atomically
 from simulator.utils.results import package_version
 
@@ -148,6 +155,8 @@ def policy_content(name: str) -> str:
     files = _own_files(base) or _named_files(base)
     for value in options.values():
         files += _named_files(str(value))
+        if value == LEARNT:
+            files += [Path(f"{file}.safetensors") for file in weight_files(FORECASTERS)]
     if not files:
         return ""
     found = hashlib.sha256()
@@ -162,7 +171,7 @@ def _own_files(base: str) -> list[Path]:
     if head.endswith(".py"):
         return _with_neighbours(Path(head).expanduser())
     if head in ("ppo", "regression"):
-        return _named_files(tail or training_seeds(head)[0].partition(":")[2])
+        return _named_files(training_seeds(base)[0].partition(":")[2])
     if head == "recorded":
         return _named_files(tail)
     if tail and "." in head:

@@ -26,7 +26,14 @@ from agents.learning.networks import ExposureFeatures, StateHead
 from agents.metering.meters import make_meter
 from agents.metering.reading import Meter
 from agents.metering.trend import TrendTracker
-from agents.policy import PRETRAINED, Observations, PolicyContext, masked_argmax, weight_files
+from agents.policy import (
+    FORECASTERS,
+    LEARNT,
+    Observations,
+    PolicyContext,
+    masked_argmax,
+    weight_files,
+)
 
 #: Dropout of the CNN's channels, relative to that of the features.
 _OF_CHANNELS = 0.4
@@ -125,7 +132,7 @@ class RegressionPolicy(NetworkPolicy):
         self.foresight = foresight
         self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):
-            pattern = str(PRETRAINED / "forecaster-*") if foresight == "learnt" else foresight
+            pattern = FORECASTERS if foresight == LEARNT else foresight
             files = weight_files(pattern) or [pattern]  # where there is none, the error says so
             self._forecasters = [load_forecaster(file, device) for file in files]
         super().__init__(context, weights, network, device)
