@@ -10,6 +10,7 @@ from agents.cli import train_simulator
 from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
+from simulator.training import calibration
 from simulator.training.config import SimulatorConfig
 from simulator.training.crops import DetailCrops
 from simulator.training.data import ReferencePairs
@@ -30,6 +31,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.delenv("AE_ENV_DATA", raising=False)
     monkeypatch.setattr(pictures, "_DRAWN", {"train": 2, "validation": 1})
     monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    monkeypatch.setattr(calibration, "_CROPS", 8)
     (tmp_path / "tiny.yaml").write_text(TINY)
     steps = []
 
