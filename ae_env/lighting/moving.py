@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import csv
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ae_env.lighting.base import Lighting, RollingShutter
 from ae_env.lighting.flicker import FlickerLighting
-from ae_env.lighting.pans import PANS
 from ae_env.utils.checks import check_word
 
+#: Mean light that a camera sees as it turns, in 72 directions [EV], 5 degrees apart: a line for
+#: each public panorama (CC0) of the test split of `ae_env.scenes.polyhaven`, from `light_around`.
+_PANS_FILE = "pans.csv"
 #: Frames that are drawn; after the last one the light stays.
 FRAMES = 1024
 #: Episodes whose light is kept.
@@ -89,10 +93,17 @@ def clouds(rng: Generator) -> np.ndarray:
     return light - light[0]
 
 
+@functools.cache
+def read_pans() -> dict[str, tuple[float, ...]]:
+    """EV of each direction, by the panorama's name."""
+    text = (files("ae_env.lighting") / _PANS_FILE).read_text(encoding="utf-8")
+    return {line[0]: tuple(map(float, line[1:])) for line in csv.reader(text.splitlines())}
+
+
 def pans(rng: Generator) -> np.ndarray:
     """A camera that turns quickly in a real place, to and fro: the mean light of what it sees."""
-    names = sorted(PANS)
-    turn = np.array(PANS[names[rng.integers(len(names))]])
+    places = read_pans()
+    turn = np.array(places[sorted(places)[rng.integers(len(places))]])
     speed = _log_uniform(rng, 2.0, 6.0)
     swing = rng.uniform(20.0, 70.0)  # of 72 directions
     there = np.abs((np.arange(FRAMES) * speed / swing) % 2.0 - 1.0) * swing

@@ -39,7 +39,8 @@ Policies = Annotated[
     list[str] | None, typer.Option(help="A policy; give the option several times.")
 ]
 Preset = Annotated[
-    str | None, typer.Option(help="quick, standard, ae_bench_v1, or a .yaml file of one's own.")
+    str | None,
+    typer.Option(help="quick, standard, video, ae_bench_v1, or a .yaml file of one's own."),
 ]
 Environment = Annotated[
     str | None, typer.Option(help="Environment: a preset of configs/env, or a .yaml file.")
@@ -48,7 +49,7 @@ Scenes = Annotated[
     str | None, typer.Option(help="'bundled', or a folder or file of raws or radiance maps.")
 ]
 Split = Annotated[str | None, typer.Option(help="train, test (default) or all.")]
-Grid = Annotated[str | None, typer.Option(help="default or third_stop.")]
+Grid = Annotated[str | None, typer.Option(help="default, third_stop or video.")]
 Scorer = Annotated[str | None, typer.Option(help="The scorer of the states: balanced...")]
 Lighting = Annotated[str | None, typer.Option(help="static (default), step, ramp, sine, tunnel...")]
 Delay = Annotated[

@@ -195,7 +195,7 @@ def train_forecaster(
             default the hyperparameters.
     """
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(training.seed)
+        torch.default_generator.manual_seed(training.seed)
         network = LightForecaster(training.width).to(device)
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay

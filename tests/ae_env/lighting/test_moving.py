@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ae_env.lighting import FlickerLighting, make_lighting
-from ae_env.lighting.moving import KIND_SETS, MOVES
-from ae_env.lighting.pans import PANS
+from ae_env.lighting.moving import KIND_SETS, MOVES, read_pans
 from ae_env.scenes.polyhaven import light_around, list_assets, split_assets
 from ae_env.scenes.radiance import read_radiance
 
@@ -72,9 +71,10 @@ def test_kinds_are_checked():
 
 
 def test_pans_are_of_places_to_test_on_and_of_their_maps(data_dir):
-    assert set(PANS) == {asset.name for asset in list_assets() if asset.split == "test"}
-    assert {len(turn) for turn in PANS.values()} == {72}
+    places = read_pans()
+    assert set(places) == {asset.name for asset in list_assets() if asset.split == "test"}
+    assert {len(turn) for turn in places.values()} == {72}
     asset = next(a for a in split_assets("polyhaven", "test") if a.name == "spree_bank")
     assert asset.path is not None
     found = light_around(read_radiance(asset.path))
-    np.testing.assert_allclose(PANS["spree_bank"], found, atol=6e-4)
+    np.testing.assert_allclose(places["spree_bank"], found, atol=6e-4)
