@@ -133,7 +133,12 @@ class RegressionPolicy(NetworkPolicy):
         self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):
             pattern = FORECASTERS if foresight == LEARNT else foresight
-            files = weight_files(pattern) or [pattern]  # where there is none, the error says so
+            files = weight_files(pattern)
+            if not files:
+                raise ValueError(
+                    f"`foresight` (={foresight!r}) must be 'none', 'trend', {LEARNT!r} or the name "
+                    "of a forecaster's files, as `ae-env train` writes them"
+                )
             self._forecasters = [load_forecaster(file, device) for file in files]
         super().__init__(context, weights, network, device)
 

@@ -4,6 +4,7 @@ import pytest
 
 from agents import PolicyContext, evaluate, make_policy
 from agents.episodes import make_envs
+from agents.evaluation.store import policy_content
 from agents.policy import training_seeds
 
 SCENES = {"scenes": "bundled:small", "split": "test", "resolution": 64}
@@ -20,6 +21,27 @@ def test_shipped_agents_beat_a_plain_meter_and_differ_by_their_seed(name):
     weights = [next(iter(p.network.parameters())) for p in seeds]
     assert len(seeds) == 3
     assert not any((a == b).all() for a, b in combinations(weights, 2))
+
+
+def test_agents_for_moving_light_come_with_their_forecasts():
+    """They foresee with what ships, and refuse a grid that they were not trained on."""
+    video = {**SCENES, "grid": "video", "delay": {"iso": 1, "exposure_time": 2, "f_number": 2}}
+    video["lighting"] = {"kind": "moving", "kinds": "sines"}
+    context = PolicyContext.from_envs(make_envs(video, num_envs=1, frames=1))
+    names = ("regression:video", "regression:video?foresight=learnt", "ppo:video", "average:P")
+    result = evaluate({n: make_policy(n, context) for n in names}, video, frames=32, batch=16)
+    gains = {n: result.group_gains(n)[0].mean() for n in names}
+    assert gains["regression:video?foresight=learnt"] > gains["regression:video"]
+    assert gains["ppo:video"] > gains["average:P"]
+    with pytest.raises(ValueError, match=r"`foresight` \(='runs/none'\) must be 'none', 'trend'"):
+        make_policy("regression:video?foresight=runs/none", context)
+    # A stored evaluation is of these files: each other one decides another result.
+    content = {n: policy_content(n) for n in ("regression", *names)}
+    assert len(set(content.values())) == 5
+    assert content["average:P"] == ""
+    still = PolicyContext.from_envs(make_envs(SCENES, num_envs=1, frames=1))
+    with pytest.raises(ValueError, match="was trained with exposure_times from"):
+        make_policy("regression:video", still)
 
 
 def test_a_pattern_names_the_training_seeds(tmp_path):
