@@ -30,7 +30,7 @@ class AutoExposureVideoEnv(AutoExposureEnv):
     As on a real sensor an exposure time reaches the frame two frames after the next, a gain one
     frame after it, and the aperture follows with the exposure time. Whoever exposes for the frame
     that he has just seen is late: the light of the frame that an action exposes must be predicted,
-    from a few frames, noisy and clipped. Neither a bandit nor a light meter can.
+    from a few frames, noisy and clipped. Neither a bandit nor a meter of the frame in hand can.
 
     The task is partially observable: a frame shows the light of its moment, not how it changes, nor
     which settings are on their way. An agent needs memory, or a stack of frames and its actions.
