@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from ae_env.env import AutoExposureEnv
-from ae_env.registration import with_defaults
+from ae_env.registration import TASKS, with_defaults
 from ae_env.vector_env import AutoExposureVectorEnv
 
-#: Actions of an episode: 3.2 s at 30 frames per second.
-FRAMES = 96
 #: Arguments that differ from those of `AutoExposureEnv`.
 DEFAULTS: dict[str, Any] = {
     "grid": "video",
@@ -82,4 +80,8 @@ class AutoExposureVideoVectorEnv(AutoExposureVectorEnv):
     All arguments are those of `AutoExposureVectorEnv`, with the defaults of the task.
     """
 
-    __init__ = with_defaults(AutoExposureVectorEnv.__init__, max_episode_steps=FRAMES, **DEFAULTS)
+    __init__ = with_defaults(
+        AutoExposureVectorEnv.__init__,
+        max_episode_steps=TASKS["ae_env/AutoExposureVideo-v0"][2],
+        **DEFAULTS,
+    )

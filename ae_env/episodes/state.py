@@ -78,7 +78,8 @@ class Episodes:
     """
 
     def __init__(self, count: int, grid: ExposureGrid, delays: tuple[int, int, int]) -> None:
-        self._grid, self._delays = grid, delays
+        # With one delay of all controls a state needs not be put together.
+        self._grid, self._delays = grid, delays if len(set(delays)) > 1 else delays[:1]
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
         self.speed, self.defocus, self.focus_drive, self.phase = np.zeros((4, count))
         self.direction, self.turn, self.subject_speed, self.subject_direction = np.zeros((4, count))
@@ -102,8 +103,9 @@ class Episodes:
         self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
         self.pending[env_indices, -1] = actions
         in_effect = [self.pending[env_indices, -1 - delay] for delay in self._delays]
-        alike = len(set(self._delays)) == 1
-        self.state[env_indices] = in_effect[0] if alike else self._grid.mixed(*in_effect)
+        self.state[env_indices] = (
+            in_effect[0] if len(in_effect) == 1 else self._grid.mixed(*in_effect)
+        )
         self.frame[env_indices] += 1
 
     def __getitem__(self, env_index: int) -> Episode:

@@ -21,7 +21,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
 from agents.foresight import Floats, Foresight, LightTracker
 from agents.learning.agent_weights import NetworkPolicy, trained_grid
-from agents.learning.forecaster import LearntTracker, LightForecaster, load_forecaster
+from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
 from agents.learning.networks import ExposureFeatures, StateHead
 from agents.metering.meters import make_meter
 from agents.metering.reading import Meter
@@ -139,6 +139,11 @@ class RegressionPolicy(NetworkPolicy):
                     f"`foresight` (={foresight!r}) must be 'none', 'trend', {LEARNT!r} or the name "
                     "of a forecaster's files, as `ae-env train` writes them"
                 )
+            if 1 + max(context.delays) > HORIZON:
+                raise ValueError(
+                    f"`foresight` (={foresight!r}) forecasts {HORIZON} frames, and a delay of "
+                    f"{max(context.delays)} asks for {1 + max(context.delays)}: use 'trend'"
+                )
             self._forecasters = [load_forecaster(file, device) for file in files]
         super().__init__(context, weights, network, device)
 
@@ -164,7 +169,9 @@ class RegressionPolicy(NetworkPolicy):
         self._foresight: Foresight | None = None
         if self.foresight != "none":
             self._foresight = Foresight(self.context, self._tracker(num_envs))
-        self._recent: list[tuple[Observations, Floats]] = []  # frames and their metered EV100
+        # The network's inputs of the latest frames, but for the settings, which are beside them,
+        # and the metered EV100.
+        self._recent: list[tuple[torch.Tensor, Any, torch.Tensor | None, Floats]] = []
 
     def _tracker(self, num_envs: int) -> LightTracker:
         if self._forecasters:
@@ -196,7 +203,10 @@ class RegressionPolicy(NetworkPolicy):
     ) -> NDArray[np.int64]:
         reading = self._meter(observations)
         foresight.observe(reading, observations)
-        self._recent = [*self._recent, (observations, reading.ev100)][-RECENT:]
+        device = next(self.network.parameters()).device
+        codes, _, sensors = observation_tensors(observations, device)
+        frame = codes, np.array(observations["settings"]), sensors, reading.ev100
+        self._recent = [*self._recent, frame][-RECENT:]
         chosen = masked_argmax(foresight.utility(self._scores_in), action_masks)
         foresight.decided(chosen)
         return chosen
@@ -205,11 +215,10 @@ class RegressionPolicy(NetworkPolicy):
         """Scores (N, S) in light that is metered at `ev100` (N,), from all recent frames."""
         device = next(self.network.parameters()).device
         weighted, precisions = np.zeros((2, len(ev100), len(self.context.grid)))
-        for observations, metered in self._recent:
-            settings = as_if_at(observations["settings"], ev100 - metered)
-            inputs = observation_tensors({**observations, "settings": settings}, device)
+        for codes, settings, sensors, metered in self._recent:
+            shifted = torch.from_numpy(as_if_at(settings, ev100 - metered)).to(device)
             with torch.inference_mode():
-                scores, log_variance = self.network(*inputs)
+                scores, log_variance = self.network(codes, shifted, sensors)
             precision = torch.exp(-log_variance).double().cpu().numpy()
             weighted += precision * scores.double().cpu().numpy()
             precisions += precision

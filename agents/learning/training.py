@@ -62,8 +62,11 @@ class AgentConfig(Configuration):
         from ae_env.options import EnvOptions
 
         hyperparameters = self.hyperparameters()
-        if self.agent == "forecaster" and self.environment:
-            raise ValueError("`environment` is not used by a forecaster, which sees no pictures")
+        if self.agent == "forecaster":
+            for name in sorted(self.model_fields_set - {"agent", "training"}):
+                unused = type(self).model_fields[name].get_default(call_default_factory=True)
+                if getattr(self, name) != unused:
+                    raise ValueError(f"`{name}` is not used by a forecaster: it sees no pictures")
         try:
             options = EnvOptions.from_kwargs(self.environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
@@ -128,9 +131,11 @@ def is_trained(config: AgentConfig, out: Path) -> bool:
     except (FileNotFoundError, ValueError):
         return False
     try:  # what an earlier version did not know has its default
-        return AgentConfig.model_validate(card["training"]).card() == config.card()
+        known = AgentConfig.model_validate(card["training"]).card()
     except ValueError:
         return False
+    # Through JSON, as the card was: a tuple comes back as a list.
+    return bool(known == json.loads(json.dumps(config.card())))
 
 
 def train_agent(

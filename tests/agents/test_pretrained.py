@@ -1,3 +1,4 @@
+import dataclasses
 from itertools import combinations
 
 import pytest
@@ -35,6 +36,9 @@ def test_agents_for_moving_light_come_with_their_forecasts():
     assert gains["ppo:video"] > gains["average:P"]
     with pytest.raises(ValueError, match=r"`foresight` \(='runs/none'\) must be 'none', 'trend'"):
         make_policy("regression:video?foresight=runs/none", context)
+    late = dataclasses.replace(context, delays=(4, 4, 4))
+    with pytest.raises(ValueError, match="forecasts 4 frames, and a delay of 4 asks for 5"):
+        make_policy("regression:video?foresight=learnt", late)
     # A stored evaluation is of these files: each other one decides another result.
     content = {n: policy_content(n) for n in ("regression", *names)}
     assert len(set(content.values())) == 5

@@ -68,6 +68,7 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: ppo\nmax_episode_steps: 0", r"max_episode_steps \(=0\)"),
         ("agent: forecaster\ntraining: {mixed: 2}", r"training.mixed \(=2\)"),
         ("agent: forecaster\nenvironment: {split: train}", r"`environment` is not used"),
+        ("agent: forecaster\nnum_envs: 3", r"`num_envs` is not used"),
         ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
     ],
 )
