@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 #: What oracles know, and the entry of ``info`` that tells it.
 ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}
 #: Episodes per scene from which the best constant state is taken.
-FIT_EPISODES = 4
+FIT_EPISODES = 2
 #: Scenes that they are of, at most.
 FIT_SCENES = 400
 

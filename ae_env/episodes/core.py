@@ -35,11 +35,14 @@ from simulator.capture.batch import CaptureBatch
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.generator import Noise
 from simulator.optics.disc_bank import DIAMETERS
+from simulator.utils.cache import LruCache
 
 #: Samples that are scored together: a chunk this small stays in the processor's cache.
 CHUNK_SAMPLES = 2**18
 #: Memory that the blurred light of all episodes together may take [byte]; else it is not cached.
 LIGHT_CACHE_BYTES = 256 * 2**20
+#: Memory for score tables [byte]: some eight thousand of 64 states.
+TABLES_BYTES = 2**25
 _RAW_DTYPES = {"uint8": np.uint8, "statistics": np.uint8, "linear": np.float32, "dn": np.uint16}
 _STATE_INFO = ("iso", "exposure_time", "f_number", "ev100")
 #: How the noise is made, by the environment's argument.
@@ -110,7 +113,9 @@ class EpisodeCore:
         self._light = FrameLight(
             self.lighting, self.episodes, self.scenes, self.camera, options.resolution
         )
-        self._tables: list[tuple[float, ScoreTable] | None] = [None] * num_envs
+        self._tables: LruCache[ScoreTable] = LruCache(
+            max(TABLES_BYTES, 128 * num_envs * len(self.grid))
+        )
         self._at_rest: dict[int, PreparedScene] = {}
         frame_bytes = 16 * options.resolution**2
         self._captures = CaptureBatch(
@@ -204,8 +209,6 @@ class EpisodeCore:
         if len(own):
             self._captures.forget(own)
             self._part_scores.forget(own)
-        for env_index in env_indices.tolist():
-            self._tables[env_index] = None
 
     def _set_light_index(self, env_indices: np.ndarray) -> None:
         """Sets `Episodes.light_index`: episodes at rest share the light of their scene."""
@@ -424,11 +427,14 @@ class EpisodeCore:
         gain: float | np.ndarray = 1.0
         rows = None
         if self.lighting.within_frame:
-            key: float = episode.frame
+            moment: tuple[float, ...] = (episode.frame, episode.phase)
         else:
-            key = gain = self._light.of(env_index, 0.0)[0]
-        known = self._tables[env_index]
-        if known is None or known[0] != key:
+            gain = self._light.of(env_index, 0.0)[0]
+            moment = (gain,)
+        # All that a table depends on: episodes that were seen before keep theirs.
+        key = (episode.scene, episode.speed, episode.defocus, episode.movement, moment)
+        table = self._tables.get(key)
+        if table is None:
             if self.lighting.within_frame:
                 gain, rows = self._light.of_states(env_index, self._bounds[1])
             table = self.tables.table(
@@ -437,5 +443,5 @@ class EpisodeCore:
                 row_gain=rows,
                 prepared=self._prepared(int(self.episodes.light_index[env_index])),
             )
-            known = self._tables[env_index] = (key, table)
-        return known[1]
+            self._tables.put(key, table, table.nbytes)
+        return table

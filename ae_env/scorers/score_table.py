@@ -57,6 +57,11 @@ class ScoreTable:
     parts: dict[str, np.ndarray]
     allowed: np.ndarray | None = None
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that the table takes [byte], about."""
+        return sum(a.nbytes for a in (self.mean, self.standard_error, *self.parts.values()))
+
     @cached_property
     def oracle(self) -> int:
         """The best state that is allowed; ties go to the lower index, that is the lower ISO.

@@ -35,9 +35,9 @@ BASELINES = (
     *("random", "best_fixed", "average:P", "centre_weighted:P", "matrix:P"),
     *("centre_weighted:tuned", "matrix:tuned", "oracle"),
 )
-#: Frames that each agent sees: both trainings end within about three minutes on two cores.
-REGRESSION_FRAMES = 75_000
-PPO_FRAMES = 80_000
+#: Frames that each agent sees: both trainings end within within three minutes on two cores.
+REGRESSION_FRAMES = 50_000
+PPO_FRAMES = 55_000
 #: Episodes per scene of the evaluation.
 EPISODES = 2
 
