@@ -13,6 +13,8 @@ from ae_env.registration import register_envs
 if TYPE_CHECKING:
     from ae_env import lighting as lighting
     from ae_env import wrappers as wrappers
+    from ae_env.bracket import ExposureBracketEnv as ExposureBracketEnv
+    from ae_env.bracket import ExposureBracketVectorEnv as ExposureBracketVectorEnv
     from ae_env.env import AutoExposureEnv as AutoExposureEnv
     from ae_env.grid import ExposureGrid as ExposureGrid
     from ae_env.lighting import FlickerLighting as FlickerLighting
@@ -56,6 +58,7 @@ __version__ = "0.1.0"
 
 #: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {
+    "bracket": "ExposureBracketEnv ExposureBracketVectorEnv",
     "env": "AutoExposureEnv",
     "grid": "ExposureGrid",
     "lighting": (

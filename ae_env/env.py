@@ -50,6 +50,10 @@ class AutoExposureBase(SpecProperty):
     render_mode: str | None
     _last: Frames | None
 
+    def _make_core(self, options: EnvOptions, num_envs: int) -> EpisodeCore:
+        """The core of `num_envs` episodes."""
+        return EpisodeCore(options, num_envs)
+
     @property
     def grid(self) -> ExposureGrid:
         """The states that actions choose from."""
@@ -261,8 +265,8 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
             reward=reward,
             with_oracle=with_oracle,
         )
-        self.core = EpisodeCore(options, num_envs=1)
-        self.action_space = gym.spaces.Discrete(len(self.core.grid))
+        self.core = self._make_core(options, 1)
+        self.action_space = gym.spaces.Discrete(self.core.num_actions)
         self.observation_space: Any = self.core.observation_space()
         self._last = None
 
@@ -283,10 +287,11 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
-        self.core.transition(_FIRST, check_actions("action", action, ())[None])
+        ended = self.core.transition(_FIRST, check_actions("action", action, ())[None])
         self._last = self.core.observe(_FIRST)
         info = single_info(self._last.info, 0)
-        return _first(self._last.observation), float(self._last.reward[0]), False, False, info
+        reward = float(self._last.reward[0])
+        return _first(self._last.observation), reward, bool(ended[0]), False, info
 
     def action_masks(self) -> np.ndarray:
         """(S,) bool: states that the scene allows."""

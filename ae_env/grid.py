@@ -87,11 +87,22 @@ class ExposureGrid:
         return cls((100, 400, 1600, 6400), (1 / 2000, 1 / 500, 1 / 125, 1 / 30), (2.8, 4, 5.6, 8))
 
     @classmethod
+    def bracket(cls) -> ExposureGrid:
+        """24 states at f/4, EV100 0 to 16, in steps of two stops of ISO and time."""
+        times = (1 / 4000, 1 / 1000, 1 / 250, 1 / 60, 1 / 15, 1 / 4)
+        return cls((100, 400, 1600, 6400), times, (4,))
+
+    @classmethod
     def from_spec(cls, spec: ExposureGrid | str | Mapping[str, Iterable[float]]) -> ExposureGrid:
-        """A grid from ``"default"``, ``"third_stop"`` or ``"video"``, or a mapping of its lists."""
+        """A grid from a name, such as ``"default"`` or ``"video"``, or a mapping of its lists."""
         if isinstance(spec, ExposureGrid):
             return spec
-        named = {"default": cls.default, "third_stop": cls.third_stop, "video": cls.video}
+        named = {
+            "default": cls.default,
+            "third_stop": cls.third_stop,
+            "video": cls.video,
+            "bracket": cls.bracket,
+        }
         if isinstance(spec, str) and spec in named:
             return named[spec]()
         names = ("isos", "exposure_times", "f_numbers")

@@ -15,8 +15,9 @@ from gymnasium.envs.registration import EnvSpec
 from ae_env.utils.checks import did_you_mean
 
 P = ParamSpec("P")
-#: The tasks: module and class, for one episode and for many, and the actions of an episode.
-TASKS = {
+#: The tasks: module and class, for one episode and for many, and the actions after which an episode
+#: is truncated; None where episodes end by themselves.
+TASKS: dict[str, tuple[str, str, int | None]] = {
     "ae_env/AutoExposure-v0": (
         "ae_env.env:AutoExposureEnv",
         "ae_env.vector_env:AutoExposureVectorEnv",
@@ -26,6 +27,11 @@ TASKS = {
         "ae_env.video:AutoExposureVideoEnv",
         "ae_env.video:AutoExposureVideoVectorEnv",
         96,
+    ),
+    "ae_env/ExposureBracket-v0": (
+        "ae_env.bracket:ExposureBracketEnv",
+        "ae_env.bracket:ExposureBracketVectorEnv",
+        None,
     ),
 }
 ENV_IDS = tuple(TASKS)

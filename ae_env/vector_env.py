@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ae_env.env import AutoExposureBase, Observation
-from ae_env.episodes.core import EpisodeCore, Frames
+from ae_env.episodes.core import Frames
 from ae_env.episodes.draws import check_options
 from ae_env.grid import ExposureGrid, plain, plain_list
 from ae_env.lighting import Lighting
@@ -120,8 +120,8 @@ class AutoExposureVectorEnv(
             reward=reward,
             with_oracle=with_oracle,
         )
-        self.core = EpisodeCore(options, num_envs)
-        self.single_action_space = gym.spaces.Discrete(len(self.core.grid))
+        self.core = self._make_core(options, num_envs)
+        self.single_action_space = gym.spaces.Discrete(self.core.num_actions)
         self.single_observation_space = self.core.observation_space()
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -184,7 +184,8 @@ class AutoExposureVectorEnv(
         if len(resetting) and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("reset the finished episodes with `reset_mask` first")
         running = np.flatnonzero(~self._done)
-        self.core.transition(running, actions[running])
+        terminated = np.zeros(self.num_envs, dtype=bool)
+        terminated[running] = self.core.transition(running, actions[running])
         self._steps[running] += 1
         if len(resetting):  # NEXT_STEP: this step begins their new episodes
             self._begin(resetting)
@@ -193,15 +194,16 @@ class AutoExposureVectorEnv(
         truncated = np.zeros(self.num_envs, dtype=bool)
         if self.max_episode_steps is not None:
             truncated = self._steps >= self.max_episode_steps
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and truncated.any():
-            observation, infos = self._restart(np.flatnonzero(truncated), frames)
+        done = terminated | truncated
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
+            observation, infos = self._restart(np.flatnonzero(done), frames)
         else:
-            self._done = truncated.copy()
+            self._done = done
             self._remember_frames(frames)
             observation = frames.observation
             infos = self._vector_info(frames.info, self._all)
         self._remember_shown(observation)
-        return observation, frames.reward, np.zeros_like(truncated), truncated, infos
+        return observation, frames.reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """One picture (H, W, 3) uint8 per environment, as `AutoExposureEnv.render` draws it.

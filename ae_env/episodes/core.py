@@ -173,6 +173,11 @@ class EpisodeCore:
             spaces["sensors"] = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         return gym.spaces.Dict(spaces)
 
+    @property
+    def num_actions(self) -> int:
+        """Number of actions: one for each state of the grid."""
+        return len(self.grid)
+
     def action_masks(self, env_indices: np.ndarray) -> np.ndarray:
         """(B, S) bool: states that the scenes shown allow; all of them before the first reset."""
         episodes = self.episodes
@@ -221,12 +226,15 @@ class EpisodeCore:
 
     # -- step: the transition -----------------------------------------------------------------
 
-    def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> None:
+    def transition(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Advances the episodes of `env_indices` (K,) by one frame.
 
         Args:
             env_indices: Whose turn it is.
             actions: (K,) their actions, integers; applied after the delay.
+
+        Returns:
+            (K,) bool, which episodes have ended with it: none, but for other tasks.
 
         Raises:
             ValueError: If an action is not a state of the grid; no episode advances then.
@@ -238,6 +246,7 @@ class EpisodeCore:
         self.episodes.act(env_indices, actions)
         if self._sequence is not None:
             self._show_next(env_indices)
+        return np.zeros(len(env_indices), bool)
 
     def _show_next(self, env_indices: np.ndarray) -> None:
         """Shows the scene of the current frame in each of `env_indices`."""

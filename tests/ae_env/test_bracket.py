@@ -1,0 +1,247 @@
+"""`ExposureBracket-v0`: its rules, its merged picture, and both environments of it."""
+
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_sb3
+
+from ae_env import ExposureGrid, Scene
+from ae_env.episodes.bracket import displaced
+from ae_env.episodes.merging import log_error, merge
+from ae_env.scenes.scene import WHITE_SIGNAL, reference_settings
+from simulator.camera import get_camera
+from simulator.capture.layout import Layout
+from tests.ae_env.environments import SMALL, check_parity, make_env, make_envs
+
+ID = "ae_env/ExposureBracket-v0"
+GRID = ExposureGrid.bracket()
+STOP = len(GRID)
+
+
+def bracket(**arguments: Any) -> gym.Env:
+    return make_env(ID, **arguments)
+
+
+def four(values: list[float]) -> torch.Tensor:
+    """(1, K, 4) numbers, the same for the four planes."""
+    return torch.tensor(values)[None, :, None].expand(1, -1, 4)
+
+
+# -- merging --------------------------------------------------------------------------------------
+
+
+def test_merging_weighs_by_the_inverse_of_the_noise() -> None:
+    """By hand: light 0.1 at gains 1 and 4, read noise 1e-4 and 4e-4, no shot noise."""
+    signals = torch.tensor([0.11, 0.38])[None, :, None, None, None].expand(1, 2, 4, 1, 1)
+    gains = torch.tensor([[1.0, 4.0]])
+    light, precision = merge(signals, gains, four([0.0, 0.0]), four([1e-4, 4e-4]))
+    weights = np.array([1.0 / 1e-4, 16.0 / 4e-4])
+    expected = (weights * [0.11, 0.095]).sum() / weights.sum()
+    np.testing.assert_allclose(light, expected, rtol=1e-6)
+    np.testing.assert_allclose(precision, weights.sum(), rtol=1e-6)
+
+
+def test_white_samples_and_missing_frames_have_no_weight() -> None:
+    signals = torch.tensor([[0.3, 0.99], [0.99, 0.98]])[:, :, None, None, None].expand(
+        2, 2, 4, 1, 1
+    )
+    gains = torch.tensor([[1.0, 4.0], [1.0, 0.0]])
+    noise = four([1e-3, 1e-3]).expand(2, 2, 4)
+    light, precision = merge(signals, gains, noise, noise)
+    np.testing.assert_allclose(light[0], 0.3, rtol=1e-6)
+    assert float(precision[0].min()) > 0.0
+    assert not precision[1].any()
+    assert not light[1].any()
+
+
+def test_the_precision_is_that_of_many_draws() -> None:
+    """Variance of the merged light over 40,000 draws, and no frame alone is better."""
+    generator = torch.Generator().manual_seed(3)
+    light, gains = 0.02, torch.tensor([[1.0, 6.0, 20.0]])
+    shot, read = four([2e-3, 8e-3, 8e-3]), four([4e-5, 1e-4, 1e-4])
+    mean = (gains * light)[:, :, None, None, None].expand(1, 3, 4, 100, 100)
+    variance = shot[..., None, None] * mean + read[..., None, None]
+    signals = mean + variance.sqrt() * torch.randn(mean.shape, generator=generator)
+    merged, precision = merge(signals, gains, shot, read)
+    assert float(merged.mean()) == pytest.approx(light, rel=0.01)
+    # Relative standard error of a variance from n draws: sqrt(2 / n); five of them.
+    spread = float(merged.double().var())
+    assert spread == pytest.approx(float((1.0 / precision).mean()), rel=5 * math.sqrt(2 / 40_000))
+    alone = (variance / gains[:, :, None, None, None] ** 2)[0, :, 0, 0, 0]
+    assert spread < float(alone.min())
+
+
+def test_log_error_by_hand() -> None:
+    light = torch.tensor([0.2, 0.05, 0.0, 9.0, 0.1]).view(1, 1, 1, 5).expand(1, 4, 1, 5)
+    truth = torch.full((1, 4, 1, 5), 0.1)
+    precision = torch.ones(1, 4, 1, 5)
+    precision[..., 4] = 0.0
+    error = log_error(light, precision, truth, torch.tensor([0.0]))[0, 0, 0]
+    np.testing.assert_allclose(error, [1.0, 1.0, 2.0, 2.0, 2.0], rtol=1e-6)
+    error = log_error(light, precision, truth, torch.tensor([0.1]))[0, 0, 0]
+    np.testing.assert_allclose(error[2], 1.0, rtol=1e-6)  # (0 + 0.1) / (0.1 + 0.1)
+
+
+# -- the environment ------------------------------------------------------------------------------
+
+
+def two_lights(low: float, high: float) -> Scene:
+    """A scene at EV100 10: one half is `low` of white, the other `high`."""
+    camera = get_camera("nikon_z6")
+    light = torch.full((4, 36, 36), low * WHITE_SIGNAL)
+    light[:, :, 18:] = high * WHITE_SIGNAL
+    return Scene.from_array(
+        light, reference_settings(10.0), camera, scene_id="two", illuminance=2560.0
+    )
+
+
+def test_both_checkers_accept_it() -> None:
+    env = bracket()
+    check_env(env.unwrapped, skip_render_check=True)
+    check_sb3(env.unwrapped)
+    check_env(bracket(observation="statistics").unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+def test_one_and_many_are_the_same(mode: str) -> None:
+    check_parity(3, 9, mode, task=ID, budget=0.1)
+
+
+def test_rewards_add_up_to_the_quality_of_the_picture() -> None:
+    """One frame shows half of the scene; the other half has the largest error, 2 EV of 2."""
+    env = bracket(scenes=[two_lights(0.2, 40.0)], split="all", noise=False, motion="none")
+    _, info = env.reset(seed=0)
+    assert info["quality"] == info["frames"] == 0
+    assert info["time_left"] == 0.3
+    # EV100 10 is ISO 100, 1/60 s, f/4: white is at 0.85, so 0.2 at 0.17, and 40 needs 1/4000 s.
+    long, short = GRID.index(0, 3, 0), GRID.index(0, 0, 0)
+    observation, reward, ended, _, info = env.step(long)
+    assert info["unseen"] == 0.5
+    assert reward == info["quality"] == pytest.approx(0.5, abs=2e-3)
+    assert info["time_left"] == pytest.approx(0.3 - 1 / 60 - 1 / 60)
+    assert not ended
+    np.testing.assert_allclose(
+        observation["bracket"], [info["time_left"] / 0.3, 2 / 3, 0.5, 0.0], rtol=1e-6
+    )
+    _, more, ended, _, info = env.step(short)
+    assert info["unseen"] == 0.0
+    assert not ended
+    assert reward + more == pytest.approx(info["quality"])
+    assert info["quality"] > 0.99
+    _, nothing, ended, _, after = env.step(STOP)
+    assert nothing == 0.0
+    assert ended
+    assert after["quality"] == info["quality"]
+    assert after["frames"] == 2
+
+
+def test_noise_lowers_the_quality() -> None:
+    """The mean of |log2(1 + s z)| for a normal z is sqrt(2 / pi) s / ln 2 for a small s."""
+    scene = two_lights(0.5, 0.5)
+    state = GRID.index(2, 1, 0)  # ISO 1600, 1/1000 s
+    env = bracket(scenes=[scene], split="all", motion="none", noise="exact")
+    env.reset(seed=1)
+    *_, info = env.step(state)
+    signal = 0.5 * WHITE_SIGNAL * 2.0 ** float(10.0 - GRID.ev100[state])
+    nlf = get_camera("nikon_z6").nlf(1600)
+    noise = np.sqrt(np.array(nlf.shot) * signal + np.array(nlf.read)) / signal
+    expected = float((math.sqrt(2.0 / math.pi) * noise / math.log(2.0)).mean())
+    # 5,184 samples; the standard deviation of |z| is 0.76 of its mean.
+    assert info["log_error"] == pytest.approx(expected, rel=5 * 0.76 / math.sqrt(5184) + 0.01)
+    assert info["quality"] == pytest.approx(1.0 - info["log_error"] / 2.0)
+
+
+def test_an_episode_ends_with_its_frames_or_its_time() -> None:
+    env = bracket()
+    env.reset(seed=0)
+    assert [env.step(0)[2] for _ in range(3)] == [False, False, True]
+    env.reset(seed=0)
+    longest = GRID.index(0, 5, 0)
+    assert not env.step(longest)[2]
+    left = 0.3 - 0.25 - 1 / 60
+    masks = env.unwrapped.action_masks()
+    assert masks.tolist() == [s.exposure_time <= left for s in GRID] + [True]
+    before = env.unwrapped.core.episode(0).frame
+    *_, ended, _, info = env.step(longest)  # does not fit: no frame, and the end
+    assert ended
+    assert info["frames"] == 1
+    assert env.unwrapped.core.episode(0).frame == before
+    one = bracket(max_frames=1)
+    one.reset(seed=0)
+    assert one.step(0)[2]
+
+
+def test_the_viewfinder_is_metered() -> None:
+    env = bracket(scenes=[two_lights(0.14, 0.14)], split="all")
+    # The mean is 0.14 of white, 0.12 of the sensor's, at EV100 10: ISO 100, 1/60 s.
+    assert env.reset(seed=0)[1]["state"] == GRID.index(0, 3, 0)
+    assert env.reset(seed=0, options={"state": 5})[1]["state"] == 5
+
+
+def test_a_subject_moves_between_frames_and_leaves_ghosts() -> None:
+    mask = torch.zeros(36, 36, dtype=torch.bool)
+    mask[10:20, 4:12] = True
+    light = torch.where(mask, 0.4, 0.1).expand(4, -1, -1)
+    scene = Scene.from_array(
+        light,
+        reference_settings(10.0),
+        get_camera("nikon_z6"),
+        scene_id="moves",
+        illuminance=2560.0,
+        layout=Layout(torch.zeros(36, 36), mask),
+    )
+    there = displaced(scene, 3, -6)  # two columns of it leave the frame
+    expected = torch.full((4, 36, 36), 0.1)
+    expected[:, 13:23, 0:6] = 0.4
+    np.testing.assert_allclose(there.light, expected, rtol=1e-6)
+    assert there.layout.subject.sum() == 60
+    assert displaced(scene, 0, 40).layout.subject is None
+    # Two frames of a subject that crosses the frame in a second are worse than one, as it is
+    # elsewhere in the second; of one that stays, they are better.
+    core = (env := bracket(scenes=[scene], split="all", motion="random")).unwrapped.core
+    gains = []
+    for speed in (0.0, 5.0):
+        env.reset(seed=0)
+        episodes = core.episodes
+        episodes.speed[0], episodes.subject_speed[0], episodes.subject_direction[0] = 0, speed, 0
+        core._set_light_index(np.array([0]))
+        env.step(GRID.index(1, 1, 0))
+        gains.append(env.step(GRID.index(1, 1, 0))[1])
+    assert gains[0] > 0.0 > gains[1]
+
+
+def test_bad_arguments_are_refused() -> None:
+    for arguments, message in (
+        ({"budget": 0}, "`budget`"),
+        ({"budget": "long"}, "`budget`"),
+        ({"max_frames": 0}, "`max_frames`"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bracket(**arguments)
+    with pytest.raises(TypeError, match=r"'buget'.*did you mean 'budget'"):
+        bracket(buget=1.0)
+    for name in ("scorer", "lighting", "with_oracle"):
+        with pytest.raises(TypeError, match=name):
+            bracket(**{name: "balanced"})
+    env = bracket()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"`action` \(=25\) must be in \[0, 24\]"):
+        env.unwrapped.step(np.int64(25))
+    with pytest.raises(ValueError, match="no score table"):
+        env.unwrapped.expected_scores()
+
+
+def test_statistics_are_those_of_the_frame() -> None:
+    envs = make_envs(2, ID, observation="statistics")
+    observation, _ = envs.reset(seed=4)
+    frames, _ = make_envs(2, ID).reset(seed=4)
+    assert observation["raw"].shape == (2, 4, 12, 16)
+    assert envs.observation_space.contains(observation)
+    white = (frames["raw"] == 255).mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(observation["clipped"][:, 0], white, atol=1e-7)
+    assert SMALL["resolution"] == frames["raw"].shape[-1]
