@@ -55,9 +55,28 @@ _LEARNT = {
     "ppo": ("agents.learning.ppo", "PPOPolicy"),
     "regression": ("agents.learning.regression", "RegressionPolicy"),
 }
+_WITH_WEIGHTS = {**_LEARNT, "bracket": ("agents.bracketing.learnt", "LearntBracket")}
+#: Policies of `ExposureBracket-v0`; `bracket` alone or with a path is the learnt one.
+_BRACKET = "bracket"
+_BRACKETS = {"fixed": "FixedBracket", "hasinoff": "Hasinoff", "planned": "Planner"}
 #: Where options begin: a question mark before a slash of a path is a part of the path.
 _OPTIONS = re.compile(r"\?(?![^=]*/)")
 _FRACTION = re.compile(r"\s*([+-]?\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s*")
+
+
+@dataclass(frozen=True)
+class BracketLimits:
+    """What the frames of an episode of `ExposureBracket-v0` may take together.
+
+    Args:
+        budget: Time [s].
+        max_frames: How many there may be.
+        box_factor: Photosites averaged a side into one pixel, which the noise depends on.
+    """
+
+    budget: float
+    max_frames: int
+    box_factor: int
 
 
 @dataclass(frozen=True)
@@ -72,6 +91,7 @@ class PolicyContext:
         frame_rate: Frames per second.
         delays: Frames after the next until a decision's ISO, exposure time and aperture are in
             effect.
+        bracket: Limits of a bracket; None for tasks without one.
     """
 
     grid: ExposureGrid
@@ -79,12 +99,17 @@ class PolicyContext:
     observation_space: gym.spaces.Dict
     frame_rate: float = 30.0
     delays: tuple[int, int, int] = (0, 0, 0)
+    bracket: BracketLimits | None = None
 
     @classmethod
     def from_envs(cls, envs: gym.vector.VectorEnv[Any, Any, Any]) -> PolicyContext:
         """The context of the environments that `envs` runs."""
         base: Any = envs.unwrapped
-        return cls(base.grid, base.camera, base.single_observation_space, delays=base.delays)
+        limits = None
+        if hasattr(base, "budget"):
+            limits = BracketLimits(base.budget, base.max_frames, base.scenes[0].box_factor)
+        space = base.single_observation_space
+        return cls(base.grid, base.camera, space, delays=base.delays, bracket=limits)
 
     @property
     def has_sensors(self) -> bool:
@@ -182,7 +207,7 @@ def training_seeds(name: str) -> list[str]:
     """The names under which `make_policy` knows the training seeds of a learnt agent.
 
     Args:
-        name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
+        name: ``"ppo"``, ``"regression"`` or ``"bracket"`` for all seeds that come with the package;
             ``"ppo:video"`` or ``"regression:video"`` for those of `AutoExposureVideo-v0`;
             ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself. Options
             of the name are those of each.
@@ -195,7 +220,7 @@ def training_seeds(name: str) -> list[str]:
     """
     base, mark, options = str(name).partition("?")
     head, _, tail = base.partition(":")
-    if head not in _LEARNT or (tail not in ("", VIDEO) and "*" not in tail):
+    if head not in _WITH_WEIGHTS or (tail not in ("", VIDEO) and "*" not in tail):
         return [name]
     files = weight_files(_shipped(head, tail) + "*" if tail in ("", VIDEO) else tail)
     if not files:
@@ -296,8 +321,10 @@ def make_policy(
             program; ``"recorded:FOLDER"``; ``"regression"`` and ``"ppo"``, the
             agents that come with the package, ``"regression:video"`` and ``"ppo:video"``, those for
             `AutoExposureVideo-v0`, or ``"regression:PATH"`` and ``"ppo:PATH"`` with weights of
-            one's own; ``"package.module:Class"`` or ``"path/to/file.py:Class"`` for a policy of
-            one's own. Options may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
+            one's own; for `ExposureBracket-v0` ``"bracket:fixed"``, ``"bracket:hasinoff"``,
+            ``"bracket:planned"``, and ``"bracket"`` or ``"bracket:PATH"``, the learnt one;
+            ``"package.module:Class"`` or ``"path/to/file.py:Class"`` for a policy of one's own.
+            Options may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
         context: The camera.
         device: Torch device of a learnt agent's network.
         options: Passed to the class, with those of the name.
@@ -329,8 +356,10 @@ def make_policy(
     elif head == _RECORDED:
         cls = _import("agents.baselines", "Recorded")
         fixed = {"path": tail}
-    elif head in _LEARNT:
-        cls = _import(*_LEARNT[head])
+    elif head == _BRACKET and tail in _BRACKETS:
+        cls = _import("agents.bracketing.policies", _BRACKETS[tail])
+    elif head in _WITH_WEIGHTS:
+        cls = _import(*_WITH_WEIGHTS[head])
         options = _with_weights(name, head, tail, device, options)
     elif tail and head not in (*METERS, *_SIMPLE, RPI_AGC, _ORACLE):
         cls = _class_in_module(head, tail, name)
@@ -429,13 +458,15 @@ def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str
 
 def _unknown(name: str) -> str:
     known = [*METERS, RPI_AGC, *list_policies(), *(f"{t}:PATH" for t in (*_LEARNT, _RECORDED))]
+    known += [_BRACKET, *(f"{_BRACKET}:{kind}" for kind in _BRACKETS)]
     near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     return (
         f"`policy` (={name!r}) must be one of {', '.join((*_SIMPLE, _ORACLE))}; a meter "
         f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
         f"{RPI_AGC}, alone or with {', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
-        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; "
+        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; {_BRACKET}, alone or with "
+        f"{', '.join(f':{kind}' for kind in _BRACKETS)} or :PATH; "
         f"package.module:Class or path.py:Class{hint}"
     )
 

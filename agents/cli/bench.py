@@ -13,8 +13,9 @@ from ae_env.utils.checks import check_word
 from agents.cli.console import Seed, make_folder
 
 BENCHMARKS = (
-    *("agents", "brackets", "colour_checker", "convergence", "defects", "denoising", "libcamera"),
-    *("ptc", "scorers", "simulator", "stability", "throughput", "transfer", "work_precision"),
+    *("agents", "bracket", "brackets", "colour_checker", "convergence", "defects", "denoising"),
+    *("libcamera", "ptc", "scorers", "simulator", "stability", "throughput", "transfer"),
+    "work_precision",
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]

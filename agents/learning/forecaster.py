@@ -7,7 +7,6 @@ they are too bright, noisy where they are dark. No picture is needed, so it trai
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from torch import nn
 
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
 from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
+from agents.learning.optimisation import Optimisation
 from agents.metering.reading import (
     BLACK_SIGNAL,
     TARGET_SIGNAL,
@@ -27,7 +27,6 @@ from agents.metering.reading import (
     Reading,
     mean_reading,
 )
-from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
 
 Floats = NDArray[np.float64]
@@ -197,43 +196,25 @@ def train_forecaster(
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(training.seed)
         network = LightForecaster(training.width).to(device)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
+    run = Optimisation(
+        network,
+        steps=training.steps,
+        learning_rate=training.learning_rate,
+        weight_decay=training.weight_decay,
+        checkpoint=checkpoint,
+        identity=identity or training.model_dump(),
     )
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, max_lr=training.learning_rate, total_steps=training.steps + 1
-    )
-    parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
-    done = 0
-    store = Checkpoint(
-        checkpoint,
-        identity or training.model_dump(),
-        lambda: {"step": done, **{name: part.state_dict() for name, part in parts.items()}},
-    )
-    past = store.load()
-    if past is not None:
-        done = int(past["step"])
-        for name, part in parts.items():
-            part.load_state_dict(past[name])
-    rng = np.random.default_rng([training.seed, done])
+    rng = np.random.default_rng([training.seed, run.done])
     traces = np.stack([MOVES[KINDS[i % len(KINDS)]](rng) for i in range(training.traces)])
-    with store:
-        while done < training.steps:
+    with run.store:
+        while run.done < training.steps:
             readings, changes = sample(traces, training, rng)
             found, spread, _ = network(torch.from_numpy(readings).to(device))
             error = (found - torch.from_numpy(changes).to(device)).abs()
-            loss = (error / spread + spread.log()).mean()  # likelihood of a Laplace distribution
-            if not math.isfinite(loss.item()):
-                raise ValueError(f"the loss (={loss.item()}) must be finite; lower `learning_rate`")
-            optimizer.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimizer.step()
-            schedule.step()
-            done += 1
+            run.step((error / spread + spread.log()).mean())  # likelihood of a Laplace distribution
             if progress is not None:
-                progress(done, training.steps, {"EV": error.mean().item()})
-            store.save_when_due()
+                progress(run.done, training.steps, {"EV": error.mean().item()})
+            run.store.save_when_due()
     return network.eval()
 
 

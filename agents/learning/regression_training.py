@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,13 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
-from torch import nn
 
 from agents.learning.agent_weights import MAX_WIDTH
 from agents.learning.augmentation import moved
+from agents.learning.optimisation import Optimisation
 from agents.learning.regression import RegressionPolicy, ScoreRegressor, observation_tensors
 from agents.policy import Observations, PolicyContext
-from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration
 
 #: Past frames come in so many parts, each from another step.
@@ -86,44 +84,30 @@ def train_regression(
             context.observation_space, context.grid, training.width, training.dropout
         )
     network.to(device)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay
-    )
     steps = max(2, training.frames // envs.num_envs)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, max_lr=training.learning_rate, total_steps=steps + 1, pct_start=0.1
+    run = Optimisation(
+        network,
+        steps=steps,
+        learning_rate=training.learning_rate,
+        weight_decay=training.weight_decay,
+        checkpoint=checkpoint,
+        identity=identity or training.model_dump(),
+        warm_up=0.1,
     )
-    parts: dict[str, Any] = {"network": network, "optimizer": optimizer, "schedule": schedule}
-    done = 0
-    store = Checkpoint(
-        checkpoint,
-        identity or training.model_dump(),
-        lambda: {"step": done, **{name: part.state_dict() for name, part in parts.items()}},
-    )
-    past = store.load()
-    if past is not None:
-        done = int(past["step"])
-        for name, part in parts.items():
-            part.load_state_dict(past[name])
-    rollout = Rollout(envs, RegressionPolicy(context, network=network), training, done)
-    with store:
-        while done < steps:
+    rollout = Rollout(envs, RegressionPolicy(context, network=network), training, run.done)
+    with run.store:
+        while run.done < steps:
             observations, target = rollout.batch()
             network.train()
-            with _seeded(device, training.seed, done):  # dropout draws from the global generator
+            with _seeded(
+                device, training.seed, run.done
+            ):  # dropout draws from the global generator
                 loss, error = _loss(network, observations, target)
-            if not math.isfinite(error):
-                raise ValueError(f"the loss (={error}) must be finite; lower `learning_rate`")
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimizer.step()
-            schedule.step()
-            done += 1
+            run.step(loss)
             network.eval()
             if progress is not None:
-                progress(done * envs.num_envs, steps * envs.num_envs, {"mse": error})
-            store.save_when_due()
+                progress(run.done * envs.num_envs, steps * envs.num_envs, {"mse": error})
+            run.store.save_when_due()
     return network
 
 

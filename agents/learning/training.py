@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
+from agents.bracketing.learnt import BracketTraining, train_bracket
 from agents.learning.agent_weights import describe_agent, load_agent, save_agent
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.regression_training import RegressionTraining, train_regression
@@ -26,6 +27,8 @@ from simulator.utils.files import sibling
 if TYPE_CHECKING:
     from agents.learning.ppo import PPOTraining
 
+    Hyperparameters = RegressionTraining | PPOTraining | BracketTraining | ForecasterTraining
+
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
 #: Seconds between two looks at the messages of the workers.
@@ -35,23 +38,28 @@ _stop: Any = None
 _messages: Any = None
 
 
+#: The task that the bracketing agent learns, and no other.
+BRACKET_TASK = "ae_env/ExposureBracket-v0"
+
+
 class AgentConfig(Configuration):
     """A training of an agent.
 
     Args:
-        agent: ``"regression"``, ``"ppo"`` or ``"forecaster"``, which needs no environment.
+        agent: ``"regression"`` or ``"ppo"``; ``"bracket"``, which needs `ExposureBracket-v0`; or
+            ``"forecaster"``, which needs no environment.
         task: Id of the environment.
         environment: Arguments of it.
         max_episode_steps: Actions of an episode; by default those of the task.
         num_envs: Episodes side by side.
-        training: Hyperparameters, those of `RegressionTraining`, `PPOTraining` or
-            `ForecasterTraining`.
+        training: Hyperparameters, those of `RegressionTraining`, `PPOTraining`, `BracketTraining`
+            or `ForecasterTraining`.
     """
 
-    agent: Literal["regression", "ppo", "forecaster"]
-    task: Literal["ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0"] = (
-        "ae_env/AutoExposure-v0"
-    )
+    agent: Literal["regression", "ppo", "bracket", "forecaster"]
+    task: Literal[
+        "ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0", "ae_env/ExposureBracket-v0"
+    ] = "ae_env/AutoExposure-v0"
     environment: dict[str, Any] = Field(default_factory=dict)
     max_episode_steps: int | None = Field(default=None, ge=1, le=10**6)
     num_envs: int = Field(default=64, ge=1, le=4096)
@@ -67,8 +75,14 @@ class AgentConfig(Configuration):
                 unused = type(self).model_fields[name].get_default(call_default_factory=True)
                 if getattr(self, name) != unused:
                     raise ValueError(f"`{name}` is not used by a forecaster: it sees no pictures")
+        if (self.agent == "bracket") != (self.task == BRACKET_TASK):
+            raise ValueError(f"`task` (={self.task!r}) is not one that agent {self.agent!r} learns")
+        environment = dict(self.environment)
+        if self.task == BRACKET_TASK:
+            for name in ("budget", "max_frames"):  # which its constructor checks
+                environment.pop(name, None)
         try:
-            options = EnvOptions.from_kwargs(self.environment)
+            options = EnvOptions.from_kwargs(environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
             options.make_lighting()
         except ValueError as error:
@@ -87,11 +101,13 @@ class AgentConfig(Configuration):
             raise ValueError(f"every entry must be a JSON value: {error}") from error
         return self
 
-    def hyperparameters(self) -> RegressionTraining | PPOTraining | ForecasterTraining:
+    def hyperparameters(self) -> Hyperparameters:
         """`training` as the hyperparameters of the agent, defaults filled in."""
-        kind: type[RegressionTraining | PPOTraining | ForecasterTraining] = RegressionTraining
+        kind: type[Hyperparameters] = RegressionTraining
         if self.agent == "ppo":
             from agents.learning.ppo import PPOTraining as kind
+        elif self.agent == "bracket":
+            kind = BracketTraining
         elif self.agent == "forecaster":
             kind = ForecasterTraining
         try:
@@ -196,6 +212,8 @@ def train_agent(
         }
         if isinstance(training, RegressionTraining):
             network = train_regression(envs, training, **common)
+        elif isinstance(training, BracketTraining):
+            network = train_bracket(envs, training, **common)
         else:
             from agents.learning.ppo import train_ppo
 

@@ -1,0 +1,377 @@
+"""The policies: fixed steps around the meter's reading, Hasinoff's schedule, and a planner."""
+
+from __future__ import annotations
+
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ae_env.episodes.bracket import FRAME_GAP
+from ae_env.episodes.merging import LOG_FLOOR, merge
+from ae_env.observation import decode_observation, decode_sensors, decode_settings
+from ae_env.scenes.scene import WHITE_SIGNAL
+from ae_env.utils.checks import check_number
+from agents.bracketing.schedules import BINS, Floats, Ints, Schedules, bin_of
+from agents.episodes import Episodes, scenes_of
+from agents.policy import Observations, Policy, PolicyContext
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+#: log2 of the luminance below which errors count less, from the EV100 of the viewfinder's frame.
+_FLOOR = float(np.log2(LOG_FLOOR * WHITE_SIGNAL))
+#: Shares of the samples that are left out at either end of the range of a frame.
+_TAIL = 0.005
+#: Headrooms above white [EV] that `Hasinoff` tries when it is fitted.
+HEADROOMS = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0)
+#: Scenes that it is fitted on, at most.
+_FIT_SCENES = 256
+
+
+class Bracketing(Policy):
+    """Base of the policies: keeps the frames of each camera, and what they show together.
+
+    Args:
+        context: The camera; it must tell the limits of a bracket.
+
+    Raises:
+        ValueError: If the context is not that of `ExposureBracket-v0`.
+    """
+
+    def __init__(self, context: PolicyContext) -> None:
+        super().__init__(context)
+        if context.bracket is None:
+            raise ValueError("bracketing policies are for ae_env/ExposureBracket-v0")
+        if context.observation_space["raw"].dtype != np.uint8 or (
+            "histogram" in context.observation_space.spaces
+        ):
+            raise ValueError("bracketing policies need `observation`='uint8'")
+        limits = context.bracket
+        self.schedules = Schedules(
+            context.grid, context.camera, limits.budget, limits.max_frames, limits.box_factor
+        )
+        self.stop = len(context.grid)
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forgets the frames so far."""
+        super().reset(num_envs, seed)
+        self._frames: list[list[tuple[int, NDArray[np.uint8]]]] = [[] for _ in range(num_envs)]
+        self._reference = np.full(num_envs, np.nan)  # EV100 of the viewfinder's frame
+        self._done = np.zeros(num_envs, bool)
+
+    def forget(self, ended: NDArray[np.bool_]) -> None:
+        """Forgets the frames of the cameras that begin a new episode."""
+        for i in np.flatnonzero(ended).tolist():
+            self._frames[i], self._reference[i], self._done[i] = [], np.nan, False
+
+    def observe(self, observations: Observations) -> None:
+        """Keeps the frames of `observations`."""
+        self.check_reset(observations)
+        aperture, time, speed = decode_settings(observations["settings"])
+        ev100 = aperture + time - (speed - 5.0)
+        # Nominal settings are rounded, so the state is the nearest one of this ISO.
+        isos = np.log2(np.array([s.iso for s in self.context.grid]) / 3.125)
+        apart = np.abs(self.context.grid.ev100 - ev100[:, None]) + 10 * np.abs(
+            isos - speed[:, None]
+        )
+        states = apart.argmin(axis=1)
+        for i, frames in enumerate(self._frames):
+            if not self._done[i]:
+                frames.append((int(states[i]), observations["raw"][i].copy()))
+        new = np.isnan(self._reference)
+        self._reference[new] = self.context.grid.ev100[states[new]]
+
+    def kept(self, camera: int) -> Ints:
+        """States of the frames that a camera has taken, without the viewfinder's."""
+        return np.array([state for state, _ in self._frames[camera][1:]], np.int64)
+
+    def merged(self, camera: int) -> tuple[Floats, Floats, float]:
+        """Luminance of each sample in all frames of a camera, its inverse variance, and the limit.
+
+        Returns:
+            Two flat arrays, and log2 of the luminance that the shortest exposure shows white.
+        """
+        states = [state for state, _ in self._frames[camera]]
+        codes = np.stack([raw for _, raw in self._frames[camera]])
+        signals = torch.from_numpy(decode_observation(codes))[None]
+        gains = np.exp2(-self.context.grid.ev100[states])
+        shot, read = (
+            torch.from_numpy(values[states])[None, :, None].expand(1, -1, 4).float()
+            for values in (self.schedules.shot, self.schedules.read)
+        )
+        # Eight-bit codes are coarser than the noise of a bright sample.
+        scale = float(gains.max())
+        light, precision = merge(signals, torch.from_numpy(gains / scale)[None], shot, read)
+        limit = -float(np.log2(gains.min()))
+        flat = light.flatten().double().numpy() / scale, precision.flatten().double().numpy()
+        return flat[0], flat[1] * scale**2, limit
+
+    def time_left(self, observations: Observations) -> Floats:
+        """(N,) time left [s]."""
+        return np.asarray(observations["bracket"][:, 0], np.float64) * self.schedules.budget
+
+    def act(
+        self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
+    ) -> Ints:
+        """The next frame's state for each camera, or to stop."""
+        self.observe(observations)
+        left = self.time_left(observations)
+        speeds = np.zeros(self.num_envs)
+        if "sensors" in observations:
+            speeds = decode_sensors(observations["sensors"])[0]
+        actions = np.full(self.num_envs, self.stop, np.int64)
+        for i in np.flatnonzero(~self._done).tolist():
+            actions[i] = self.choose(i, float(left[i]), float(speeds[i]))
+        if action_masks is not None:
+            allowed = action_masks[np.arange(len(actions)), actions]
+            actions = np.where(allowed, actions, self.stop)
+        self._done |= actions == self.stop
+        return actions
+
+    def choose(self, camera: int, time_left: float, speed: float) -> int:
+        """The next state of one camera, or `stop`.
+
+        Args:
+            camera: Index of the camera.
+            time_left: Time left [s].
+            speed: Speed of its shake [frame heights per second].
+        """
+        raise NotImplementedError(f"{type(self).__name__} must implement `choose`")
+
+
+class FixedBracket(Bracketing):
+    """The meter's exposure and as many stops above and below it, at the lowest ISO that fits.
+
+    Args:
+        context: The camera.
+        step: Stops from frame to frame; 0 takes the metered frame alone.
+    """
+
+    def __init__(self, context: PolicyContext, step: float = 2.0) -> None:
+        super().__init__(context)
+        self.step = check_number("step", step, 0.0, 16.0, more=" EV")
+        self.name = f"bracket:fixed, {step:g} EV"
+
+    def choose(self, camera: int, time_left: float, speed: float) -> int:
+        """The next of the frames."""
+        taken = len(self.kept(camera))
+        steps = np.array([0.0, 1.0, -1.0] if self.step else [0.0])
+        wanted = (self._reference[camera] + self.step * steps)[: self.schedules.max_frames]
+        if taken >= len(wanted):
+            return self.stop
+        return int(self._plan(wanted)[taken])
+
+    def _plan(self, wanted: Floats) -> Ints:
+        """States within half a stop of the EV100 `wanted`, at the lowest ISO, that fit."""
+        grid = self.context.grid
+        times = np.array([s.exposure_time for s in grid])
+        off = (2.0 * np.abs(grid.ev100 - wanted[:, None])).round()
+        off += 1e-3 * np.log2([s.iso for s in grid])
+        for longest in reversed(grid.exposure_times):
+            chosen: Ints = np.where(times <= longest, off, np.inf).argmin(axis=1)
+            gaps = FRAME_GAP * (len(chosen) - 1)
+            if times[chosen].sum() + gaps <= self.schedules.budget:
+                break
+        return chosen
+
+
+class Hasinoff(Bracketing):
+    """The noise-optimal schedule: the largest signal-to-noise ratio in the worst light.
+
+    Of all schedules that fit into the time, the one whose merged signal-to-noise ratio is largest
+    where it is smallest over the range of the scene's light (Hasinoff et al., CVPR 2010). The range
+    is that of the viewfinder's frame; where that is clipped it reaches `headroom` above white. The
+    schedule knows no motion, so exposures are at most `longest`. `fit` finds both on training
+    scenes, where they are not given.
+
+    Args:
+        context: The camera.
+        headroom: Stops; None fits it.
+        longest: Longest exposure time [s]; None fits it.
+    """
+
+    def __init__(
+        self, context: PolicyContext, headroom: float | None = None, longest: float | None = None
+    ) -> None:
+        super().__init__(context)
+        self.name = "bracket:hasinoff"
+        if headroom is not None:
+            headroom = check_number("headroom", headroom, 0.0, 16.0, more=" EV")
+        if longest is not None:
+            longest = check_number("longest", longest, context.grid.exposure_times[0], 3600.0)
+        self.headroom, self.longest = headroom, longest
+
+    def reset(self, num_envs: int, seed: int | None = None) -> None:
+        """Forgets the frames and the schedules."""
+        super().reset(num_envs, seed)
+        self._plans: dict[int, int] = {}
+
+    def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
+        """Takes what gives the best pictures of the training scenes."""
+
+        def quality(headroom: float, longest: float) -> float:
+            self.headroom, self.longest = headroom, longest
+            found = run_brackets(self, envs, seed=seed, most=_FIT_SCENES)
+            return float(found["quality"].mean())
+
+        headroom, longest = self.headroom, self.longest
+        times = self.context.grid.exposure_times
+        if longest is None:
+            middle = HEADROOMS[len(HEADROOMS) // 2] if headroom is None else headroom
+            longest = max(times, key=lambda time: quality(middle, time))
+        if headroom is None:
+            headroom = max(HEADROOMS, key=lambda stops: quality(stops, longest))
+        self.headroom, self.longest = headroom, longest
+
+    def choose(self, camera: int, time_left: float, speed: float) -> int:
+        """The next frame of the schedule."""
+        if self.headroom is None or self.longest is None:
+            raise ValueError("policy 'bracket:hasinoff' learns from scenes first: call fit(envs)")
+        reference = float(self._reference[camera])
+        kept = self.kept(camera)
+        if not len(kept):
+            low, high = self._range(camera)
+            total, _ = self.schedules.precision(reference)
+            inside = (low <= BINS + reference) & (high >= BINS + reference)
+            inside[np.abs(BINS + reference - 0.5 * (low + high)).argmin()] = True
+            ratio = np.exp2(BINS + reference) * np.sqrt(total)
+            worst = ratio[:, inside].min(axis=1) + 1e-6 * ratio[:, inside].mean(axis=1)
+            fits = self.schedules.completions(kept, time_left)
+            fits &= self.schedules.longest <= self.longest * (1.0 + 1e-6)
+            self._plans[camera] = int(np.where(fits, worst, -1.0).argmax())
+        plan = self._plans[camera]
+        exposed = self.context.grid.ev100
+        state = self.schedules.next_state(plan, kept, np.abs(exposed - reference))
+        return self.stop if state < 0 else state
+
+    def _range(self, camera: int) -> tuple[float, float]:
+        """log2 of the least and the most luminance."""
+        assert self.headroom is not None
+        light, precision, limit = self.merged(camera)
+        clear = light * np.sqrt(precision) > 1.0  # above the noise
+        shown = light[clear & (precision > 0.0)]
+        white = float((precision <= 0.0).mean())
+        if not len(shown):
+            return limit - 8.0, limit + self.headroom
+        low, high = np.log2(np.quantile(shown, [_TAIL, 1.0 - _TAIL]))
+        return float(low), limit + self.headroom if white > _TAIL else float(high)
+
+
+class LightEstimate(Protocol):
+    """How much of a scene has which light, from what its frames show."""
+
+    def __call__(self, described: NDArray[np.float32]) -> Floats:
+        """(L,) shares in `BINS`, from `describe`."""
+
+    def blur_error(self, pixels: Floats) -> Floats:
+        """Error that a blur over so many 64ths of the frame makes [EV]."""
+
+
+def describe(
+    light: Floats, precision: Floats, limit: float, reference: float
+) -> NDArray[np.float32]:
+    """(3, L) histograms over `BINS`: of clear samples, of white ones, of those in the noise.
+
+    White samples count where they begin, at `limit`; those in the noise at the noise.
+
+    Args:
+        light, precision, limit: Of `Bracketing.merged`.
+        reference: EV100 that `BINS` are relative to.
+    """
+    white = precision <= 0.0
+    deviation = 1.0 / np.sqrt(np.maximum(precision, 1e-300))
+    noisy = ~white & (light < 2.0 * deviation)
+    clear = ~white & ~noisy
+    place = np.log2(np.where(clear, light, np.where(noisy, deviation, 2.0**limit))) - reference
+    bins = bin_of(place)
+    counts = [np.bincount(bins[which], minlength=len(BINS)) for which in (clear, white, noisy)]
+    return (np.stack(counts) / len(light)).astype(np.float32)
+
+
+class Planner(Bracketing):
+    """Takes the frame that the best schedule for the expected light begins with, frame by frame.
+
+    Args:
+        context: The camera.
+        estimate: The light that is expected; None takes what the frames show for all of it.
+    """
+
+    def __init__(self, context: PolicyContext, estimate: LightEstimate | None = None) -> None:
+        super().__init__(context)
+        self.name = "bracket:planned"
+        self.estimate = estimate
+
+    def choose(self, camera: int, time_left: float, speed: float) -> int:
+        """The next state, or to stop where no further frame helps."""
+        reference, kept = float(self._reference[camera]), self.kept(camera)
+        described = describe(*self.merged(camera), reference)
+        light = described.sum(axis=0) if self.estimate is None else self.estimate(described)
+        blur = np.zeros(len(self.context.grid))
+        if self.estimate is not None:
+            times = np.array([s.exposure_time for s in self.context.grid])
+            blur = self.estimate.blur_error(64.0 * speed * times)
+        floor = reference + _FLOOR
+        errors = self.schedules.errors(reference, floor, np.asarray(light, np.float64), blur)
+        fits = self.schedules.completions(kept, time_left)
+        best = int(np.where(fits, errors, np.inf).argmin())
+        state = self.schedules.next_state(best, kept, self._of_one(errors))
+        return self.stop if state < 0 else state
+
+    def _of_one(self, errors: Floats) -> Floats:
+        """(S,) errors of single frames; those that do not fit into the budget are worst."""
+        found = np.full(len(self.context.grid), np.inf)
+        single = np.flatnonzero(self.schedules.frames == 1)
+        found[self.schedules.states[single, 0]] = errors[single]
+        return found
+
+
+def run_brackets(
+    policy: Policy,
+    envs: gym.vector.VectorEnv[Any, Any, Any],
+    *,
+    count: int = 1,
+    seed: int = 0,
+    most: int | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Episodes of each scene of `envs` (autoreset mode DISABLED), driven by `policy`.
+
+    Args:
+        policy: The policy.
+        envs: Environments of `ExposureBracket-v0`.
+        count: Episodes of each scene.
+        seed: Of the first.
+        most: Use so many scenes at most.
+
+    Returns:
+        ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each
+        episode, and the ``seconds`` that each decision took on average.
+    """
+    names = ("quality", "log_error", "unseen", "frames", "time_left")
+    found: dict[str, list[NDArray[Any]]] = {name: [] for name in (*names, "group", "seconds")}
+    episodes = Episodes.of_each_scene(scenes_of(envs), count=count, seed=seed, most=most)
+    for batch in episodes.batches(envs):
+        policy.reset(envs.num_envs, batch.seed)
+        observations, info, masks = batch.observations, batch.info, batch.action_masks
+        base: Any = envs.unwrapped
+        running = np.ones(envs.num_envs, bool)
+        last = {name: np.array(info[name], np.float64) for name in names}
+        seconds, decisions = 0.0, 0
+        while running.any():
+            begun = perf_counter()
+            actions = policy.act(observations, masks)
+            seconds, decisions = seconds + perf_counter() - begun, decisions + len(actions)
+            observations, _, ended, _, info = envs.step(actions)
+            for name in names:
+                last[name][running] = info[name][running]
+            running &= ~ended
+            if running.any() and ended.any():  # the others go on with episodes that do not count
+                observations, _ = base.reset(options={"reset_mask": ended})
+            masks = base.action_masks()
+        for name in names:
+            found[name].append(last[name][batch.valid])
+        found["group"].append(batch.groups[batch.valid])
+        found["seconds"].append(np.full(int(batch.valid.sum()), seconds / decisions))
+    return {name: np.concatenate(parts) for name, parts in found.items()}

@@ -1,0 +1,216 @@
+"""Schedules, the policies that follow them, and the agent that learns hidden light."""
+
+import itertools
+import math
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import ae_env  # noqa: F401  (registers the environment)
+from ae_env import ExposureGrid
+from ae_env.episodes.merging import log_error, merge
+from agents.bracketing.learnt import BLURS, HiddenLight, LearntBracket, LearntLight
+from agents.bracketing.policies import FixedBracket, describe, run_brackets
+from agents.bracketing.schedules import BINS, Schedules
+from agents.learning.training import AgentConfig, train_agent
+from agents.policy import PolicyContext, make_policy, training_seeds
+from simulator.camera import get_camera
+from tests.ae_env.environments import SMALL
+
+ID = "ae_env/ExposureBracket-v0"
+CAMERA = get_camera("nikon_z6")
+GRID = ExposureGrid((100, 1600), (1 / 1000, 1 / 60, 1 / 4), (4,))
+
+
+def make_envs(count: int = 4, **arguments: Any) -> gym.vector.VectorEnv:
+    options = {**SMALL, "autoreset_mode": "DISABLED", **arguments}
+    return gym.make_vec(ID, num_envs=count, **options)
+
+
+@pytest.fixture(scope="module")
+def context() -> PolicyContext:
+    return PolicyContext.from_envs(make_envs())
+
+
+def test_every_schedule_that_fits_is_there_once() -> None:
+    """By hand, each pair and each single state whose time is at most 0.3 s."""
+    schedules = Schedules(GRID, CAMERA, 0.3, 2, 4)
+    times = [1 / 1000, 1 / 60, 1 / 4] * 2
+    expected = [(-1, -1)] + [(s, -1) for s in range(6)]
+    for pair in itertools.combinations_with_replacement(range(6), 2):
+        if times[pair[0]] + times[pair[1]] + 1 / 60 <= 0.3:
+            expected.append(pair)
+    assert sorted(map(tuple, schedules.states.tolist())) == sorted(expected)
+    # With 1/60 s taken, and 0.26 s left: what holds it and needs no more.
+    fits = schedules.completions(np.array([1]), 0.26)
+    found = {tuple(row) for row in schedules.states[fits].tolist()}
+    assert found == {(1, -1), *((min(1, s), max(1, s)) for s in range(6))}
+    fits = schedules.completions(np.array([1]), 0.1)
+    assert {tuple(r) for r in schedules.states[fits].tolist()} == found - {(1, 2), (1, 5)}
+
+
+def test_expected_errors_are_those_of_merged_frames() -> None:
+    """Against the environment's own merging of 10,000 noisy samples in four lights."""
+    schedules = Schedules(GRID, CAMERA, 0.3, 2, 4)
+    reference, floor = 6.0, -6.0
+    generator = torch.Generator().manual_seed(1)
+    for states in ((0, -1), (1, 3), (2, 3)):
+        row = schedules.states.tolist().index(list(states))
+        chosen = [GRID[s] for s in states if s >= 0]
+        gains = torch.tensor([[2.0**s.log2_exposure for s in chosen]])
+        nlfs = [CAMERA.nlf(s.iso).scaled(1 / 16) for s in chosen]
+        noise = [torch.tensor([[[np.mean(v)] * 4 for v in vs]]) for vs in
+                 ([n.shot for n in nlfs], [n.read for n in nlfs])]  # fmt: skip
+        expected = schedules.noise_error(reference, floor)[row]
+        for place in (18, 28, 34, 44):
+            light = 2.0 ** float(BINS[place] + reference)
+            mean = (gains * light)[:, :, None, None, None].expand(1, -1, 4, 50, 50)
+            variance = noise[0][..., None, None] * mean + noise[1][..., None, None]
+            draws = torch.randn(mean.shape, generator=generator)
+            signals = (mean + variance.sqrt() * draws).clamp(max=1.0).float()
+            merged = merge(signals, gains, noise[0], noise[1])
+            truth = torch.full((1, 4, 50, 50), light)
+            error = log_error(*merged, truth, torch.tensor([2.0**floor]))
+            deviation = float(error.std()) / math.sqrt(error.numel())
+            # Five standard errors; eleven quantiles cut the tails of the noise off by 4 %.
+            assert float(error.mean()) == pytest.approx(
+                float(expected[place]), abs=5 * deviation + 0.05 * float(expected[place]) + 1e-4
+            )
+
+
+def test_fixed_steps_around_the_metered_state() -> None:
+    """EV100 10 metered: 1/60 s at ISO 100; +-4 EV are 1/1000 s and 1/4 s, in 0.301 s together."""
+    context = PolicyContext.from_envs(make_envs(budget=0.31))
+    policy, grid = FixedBracket(context, step=4), context.grid
+    wanted = policy._plan(np.array([grid.ev100[grid.index(0, 3, 0)] + d for d in (0, 4, -4)]))
+    assert wanted.tolist() == [grid.index(0, 3, 0), grid.index(0, 1, 0), grid.index(0, 5, 0)]
+    short = FixedBracket(PolicyContext.from_envs(make_envs(budget=0.1)), step=4)
+    chosen = short._plan(np.array([10.0, 14.0, 6.0]))
+    times = [grid[int(s)].exposure_time for s in chosen]
+    assert sum(times) + 2 / 60 <= 0.1
+    np.testing.assert_allclose(grid.ev100[chosen], [10.0, 14.0, 6.0], atol=0.2)
+
+
+def test_hasinoff_takes_the_largest_ratio_in_the_worst_light() -> None:
+    """A scene of two lights, 12 stops apart: over all schedules, tried one by one."""
+    envs = make_envs(1)
+    context = PolicyContext.from_envs(envs)
+    policy: Any = make_policy("bracket:hasinoff?headroom=0&longest=1/4", context)
+    policy.reset(1)
+    policy._range = lambda camera: (1.0, 13.0)  # log2 of the luminances
+    policy._reference[0] = 8.0
+    policy._frames[0] = [(0, np.zeros((4, 36, 36), np.uint8))]
+    first = policy.choose(0, 0.3, 0.0)
+    best, chosen = -1.0, ()
+    lights = 2.0 ** np.arange(1.0, 13.01, 0.5)
+    for count in (1, 2, 3):
+        for states in itertools.combinations_with_replacement(range(24), count):
+            taken = [context.grid[s] for s in states]
+            if sum(s.exposure_time for s in taken) + (count - 1) / 60 > 0.3:
+                continue
+            total = np.zeros(len(lights))
+            for s in taken:
+                nlf, gain = CAMERA.nlf(s.iso).scaled(1 / 16), 2.0**s.log2_exposure
+                shown = np.where(gain * lights < 0.97, gain**2, 0.0)
+                total += shown / (np.mean(nlf.shot) * gain * lights + np.mean(nlf.read))
+            worst = float((lights * np.sqrt(total)).min())
+            if worst > best * (1 + 1e-9):
+                best, chosen = worst, states
+    plan = policy.schedules.states[policy._plans[0]]
+    assert sorted(s for s in plan.tolist() if s >= 0) == sorted(chosen)
+    assert first in chosen
+
+
+def test_what_frames_show_is_counted_by_hand() -> None:
+    light = np.array([1.0, 4.0, 4.0, 0.0, 0.01])
+    precision = np.array([100.0, 100.0, 100.0, 0.0, 1.0])  # white where 0; the last is noise
+    clear, white, noisy = describe(light, precision, limit=6.0, reference=2.0)
+    assert {float(BINS[i]): float(clear[i]) for i in np.flatnonzero(clear)} == {
+        -2.0: pytest.approx(0.2),
+        0.0: pytest.approx(0.4),
+    }
+    assert BINS[np.flatnonzero(white)].tolist() == [4.0]
+    assert BINS[np.flatnonzero(noisy)].tolist() == [-2.0]  # at its standard deviation, 1
+
+
+def test_hidden_light_lies_where_it_may() -> None:
+    """Clear light stays; white light is at or above where white begins, noisy at or below."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = HiddenLight(8)
+    described = torch.zeros(1, 3, len(BINS))
+    described[0, 0, 30], described[0, 1, 40], described[0, 2, 10] = 0.5, 0.3, 0.2
+    found = network(described)[0].detach()
+    assert float(found.sum()) == pytest.approx(1.0, abs=1e-5)
+    assert float(found[30]) == pytest.approx(0.5, abs=1e-5)
+    assert float(found[40:].sum()) == pytest.approx(0.3, abs=1e-5)
+    assert float(found[:11].sum()) == pytest.approx(0.2, abs=1e-5)
+    network.blur.copy_(torch.arange(len(BLURS)) / 10.0)
+    errors = LearntLight(network).blur_error(np.array([0.0, 1.0, 2.0**0.5]))
+    np.testing.assert_allclose(errors, [0.0, 0.4, 0.45], atol=1e-6)
+
+
+def test_a_training_places_the_light_better_and_makes_an_agent(tmp_path: Path) -> None:
+    """A second call trains nothing; the agent keeps the rules."""
+    config = AgentConfig(
+        agent="bracket",
+        task=ID,
+        environment=SMALL,
+        num_envs=8,
+        training={"frames": 400, "steps_per_frame": 2, "batch_size": 64, "width": 16},
+    )
+    misplaced: list[float] = []
+    out = train_agent(
+        config,
+        tmp_path / "bracket",
+        progress=lambda done, total, values: misplaced.append(values["misplaced"]),
+    )
+    assert np.mean(misplaced[-10:]) < 0.7 * np.mean(misplaced[:10])
+    train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
+    envs = make_envs(8, split="test")
+    policy = make_policy(f"bracket:{out}", PolicyContext.from_envs(envs))
+    found = run_brackets(policy, envs, count=2)
+    assert set(found["frames"].tolist()) <= {1.0, 2.0, 3.0}
+    assert (found["time_left"] >= 0.0).all()
+
+
+def test_the_agent_that_ships_is_ahead_of_the_schedule_on_unseen_scenes() -> None:
+    envs = make_envs(16, split="test", resolution=64)
+    context = PolicyContext.from_envs(envs)
+    assert [Path(name).name for name in training_seeds("bracket")] == [
+        f"bracket-{seed}" for seed in (0, 1, 2)
+    ]
+    schedule = make_policy("bracket:hasinoff?headroom=6&longest=1/15", context)
+    found = [
+        run_brackets(policy, envs, count=2)["quality"].mean()
+        for policy in (make_policy("bracket", context), schedule)
+    ]
+    assert found[0] > found[1]
+
+
+def test_mistakes_are_named(context: PolicyContext) -> None:
+    other = PolicyContext(context.grid, context.camera, context.observation_space)
+    for name in ("bracket", "bracket:fixed"):
+        with pytest.raises(ValueError, match="ExposureBracket-v0"):
+            make_policy(name, other)
+    statistics = PolicyContext.from_envs(make_envs(observation="statistics"))
+    with pytest.raises(ValueError, match="`observation`='uint8'"):
+        make_policy("bracket:planned", statistics)
+    with pytest.raises(ValueError, match="`step`"):
+        make_policy("bracket:fixed?step=-1", context)
+    schedule = make_policy("bracket:hasinoff", context)
+    schedule.reset(4)
+    observations, _ = make_envs().reset(seed=0)
+    with pytest.raises(ValueError, match="fit"):
+        schedule.act(observations)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        make_policy("bracket:nowhere", context)
+    with pytest.raises(ValueError, match="weights"):
+        LearntBracket(context)
+    for agent, task in (("bracket", "ae_env/AutoExposure-v0"), ("ppo", ID)):
+        with pytest.raises(ValueError, match="`task`"):
+            AgentConfig(agent=agent, task=task)
