@@ -32,10 +32,10 @@ bench: $(STAMP)
 	$(BIN)/ae-env bench ptc
 	$(BIN)/ae-env bench throughput
 	$(BIN)/ae-env bench stability
-	@echo "error against time (about 20 minutes, and an hour once for the networks to compare with): $(BIN)/ae-env bench work-precision"
-	@echo "the simulator against the reference camera (trains the networks to compare with: about 1.5 hours): $(BIN)/ae-env bench simulator"
+	@echo "error against time (half an hour, and three hours once for the networks to compare with): $(BIN)/ae-env bench work-precision"
+	@echo "the simulator against the reference camera (20 minutes, and three hours once for the networks to compare with): $(BIN)/ae-env bench simulator"
 	@echo "agents trained on the simulator, judged in the truth (about an hour): $(BIN)/ae-env bench transfer"
-	@echo "the agents' long training (about an hour): $(BIN)/ae-env bench agents"
+	@echo "the agents against all meters (10 minutes; two hours with the agents' training): $(BIN)/ae-env bench agents"
 
 $(VENV): $(STAMP)
 

@@ -91,7 +91,7 @@ class EnvOptions:
         why = ": the default CNNs of RL libraries take no smaller image"
         resolution = check_integer("resolution", self.resolution, MIN_RESOLUTION, 4096, more=why)
         object.__setattr__(self, "resolution", resolution)  # NumPy's integers as an int
-        object.__setattr__(self, "delay", _checked_delay(self.delay))
+        object.__setattr__(self, "delay", checked_delay(self.delay))
         # A blur diameter in pixels of a 64-pixel frame.
         widest = 64.0 * max(1.0, MAX_DISC_PX / resolution)
         for name, words, most in (
@@ -221,8 +221,12 @@ class EnvOptions:
         return scene if self.noise else without_noise(scene)
 
 
-def _checked_delay(delay: Any) -> int | dict[str, int]:
-    """`delay` with Python's integers; a mapping of equal ones, of all controls, as one."""
+def checked_delay(delay: Any) -> int | dict[str, int]:
+    """`delay` with Python's integers; a mapping of equal ones, of all controls, as one.
+
+    Raises:
+        ValueError: If it is neither, or names no control.
+    """
     if not isinstance(delay, Mapping):
         more = f" frames, or a mapping of them by {list(CONTROLS)}"
         return check_integer("delay", delay, 0, MAX_DELAY, more=more)

@@ -35,7 +35,7 @@ THUMB_PIXELS = 104
 #: Height that scenes are averaged to for it [packed pixel].
 CAPTURE_PIXELS = 192
 #: Colours that stay apart for colour-blind eyes (Okabe and Ito 2008), one per policy.
-PATH_COLOURS = ("#E69F00", "#56B4E9", "#D55E00", "#F0E442", "#CC79A7", "#009E73", "#0072B2")
+PATH_COLOURS = ("#D55E00", "#56B4E9", "#FFFFFF", "#CC79A7", "#009E73", "#0072B2", "#E69F00")
 _BACKGROUND, _INK, _FAINT = (27, 27, 27), (235, 235, 235), (165, 165, 165)
 _BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
 _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
@@ -131,8 +131,10 @@ def contact_sheet(
         seed: Seed of the noise.
 
     Raises:
-        ValueError: If the grid has more than 256 states, or a path leaves it.
+        ValueError: If the grid has more than 256 states, or a path leaves it, or `scene` is none.
     """
+    if not isinstance(scene, Scene):
+        raise ValueError(f"`scene` (={scene!r}) must be a Scene, such as load_scenes() returns")
     camera = scene.camera if camera is None else camera
     grid = ExposureGrid.default() if grid is None else grid
     if len(grid) > MAX_SHEET_STATES:

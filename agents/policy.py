@@ -437,6 +437,8 @@ def _construct(
             raise ValueError(message) from error
         if isinstance(error, ValueError) and "?" in name:
             raise ValueError(f"`policy` (={name!r}): {error}") from error
+        if str(error).startswith("`weights`"):  # which the name gave
+            raise type(error)(f"`policy` (={name!r}): {error}") from error
         raise  # our own errors say which argument is wrong
     return policy
 

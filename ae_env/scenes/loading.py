@@ -208,6 +208,8 @@ def check_weights(name: str) -> None:
 
     known = sorted({DEFAULT_SIMULATOR, *list_pretrained()})
     if name not in known:
+        if name.endswith(".safetensors"):
+            raise ValueError(f"`simulator` (={name!r}): there is no such file")
         raise ValueError(
             f"`simulator` (={name!r}) must be None, one of {known} or the path of a .safetensors "
             f"file{did_you_mean(name, known)}"

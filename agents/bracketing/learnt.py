@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import nn
 
 from ae_env.observation import decode_sensors
+from ae_env.utils.checks import check_flag
 from agents.bracketing.policies import Bracketing, Planner, describe
 from agents.bracketing.schedules import BINS, Floats, light_histogram
 from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
@@ -68,13 +69,16 @@ class LearntLight:
 
     Args:
         network: The trained network.
+        hidden: Whether light is expected where frames are white or noisy, or only blur is known.
     """
 
-    def __init__(self, network: HiddenLight) -> None:
-        self.network = network.eval()
+    def __init__(self, network: HiddenLight, hidden: bool = True) -> None:
+        self.network, self.hidden = network.eval(), hidden
 
     def __call__(self, described: NDArray[np.float32]) -> Floats:
         """(L,) shares in `BINS`."""
+        if not self.hidden:
+            return described.sum(axis=0, dtype=np.float64)
         with torch.inference_mode():
             found: Floats = self.network(torch.from_numpy(described)[None])[0].double().numpy()
         return found
@@ -94,6 +98,7 @@ class LearntBracket(Planner):
         weights: File that a training wrote; or give `network`.
         network: A network in memory.
         device: Not used: the network is too small to gain from another.
+        hidden: See `LearntLight`.
     """
 
     def __init__(
@@ -102,14 +107,16 @@ class LearntBracket(Planner):
         weights: str | Path | None = None,
         network: HiddenLight | None = None,
         device: str = "cpu",
+        hidden: bool = True,
     ) -> None:
+        check_flag("hidden", hidden)
         if (weights is None) == (network is None):
             raise ValueError("give either `weights` or `network`")
         if network is None:
             tensors, card = load_agent(str(weights), "bracket")
             network = HiddenLight(card["width"])
             load_into(network, tensors, str(weights))
-        super().__init__(context, LearntLight(network))
+        super().__init__(context, LearntLight(network, hidden))
         self.name = "bracket"
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -23,38 +24,50 @@ from agents.cli.console import (
 )
 
 if TYPE_CHECKING:
+    from agents.evaluation.bracket_plan import BracketPlan
     from agents.evaluation.evaluation_plan import EvaluationPlan
     from agents.evaluation.intervals import Rank
     from agents.evaluation.result import EvaluationResult
 
 logger = logging.getLogger(__name__)
+Plan = TypeVar("Plan", "EvaluationPlan", "BracketPlan")
 
 #: Source groups in one table on the terminal.
 _GROUPS_ABREAST = 4
-#: Options that are arguments of the environment, and those of the condition.
-_ENVIRONMENT = ("scenes", "split", "grid", "sensors", "resolution", "scorer")
+#: Options that are arguments of the environment, and those of the condition; the only one that a
+#: benchmark takes; and those that an evaluation of brackets takes.
+_ENVIRONMENT = ("scenes", "split", "grid", "observation", "sensors", "resolution", "scorer")
 _CONDITION = ("lighting", "delay")
+_OF_BENCHMARKS = ("observation",)
+_OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 
 Policies = Annotated[
     list[str] | None, typer.Option(help="A policy; give the option several times.")
 ]
 Preset = Annotated[
     str | None,
-    typer.Option(help="quick, standard, video, ae_bench_v1, or a .yaml file of one's own."),
+    typer.Option(
+        help="quick, standard, video, bracket, ae_bench_v2_still (_video, _bracket), or a .yaml "
+        "file of one's own."
+    ),
 ]
 Environment = Annotated[
     str | None, typer.Option(help="Environment: a preset of configs/env, or a .yaml file.")
 ]
 Scenes = Annotated[
-    str | None, typer.Option(help="'bundled', or a folder or file of raws or radiance maps.")
+    str | None,
+    typer.Option(
+        help="'bundled', 'polyhaven', 'mixed', or a folder or file of raws or radiance maps."
+    ),
 ]
 Split = Annotated[str | None, typer.Option(help="train, test (default) or all.")]
-Grid = Annotated[str | None, typer.Option(help="default, third_stop or video.")]
+Grid = Annotated[str | None, typer.Option(help="default, third_stop, video or bracket.")]
 Scorer = Annotated[str | None, typer.Option(help="The scorer of the states: balanced...")]
 Lighting = Annotated[str | None, typer.Option(help="static (default), step, ramp, sine, tunnel...")]
 Delay = Annotated[
     int | None, typer.Option(help="Frames from a decision to its frame; 0 by default.", min=0)
 ]
+Observation = Annotated[str | None, typer.Option(help="uint8 (default), statistics...")]
 Sensors = Annotated[bool | None, typer.Option(help="Whether speed and defocus are observed (yes).")]
 Resolution = Annotated[int | None, typer.Option(help="Packed pixels a side; 64 by default.")]
 EpisodeCount = Annotated[
@@ -82,6 +95,7 @@ def evaluate(
     scorer: Scorer = None,
     lighting: Lighting = None,
     delay: Delay = None,
+    observation: Observation = None,
     sensors: Sensors = None,
     resolution: Resolution = None,
     episodes: EpisodeCount = None,
@@ -105,6 +119,7 @@ def evaluate(
         "split": split,
         "grid": grid,
         "scorer": scorer,
+        "observation": observation,
         "sensors": sensors,
         "resolution": resolution,
         "lighting": lighting,
@@ -120,18 +135,23 @@ def evaluate(
         raise ValueError(
             f"`on-error` (={on_error!r}) is about the files of --scenes: give that, too"
         )
+    from agents.evaluation.bracket_plan import BracketPlan
+
     device = torch_device(device)
     plan = _plan(preset, env, list(policy or ()), given)
     if append is not None and plan.hash is None:
         raise ValueError(
             f"`append` (={str(append)!r}) takes the results of a benchmark only: give "
-            "--preset ae_bench_v1"
+            "--preset ae_bench_v2_still, _video or _bracket"
         )
     if append is None and author:
         raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
     if append is not None:
         make_folder(append.parent, name="append", file=append)
-    _run(plan, out, append, author, workers, device)
+    if isinstance(plan, BracketPlan):
+        _run_brackets(plan, out, append, author)
+    else:
+        _run(plan, out, append, author, workers, device)
 
 
 def _run(
@@ -144,7 +164,7 @@ def _run(
 ) -> None:
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.evaluation.plan_run import StoredRun
-    from agents.report.ae_bench import append_results, check_append, check_hash
+    from agents.report.ae_bench import append_rows, check_append, check_hash, result_rows
     from agents.report.evaluation_report import write_report
     from agents.report.result_table import overall_ranking
 
@@ -157,36 +177,70 @@ def _run(
             for name in (p for p in plan.policies if p not in ranked):
                 logger.warning("%s gets no row in %s: it is told the best states", name, append)
         make_folder(out)
+        if (out / "results.json").is_file():
+            logger.warning("%s has the results of another run, which this one replaces", out)
         with progress_bars() as progress, progress("evaluation") as task:
             results = run.run(workers=workers, progress=task)
     files = write_report(results, out, command=command_line())
     ranking = overall_ranking(results)
     if append is not None:
-        files |= append_results(append, plan, results, ranking, author=author)
+        rows = result_rows(plan, results, ranking)
+        files |= append_rows(append, plan, rows, author=author)
     _print_ranking(ranking, results, plan.static_condition)
+    print_files(files)
+
+
+def _run_brackets(plan: BracketPlan, out: Path, append: Path | None, author: str) -> None:
+    from agents.evaluation.bracket_plan import run_bracket_plan
+    from agents.evaluation.evaluation_plan import plan_scenes
+    from agents.report.ae_bench import append_rows, bracket_rows, check_append, check_hash
+    from agents.report.bracket_report import rows_by_budget, write_bracket_report
+
+    scenes = plan_scenes(plan.of_conditions())
+    check_hash(plan, scenes)
+    if append is not None and plan.policies:
+        check_append(append, plan, plan.policies, author=author)
+    make_folder(out)
+    with progress_bars() as progress, progress("evaluation") as task:
+        results = run_bracket_plan(plan, scenes, progress=task)
+        task(1, 1)
+    files = write_bracket_report(plan, results, out, command=command_line())
+    if append is not None:
+        files |= append_rows(append, plan, bracket_rows(results), author=author)
+    head, body = rows_by_budget(plan, results)
+    _print_table("quality of the merged picture, by time of all frames", head, body)
     print_files(files)
 
 
 def _plan(
     preset: str | None, env: str | None, policies: list[str], given: Mapping[str, Any]
-) -> EvaluationPlan:
+) -> EvaluationPlan | BracketPlan:
     """The plan that the options describe."""
-    from agents.evaluation.evaluation_plan import EvaluationPlan, load_plan
+    from agents.evaluation.bracket_plan import BracketPlan, load_bench_plan
+    from agents.evaluation.evaluation_plan import EvaluationPlan
 
-    base = None if preset is None else load_plan(preset)
+    base = None if preset is None else load_bench_plan(preset)
     changed = [*given, *(["env"] if env is not None else [])]
-    if base is not None and base.hash is not None and changed:
-        raise ValueError(
-            f"`preset` (={base.name!r}) is a fixed benchmark: it does not take "
-            f"{', '.join('--' + name for name in changed)}"
-        )
+    allowed: tuple[str, ...] = tuple(changed)
+    if base is not None and base.hash is not None:
+        allowed, what = _OF_BENCHMARKS, "is a fixed benchmark"
+    elif isinstance(base, BracketPlan):
+        allowed, what = _OF_BRACKETS, "is of ExposureBracket-v0"
+    refused = [f"--{name}" for name in changed if name not in allowed]
+    if base is not None and refused:
+        raise ValueError(f"`preset` (={base.name!r}) {what}: it does not take {', '.join(refused)}")
+    if isinstance(base, BracketPlan):
+        return _bracket_plan(base, policies, given)
     environment: dict[str, Any] = {} if base is None else dict(base.environment)
     condition: dict[str, Any] = {}
     if env is not None:
+        from ae_env.options import EnvOptions
         from ae_env.utils.presets import load_preset
 
         arguments = load_preset(env)
         arguments.pop("max_episode_steps", None)
+        with _errors_of(env):
+            EnvOptions.from_kwargs(arguments)
         condition = {k: arguments.pop(k) for k in _CONDITION if k in arguments}
         environment |= arguments
     environment |= {k: given[k] for k in _ENVIRONMENT if k in given}
@@ -202,13 +256,38 @@ def _plan(
         return _changed(EvaluationPlan(), entries | _plain(environment, condition, given))
     if condition:  # in place of the preset's
         entries |= {"conditions": _one_condition(condition), "delays": [0]}
-    if "seed" in given or "episodes" in given:
-        first = given.get("seed", base.seeds[0])
-        count = given.get("episodes", len(base.seeds))
-        entries["seeds"] = [first + i for i in range(count)]
+    entries["seeds"] = _seeds(base.seeds, given)
     if env is not None or "scenes" in given or "split" in given:
         entries["scene_ids"] = []  # those are of the preset's own scenes
     return _changed(base, entries)
+
+
+@contextmanager
+def _errors_of(env: str) -> Iterator[None]:
+    """Errors about an argument name the file that it is in."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"`env` (={env!r}): {error}") from error
+
+
+def _bracket_plan(base: BracketPlan, policies: list[str], given: Mapping[str, Any]) -> BracketPlan:
+    environment = dict(base.environment) | {k: given[k] for k in _ENVIRONMENT if k in given}
+    entries: dict[str, Any] = {"environment": environment}
+    entries |= {"seeds": _seeds(base.seeds, given)}
+    if policies:
+        entries["policies"] = list(dict.fromkeys(policies))
+    if "scenes" in given or "split" in given:
+        entries["scene_ids"] = []  # those are of the preset's own scenes
+    return _changed(base, entries)
+
+
+def _seeds(known: Sequence[int], given: Mapping[str, Any]) -> list[int]:
+    """Seeds of the episodes, with those of the options in place of the preset's."""
+    if "seed" not in given and "episodes" not in given:
+        return list(known)
+    first = given.get("seed", known[0])
+    return [first + i for i in range(given.get("episodes", len(known)))]
 
 
 def _plain(
@@ -236,7 +315,7 @@ def _one_condition(entries: Mapping[str, Any]) -> dict[str, Any]:
     return {light_name(entries.get("lighting", "static")): entries}
 
 
-def _changed(plan: EvaluationPlan, entries: Mapping[str, Any]) -> EvaluationPlan:
+def _changed(plan: Plan, entries: Mapping[str, Any]) -> Plan:
     """`plan` with other entries; an error about them has one line."""
     from pydantic import ValidationError
 

@@ -34,11 +34,14 @@ def film(
     import gymnasium as gym
 
     import ae_env  # noqa: F401  (registers the environment)
+    from ae_env.lighting.moving import KIND_SETS, MOVES
+    from ae_env.utils.checks import check_word
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext, make_policy
     from agents.report.film import film as write
 
     make_folder(out.parent, file=out)
+    check_word("light", light, (*MOVES, *KIND_SETS))
     options: dict[str, Any] = {"scenes": scenes, "split": "test"}
     envs = gym.make_vec(
         "ae_env/AutoExposureVideo-v0",
@@ -50,6 +53,8 @@ def film(
         with_oracle=True,
     )
     with closing(envs), progress_bars() as progress:
+        if scene is not None:
+            _check_scene(scene, envs)
         context = PolicyContext.from_envs(envs)
         policies = {name: make_policy(name, context) for name in policy or POLICIES}
         with progress("fitting") as task:
@@ -57,3 +62,15 @@ def film(
         with progress("film") as task:
             write(policies, envs, out, frames=frames, seed=seed, scene=scene, progress=task)
     print_files({"film": out})
+
+
+def _check_scene(scene: str, envs: Any) -> None:
+    """Raises a `ValueError` unless `envs` have `scene`."""
+    from ae_env.utils.checks import did_you_mean
+
+    known = [one.scene_id for one in envs.unwrapped.scenes]
+    if scene not in known:
+        raise ValueError(
+            f"`scene` (={scene!r}) must be the id of a test scene, such as {known[0]!r}"
+            f"{did_you_mean(scene, known)}"
+        )

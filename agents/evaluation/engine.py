@@ -37,6 +37,7 @@ from agents.evaluation.running import (
     fit_policies,
     milliseconds_alone,
     run_batch,
+    training_envs,
 )
 from agents.policy import Policy, PolicyContext, make_policy, training_seeds
 
@@ -187,6 +188,7 @@ class EvaluationRun:
         self.grid = plan.options().make_grid()
         self.episodes = plan_episodes(plan, self.scenes, self.grid)
         self._envs: dict[tuple[Any, ...], VectorEnv] = {}
+        self._training: VectorEnv | None = None
         self._open_for: Condition | None = None
 
     @property
@@ -205,6 +207,9 @@ class EvaluationRun:
 
     def __exit__(self, *_: object) -> None:
         self._close()
+        if self._training is not None:
+            self._training.close()
+            self._training = None
 
     def _close(self) -> None:
         for envs in self._envs.values():
@@ -275,11 +280,15 @@ class EvaluationRun:
     def fitted(self, member: Member, condition: Condition) -> Policy:
         """The policy of `member`, fitted on training scenes in static light."""
         policy = self.make(member, condition)
+        if getattr(type(policy), "fit", Policy.fit) is Policy.fit:
+            return policy
         base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
         source = base.get("scenes", "bundled")
         if isinstance(source, str):
             base["scenes"] = training_scenes(source, self.plan.options().resolution)[0]
-        fit_policies({member.name: policy}, base, seed=self.plan.seeds[0])
+        if self._training is None:
+            self._training = training_envs(base)
+        fit_policies({member.name: policy}, base, seed=self.plan.seeds[0], training=self._training)
         return policy
 
     def follow(

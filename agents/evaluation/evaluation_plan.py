@@ -7,11 +7,12 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from ae_env.options import checked_delay
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.utils.checks import did_you_mean
 from agents.episodes import Episodes
@@ -34,7 +35,7 @@ _SEED_STRIDE = 2**20
 CONDITION_ARGUMENTS = ("lighting", "delay")
 _OWN_ARGUMENTS = ("with_oracle", "max_episode_steps", "autoreset_mode")
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
-NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "hash")
+NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "suite", "hash")
 
 
 class Condition(Configuration):
@@ -47,7 +48,12 @@ class Condition(Configuration):
     """
 
     lighting: Any = "static"
-    delay: Annotated[int, Field(ge=0, le=16)] | dict[str, int] = 0
+    delay: Any = 0
+
+    @field_validator("delay")
+    @classmethod
+    def _delay(cls, value: Any) -> Any:
+        return checked_delay(value)
 
     @property
     def at_rest(self) -> bool:
@@ -74,7 +80,10 @@ class EvaluationPlan(Configuration):
         other_scorers: Names of scorers that no policy was trained on; chosen states are also rated
             by these.
         other_scorer_scenes: Scenes that they rate, source groups in turn.
-        hash: Of a benchmark: sha256 of the plan and of the scenes' light, which is checked.
+        task: Of a plan that is a part of a benchmark: which of its tables has the results.
+        suite: Presets of all plans of that benchmark, which have one hash.
+        hash: Of a benchmark: sha256 of the plan, or of all of its suite, and of the scenes' light,
+            which is checked.
     """
 
     name: str = "evaluation"
@@ -89,6 +98,8 @@ class EvaluationPlan(Configuration):
     policies: tuple[str, ...] = ()
     other_scorers: tuple[str, ...] = ()
     other_scorer_scenes: int = Field(default=8, ge=1, le=MAX_SCENES)
+    task: str = ""
+    suite: tuple[str, ...] = ()
     hash: str | None = None
 
     @field_validator("scene_ids", "delays", "starts", "seeds", "policies", "other_scorers")
@@ -126,6 +137,11 @@ class EvaluationPlan(Configuration):
             except ValueError as error:
                 raise ValueError(f"condition {name!r}: {error}") from error
         return self
+
+    @property
+    def observation(self) -> str:
+        """What policies are shown."""
+        return str(self.environment.get("observation", "uint8"))
 
     @property
     def all_conditions(self) -> dict[str, Condition]:
@@ -176,7 +192,10 @@ class EvaluationPlan(Configuration):
         def refuse(value: Any) -> Any:
             raise ValueError(f"every entry of a plan must be a JSON value, not {value!r}")
 
-        return {k: v for k, v in self.describe(refuse).items() if k not in NOT_OF_THE_PROTOCOL}
+        found = {k: v for k, v in self.describe(refuse).items() if k not in NOT_OF_THE_PROTOCOL}
+        if not self.task:  # plans of before there were tasks keep their digest
+            del found["task"]
+        return found
 
     def changed(self, **entries: Any) -> EvaluationPlan:
         """The same plan with other entries, checked.

@@ -31,6 +31,7 @@ def fit_policies(
     seed: int = 0,
     batch: int = 64,
     progress: Progress | None = None,
+    training: VectorEnv | None = None,
 ) -> None:
     """Call `fit` of every policy that has one, on the training split.
 
@@ -40,12 +41,13 @@ def fit_policies(
         seed: Decides the training episodes.
         batch: Episodes at a time.
         progress: Called before and after each fit.
+        training: Environments to use, see `training_envs`, which stay open; by default new ones.
     """
     learners = {n: p for n, p in policies.items() if getattr(type(p), "fit", None)}
     learners = {n: p for n, p in learners.items() if type(p).fit is not Policy.fit}
     if not learners:
         return
-    envs = make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
+    envs = training_envs(env_options, batch) if training is None else training
     try:
         for i, (name, policy) in enumerate(learners.items()):
             if progress is not None:
@@ -55,7 +57,18 @@ def fit_policies(
         if progress is not None:
             progress(len(learners), len(learners), "")
     finally:
-        envs.close()
+        if training is None:
+            envs.close()
+
+
+def training_envs(env_options: Mapping[str, Any], batch: int = 64) -> VectorEnv:
+    """Environments to fit policies on; fits that follow each other share their score tables.
+
+    Args:
+        env_options: As of `fit_policies`.
+        batch: As of `fit_policies`.
+    """
+    return make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
 
 
 def run_batch(

@@ -58,6 +58,7 @@ class ForecasterTraining(Configuration):
         mixed: Share of the light that is a sum of two to four kinds.
         bent: Share of the light that is cut at a level above or below, as light is that comes
             through gaps; likewise the share whose pace varies, and the share that is smoothed.
+        amplitude: Standard deviation of the log2 of a factor on all changes of a sequence.
         seed: Seed of light, frames and weights.
 
     Raises:
@@ -72,6 +73,7 @@ class ForecasterTraining(Configuration):
     traces: int = Field(default=4096, ge=1, le=10**6)
     mixed: float = Field(default=0.5, ge=0.0, le=1.0)
     bent: float = Field(default=0.4, ge=0.0, le=1.0)
+    amplitude: float = Field(default=0.0, ge=0.0, le=3.0)
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
 
@@ -246,6 +248,8 @@ def sample(
         light = light * np.where(share > 0.0, rng.uniform(0.4, 1.0, (count, 1)), 1.0)
         light += share * windows()
     light = _bent(light, training.bent, rng)
+    if training.amplitude:
+        light *= np.exp2(rng.normal(0.0, training.amplitude, (count, 1)))
     light += rng.uniform(4.0, 14.0, (count, 1))
     reading, exposed_at = metered(light, rng)
     before = np.concatenate([reading.ev100[:, :1], reading.ev100[:, :-1]], axis=1)

@@ -55,7 +55,8 @@ class RpiAgc(Policy):
         compensation: Exposure compensation [EV], positive is brighter.
         damping: Share of the distance to the filtered EV that remains after a frame, in [0, 1).
         shutter_cap: Longest exposure time that may be used [s].
-        f_number: Aperture of the lens.
+        f_number: Aperture of the lens; by default the widest of the grid, which is nearest to the
+            f/1.8 and f/2 of the Raspberry Pi's own cameras.
         exposure_time: Shutter that S and M keep [s]; None: 1/125.
         iso: ISO speed that M keeps; None: it follows the meter.
         max_gain: Gain at the end of the ladder, 1 at ISO 100.
@@ -79,7 +80,7 @@ class RpiAgc(Policy):
         compensation: float = 0.0,
         damping: float = 0.0,
         shutter_cap: float | None = None,
-        f_number: float = 5.6,
+        f_number: float | None = None,
         exposure_time: float | None = None,
         iso: float | None = None,
         max_gain: float = 16.0,
@@ -94,7 +95,8 @@ class RpiAgc(Policy):
         check_word("mode", mode, tuple(LADDERS))
         check_word("constraint", constraint, tuple(CONSTRAINTS))
         time = PRIORITY_TIME if exposure_time is None else exposure_time
-        self.options = ProgramOptions(compensation, damping, shutter_cap, f_number, time, iso)
+        lens = context.grid.f_numbers[0] if f_number is None else f_number
+        self.options = ProgramOptions(compensation, damping, shutter_cap, lens, time, iso)
         self.speed = check_number("speed", speed, 1e-3, 1.0)
         self.startup_frames = check_integer("startup_frames", startup_frames, 0)
         max_gain = check_number("max_gain", max_gain, 1.0, 1e5)

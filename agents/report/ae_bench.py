@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation import metrics
+from agents.evaluation.bracket_plan import BracketPlan, BracketResult, load_bench_plan
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest
 from agents.evaluation.intervals import Rank
 from agents.policy import split_class, split_options
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from ae_env.scenes import Scene
 
 logger = logging.getLogger(__name__)
+#: The plan of a task of a benchmark.
+BenchPlan = EvaluationPlan | BracketPlan
 
 #: The scenes' light is hashed as means of so many blocks a side, to so many EV: a scene that was
 #: made otherwise is noticed, the last bit of another processor's arithmetic is not.
@@ -36,38 +40,85 @@ BLOCKS, STEP_EV = 4, 0.1
 #: that are measured on the capture.
 RULES = 2
 #: Kinds of policies whose names have a file's or folder's path behind the colon.
-_WITH_FILES = ("ppo", "regression", "recorded")
+_WITH_FILES = ("ppo", "regression", "bracket", "recorded")
 COLUMNS = (
-    *("policy", "author", "date", "normalised_score", "ci95_low", "ci95_high", "static"),
-    *("hard", "regret", "ev_within_third", "frames_to_converge", "converged", "clipped_high"),
-    *("clipped_low", "ms_alone", "cpu", "training_seeds", "version", "hash"),
+    *("task", "policy", "observation", "author", "date", "score", "ci95_low", "ci95_high"),
+    *("procedural", "real", "regret", "ev_within_third", "frames_to_converge", "converged"),
+    *("reversals", "jump", "clipped_high", "clipped_low", "log_error", "unseen", "frames"),
+    *("ms_alone", "cpu", "training_seeds", "version", "hash"),
 )
+#: What identifies a row.
+_KEY = ("task", "policy", "observation", "author")
 #: Metrics of a row that are means over all conditions.
-_MEANS = COLUMNS[8:14]
+_MEANS = (
+    *("regret", "ev_within_third", "frames_to_converge", "converged", "reversals", "jump"),
+    *("clipped_high", "clipped_low"),
+)
+#: The tables of a page: their tasks, what is said of each, and its columns by heading.
+_COMMON = {"policy": "policy", "sees": "observation", "score": "score", "95 % interval": "ci95"}
+_SCENES = {"procedural": "procedural", "real": "real"}
+_LAST = {"ms alone": "ms_alone", "seeds": "training_seeds", "author": "author", "date": "date"}
+_FRAMES = {
+    "regret": "regret",
+    "within 1/3 EV": "ev_within_third",
+    "frames to converge": "frames_to_converge",
+    "converged": "converged",
+    "reversals": "reversals",
+    "jump": "jump",
+    "white": "clipped_high",
+}
+_TABLES = {
+    "still": (
+        "Still: `AutoExposure-v0`",
+        "Score: normalised over all conditions, each with the same weight; 0 is a random policy, "
+        "1 the best state of every frame in that frame's own light.",
+        {**_COMMON, **_SCENES, **_FRAMES, **_LAST},
+    ),
+    "video": (
+        "Video: `AutoExposureVideo-v0`",
+        "Score: as above. Nobody reaches 1, as the light to come must be guessed: "
+        "`oracle:last_frame`, which is not ranked, knows that of the frame in hand.",
+        {**_COMMON, **_SCENES, **_FRAMES, **_LAST},
+    ),
+    "bracket": (
+        "Bracket: `ExposureBracket-v0`",
+        "Score: quality of the merged picture, 1 - mean error / 2 EV, over all time budgets.",
+        {
+            **_COMMON,
+            **_SCENES,
+            "error [EV]": "log_error",
+            "unseen": "unseen",
+            "frames": "frames",
+            **_LAST,
+        },
+    ),
+}
+_PERCENT = ("ev_within_third", "converged", "clipped_high", "unseen")
 _PAGE = """\
-# {name}
+# AE-Bench v2
 
 <!-- written by `ae-env evaluate --append`; the numbers are in the CSV file -->
 
-{scenes} bundled scenes that nothing was trained on, conditions {conditions}; starts {starts}; \
-{frames} frames; scorer `{scorer}`. Score: normalised score over all conditions, each with the \
-same weight; 0 is a random policy, 1 an oracle that is told the best state of the last frame's \
-light in every frame. What the columns mean: [evaluation.md](evaluation.md). Times are those of \
-each row's own machine (`cpu` in the CSV file).
+40 scenes that nothing was trained on: 24 of the procedural generators, and a view of each of the \
+16 real places of the test split (`ae-env scenes download` fetches them). Three tasks, each a \
+preset of `configs/evaluation`; what the columns mean: [evaluation.md](evaluation.md). Times are \
+those of each row's own machine (`cpu` in the CSV file). [AE-Bench v1](ae-bench/v1.md) is \
+superseded.
 
-Add your own policy with one command:
+Add your own policy with one command for each task that it is for:
 
-    ae-env evaluate --preset ae_bench_v1 --policy my.py:Mine \\
+    ae-env evaluate --preset ae_bench_v2_still --policy my.py:Mine \
         --append {table} --author "Your name"
 
-Its row replaces the one of the same policy and author, where there is one, and no other. Send it \
-as a pull request with the two files that the command changes, `{table}` and `{page}`, and, if it \
-may be public, the policy's file.
+`_still`, `_video` or `_bracket`; `--observation statistics` shows the policy the statistics of an \
+image processor in place of pixels. A row replaces the one of the same task, policy, observation \
+and author, where there is one, and no other. Send it as a pull request with the two files that \
+the command changes, `{table}` and `{page}`, and, if it may be public, the policy's file.
 
-The plan, its scenes and the rules of the environment have the hash `{hash}`, which every row \
-carries; a run under another one is refused.
+The plans of all tasks, their scenes and the rules of the environment have the hash `{hash}`, \
+which every row carries; a run under another one is refused.
 
-{rows}
+{tables}
 """
 
 
@@ -96,12 +147,22 @@ def _blocks(planes: Tensor) -> NDArray[Any]:
     return means
 
 
-def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
-    """sha256 of the plan, of its scenes, and of `RULES`."""
-    return digest(RULES, plan.protocol(), [scene_signature(scene) for scene in scenes])
+def bench_hash(plan: BenchPlan, scenes: Sequence[Scene]) -> str:
+    """sha256 of the plan, or of all plans of its suite, of its scenes, and of `RULES`."""
+    protocols: Any = plan.protocol()
+    if plan.suite:
+        protocols = [_shared(load_bench_plan(name)) for name in plan.suite]
+    return digest(RULES, protocols, [scene_signature(scene) for scene in scenes])
 
 
-def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
+def _shared(plan: BenchPlan) -> dict[str, Any]:
+    """What decides the episodes of a plan of a suite: a policy may choose what it is shown."""
+    protocol = plan.protocol()
+    shown = {k: v for k, v in protocol["environment"].items() if k != "observation"}
+    return {**protocol, "environment": shown}
+
+
+def check_hash(plan: BenchPlan, scenes: Sequence[Scene]) -> None:
     """Checks that a benchmark is still the one that its hash was written down for.
 
     Raises:
@@ -134,21 +195,25 @@ def row_name(policy: str) -> str:
     return policy
 
 
-def check_append(
-    table: Path, plan: EvaluationPlan, policies: Sequence[str], *, author: str
-) -> None:
+def check_append(table: Path, plan: BenchPlan, policies: Sequence[str], *, author: str) -> None:
     """Checks that rows of `policies` can be added to a table, before they are measured.
 
     Args:
         table: CSV with `COLUMNS`, or a file to be made.
-        plan: The benchmark.
+        plan: The plan of one of the benchmark's tasks.
         policies: Those that get a row.
         author: Who made them.
 
     Raises:
-        ValueError: If `table` is no benchmark's table or has rows of another hash, no policy gets
-            a row, two would get the same one, or a row without an author would be replaced.
+        ValueError: If `plan` is of no benchmark that takes rows, `table` is no benchmark's table or
+            has rows of another hash, no policy gets a row, two would get the same one, or a row
+            without an author would be replaced.
     """
+    if plan.task not in _TABLES:
+        raise ValueError(
+            f"`append` (={str(table)!r}): {plan.name} takes no rows any more, AE-Bench v2 has "
+            "superseded it: --preset ae_bench_v2_still"
+        )
     rows = _rows_of_hash(table, plan)
     if page_of(table) == table:
         raise ValueError(f"`append` (={str(table)!r}) must be a CSV file, such as mine.csv")
@@ -166,25 +231,25 @@ def check_append(
                 f"{table}: rename a file"
             )
         seen[name] = policy
-        if not author.strip() and (name, "") in rows:
+        if not author.strip() and (plan.task, name, plan.observation, "") in rows:
             raise ValueError(
                 f"`author` (={author!r}) must be given: {table} has a row of {name!r} without an "
                 "author, which may be another's"
             )
 
 
-def append_results(
-    table: Path, plan: EvaluationPlan, results: Results, ranking: Sequence[Rank], *, author: str
+def append_rows(
+    table: Path, plan: BenchPlan, found: Sequence[Mapping[str, Any]], *, author: str
 ) -> dict[str, Path]:
-    """Adds a row per policy to a benchmark's table, and writes its page again.
+    """Adds rows to a benchmark's table, and writes its page again.
 
-    A row of the same policy and author is replaced, which is logged; rows of other authors stay.
+    A row of the same task, policy, observation and author is replaced, which is logged; others
+    stay.
 
     Args:
         table: CSV with `COLUMNS`; made where missing.
-        plan: The benchmark.
-        results: By condition.
-        ranking: Over all conditions.
+        plan: The plan of the task.
+        found: ``policy`` and the numbers of each row, see `result_rows` and `COLUMNS`.
         author: Who made the policies.
 
     Returns:
@@ -193,14 +258,24 @@ def append_results(
     Raises:
         ValueError: If the table has other columns, or rows of another hash.
     """
-    rows, author = _rows_of_hash(table, plan), author.strip()
-    for one in ranking:
-        row = _row(plan, results, one, author)
-        key = row["policy"], author
+    rows = _rows_of_hash(table, plan)
+    for one in found:
+        row = _written(one) | {
+            "task": plan.task,
+            "policy": row_name(one["policy"]),
+            "observation": plan.observation,
+            "author": author.strip(),
+            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+            "cpu": str(machine()["cpu"]),
+            "version": versions().get("ae-env", ""),
+            "hash": plan.hash or "",
+        }
+        key = tuple(row[name] for name in _KEY)
         if key in rows:
-            logger.warning("%s: replaced the row of %r by %r", table, *key)
+            logger.warning("%s: replaced the row of %r by %r", table, row["policy"], row["author"])
         rows[key] = row
-    ordered = sorted(rows.values(), key=lambda row: -float(row["normalised_score"]))
+    tasks = list(_TABLES)
+    ordered = sorted(rows.values(), key=lambda r: (tasks.index(r["task"]), -float(r["score"])))
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()
@@ -212,13 +287,23 @@ def append_results(
     }
 
 
-def _rows_of_hash(table: Path, plan: EvaluationPlan) -> dict[tuple[str, str], dict[str, str]]:
-    """Rows of a table by policy and author; an error where one has another hash."""
-    rows = {(row["policy"], row["author"]): row for row in read_table(table)}
-    for (name, _), row in rows.items():
+def _written(row: Mapping[str, Any]) -> dict[str, str]:
+    """A row's numbers as the table has them; what there is none of stays empty."""
+    numbers = {key: row.get(key) for key in COLUMNS}
+    return {
+        key: "" if value is None else str(value) if isinstance(value, int) else f"{value:.4f}"
+        for key, value in numbers.items()
+        if not isinstance(value, str)
+    }
+
+
+def _rows_of_hash(table: Path, plan: BenchPlan) -> dict[tuple[str, ...], dict[str, str]]:
+    """Rows of a table by `_KEY`; an error where one has another hash."""
+    rows = {tuple(row[name] for name in _KEY): row for row in read_table(table)}
+    for key, row in rows.items():
         if row["hash"] != plan.hash:
             raise ValueError(
-                f"{table}: policy {name!r} was measured under the hash {row['hash']}, this run "
+                f"{table}: policy {key[1]!r} was measured under the hash {row['hash']}, this run "
                 f"under {plan.hash}: they do not compare"
             )
     return rows
@@ -252,9 +337,22 @@ def page_of(table: Path) -> Path:
     return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
 
 
-def _row(plan: EvaluationPlan, results: Results, one: Rank, author: str) -> dict[str, str]:
-    name, static = one.policy, results[plan.static_condition]
-    track = static.tracks[name]
+def result_rows(
+    plan: EvaluationPlan, results: Results, ranking: Sequence[Rank]
+) -> list[dict[str, Any]]:
+    """The rows of policies of a plan of conditions: means over all of them.
+
+    Args:
+        plan: The plan.
+        results: By condition.
+        ranking: Over all conditions.
+    """
+    return [_row(plan, results, one) for one in ranking]
+
+
+def _row(plan: EvaluationPlan, results: Results, one: Rank) -> dict[str, Any]:
+    name = one.policy
+    track = results[plan.static_condition].tracks[name]
 
     def mean(key: str) -> float:
         """Over all conditions, source groups with the same weight."""
@@ -264,67 +362,80 @@ def _row(plan: EvaluationPlan, results: Results, one: Rank, author: str) -> dict
         ]
         return float(np.mean(values))
 
-    def score(part: str) -> float:
-        gains, span = static.group_gains(name, part)
-        return float(gains.mean(axis=0).sum() / span.sum())
+    def score(real: bool) -> float | None:
+        """Over the groups that are real places, or over the others."""
+        found = []
+        for result in results.values():
+            chosen = is_real(result.groups) == real
+            if not chosen.any():
+                return None
+            gains = (result.episode_metrics(name)["score"] - result.random)[:, chosen]
+            span, groups = (result.oracle - result.random)[chosen], result.groups[chosen]
+            gained = metrics.group_means(gains, groups)[0].mean(axis=0).sum()
+            found.append(gained / metrics.group_means(span, groups)[0].sum())
+        return float(np.mean(found))
 
     low, high = one.score.pair or (None, None)
-    numbers = {
-        "normalised_score": one.score.value,
+    return {
+        "policy": name,
+        "score": one.score.value,
         "ci95_low": low,
         "ci95_high": high,
-        "static": score("all"),
-        "hard": score("hard") if static.hard.any() else None,
+        "procedural": score(real=False),
+        "real": score(real=True),
         **{key: mean(key) for key in _MEANS},
         "ms_alone": track.ms_alone,
-    }
-    return {
-        "policy": row_name(name),
-        "author": author,
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        **{key: "" if value is None else f"{value:.4f}" for key, value in numbers.items()},
-        "cpu": str(machine()["cpu"]),
-        "training_seeds": str(len(track.states)),
-        "version": versions().get("ae-env", ""),
-        "hash": plan.hash or "",
+        "training_seeds": len(track.states),
     }
 
 
-def table_page(plan: EvaluationPlan, rows: Sequence[Mapping[str, str]], table: Path) -> str:
+def bracket_rows(results: Sequence[BracketResult]) -> list[dict[str, Any]]:
+    """The rows of policies of a plan of brackets: means over all budgets."""
+    rows = []
+    for result in results:
+        real, interval = is_real(result.groups), result.score()
+        low, high = interval.pair or (None, None)
+        rows.append(
+            {
+                "policy": result.policy,
+                "score": interval.value,
+                "ci95_low": low,
+                "ci95_high": high,
+                "procedural": None if real.all() else result.mean("quality", ~real),
+                "real": result.mean("quality", real) if real.any() else None,
+                **{key: result.mean(key) for key in ("log_error", "unseen", "frames")},
+                "ms_alone": 1000.0 * result.mean("seconds"),
+                "training_seeds": len(result.values["quality"]),
+            }
+        )
+    return rows
+
+
+def is_real(groups: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which of the source groups are real places."""
+    return np.isin(groups, [asset.place for asset in list_assets()])
+
+
+def table_page(plan: BenchPlan, rows: Sequence[Mapping[str, str]], table: Path) -> str:
     """The page of a benchmark's table as Markdown."""
 
     def shown(path: Path) -> str:  # a full path is of one machine only
         return path.name if path.is_absolute() else path.as_posix()
 
-    head = [
-        *("policy", "score", "95 % interval", "static", "static, hard", "regret"),
-        *("within 1/3 EV", "frames to converge", "converged", "white", "ms alone", "seeds"),
-        *("author", "date", "version"),
-    ]
-    body = [
-        [
-            escape(row["policy"]),
-            row["normalised_score"],
-            f"{row['ci95_low']} to {row['ci95_high']}" if row["ci95_low"] else "-",
-            *(row[key] for key in ("static", "hard", "regret")),
-            f"{float(row['ev_within_third']):.0%}",
-            f"{float(row['frames_to_converge']):.1f}",
-            f"{float(row['converged']):.0%}",
-            f"{float(row['clipped_high']):.2%}",
-            *(row["ms_alone"] or "-", row["training_seeds"]),
-            *(escape(row[key]) for key in ("author", "date", "version")),
-        ]
-        for row in rows
-    ]
+    blocks = []
+    for task, (title, text, columns) in _TABLES.items():
+        own = [row for row in rows if row["task"] == task]
+        if own:
+            body = [[_cell(row, key) for key in columns.values()] for row in own]
+            blocks.append(f"## {title}\n\n{text}\n\n{markdown_table(list(columns), body)}")
     return _PAGE.format(
-        name=plan.name,
-        scenes=len(plan.scene_ids),
-        conditions=", ".join(f"`{name}`" for name in plan.all_conditions),
-        starts=", ".join(plan.starts),
-        frames=plan.frames,
-        scorer=plan.environment.get("scorer", "balanced"),
-        table=shown(table),
-        page=shown(page_of(table)),
-        hash=plan.hash,
-        rows=markdown_table(head, body),
+        table=shown(table), page=shown(page_of(table)), hash=plan.hash, tables="\n\n".join(blocks)
     )
+
+
+def _cell(row: Mapping[str, str], key: str) -> str:
+    if key == "ci95":
+        return f"{row['ci95_low']} to {row['ci95_high']}" if row["ci95_low"] else "-"
+    if not row[key]:
+        return "-"
+    return f"{float(row[key]):.2%}" if key in _PERCENT else escape(row[key])

@@ -67,7 +67,7 @@ def write_report(
 
     Those are ``results.json``, ``scenes.csv``, ``metrics.csv``, ``report.md``, ``report.html`` and
     pictures: ``scores.png``, ``ev_error.png``, ``cost.png`` where decisions of one camera were
-    timed, ``contact_sheet.png`` and so on where the scenes are known.
+    timed, ``contact_sheet.webp`` and so on where the scenes are known.
 
     Args:
         results: The return value of `evaluate` or `run_plan`.

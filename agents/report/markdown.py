@@ -76,8 +76,8 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
 
     Args:
         markdown: CommonMark with tables; raw HTML in it is shown as text.
-        pictures: The PNG files that may be shown, by their names in `markdown`; they are put into
-            the page. Of any other only the caption is shown.
+        pictures: The picture files that may be shown, by their names in `markdown`; they are put
+            into the page. Of any other only the caption is shown.
         title: Of the page.
     """
     from markdown_it import MarkdownIt
@@ -88,7 +88,8 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
         if file is None:
             return caption
         content = base64.b64encode(file.read_bytes()).decode()
-        return f'<img src="data:image/png;base64,{content}" alt="{caption}">'
+        kind = file.suffix.removeprefix(".")
+        return f'<img src="data:image/{kind};base64,{content}" alt="{caption}">'
 
     page = MarkdownIt("commonmark", {"html": False}).enable("table")
     page.add_render_rule("image", image)

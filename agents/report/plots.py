@@ -31,6 +31,8 @@ _PARTS = {
 _COLUMNS = 4
 #: Paths on one contact sheet, and frames of a path.
 _PATHS, _PATH_FRAMES = 5, 8
+#: Most sheets, and the quality of their compression.
+_SHEETS, _QUALITY = 2, 75
 #: The kinds of scene whose contact sheet is shown, the first that there is: pictures, not drawings.
 _KINDS = ("photograph", "backlit")
 
@@ -180,8 +182,8 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
     """Write contact sheets of one scene's states with the paths of the policies.
 
     Args:
-        folder: Folder of ``contact_sheet.png``, and of ``contact_sheet_2.png`` and so on for
-            further policies.
+        folder: Folder of ``contact_sheet.webp``, and of ``contact_sheet_2.webp`` for further
+            policies; only the best of them are shown.
         result: The results in unchanging light.
         order: Policies, the best first.
 
@@ -197,7 +199,7 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
     episode = next((kinds.index(kind) for kind in _KINDS if kind in kinds), 0)
     options = result.plan.options()
     files = {}
-    for k, first in enumerate(range(0, len(order), _PATHS)):
+    for k, first in enumerate(range(0, min(len(order), _SHEETS * _PATHS), _PATHS)):
         paths = {}
         for name in order[first : first + _PATHS]:
             states = result.tracks[name].states[0, episode, :_PATH_FRAMES]
@@ -210,8 +212,10 @@ def path_sheets(folder: Path, result: EvaluationResult, order: Sequence[str]) ->
             path=paths,
             **result.moves(episode),
         )
-        name = "contact_sheet.png" if k == 0 else f"contact_sheet_{k + 1}.png"
-        files[name] = write_palette_png(folder / name, picture)
+        name = "contact_sheet.webp" if k == 0 else f"contact_sheet_{k + 1}.webp"
+        stream = io.BytesIO()
+        picture.save(stream, format="WEBP", quality=_QUALITY)
+        files[name] = write_atomically(folder / name, stream.getvalue())
     return files
 
 

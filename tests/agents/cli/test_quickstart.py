@@ -15,7 +15,7 @@ from agents.learning.agent_weights import load_agent
 from simulator import RawImage, write_dng
 
 FILES = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png"}
-FILES |= {"ev_error.png", "cost.png", "contact_sheet.png", "contact_sheet_2.png"}
+FILES |= {"ev_error.png", "cost.png", "contact_sheet.webp", "contact_sheet_2.webp"}
 
 
 class Bars:
@@ -35,7 +35,7 @@ class Bars:
 def check_files(done: quickstart.QuickstartResult, out: Path) -> dict[str, Any]:
     assert done.files == {name: out / name for name in FILES}
     assert all(file.stat().st_size > 200 for file in done.files.values())
-    with Image.open(out / "contact_sheet.png") as picture:
+    with Image.open(out / "contact_sheet.webp") as picture:
         assert min(picture.size) > 300
     content = json.loads((out / "results.json").read_text())
     rows = [row for row in content["rows"] if row["condition"] == "all"]

@@ -40,7 +40,7 @@ def test_delays_multiply_the_conditions_that_have_none_of_their_own():
         ({"frames": 0}, "greater than or equal to 1"),
         ({"conditions": {"hard": {}}}, "none of"),
         ({"conditions": {"a": {"lighting": "disco"}}}, "condition 'a': `lighting`"),
-        ({"conditions": {"a": {"delay": 99}}}, "less than or equal to 16"),
+        ({"conditions": {"a": {"delay": 99}}}, r"`delay` \(=99\) must be an integer in \[0, 16\]"),
         ({"environment": {"lighting": "sine"}}, "must not have `lighting`"),
         ({"environment": {"scorrer": "noise"}}, "did you mean `scorer`"),
         ({"polices": ["random"]}, "Extra inputs"),

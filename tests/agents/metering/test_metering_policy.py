@@ -182,7 +182,7 @@ def test_comes_to_rest_after_a_step_with_delay(name, stops):
     low, high, ev, _ = _loop(f"{name}:P", 60, step=stops)
     assert np.ptp(ev[:, -8:], axis=1).max() < 0.1
     before, after = ev[:, 11], ev[:, -1]
-    end = 5.6 if name == "rpi_agc" else low + 0.6  # of its ladder
+    end = 4.6 if name == "rpi_agc" else low + 0.6  # of its ladder
     inside = (after > end) & (after < high - 0.6)
     assert np.median((after - before)[inside]) == pytest.approx(stops, abs=1.5)
 

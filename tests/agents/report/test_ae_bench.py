@@ -1,10 +1,12 @@
 import csv
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from agents.evaluation.bracket_plan import MEASURES, BracketPlan, BracketResult, load_bench_plan
 from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
 from agents.evaluation.plan_run import run_plan
 from agents.report import ae_bench
@@ -13,6 +15,7 @@ from simulator.capture.layout import Layout
 
 PLAN = EvaluationPlan(
     name="Bench",
+    task="still",
     environment={"scenes": "bundled:small", "split": "test", "resolution": 36},
     max_scenes=16,
     frames=3,
@@ -58,38 +61,87 @@ def test_signature_of_known_light(scenes):
     assert (codes[:, 0, 0] - codes[:, 3, 3] == 20).all()  # two stops in tenths
 
 
+def test_plans_of_a_suite_have_one_hash_whatever_a_policy_sees(scenes, tmp_path):
+    files = [str(tmp_path / f"{task}.yaml") for task in ("still", "bracket")]
+    text = "environment: {{scenes: 'bundled:small', split: test, resolution: 36}}\nsuite: {0}\n{1}"
+    (tmp_path / "still.yaml").write_text(text.format(files, "frames: 3\n"))
+    (tmp_path / "bracket.yaml").write_text(text.format(files, "budgets: [0.1]\n"))
+    still, bracket = (load_bench_plan(file) for file in files)
+    assert isinstance(bracket, BracketPlan)
+    found = ae_bench.bench_hash(still, scenes)
+    assert found == ae_bench.bench_hash(bracket, scenes)
+    statistics = still.changed(environment={**still.environment, "observation": "statistics"})
+    assert found == ae_bench.bench_hash(statistics, scenes)
+    (tmp_path / "bracket.yaml").write_text(text.format(files, "budgets: [0.2]\n"))
+    assert found != ae_bench.bench_hash(still, scenes)
+
+
+def test_the_published_suite_is_one():
+    plans = [load_bench_plan(f"ae_bench_v2_{task}") for task in ("still", "video", "bracket")]
+    assert {plan.task for plan in plans} == {"still", "video", "bracket"}
+    assert len({(plan.suite, plan.scene_ids, plan.hash) for plan in plans}) == 1
+    assert {"bundled", "mixed"} >= {plan.environment["scenes"] for plan in plans}
+    for row in ae_bench.read_table(Path("docs/ae-bench/v2.csv")):
+        assert row["hash"] == plans[0].hash
+
+
 def test_rows_are_added_and_replaced_and_the_page_written(plan, tmp_path, caplog):
     results = run_plan(plan, tmp_path / "parts")
     ranking = overall_ranking(results, resamples=200)
-    table = tmp_path / "docs" / "ae-bench" / "v1.csv"
-    files = ae_bench.append_results(table, plan, results, ranking, author="first")
-    assert sorted(files) == ["ae-bench.md", "v1.csv"]
-    again = [one for one in ranking if one.policy == "random"]
+    found = ae_bench.result_rows(plan, results, ranking)
+    table = tmp_path / "docs" / "ae-bench" / "v2.csv"
+    files = ae_bench.append_rows(table, plan, found, author="first")
+    assert sorted(files) == ["ae-bench.md", "v2.csv"]
+    again = [row for row in found if row["policy"] == "random"]
+    statistics = plan.changed(environment={**plan.environment, "observation": "statistics"})
     assert "replaced" not in caplog.text
-    ae_bench.append_results(table, plan, results, again, author="second")
+    ae_bench.append_rows(table, plan, again, author="second")
+    ae_bench.append_rows(table, statistics, again, author="first")
     assert "replaced" not in caplog.text
-    ae_bench.append_results(table, plan, results, again, author="first")
+    ae_bench.append_rows(table, plan, again, author="first")
     assert "replaced the row of 'random' by 'first'" in caplog.text
     with table.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
-    found = sorted(f"{row['policy']} {row['author']}" for row in rows)
-    assert found == ["matrix:P first", "random first", "random second"]
+    shown = sorted(f"{row['policy']} {row['observation']} {row['author']}" for row in rows)
+    assert shown == [
+        *("matrix:P uint8 first", "random statistics first"),
+        *("random uint8 first", "random uint8 second"),
+    ]
     assert tuple(rows[0]) == ae_bench.COLUMNS
-    assert {row["hash"] for row in rows} == {plan.hash}
-    assert float(rows[0]["normalised_score"]) == pytest.approx(ranking[0].score.value, abs=5e-5)
+    assert {(row["task"], row["hash"]) for row in rows} == {("still", plan.hash)}
+    assert float(rows[0]["score"]) == pytest.approx(ranking[0].score.value, abs=5e-5)
+    assert rows[0]["real"] == rows[0]["unseen"] == ""  # no real places, no brackets
+    assert float(rows[0]["procedural"]) == pytest.approx(float(rows[0]["score"]), abs=2e-4)
     page = (tmp_path / "docs" / "ae-bench.md").read_text()
-    assert "| matrix:P |" in page
-    assert page.index("matrix:P") < page.index("| random |")
+    assert "## Still" in page
+    assert "## Bracket" not in page
+    assert page.index("| matrix:P |") < page.index("| random |")
     assert str(tmp_path) not in page
     with pytest.raises(ValueError, match="they do not compare"):
-        ae_bench.append_results(table, plan.changed(hash="0"), results, ranking, author="x")
+        ae_bench.append_rows(table, plan.changed(hash="0"), found, author="x")
     table.write_text("policy,score\n")
     with pytest.raises(ValueError, match="its columns must be"):
         ae_bench.read_table(table)
 
 
+def test_rows_of_brackets_by_hand(tmp_path):
+    """Two groups, one of a real place; two budgets; one seed."""
+    quality = np.array([[[0.9, 0.7], [1.0, 0.8]]])
+    values = dict.fromkeys(MEASURES, quality / 10.0) | {"quality": quality}
+    place = ae_bench.list_assets()[0].place
+    groups = np.array([place, "zz"])
+    (row,) = ae_bench.bracket_rows([BracketResult("p", groups, values)])
+    assert row["score"] == pytest.approx(0.85)
+    assert (row["real"], row["procedural"]) == (pytest.approx(0.95), pytest.approx(0.75))
+    assert row["ms_alone"] == pytest.approx(85.0)
+    plan = BracketPlan(budgets=(0.1, 0.2), task="bracket", hash="h")
+    ae_bench.append_rows(tmp_path / "mine.csv", plan, [row], author="me")
+    assert "| p | uint8 | 0.8500 | - | 0.7500 | 0.9500 |" in (tmp_path / "mine.md").read_text()
+
+
 def _table(file, plan, **entries):
-    row = dict.fromkeys(ae_bench.COLUMNS, "") | {"hash": plan.hash} | entries
+    known = {"hash": plan.hash, "task": "still", "observation": "uint8"}
+    row = dict.fromkeys(ae_bench.COLUMNS, "") | known | entries
     file.write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
     return file
 
@@ -100,6 +152,8 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
     table = _table(tmp_path / "a.csv", plan, policy="my.py:Mine")
     check(table, plan, ["u/my.py:Mine"], author="me")
     check(table, plan, ["random"], author="")
+    with pytest.raises(ValueError, match="superseded"):
+        check(tmp_path / "new.csv", plan.changed(task=""), ["random"], author="me")
     (broken := tmp_path / "broken.csv").write_bytes(b"\xff\xfe")
     other = _table(tmp_path / "b.csv", plan, hash="0")
     for file, policies, author, message in (

@@ -25,8 +25,9 @@ POLICIES = {
     "bracket:fixed?step=2": "metered, +2 and -2 EV",
     "bracket:fixed?step=4": "metered, +4 and -4 EV",
     "bracket:hasinoff": "Hasinoff et al. 2010",
-    "bracket:planned": "planner, light as the frames show it",
-    "bracket": "learnt (3 seeds)",
+    "bracket:planned": "planner, light as the frames show it, no blur",
+    "bracket?hidden=false": "planner that has learnt what blur costs (3 seeds)",
+    "bracket": "and which light hides (3 seeds)",
     "known": "planner that knows light and speed",
 }
 #: The policy that the others are compared with.
@@ -187,7 +188,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "all. Means over source groups; intervals are paired bootstraps over these and training "
         "seeds.",
         *sections(rows, "{scenes}, {budget} s", lambda own: table(own, columns)),
-        "![loss of quality of the source groups](bracket.png)",
+        "![loss of quality of the source groups](bracketing.png)",
         "Hasinoff's schedule maximises the signal-to-noise ratio in the worst light and knows no "
         "motion; how far it looks above white, and its longest exposure, were fitted on the "
         f"training scenes of each set ({fitted}). The learnt agent is the same in all rows: "
@@ -197,14 +198,14 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "2025) 39.70 dB on HDRV, Hasinoff's schedule 37.59 dB.",
     ]
     each = [{name: value for name, value in row.items() if name != "each"} for row in rows]
-    return Report(each, page, {}, {"bracket.png": distributions(rows)})
+    return Report(each, page, {}, {"bracketing.png": distributions(rows)})
 
 
 BENCHMARK = Benchmark(
-    name="bracket",
+    name="bracketing",
     title="Frames for a merged picture",
     parts=parts,
     report=report,
-    code=("ae_env", "agents/bracketing", "benchmarks/bracket"),
+    code=("ae_env", "agents/bracketing", "benchmarks/bracketing"),
 )
 run = BENCHMARK.run

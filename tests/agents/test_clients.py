@@ -1,0 +1,82 @@
+"""Other people's training code runs every task unchanged."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import PPO
+from torch import nn
+
+from ae_env.registration import ENV_IDS
+from tests.ae_env.environments import SMALL
+
+
+@pytest.fixture(params=ENV_IDS)
+def task(request: pytest.FixtureRequest) -> str:
+    """Id of a task."""
+    return str(request.param)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "policy"), [(PPO, "MultiInputPolicy"), (RecurrentPPO, "MultiInputLstmPolicy")]
+)
+def test_stable_baselines(task: str, algorithm: Any, policy: str) -> None:
+    env = gym.make(task, **SMALL)
+    agent = algorithm(policy, env, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu")
+    before = [p.clone() for p in agent.policy.parameters()]
+    agent.learn(32)
+    changed = [
+        not torch.equal(a, b) for a, b in zip(before, agent.policy.parameters(), strict=True)
+    ]
+    assert agent.num_timesteps == 32
+    assert sum(changed) > len(changed) / 2
+    action, _ = agent.predict(env.reset(seed=0)[0])
+    assert env.action_space.contains(np.int64(action))
+
+
+def test_a_loop_as_cleanrl_writes_it(task: str) -> None:
+    """`ppo.py`: a vector environment in SAME_STEP mode, statistics of episodes, a flat network."""
+    envs = gym.make_vec(task, num_envs=4, autoreset_mode="SAME_STEP", **SMALL)
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(envs)
+    torch.manual_seed(0)
+    size = int(np.prod(envs.single_observation_space["raw"].shape)) + 3
+    network = nn.Sequential(
+        nn.Linear(size, 16), nn.Tanh(), nn.Linear(16, envs.single_action_space.n)
+    )
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    observation, _ = envs.reset(seed=1)
+    lengths: list[int] = []
+    for _ in range(100):
+        raw = torch.from_numpy(observation["raw"]).flatten(1).float() / 255.0
+        inputs = torch.cat([raw, torch.from_numpy(observation["settings"])], dim=1)
+        chosen = torch.distributions.Categorical(logits=network(inputs))
+        actions = chosen.sample()
+        observation, rewards, terminated, truncated, info = envs.step(actions.numpy())
+        loss = -(chosen.log_prob(actions) * torch.from_numpy(rewards)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        done = terminated | truncated
+        if done.any():
+            assert set(np.flatnonzero(done)) == {i for i, o in enumerate(info["final_obs"]) if o}
+            lengths += info["episode"]["l"][done].tolist()
+    assert lengths
+    limit = {"ae_env/AutoExposure-v0": 8, "ae_env/AutoExposureVideo-v0": 96}.get(task)
+    assert set(lengths) == {limit} if limit else set(lengths) <= {1, 2, 3}
+
+
+def test_torchrl(task: str) -> None:
+    from torchrl.envs import GymWrapper
+    from torchrl.envs.utils import check_env_specs
+
+    env = GymWrapper(gym.make(task, **SMALL))
+    env.set_seed(0)
+    check_env_specs(env)
+    rollout = env.rollout(8)
+    assert rollout["next", "reward"].isfinite().all()
+    # An episode ends with its last step, and no earlier.
+    done = rollout["next", "done"].flatten()
+    assert not done[:-1].any()
