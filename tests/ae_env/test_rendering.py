@@ -77,7 +77,7 @@ def test_time_grows_to_the_right_and_f_number_downwards_in_a_panel_per_iso() -> 
 def test_paths_are_drawn_in_their_own_colours() -> None:
     plain = np.asarray(contact_sheet(_scene(), grid=SMALL))
     drawn = contact_sheet(_scene(), grid=SMALL, path={"first": [0, 7], "second": [3, 3, 4]})
-    colours = {(0xE6, 0x9F, 0x00), (0x56, 0xB4, 0xE9)}
+    colours = {(0xD5, 0x5E, 0x00), (0x56, 0xB4, 0xE9)}
     found = {tuple(c) for c in np.asarray(drawn).reshape(-1, 3).tolist()}
     assert colours <= found
     assert not colours & {tuple(c) for c in plain.reshape(-1, 3).tolist()}
