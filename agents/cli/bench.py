@@ -13,7 +13,16 @@ from ae_env.utils.checks import check_word
 from agents.cli.console import Seed, make_folder
 
 BENCHMARKS = (
-    *("agents", "bracketing", "brackets", "colour_checker", "convergence", "defects", "denoising"),
+    *(
+        "ablation",
+        "agents",
+        "bracketing",
+        "brackets",
+        "colour_checker",
+        "convergence",
+        "defects",
+        "denoising",
+    ),
     *("libcamera", "ptc", "scorers", "simulator", "stability", "throughput", "transfer"),
     "work_precision",
 )

@@ -116,17 +116,24 @@ class ExposureFeatures(nn.Module):
         joint: torch.Tensor = self.head(torch.cat([*features, *numbers], dim=1))
         return joint
 
-    def light(self, codes: torch.Tensor, settings: torch.Tensor) -> torch.Tensor:
+    def light(
+        self, codes: torch.Tensor, settings: torch.Tensor, histogram: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Histograms of the frame's luminance, ``(B, LIGHT_NUMBERS)``, for a `StateHead`.
 
         Args:
             codes: As for `forward`.
             settings: As for `forward`.
+            histogram: (B, 128) shares of all samples by code, where statistics are observed; the
+                brightest of each pixel is then that of each zone.
         """
         step = max(1, min(codes.shape[2:]) // _COUNTED)
         counted = (codes[:, :, ::step, ::step] * 255.0).round().long()
         luminance = self.log2_signal + self._ev100(settings)[:, None]  # (B, 256), of each code
-        every = _spread(_count(counted), luminance)
+        counts = _count(counted)
+        if histogram is not None:
+            counts = histogram.repeat_interleave(2, dim=1) / 2.0  # two codes a bin
+        every = _spread(counts, luminance)
         return torch.cat([every, _spread(_count(counted.amax(dim=1)), luminance)], dim=1)
 
     def _ev100(self, settings: torch.Tensor) -> torch.Tensor:

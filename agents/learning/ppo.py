@@ -53,7 +53,8 @@ class ExposureExtractor(BaseFeaturesExtractor):
         raw, settings = observations["raw"], observations["settings"]
         sensors = observations.get("sensors")
         features = self.features(raw, settings, sensors, observations.get("history"))
-        parts = [features, self.features.light(raw, settings)]
+        light = self.features.light(raw, settings, observations.get("histogram"))
+        parts = [features, light]
         return torch.cat(parts if sensors is None else [*parts, sensors], dim=1)
 
 

@@ -87,10 +87,11 @@ class AgentConfig(Configuration):
             options.make_lighting()
         except ValueError as error:
             raise ValueError(f"environment: {error}") from error
-        if options.observation != "uint8":
+        taken = ("uint8", "statistics") if self.agent == "ppo" else ("uint8",)
+        if options.observation not in taken:
             raise ValueError(
-                f"environment: `observation` (={options.observation!r}) must be 'uint8', which is "
-                "what the agents' networks take"
+                f"environment: `observation` (={options.observation!r}) must be one of "
+                f"{list(taken)}, which is what the agent's network takes"
             )
         check_batch = getattr(hyperparameters, "check_batch", None)
         if check_batch is not None:

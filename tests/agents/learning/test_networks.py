@@ -109,3 +109,20 @@ def test_foretold_shares_are_those_of_the_captures(make_tiny_envs) -> None:
             error = (shares[:, row, level] - expected).abs()
             assert error.max() < 0.15
             assert error.mean() < 0.03
+
+
+def test_statistics_tell_the_light_as_pixels_do(make_tiny_envs) -> None:
+    """The mean log2 luminance of the histogram of statistics is that of the pixels' codes."""
+    shown = [make_tiny_envs(num_envs=6, observation=o) for o in ("uint8", "statistics")]
+    pixels, statistics = (envs.reset(seed=5)[0] for envs in shown)
+    found = []
+    for envs, seen in zip(shown, (pixels, statistics), strict=True):
+        features = ExposureFeatures(envs.single_observation_space, width=8)
+        codes = torch.from_numpy(seen["raw"]).float() / 255.0
+        histogram = torch.from_numpy(seen["histogram"]) if "histogram" in seen else None
+        light = features.light(codes, torch.from_numpy(seen["settings"]), histogram)
+        every = light[:, : LIGHT_NUMBERS // 2]
+        assert torch.allclose(every.sum(dim=1), torch.ones(6), atol=1e-5)
+        found.append((every * torch.arange(LIGHT_NUMBERS // 2)).sum(dim=1) / 2.0)  # [EV]
+    # Two codes share a bin: near black they are a stop and more apart.
+    assert float((found[0] - found[1]).abs().max()) < 0.35

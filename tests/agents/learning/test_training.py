@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+from agents.bracketing.learnt import BracketTraining
 from agents.learning import training
 from agents.learning.ppo import PPOTraining
 from agents.learning.regression_training import RegressionTraining
@@ -35,7 +36,8 @@ def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs(path: Path) -> None:
     config, text = training.load_config(path), yaml.safe_load(path.read_text())
-    kind = {"regression": RegressionTraining, "ppo": PPOTraining}[config.agent]
+    kinds = {"regression": RegressionTraining, "ppo": PPOTraining, "bracket": BracketTraining}
+    kind = kinds[config.agent]
     hyperparameters = config.hyperparameters()
     assert isinstance(hyperparameters, kind)
     assert text["training"].items() <= hyperparameters.model_dump().items()
@@ -48,7 +50,10 @@ def test_shipped_configs(path: Path) -> None:
     ("text", "message"),
     [
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
-        ("agent: dqn", r"agent \(='dqn'\): Input should be 'regression', 'ppo' or 'forecaster'"),
+        (
+            "agent: dqn",
+            r"agent \(='dqn'\): Input should be 'regression', 'ppo', 'bracket' or 'forecaster'",
+        ),
         ("", r"is empty: it must map entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
         ("agent: ppo\ntraining: {n_step: 3}", r"training.n_step \(=3\): unknown.*mean `n_steps`"),
@@ -69,7 +74,10 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: forecaster\ntraining: {mixed: 2}", r"training.mixed \(=2\)"),
         ("agent: forecaster\nenvironment: {split: train}", r"`environment` is not used"),
         ("agent: forecaster\nnum_envs: 3", r"`num_envs` is not used"),
-        ("agent: ppo\nenvironment: {observation: linear}", r"`observation`.*must be 'uint8'"),
+        (
+            "agent: ppo\nenvironment: {observation: linear}",
+            r"`observation`.*must be one of \['uint8', 'statistics'\]",
+        ),
     ],
 )
 def test_bad_configs_name_file_and_entry(tmp_path: Path, text: str, message: str) -> None:
