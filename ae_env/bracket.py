@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ae_env.env import AutoExposureBase, AutoExposureEnv
-from ae_env.episodes.bracket import BracketCore
+from ae_env.episodes.bracket_core import BracketCore
 from ae_env.episodes.core import EpisodeCore
 from ae_env.options import EnvOptions
 from ae_env.registration import names_nearest

@@ -46,7 +46,8 @@ class Random(Policy):
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
         """Draw a state per camera."""
-        draws = self._rng.random((len(observations["raw"]), len(self.context.grid)))
+        count = len(self.context.grid) if action_masks is None else action_masks.shape[1]
+        draws = self._rng.random((len(observations["raw"]), count))
         return masked_argmax(draws, action_masks)
 
 

@@ -27,7 +27,7 @@ VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "no sensors": ({}, {"sensors": False}),
 }
 #: Frames of each training, and of a quick one.
-FRAMES, QUICK_FRAMES = 200_000, 4_096
+FRAMES, QUICK_FRAMES = 150_000, 4_096
 #: Kinds of light and scenes of the judgement.
 LIGHTS, SCENES = ("shadows", "clouds", "pans"), 40
 

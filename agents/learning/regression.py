@@ -24,7 +24,7 @@ from agents.learning.agent_weights import NetworkPolicy, trained_grid
 from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
 from agents.learning.networks import ExposureFeatures, StateHead
 from agents.metering.meters import make_meter
-from agents.metering.reading import Meter
+from agents.metering.reading import Meter, Reading
 from agents.metering.trend import TrendTracker
 from agents.policy import (
     FORECASTERS,
@@ -41,6 +41,8 @@ _OF_CHANNELS = 0.4
 _LOG_VARIANCE = (-8.0, 0.0)
 #: Frames that foresight shows to the network in the light to come.
 RECENT = 4
+#: Share of white samples from which a frame's reading is only a bound of the light.
+WHITE_SHARE = 0.5
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
@@ -170,8 +172,8 @@ class RegressionPolicy(NetworkPolicy):
         if self.foresight != "none":
             self._foresight = Foresight(self.context, self._tracker(num_envs))
         # The network's inputs of the latest frames, but for the settings, which are beside them,
-        # and the metered EV100.
-        self._recent: list[tuple[torch.Tensor, Any, torch.Tensor | None, Floats]] = []
+        # and the meter's reading.
+        self._recent: list[tuple[torch.Tensor, Any, torch.Tensor | None, Reading]] = []
 
     def _tracker(self, num_envs: int) -> LightTracker:
         if self._forecasters:
@@ -205,7 +207,7 @@ class RegressionPolicy(NetworkPolicy):
         foresight.observe(reading, observations)
         device = next(self.network.parameters()).device
         codes, _, sensors = observation_tensors(observations, device)
-        frame = codes, np.array(observations["settings"]), sensors, reading.ev100
+        frame = codes, np.array(observations["settings"]), sensors, reading
         self._recent = [*self._recent, frame][-RECENT:]
         chosen = masked_argmax(foresight.utility(self._scores_in), action_masks)
         foresight.decided(chosen)
@@ -215,11 +217,17 @@ class RegressionPolicy(NetworkPolicy):
         """Scores (N, S) in light that is metered at `ev100` (N,), from all recent frames."""
         device = next(self.network.parameters()).device
         weighted, precisions = np.zeros((2, len(ev100), len(self.context.grid)))
-        for codes, settings, sensors, metered in self._recent:
-            shifted = torch.from_numpy(as_if_at(settings, ev100 - metered)).to(device)
+        # What a white frame reads is only a bound: in hand, it counts alone and as it is.
+        newest = self._recent[-1][3]
+        white = newest.saturated >= WHITE_SHARE
+        ev100 = np.where(white, newest.ev100, ev100)
+        for codes, settings, sensors, reading in self._recent:
+            shifted = torch.from_numpy(as_if_at(settings, ev100 - reading.ev100)).to(device)
             with torch.inference_mode():
                 scores, log_variance = self.network(codes, shifted, sensors)
             precision = torch.exp(-log_variance).double().cpu().numpy()
+            if reading is not newest:
+                precision[white | (reading.saturated >= WHITE_SHARE)] = 0.0
             weighted += precision * scores.double().cpu().numpy()
             precisions += precision
         return weighted / precisions

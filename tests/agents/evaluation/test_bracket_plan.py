@@ -67,7 +67,7 @@ def test_the_command_writes_a_report_and_refuses_what_is_not_of_brackets(tmp_pat
     plan.write_text(
         "environment: {scenes: 'bundled:small', resolution: 36}\nmax_scenes: 4\nbudgets: [0.1]\n"
     )
-    names = ["bracket:fixed?step=0", "bracket"]
+    names = ["bracket:fixed?step=0", "bracket", "random"]
     evaluate(policy=names, preset=str(plan), out=tmp_path / "out")
     found = json.loads((tmp_path / "out" / "results.json").read_text())
     assert {row["policy"] for row in found["rows"]} == set(names)
