@@ -54,7 +54,7 @@ def test_mistakes_in_a_plan_are_told(entries, message):
 def test_presets_are_valid():
     plans = {name: load_plan(name) for name in ("quick", "standard")}
     assert all(plan.policies for plan in plans.values())
-    assert [len(plan.all_conditions) for plan in plans.values()] == [4, 28]
+    assert [len(plan.all_conditions) for plan in plans.values()] == [4, 24]
 
 
 def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
