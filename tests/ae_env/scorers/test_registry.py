@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ae_env.grid import ExposureGrid
@@ -236,6 +236,7 @@ def test_any_picture_has_a_score_alone_and_in_a_batch(name: str) -> None:
         assert bool(((values >= 0.0) & (values <= 1.0)).all()), (height, width)
 
 
+@settings(max_examples=12)  # each of all scorers
 @given(
     lights(LIGHT.map(abs)),
     USUAL_SETTINGS,
