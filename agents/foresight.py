@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import decode_settings
+from agents.metering.matching import MatchedReadings
 from agents.metering.reading import Reading, frame_ev100
 from agents.policy import Observations, PolicyContext
 
@@ -48,15 +49,27 @@ class Foresight:
 
     def __init__(self, context: PolicyContext, tracker: LightTracker) -> None:
         self.grid, self._tracker = context.grid, tracker
+        self._matched = MatchedReadings(context.camera)
         #: Frames from the one in hand to the first that has this decision's ISO, time, aperture.
         self.leads = tuple(1 + delay for delay in context.delays)
         self._asked: list[Ints] = []  # the newest last
 
-    def observe(self, reading: Reading, observations: Observations) -> None:
-        """Take in one frame of each camera, and what a light meter reads in it."""
+    def observe(self, reading: Reading, observations: Observations) -> Reading:
+        """Take in one frame of each camera, and what a light meter reads in it.
+
+        Returns:
+            That reading; where the frame clips, from what it shows (`MatchedReadings`).
+        """
+        reading = self._matched.update(reading, observations)
         self._tracker.update(reading, frame_ev100(observations))
         if not self._asked:  # what the first frame was taken with stays until a decision is there
             self._asked = [self._shown(observations)] * max(self.leads)
+        return reading
+
+    @property
+    def asked(self) -> Ints:
+        """States that were asked for last, ``(N,)``."""
+        return self._asked[-1]
 
     def ev100(self, frames: int) -> Floats:
         """EV100 that a meter is expected to read `frames` after the frame in hand, ``(N,)``."""

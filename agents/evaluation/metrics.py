@@ -138,6 +138,19 @@ def frames_to_converge(
     return np.minimum(counted, frames - np.asarray(since)), last_outside < frames
 
 
+def frames_to_settle(evs: Floats, since: Ints | int = 0) -> Ints:
+    """First frame from which the exposure stays within 1/3 EV of where it ends, right or wrong.
+
+    Args:
+        evs: EV100 of the start state and after each action, ``(..., T + 1)``.
+        since: As for `frames_to_converge`.
+
+    >>> frames_to_settle(np.array([[9.0, 9.0, 5.0, 6.0, 6.0, 6.0]])).tolist()
+    [3]
+    """
+    return frames_to_converge(np.abs(evs[..., 1:] - evs[..., -1:]), since=since)[0]
+
+
 def overshoot(evs: Floats, since: Ints | int = 0) -> Floats:
     """How far the exposure passes beyond where it ends, in the direction it came from [EV].
 

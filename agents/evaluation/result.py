@@ -189,6 +189,7 @@ class EvaluationResult:
             "ev_error": errors,
             "frames_to_converge": frames,
             "converged": converged,
+            "frames_to_settle": metrics.frames_to_settle(evs, since=self.settling),
             "overshoot": metrics.overshoot(evs, since=self.settling),
             "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
             "reversals": metrics.reversals(evs),

@@ -20,6 +20,7 @@ from torch import nn
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
 from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
 from agents.learning.optimisation import Optimisation
+from agents.metering.matching import TRUSTED_SATURATED, light_change
 from agents.metering.reading import (
     BLACK_SIGNAL,
     TARGET_SIGNAL,
@@ -58,7 +59,6 @@ class ForecasterTraining(Configuration):
         mixed: Share of the light that is a sum of two to four kinds.
         bent: Share of the light that is cut at a level above or below, as light is that comes
             through gaps; likewise the share whose pace varies, and the share that is smoothed.
-        amplitude: Standard deviation of the log2 of a factor on all changes of a sequence.
         seed: Seed of light, frames and weights.
 
     Raises:
@@ -73,7 +73,6 @@ class ForecasterTraining(Configuration):
     traces: int = Field(default=4096, ge=1, le=10**6)
     mixed: float = Field(default=0.5, ge=0.0, le=1.0)
     bent: float = Field(default=0.4, ge=0.0, le=1.0)
-    amplitude: float = Field(default=0.0, ge=0.0, le=3.0)
     seed: int = Field(default=0, ge=0, le=2**32 - 1)
 
 
@@ -230,10 +229,10 @@ def sample(
         rows = rng.integers(len(traces), size=count)
         starts = rng.integers(FRAMES // 4, size=count)
         frames = np.arange(_LENGTH + HORIZON, dtype=np.float64)
-        varies = rng.random(count) < training.bent
+        varies = rng.random((count, 1)) < training.bent
         turn = frames / rng.uniform(20.0, 80.0, (count, 1)) + rng.random((count, 1))
-        pace = 1.0 + 0.4 * varies[:, None] * np.sin(2.0 * np.pi * turn)
-        times = starts[:, None] + np.cumsum(pace * np.exp(rng.normal(0.0, 0.2, (count, 1))), axis=1)
+        pace = (1.0 + 0.4 * np.sin(2.0 * np.pi * turn)) * np.exp(rng.normal(0.0, 0.2, (count, 1)))
+        times = starts[:, None] + np.cumsum(np.where(varies, pace, 1.0), axis=1)
         times = np.minimum(times, FRAMES - 2)
         below = times.astype(np.int64)
         weight = times - below
@@ -248,8 +247,6 @@ def sample(
         light = light * np.where(share > 0.0, rng.uniform(0.4, 1.0, (count, 1)), 1.0)
         light += share * windows()
     light = _bent(light, training.bent, rng)
-    if training.amplitude:
-        light *= np.exp2(rng.normal(0.0, training.amplitude, (count, 1)))
     light += rng.uniform(4.0, 14.0, (count, 1))
     reading, exposed_at = metered(light, rng)
     before = np.concatenate([reading.ev100[:, :1], reading.ev100[:, :-1]], axis=1)
@@ -296,4 +293,20 @@ def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
     signal = TARGET_SIGNAL * np.exp2(light - exposed_at)[:, :, None] * luminance[:, None]
     saturated = (signal >= WHITE_SIGNAL).mean(axis=2)
     mean = np.minimum(signal, 1.0).mean(axis=2) + rng.normal(0.0, BLACK_SIGNAL, light.shape)
-    return mean_reading(mean, saturated, exposed_at), exposed_at
+    reading = mean_reading(mean, saturated, exposed_at)
+    return _matched(
+        reading, np.where(signal >= WHITE_SIGNAL, np.nan, signal), exposed_at
+    ), exposed_at
+
+
+def _matched(reading: Reading, shown: Floats, exposed_at: Floats) -> Reading:
+    """As `agents.metering.matching` reads them: (B, T) readings of what is shown, (B, T, 64)."""
+    ev100, saturated = reading.ev100.copy(), reading.saturated.copy()
+    change, comparable = light_change(shown[:, :-1], shown[:, 1:])
+    change += np.diff(exposed_at, axis=1)
+    matched = comparable & (saturated[:, 1:] > TRUSTED_SATURATED)
+    for frame in range(change.shape[1]):
+        known, found = matched[:, frame], ev100[:, frame] + change[:, frame]
+        ev100[:, frame + 1] = np.where(known, found, ev100[:, frame + 1])
+    saturated[:, 1:][matched] = 0.0
+    return Reading(ev100, saturated, reading.black)

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
 from agents.evaluation.result import EvaluationResult
@@ -288,6 +290,11 @@ class _Report:
         ):
             body = [[c, *(f"{self.by[p, c][key]:{form}}" for p in names)] for c in self.results]
             parts += [f"### {title}", markdown_table(head, body)]
+        settled = [
+            [c, *(f"{np.median(r.episode_metrics(p)['frames_to_settle']):.1f}" for p in names)]
+            for c, r in self.results.items()
+        ]
+        parts += ["### Frames until the exposure stays, median", markdown_table(head, settled)]
         share = [
             [c, *(f"{r.episode_metrics(p)['converged'].mean():.0%}" for p in names)]
             for c, r in self.results.items()

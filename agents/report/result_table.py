@@ -33,7 +33,7 @@ SCENE_COLUMNS = (
     *("policy", "scene_id", "group", "kind", "hard", "episodes", "score", "oracle", "random"),
     *("regret", "regret_delayed", "regret_given_ev", "ev_error_median", "ev_error_p95"),
     *("ev_within_third", "frames_to_converge", "converged", "overshoot", "reversals", "flicker"),
-    *("jump", "clipped_high", "clipped_low", "final_state", "oracle_state"),
+    *("jump", "frames_to_settle", "clipped_high", "clipped_low", "final_state", "oracle_state"),
 )
 
 

@@ -106,6 +106,14 @@ def test_settling_is_the_frame_after_the_last_change(light, since):
     assert metrics.settling(scores).tolist() == [since]
 
 
+def test_settling_is_counted_from_the_step_and_does_not_ask_where():
+    # Wrong but still from frame 6 on, the second that knows of a step in frame 4 (index 3).
+    evs = np.array([9.0, 9, 9, 9, 9, 6, 5, 5, 5, 5, 5])
+    assert metrics.frames_to_settle(evs, since=4) == 2
+    assert metrics.frames_to_settle(evs + np.array([0.0, *[0.3] * 9, 0.0]), since=4) == 2
+    assert metrics.frames_to_settle(np.tile([5.0, 6.0], 5), since=4) == 5  # as many as there are
+
+
 def test_overshoot_after_a_step_is_that_of_the_answer_to_it():
     # 9 -> 5 before the step; then 5 -> 8 by way of 10: two beyond. Counted from the start, the
     # way down from 9 would make it 2 in the other direction: 8 - 5 = 3.
