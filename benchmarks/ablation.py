@@ -6,7 +6,10 @@ judged on unseen scenes in kinds of light that no training had.
 
 from __future__ import annotations
 
+import runpy
 import tempfile
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,10 +24,13 @@ CONFIG = ROOT / "configs" / "video" / "ppo.yaml"
 VARIANTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "as shipped: gamma 0.8, 12 readings": ({}, {}),
     "gamma 0": ({"gamma": 0.0}, {}),
+    "gamma 0.9": ({"gamma": 0.9}, {}),
     "no memory": ({"history": 0}, {}),
     "statistics in place of pixels": ({}, {"observation": "statistics"}),
     "no sensors": ({}, {"sensors": False}),
 }
+#: A memory that is learnt, in place of the readings: the program that trains and runs it.
+RECURRENT, PROGRAM = "RecurrentPPO (LSTM)", ROOT / "examples" / "recurrent_ppo.py"
 #: Frames of each training, and of a quick one.
 FRAMES, QUICK_FRAMES = 100_000, 4_096
 #: Kinds of light and scenes of the judgement.
@@ -40,15 +46,7 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     from agents.learning.training import AgentConfig, load_config, train_agent
     from agents.report.result_table import overall_ranking
 
-    training, environment = VARIANTS[variant]
-    base = load_config(CONFIG)
-    config = AgentConfig.model_validate(
-        {
-            **base.model_dump(),
-            "environment": {**base.environment, **environment},
-            "training": {**base.training, **training, "total_timesteps": frames, "seed": seed},
-        }
-    )
+    training, environment = VARIANTS.get(variant, ({}, {}))
     curve: list[tuple[int, float]] = []
 
     def progress(done: int, total: int, values: dict[str, float]) -> None:
@@ -59,14 +57,27 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     out = RUNS.parent / "bench_ablation" / f"{name}-{frames}-{seed}"
     out.parent.mkdir(parents=True, exist_ok=True)
     begun = time.perf_counter()
-    train_agent(config, out, progress=progress)
+    if variant == RECURRENT:
+        policy = _train_recurrent(f"{out}.safetensors", frames, seed, progress)
+    else:
+        base = load_config(CONFIG)
+        changed = {"total_timesteps": frames, "seed": seed, **training}
+        config = AgentConfig.model_validate(
+            {
+                **base.model_dump(),
+                "environment": {**base.environment, **environment},
+                "training": {**base.training, **changed},
+            }
+        )
+        train_agent(config, out, progress=progress)
+        policy = f"ppo:{out}"
     seconds = time.perf_counter() - begun
     plan = load_plan("video")
     plan = plan.changed(
         environment={**plan.environment, **environment},
         conditions={light: plan.conditions[light] for light in LIGHTS},
         max_scenes=scenes,
-        policies=(f"ppo:{out}",),
+        policies=(policy,),
     )
     with tempfile.TemporaryDirectory() as folder:
         results = run_plan(plan, folder)
@@ -82,6 +93,22 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     }
 
 
+def _train_recurrent(
+    weights: str, frames: int, seed: int, progress: Callable[[int, int, dict[str, float]], None]
+) -> str:
+    """Trains the example's agent, and names it."""
+    recent: deque[float] = deque(maxlen=50)
+
+    def callback(variables: dict[str, Any], _: Any) -> bool:
+        recent.append(float(np.mean(variables["rewards"])))
+        done = variables["self"].num_timesteps
+        progress(done, frames, {"reward": float(np.mean(recent))})
+        return True
+
+    runpy.run_path(str(PROGRAM))["train"](weights, frames, seed, callback)
+    return f"{PROGRAM}:RecurrentAgent?weights={weights}"
+
+
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each variant."""
     frames, scenes = (QUICK_FRAMES, 16) if quick else (FRAMES, SCENES)
@@ -92,7 +119,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
             {"variant": variant, "frames": frames, "seed": seed, "scenes": scenes},
             threads=1,
         )
-        for variant in VARIANTS
+        for variant in (*VARIANTS, RECURRENT)
     ]
 
 
@@ -131,7 +158,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "![mean reward over the frames of each training](ablation.png)",
         "An action shows two to three frames later, so without a discount nothing is learnt. "
         "`statistics` are 12 x 16 zones, a histogram and the clipped shares, 18 times fewer "
-        "numbers than pixels.",
+        "numbers than pixels. RecurrentPPO of sb3-contrib (examples/recurrent_ppo.py) has an LSTM "
+        "in place of the readings, and logits that are linear in it; its other hyperparameters "
+        "are PPO's.",
     ]
     kept = [{k: v for k, v in row.items() if k != "curve"} for row in rows]
     return Report(kept, page, {"frames": frames}, {"ablation.png": curves(rows)})
@@ -142,6 +171,9 @@ BENCHMARK = Benchmark(
     title="What PPO needs in moving light",
     parts=parts,
     report=report,
-    code=("ae_env/episodes", "ae_env/lighting", "agents/learning", "benchmarks/ablation"),
+    code=(
+        *("ae_env/episodes", "ae_env/lighting", "agents/learning"),
+        *("benchmarks/ablation", "examples/recurrent_ppo"),
+    ),
 )
 run = BENCHMARK.run

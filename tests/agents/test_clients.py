@@ -1,5 +1,7 @@
 """Other people's training code runs every task unchanged."""
 
+import runpy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +13,11 @@ from stable_baselines3 import PPO
 from torch import nn
 
 from ae_env.registration import ENV_IDS
+from agents import PolicyContext, make_policy
 from tests.ae_env.environments import SMALL
+
+#: The repository.
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(params=ENV_IDS)
@@ -80,3 +86,28 @@ def test_torchrl(task: str) -> None:
     # An episode ends with its last step, and no earlier.
     done = rollout["next", "done"].flatten()
     assert not done[:-1].any()
+
+
+def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It trains, its weights come back, and a reset forgets the episode."""
+    make_vec = gym.make_vec
+
+    def with_few(task: str, **arguments: Any) -> gym.vector.VectorEnv:
+        return make_vec(task, **{**arguments, **SMALL, "num_envs": 8})
+
+    monkeypatch.setattr(gym, "make_vec", with_few)
+    program, weights = ROOT / "examples" / "recurrent_ppo.py", tmp_path / "recurrent.safetensors"
+    runpy.run_path(str(program))["train"](weights, frames=256)
+    envs = gym.make_vec("ae_env/AutoExposureVideo-v0", split="test")
+    context = PolicyContext.from_envs(envs)
+    policy = make_policy(f"{program}:RecurrentAgent?weights={weights}", context)
+    memories = []
+    for _ in range(2):
+        policy.reset(8)
+        observations, _ = envs.reset(seed=0)
+        for _ in range(3):
+            observations, *_ = envs.step(policy.act(observations))
+        memories.append(policy.memory)  # type: ignore[attr-defined]
+    first, again = np.array(memories)
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first).max() > 0.0
