@@ -50,7 +50,8 @@ class AutoExposureVectorEnv(
     Args:
         num_envs: Number of episodes side by side.
         autoreset_mode: ``"NEXT_STEP"`` (default), ``"SAME_STEP"`` (``final_obs``, ``final_info``)
-            or ``"DISABLED"`` (``reset(options={"reset_mask": mask})``).
+            or ``"DISABLED"`` (``reset(options={"reset_mask": mask})``); Gymnasium's enum and its
+            values (``"SameStep"``), too.
         max_episode_steps: Steps after which an episode is truncated; None for never.
 
     All other arguments are those of `AutoExposureEnv`.
@@ -364,5 +365,6 @@ def _assign_rows(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray)
 def _autoreset_mode(mode: str | AutoresetMode) -> AutoresetMode:
     if isinstance(mode, AutoresetMode):
         return mode
-    check_word("autoreset_mode", mode, tuple(AutoresetMode.__members__))
-    return AutoresetMode[mode]
+    modes = {known: one for one in AutoresetMode for known in (one.name, one.value)}
+    check_word("autoreset_mode", mode, tuple(modes))
+    return modes[mode]

@@ -25,6 +25,12 @@ def test_parity_with_sync_vector_env(mode: str, extra: dict[str, Any]) -> None:
     check_parity(11, 9, mode, max_episode_steps=3, **extra)
 
 
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_modes_have_the_names_and_values_of_gymnasiums_enum(mode: AutoresetMode) -> None:
+    for given_as in (mode, mode.name, mode.value):
+        assert make_envs(autoreset_mode=given_as).metadata["autoreset_mode"] is mode
+
+
 LIGHTINGS: list[Any] = [
     "static",
     {"kind": "step", "stops": 2, "at": 1},
