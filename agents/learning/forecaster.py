@@ -20,7 +20,7 @@ from torch import nn
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
 from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
 from agents.learning.optimisation import Optimisation
-from agents.metering.matching import TRUSTED_SATURATED, light_change
+from agents.metering.matching import ZoneMatcher
 from agents.metering.reading import (
     BLACK_SIGNAL,
     TARGET_SIGNAL,
@@ -281,7 +281,7 @@ def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
         rng: Draws the scenes and the errors.
 
     Returns:
-        The readings, and the EV100 of the exposures, (B, T) each.
+        The readings, matched where frames clip, and the EV100 of the exposures, (B, T) each.
     """
     count, frames = light.shape
     spread = rng.uniform(0.8, 2.2, (count, 1))
@@ -293,20 +293,18 @@ def metered(light: Floats, rng: np.random.Generator) -> tuple[Reading, Floats]:
     signal = TARGET_SIGNAL * np.exp2(light - exposed_at)[:, :, None] * luminance[:, None]
     saturated = (signal >= WHITE_SIGNAL).mean(axis=2)
     mean = np.minimum(signal, 1.0).mean(axis=2) + rng.normal(0.0, BLACK_SIGNAL, light.shape)
-    reading = mean_reading(mean, saturated, exposed_at)
-    return _matched(
-        reading, np.where(signal >= WHITE_SIGNAL, np.nan, signal), exposed_at
-    ), exposed_at
-
-
-def _matched(reading: Reading, shown: Floats, exposed_at: Floats) -> Reading:
-    """As `agents.metering.matching` reads them: (B, T) readings of what is shown, (B, T, 64)."""
-    ev100, saturated = reading.ev100.copy(), reading.saturated.copy()
-    change, comparable = light_change(shown[:, :-1], shown[:, 1:])
-    change += np.diff(exposed_at, axis=1)
-    matched = comparable & (saturated[:, 1:] > TRUSTED_SATURATED)
-    for frame in range(change.shape[1]):
-        known, found = matched[:, frame], ev100[:, frame] + change[:, frame]
-        ev100[:, frame + 1] = np.where(known, found, ev100[:, frame + 1])
-    saturated[:, 1:][matched] = 0.0
-    return Reading(ev100, saturated, reading.black)
+    shown = np.where(signal >= WHITE_SIGNAL, np.nan, signal)
+    matcher = ZoneMatcher()
+    read = [
+        matcher.match(
+            mean_reading(mean[:, t], saturated[:, t], exposed_at[:, t]),
+            shown[:, t],
+            exposed_at[:, t],
+        )
+        for t in range(frames)
+    ]
+    columns = (
+        np.stack([getattr(one, name) for one in read], axis=1)
+        for name in ("ev100", "saturated", "black")
+    )
+    return Reading(*columns), exposed_at

@@ -20,7 +20,7 @@ TRUSTED_SATURATED = 0.02
 LEAST_SHARE, LEAST_SIGNAL = 0.01, 0.004
 
 
-class MatchedReadings:
+class ZoneMatcher:
     """Replaces what a meter reads in frames that clip by how much brighter they are than the last.
 
     A frame that is exposed four stops too long is mostly white, and its mean is only a lower bound
@@ -28,20 +28,20 @@ class MatchedReadings:
     frame nor in the one before, the ratio of the signals is that of the exposures times that of the
     light (the comparametric principle of Mann 2000, on a linear sensor). Where too little is left
     to compare, the meter's reading stands, with its share of white as a warning.
-
-    Args:
-        camera: The camera, for its black and white level.
     """
 
-    def __init__(self, camera: CameraProfile) -> None:
-        self.camera = camera
-        self._zones: Floats | None = None  # (N, zones), NaN where a pixel clips
+    def __init__(self) -> None:
+        self._zones: Floats | None = None
         self._light, self._exposed_at = np.empty(0), np.empty(0)
 
-    def update(self, reading: Reading, observations: Observations) -> Reading:
-        """Take in one frame of each camera; what it reads, unsaturated where it was matched."""
-        signal = linear_signal(observations["raw"], self.camera, GREEN)
-        zones, exposed_at = _zones(signal), frame_ev100(observations)
+    def match(self, reading: Reading, zones: Floats, exposed_at: Floats) -> Reading:
+        """Take in one frame of each camera; what it reads, unsaturated where it was matched.
+
+        Args:
+            reading: What a meter reads in the frames, ``(N,)``.
+            zones: Mean signals of their zones, ``(N, zones)``, NaN where a pixel clips.
+            exposed_at: EV100 that they were taken at, ``(N,)``.
+        """
         light, saturated = reading.ev100, reading.saturated
         if self._zones is not None:
             change, comparable = light_change(self._zones, zones)
@@ -51,6 +51,23 @@ class MatchedReadings:
             saturated = np.where(matched, 0.0, saturated)
         self._zones, self._light, self._exposed_at = zones, light, exposed_at
         return Reading(light, saturated, reading.black)
+
+
+class MatchedReadings(ZoneMatcher):
+    """`ZoneMatcher` on the zones of observed frames.
+
+    Args:
+        camera: The camera, for its black and white level.
+    """
+
+    def __init__(self, camera: CameraProfile) -> None:
+        super().__init__()
+        self.camera = camera
+
+    def update(self, reading: Reading, observations: Observations) -> Reading:
+        """Take in one frame of each camera; what it reads, unsaturated where it was matched."""
+        signal = linear_signal(observations["raw"], self.camera, GREEN)
+        return self.match(reading, _zones(signal), frame_ev100(observations))
 
 
 def light_change(before: Floats, now: Floats) -> tuple[Floats, NDArray[np.bool_]]:

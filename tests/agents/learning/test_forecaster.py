@@ -37,14 +37,14 @@ def _forecasts(network: LightForecaster, light: np.ndarray) -> tuple[np.ndarray,
 def test_it_learns_to_foresee_swinging_light():
     """After a short training nearer than the latest reading."""
     training = ForecasterTraining(
-        steps=220, batch_size=24, width=24, traces=300, mixed=0.0, bent=0.0, learning_rate=1e-2
+        steps=220, batch_size=24, width=48, traces=300, mixed=0.0, bent=0.0, learning_rate=2e-2
     )
     network = train_forecaster(training)
     light = _light("sines", 40)
     expected, reading = _forecasts(network, light)
     ahead = light[:, 23:63]
     forecast, latest = (np.abs(x[:, 20:60] - ahead).mean() for x in (expected, reading))
-    assert forecast < 0.95 * latest  # which is what a forecast of no change would err by
+    assert forecast < 0.8 * latest
 
 
 def test_samples_are_what_a_meter_reads_and_where_the_light_goes():
