@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from ae_env.utils.checks import UserCodeError
 from agents.policy import Observations
 
 if TYPE_CHECKING:
@@ -160,3 +162,39 @@ class Episodes:
                 valid=valid,
                 seed=int(self.seeds[begin]),
             )
+
+
+@contextmanager
+def errors_of(policy: str, method: str) -> Iterator[None]:
+    """An error that a policy raises inside becomes a `UserCodeError` that names the policy."""
+    try:
+        yield
+    except Exception as error:  # the policy may be the user's own, and raise anything
+        text = f"policy {policy!r}: `{method}` raised {type(error).__name__}: {error}"
+        raise UserCodeError(text) from error
+
+
+def checked_states(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
+    """The actions that a policy returned, as int64.
+
+    Raises:
+        UserCodeError: Unless they are allowed states, one per camera.
+    """
+    try:
+        array = np.asarray(actions)
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor of a GPU
+        array = np.empty(0, object)
+    if array.shape != masks.shape[:1] or not np.issubdtype(array.dtype, np.integer):
+        raise UserCodeError(
+            f"policy {name!r}: `act` must return {masks.shape[0]} integers, one per camera, not "
+            f"{type(actions).__name__} of shape {array.shape} and dtype {array.dtype}"
+        )
+    outside = (array < 0) | (array >= masks.shape[1])
+    if outside.any():
+        raise UserCodeError(
+            f"policy {name!r}: state {array[outside][0]} is not in [0, {masks.shape[1]})"
+        )
+    forbidden = ~np.take_along_axis(masks, array[:, None], axis=1)[:, 0]
+    if forbidden.any():
+        raise UserCodeError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")
+    return array.astype(np.int64)

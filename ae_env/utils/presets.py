@@ -43,7 +43,7 @@ def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
                 return own
             raise ValueError(f"`{option}` (={str(name)!r}): there is no such file")
     known = list_presets(kind)
-    hint = did_you_mean(name, known)
+    hint = did_you_mean(name, [k for k in known if k.startswith(f"{name}_")] or known)
     raise ValueError(
         f"`{option}` (={name!r}) must be one of {', '.join(known)} or a .yaml file{hint}"
     )

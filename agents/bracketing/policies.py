@@ -15,7 +15,7 @@ from ae_env.observation import decode_observation, decode_sensors, decode_settin
 from ae_env.scenes.scene import WHITE_SIGNAL
 from ae_env.utils.checks import check_number
 from agents.bracketing.schedules import BINS, Floats, Ints, Schedules, bin_of
-from agents.episodes import Episodes, scenes_of
+from agents.episodes import Episodes, checked_states, errors_of, scenes_of
 from agents.policy import Observations, Policy, PolicyContext
 
 if TYPE_CHECKING:
@@ -44,7 +44,10 @@ class Bracketing(Policy):
     def __init__(self, context: PolicyContext) -> None:
         super().__init__(context)
         if context.bracket is None:
-            raise ValueError("bracketing policies are for ae_env/ExposureBracket-v0")
+            raise ValueError(
+                "bracketing policies are for ae_env/ExposureBracket-v0 (`ae-env evaluate --preset "
+                "bracket`)"
+            )
         if context.observation_space["raw"].dtype != np.uint8 or (
             "histogram" in context.observation_space.spaces
         ):
@@ -335,6 +338,7 @@ def run_brackets(
     count: int = 1,
     seed: int = 0,
     most: int | None = None,
+    name: str | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Episodes of each scene of `envs` (autoreset mode DISABLED), driven by `policy`.
 
@@ -344,34 +348,43 @@ def run_brackets(
         count: Episodes of each scene.
         seed: Of the first.
         most: Use so many scenes at most.
+        name: The policy's name in errors; by default its own.
 
     Returns:
         ``quality``, ``log_error``, ``unseen``, ``frames``, ``time_left`` and ``group`` of each
         episode, and the ``seconds`` that each decision took on average.
+
+    Raises:
+        UserCodeError: If the policy raises, or returns something else than actions.
     """
+    name = policy.name if name is None else name
     names = ("quality", "log_error", "unseen", "frames", "time_left")
-    found: dict[str, list[NDArray[Any]]] = {name: [] for name in (*names, "group", "seconds")}
+    found: dict[str, list[NDArray[Any]]] = {key: [] for key in (*names, "group", "seconds")}
     episodes = Episodes.of_each_scene(scenes_of(envs), count=count, seed=seed, most=most)
     for batch in episodes.batches(envs):
-        policy.reset(envs.num_envs, batch.seed)
+        with errors_of(name, "reset"):
+            policy.reset(envs.num_envs, batch.seed)
         observations, info, masks = batch.observations, batch.info, batch.action_masks
         base: Any = envs.unwrapped
         running = np.ones(envs.num_envs, bool)
-        last = {name: np.array(info[name], np.float64) for name in names}
+        last = {key: np.array(info[key], np.float64) for key in names}
         seconds, decisions = 0.0, 0
         while running.any():
             begun = perf_counter()
-            actions = policy.act(observations, masks)
-            seconds, decisions = seconds + perf_counter() - begun, decisions + len(actions)
+            with errors_of(name, "act"):
+                chosen = policy.act(observations, masks)
+            seconds, decisions = seconds + perf_counter() - begun, decisions + envs.num_envs
+            # A state that no longer fits is allowed, and ends the episode.
+            actions = checked_states(name, chosen, np.ones_like(masks))
             observations, _, ended, _, info = envs.step(actions)
-            for name in names:
-                last[name][running] = info[name][running]
+            for key in names:
+                last[key][running] = info[key][running]
             running &= ~ended
             if running.any() and ended.any():  # the others go on with episodes that do not count
                 observations, _ = base.reset(options={"reset_mask": ended})
             masks = base.action_masks()
-        for name in names:
-            found[name].append(last[name][batch.valid])
+        for key in names:
+            found[key].append(last[key][batch.valid])
         found["group"].append(batch.groups[batch.valid])
         found["seconds"].append(np.full(int(batch.valid.sum()), seconds / decisions))
-    return {name: np.concatenate(parts) for name, parts in found.items()}
+    return {key: np.concatenate(parts) for key, parts in found.items()}

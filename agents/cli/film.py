@@ -40,6 +40,8 @@ def film(
     from agents.policy import PolicyContext, make_policy
     from agents.report.film import film as write
 
+    if out.suffix.lower() != ".gif":
+        raise ValueError(f"`out` (={str(out)!r}) must end in .gif: the film is an animated GIF")
     make_folder(out.parent, file=out)
     check_word("light", light, (*MOVES, *KIND_SETS))
     options: dict[str, Any] = {"scenes": scenes, "split": "test"}

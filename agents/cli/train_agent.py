@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,12 @@ from agents.cli.console import (
     progress_bars,
     torch_device,
 )
+
+if TYPE_CHECKING:
+    from agents.learning.training import AgentConfig
+
+#: Evaluations of the tasks; that of still light is the command's own default.
+_PRESETS = {"ae_env/AutoExposureVideo-v0": "video", "ae_env/ExposureBracket-v0": "bracket"}
 
 
 def train(
@@ -48,4 +54,20 @@ def train(
 
         train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
     print_files({"weights": sibling(out, ".safetensors"), "description": file})
-    print_line("next: " + shlex.join(["ae-env", "evaluate", "--policy", f"{agent.agent}:{out}"]))
+    print_line("next: " + shlex.join(["ae-env", "evaluate", *_evaluation(agent, out)]))
+
+
+def _evaluation(agent: AgentConfig, out: Path) -> list[str]:
+    """Options that evaluate the agent on what it was trained for."""
+    if agent.agent == "forecaster":
+        return ["--preset", "video", "--policy", f"regression:video?foresight={out}"]
+    words = ["--policy", f"{agent.agent}:{out}"]
+    preset = _PRESETS.get(agent.task)
+    if preset is not None:
+        words = ["--preset", preset, *words]
+    if preset is None and isinstance(agent.environment.get("grid"), str):
+        words += ["--grid", agent.environment["grid"]]
+    for name in ("observation", "resolution"):
+        if name in agent.environment:
+            words += [f"--{name}", str(agent.environment[name])]
+    return words if agent.environment.get("sensors", True) else [*words, "--no-sensors"]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from agents.baselines import Random
 from agents.evaluation.evaluation_plan import (
     MAX_SCENES,
     MAX_SEED,
@@ -189,7 +190,7 @@ def run_bracket_plan(
     Raises:
         ValueError: If a policy is unknown or does not fit the environment; before any work.
     """
-    from agents.bracketing.policies import run_brackets
+    from agents.bracketing.policies import Bracketing, run_brackets
 
     if not plan.policies:
         raise ValueError("`policies` (=[]) must hold at least one policy")
@@ -201,6 +202,13 @@ def run_bracket_plan(
         with closing(plan.make_envs(budget, scenes)) as envs:
             context = PolicyContext.from_envs(envs)
             made = [(policy, name, make_policy(name, context)) for policy, name in members]
+            for _, name, one in made:
+                built_in = type(one).__module__.startswith("agents.")
+                if built_in and not isinstance(one, Bracketing | Random):
+                    raise ValueError(
+                        f"`policy` (={name!r}) is not for {ENV_ID}: take random, bracket, "
+                        "bracket:fixed, bracket:hasinoff, bracket:planned or one of your own"
+                    )
             for j, (policy, name, one) in enumerate(made):
                 if progress is not None:
                     done = i * len(made) + j
@@ -208,7 +216,7 @@ def run_bracket_plan(
                 if type(one).fit is not Policy.fit:
                     with closing(plan.make_envs(budget)) as train:
                         one.fit(train, plan.seeds[0])
-                runs = [run_brackets(one, envs, seed=seed << 20) for seed in plan.seeds]
+                runs = [run_brackets(one, envs, seed=seed << 20, name=name) for seed in plan.seeds]
                 merged = {k: np.concatenate([r[k] for r in runs]) for k in (*MEASURES, "group")}
                 means = {
                     k: group_means(merged[k].astype(np.float64), merged["group"])[0]

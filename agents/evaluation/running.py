@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.utils.checks import UserCodeError, check_number
-from agents.episodes import EpisodeBatch, Episodes, action_masks, make_envs
+from ae_env.utils.checks import check_number
+from agents.episodes import (
+    EpisodeBatch,
+    Episodes,
+    action_masks,
+    checked_states,
+    errors_of,
+    make_envs,
+)
 from agents.metering.reading import linear_signal, signal_codes
 from agents.policy import Policy
 
@@ -113,7 +119,7 @@ def run_batch(
         with errors_of(name, "act"):
             actions = policy.act(observations, masks, **extra)
         seconds.append(time.perf_counter() - begin)
-        observations, _, _, _, info = envs.step(_checked(name, actions, masks))
+        observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
         masks = action_masks(envs)  # the next frame of a sequence is another scene
         states.append(np.array(info["state"], dtype=np.int64))  # with a delay, an older choice
         means.append(linear_signal(observations["raw"], base.camera).mean(axis=(1, 2, 3)))
@@ -159,16 +165,6 @@ def milliseconds_alone(
     return 1000.0 * float(np.median(found["seconds"][_WARM_UP:]))
 
 
-@contextmanager
-def errors_of(policy: str, method: str) -> Iterator[None]:
-    """An error that a policy raises inside becomes a `UserCodeError` that names the policy."""
-    try:
-        yield
-    except Exception as error:  # the policy may be the user's own, and raise anything
-        text = f"policy {policy!r}: `{method}` raised {type(error).__name__}: {error}"
-        raise UserCodeError(text) from error
-
-
 def check_captures(name: str, policy: Policy) -> float:
     """`captures_per_decision` of a policy.
 
@@ -177,29 +173,3 @@ def check_captures(name: str, policy: Policy) -> float:
     """
     captures = getattr(policy, "captures_per_decision", 1.0)
     return check_number(f"captures_per_decision` of policy `{name}", captures, 0.0, 1e9)
-
-
-def _checked(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
-    """The policy's actions as int64.
-
-    Raises:
-        UserCodeError: Unless they are allowed states, one per camera.
-    """
-    try:
-        array = np.asarray(actions)
-    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor of a GPU
-        array = np.empty(0, object)
-    if array.shape != masks.shape[:1] or not np.issubdtype(array.dtype, np.integer):
-        raise UserCodeError(
-            f"policy {name!r}: `act` must return {masks.shape[0]} integers, one per camera, not "
-            f"{type(actions).__name__} of shape {array.shape} and dtype {array.dtype}"
-        )
-    outside = (array < 0) | (array >= masks.shape[1])
-    if outside.any():
-        raise UserCodeError(
-            f"policy {name!r}: state {array[outside][0]} is not in [0, {masks.shape[1]})"
-        )
-    forbidden = ~np.take_along_axis(masks, array[:, None], axis=1)[:, 0]
-    if forbidden.any():
-        raise UserCodeError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")
-    return array.astype(np.int64)

@@ -138,7 +138,7 @@ class RegressionPolicy(NetworkPolicy):
         self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):
             pattern = FORECASTERS if foresight == LEARNT else foresight
-            files = weight_files(pattern)
+            files = weight_files(pattern) if isinstance(pattern, str) else []
             if not files:
                 raise ValueError(
                     f"`foresight` (={foresight!r}) must be 'none', 'trend', {LEARNT!r} or the name "

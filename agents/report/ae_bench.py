@@ -6,6 +6,7 @@ import csv
 import datetime
 import io
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,6 +48,8 @@ COLUMNS = (
     *("reversals", "jump", "clipped_high", "clipped_low", "log_error", "unseen", "frames"),
     *("ms_alone", "cpu", "training_seeds", "version", "hash"),
 )
+#: Columns that hold no numbers.
+_TEXT = ("task", "policy", "observation", "author", "date", "cpu", "version", "hash")
 #: What identifies a row.
 _KEY = ("task", "policy", "observation", "author")
 #: Metrics of a row that are means over all conditions.
@@ -94,6 +97,8 @@ _TABLES = {
     ),
 }
 _PERCENT = ("ev_within_third", "converged", "clipped_high", "unseen")
+#: What tells a page that this module wrote.
+_MARK = "<!-- written by `ae-env evaluate --append`"
 _PAGE = """\
 # AE-Bench v2
 
@@ -107,7 +112,7 @@ superseded.
 
 Add your own policy with one command for each task that it is for:
 
-    ae-env evaluate --preset ae_bench_v2_still --policy my.py:Mine \
+    ae-env evaluate --preset ae_bench_v2_still --policy my.py:Mine \\
         --append {table} --author "Your name"
 
 `_still`, `_video` or `_bracket`; `--observation statistics` shows the policy the statistics of an \
@@ -217,6 +222,12 @@ def check_append(table: Path, plan: BenchPlan, policies: Sequence[str], *, autho
     rows = _rows_of_hash(table, plan)
     if page_of(table) == table:
         raise ValueError(f"`append` (={str(table)!r}) must be a CSV file, such as mine.csv")
+    page = page_of(table)
+    if page.is_file() and _MARK not in page.read_text(encoding="utf-8", errors="replace"):
+        raise ValueError(
+            f"`append` (={str(table)!r}) would replace {page}, which is not a benchmark's page: "
+            "give the table another name"
+        )
     if not policies:
         raise ValueError(
             f"`append` (={str(table)!r}): none of the policies gets a row, since privileged "
@@ -313,7 +324,7 @@ def read_table(table: Path) -> list[dict[str, str]]:
     """Rows of a benchmark's table; none where there is no file.
 
     Raises:
-        ValueError: If it cannot be read, or its columns are not `COLUMNS`.
+        ValueError: If it cannot be read, its columns are not `COLUMNS`, or a cell is no number.
     """
     if not table.is_file():
         return []
@@ -324,7 +335,21 @@ def read_table(table: Path) -> list[dict[str, str]]:
     reader = csv.DictReader(io.StringIO(text, newline=""))
     if tuple(reader.fieldnames or ()) != COLUMNS:
         raise ValueError(f"{table}: its columns must be {', '.join(COLUMNS)}")
-    return list(reader)
+    rows = list(reader)
+    for line, row in enumerate(rows, start=2):
+        for name in COLUMNS:
+            value = row[name]
+            if value is None or (name not in _TEXT and not _is_number(value, name == "score")):
+                raise ValueError(f"{table}, line {line}: `{name}` (={value!r}) must be a number")
+    return rows
+
+
+def _is_number(text: str, required: bool) -> bool:
+    """Whether a cell holds a finite number, or nothing where nothing is required."""
+    try:
+        return math.isfinite(float(text)) if text or required else True
+    except ValueError:
+        return False
 
 
 def page_of(table: Path) -> Path:

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from agents.evaluation.running import errors_of
+from agents.episodes import errors_of
 from agents.policy import Policy
 from simulator.utils.files import write_atomically
 

@@ -13,12 +13,13 @@ import torch
 import ae_env  # noqa: F401  (registers the environment)
 from ae_env import ExposureGrid
 from ae_env.episodes.merging import log_error, merge
+from ae_env.utils.checks import UserCodeError
 from agents.bracketing.learnt import BLURS, HiddenLight, LearntBracket, LearntLight
 from agents.bracketing.policies import FixedBracket, describe, run_brackets
 from agents.bracketing.schedules import BINS, Schedules
 from agents.learning.optimisation import Optimisation
 from agents.learning.training import AgentConfig, train_agent
-from agents.policy import PolicyContext, make_policy, training_seeds
+from agents.policy import Policy, PolicyContext, make_policy, training_seeds
 from simulator.camera import get_camera
 from tests.ae_env.environments import SMALL
 
@@ -241,3 +242,20 @@ def test_mistakes_are_named(context: PolicyContext) -> None:
     for agent, task in (("bracket", "ae_env/AutoExposure-v0"), ("ppo", ID)):
         with pytest.raises(ValueError, match="`task`"):
             AgentConfig(agent=agent, task=task)
+
+
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda count: np.full(count, 999), r"policy 'mine': state 999 is not in \[0, 25\)"),
+        (lambda count: [0.5], "policy 'mine': `act` must return 4 integers"),
+        (lambda count: count // 0, "policy 'mine': `act` raised ZeroDivisionError"),
+    ],
+)
+def test_errors_of_a_policy_of_ones_own_name_it(
+    context: PolicyContext, act: Any, message: str
+) -> None:
+    policy = Policy(context)
+    policy.act = lambda observations, masks=None: act(policy.num_envs)  # type: ignore[method-assign]
+    with pytest.raises(UserCodeError, match=message):
+        run_brackets(policy, make_envs(), name="mine")

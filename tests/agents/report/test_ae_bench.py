@@ -140,7 +140,7 @@ def test_rows_of_brackets_by_hand(tmp_path):
 
 
 def _table(file, plan, **entries):
-    known = {"hash": plan.hash, "task": "still", "observation": "uint8"}
+    known = {"hash": plan.hash, "task": "still", "observation": "uint8", "score": "0.5"}
     row = dict.fromkeys(ae_bench.COLUMNS, "") | known | entries
     file.write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
     return file
@@ -156,6 +156,10 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         check(tmp_path / "new.csv", plan.changed(task=""), ["random"], author="me")
     (broken := tmp_path / "broken.csv").write_bytes(b"\xff\xfe")
     other = _table(tmp_path / "b.csv", plan, hash="0")
+    damaged = _table(tmp_path / "d.csv", plan, score="abc")
+    cut = _table(tmp_path / "e.csv", plan)
+    cut.write_text(cut.read_text().rsplit(",", 3)[0])
+    (tmp_path / "notes.md").write_text("mine")
     for file, policies, author, message in (
         (table, ["u/my.py:Mine"], " ", r"`author` .*row of 'my\.py:Mine' without an author"),
         (table, ["u/my.py:Mine", "v/my.py:Mine"], "me", r"the same row 'my\.py:Mine'"),
@@ -163,6 +167,9 @@ def test_a_table_is_checked_before_the_run(plan, tmp_path):
         (tmp_path / "a.md", ["random"], "me", "must be a CSV file"),
         (other, ["random"], "me", "they do not compare"),
         (broken, ["random"], "me", "cannot be read as a table"),
+        (damaged, ["random"], "me", r"d\.csv, line 2: `score` \(='abc'\)"),
+        (cut, ["random"], "me", r"e\.csv, line 2: .*\(=None\)"),
+        (tmp_path / "notes.csv", ["random"], "me", r"would replace .*notes\.md"),
     ):
         with pytest.raises(ValueError, match=message):
             check(file, plan, policies, author=author)
