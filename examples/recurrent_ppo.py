@@ -58,6 +58,8 @@ class RecurrentAgent(Policy):
 
     def __init__(self, context, weights=WEIGHTS):
         super().__init__(context)
+        if not Path(weights).is_file():
+            raise ValueError(f"there is no {weights}: run `python examples/recurrent_ppo.py` first")
         actions = gym.spaces.Discrete(len(context.grid))
         self.network = RecurrentMultiInputActorCriticPolicy(
             context.observation_space, actions, lambda _: 0.0, **NETWORK

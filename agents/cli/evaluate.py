@@ -147,6 +147,8 @@ def evaluate(
     if append is None and author:
         raise ValueError(f"`author` (={author!r}) is of a row in a table: give --append too")
     if append is not None:
+        if not append.parent.is_dir():
+            raise ValueError(f"`append` (={str(append)!r}): there is no folder {append.parent}")
         make_folder(append.parent, name="append", file=append)
     if isinstance(plan, BracketPlan):
         _run_brackets(plan, out, append, author)

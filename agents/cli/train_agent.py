@@ -38,7 +38,9 @@ def train(
 
     Example: `ae-env train configs/ppo.yaml --out runs/ppo`
     """
+    from agents.learning.learning_curve import load_curve
     from agents.learning.training import load_config, train_agent
+    from agents.report.plots import plot_learning
     from simulator.utils.files import sibling
 
     device = torch_device(device)
@@ -53,7 +55,12 @@ def train(
             task(done, total, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
 
         train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
-    print_files({"weights": sibling(out, ".safetensors"), "description": file})
+    files = {"weights": sibling(out, ".safetensors"), "description": file}
+    curve = sibling(out, ".csv")
+    if curve.is_file():
+        picture = plot_learning(sibling(out, ".png"), {agent.agent: load_curve(curve)})
+        files |= {"learning curve": curve, "its picture": picture}
+    print_files(files)
     print_line("next: " + shlex.join(["ae-env", "evaluate", *_evaluation(agent, out)]))
 
 

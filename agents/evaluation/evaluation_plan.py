@@ -134,6 +134,13 @@ class EvaluationPlan(Configuration):
                 options = self.options(condition)
                 options.make_grid(), options.make_camera(), options.make_scorer()
                 options.make_lighting()
+                late = condition.delay
+                late = max(late.values()) if isinstance(late, Mapping) else late
+                if late >= self.frames:
+                    raise ValueError(
+                        f"`delay` (={late}) must be below `frames` (={self.frames}): no decision "
+                        "would show"
+                    )
             except ValueError as error:
                 raise ValueError(f"condition {name!r}: {error}") from error
         return self

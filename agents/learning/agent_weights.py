@@ -122,8 +122,8 @@ def describe_context(context: PolicyContext) -> dict[str, Any]:
     """Everything that a network's shape and meaning depend on, as JSON values."""
     raw = context.observation_space["raw"]
     return {
-        "resolution": list(raw.shape or ()),
         "observation": str(raw.dtype),
+        "resolution": list(raw.shape or ()),
         "sensors": context.has_sensors,
         "isos": list(context.grid.isos),
         "exposure_times": list(context.grid.exposure_times),

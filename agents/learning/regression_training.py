@@ -102,11 +102,11 @@ def train_regression(
             with _seeded(
                 device, training.seed, run.done
             ):  # dropout draws from the global generator
-                loss, error = _loss(network, observations, target)
+                loss, seen = _loss(network, observations, target)
             run.step(loss)
             network.eval()
             if progress is not None:
-                progress(run.done * envs.num_envs, steps * envs.num_envs, {"mse": error})
+                progress(run.done * envs.num_envs, steps * envs.num_envs, seen)
             run.store.save_when_due()
     return network
 
@@ -180,17 +180,20 @@ class Replay:
 
 def _loss(
     network: ScoreRegressor, observations: Observations, target: NDArray[np.float64]
-) -> tuple[torch.Tensor, float]:
-    """Loss to minimise, and the mean squared error.
+) -> tuple[torch.Tensor, dict[str, float]]:
+    """Loss to minimise; the mean squared error, and what the states that seem best lose [score].
 
     The mean learns from the plain squared error, the confidence from the likelihood with that
     error held fixed: a large predicted variance cannot excuse a poor mean.
     """
     device = next(network.parameters()).device
     scores, log_variance = network(*observation_tensors(observations, device))
-    error = (scores - torch.from_numpy(target).float().to(device)).square()
+    known = torch.from_numpy(target).float().to(device)
+    error = (scores - known).square()
+    regret = known.amax(dim=1) - known.gather(1, scores.argmax(dim=1, keepdim=True))[:, 0]
     likelihood = (error.detach() * torch.exp(-log_variance) + log_variance).mean()
-    return error.mean() + 0.01 * likelihood, error.mean().item()
+    loss = error.mean() + 0.01 * likelihood
+    return loss, {"mse": error.mean().item(), "regret": regret.mean().item()}
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError, model_validator
 from agents.bracketing.learnt import BracketTraining, train_bracket
 from agents.learning.agent_weights import describe_agent, load_agent, save_agent
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
+from agents.learning.learning_curve import LearningCurve
 from agents.learning.regression_training import RegressionTraining, train_regression
 from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
@@ -165,6 +166,8 @@ def train_agent(
 ) -> Path:
     """Trains an agent and writes it to ``out.safetensors`` and ``out.json``.
 
+    Beside them, ``out.csv`` is its learning curve (`LearningCurve`).
+
     A training that was interrupted goes on from its checkpoint, ``out.checkpoint``; one that is
     complete is not repeated.
 
@@ -181,8 +184,9 @@ def train_agent(
     if is_trained(config, out):
         return out
     training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
+    curve = LearningCurve(sibling(out, ".csv"))
     if isinstance(training, ForecasterTraining):
-        with _logged(progress, tensorboard) as report:
+        with _logged(curve, progress, tensorboard) as report:
             network: Any = train_forecaster(
                 training,
                 checkpoint=checkpoint,
@@ -204,7 +208,7 @@ def train_agent(
     envs = gym.make_vec(
         config.task, num_envs=config.num_envs, autoreset_mode="SAME_STEP", **options
     )
-    with closing(envs), _logged(progress, tensorboard) as report:
+    with closing(envs), _logged(curve, progress, tensorboard) as report:
         common: dict[str, Any] = {
             "checkpoint": checkpoint,
             "progress": report,
@@ -226,23 +230,30 @@ def train_agent(
 
 
 @contextmanager
-def _logged(progress: Progress | None, folder: Path | None) -> Iterator[Progress | None]:
-    """`progress` that also writes each value to TensorBoard."""
+def _logged(
+    curve: LearningCurve, progress: Progress | None, folder: Path | None
+) -> Iterator[Progress]:
+    """What takes each report: the curve, TensorBoard's log in `folder`, and `progress`."""
+    takers: list[Progress] = [curve] if progress is None else [curve, progress]
+
+    def report(done: int, total: int, values: dict[str, float]) -> None:
+        for take in takers:
+            take(done, total, values)
+
     if folder is None:
-        yield progress
+        yield report
         return
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError as error:
         raise ImportError("a TensorBoard log needs: pip install 'ae-env[tensorboard]'") from error
 
-    def report(done: int, total: int, values: dict[str, float]) -> None:
+    def log(done: int, total: int, values: dict[str, float]) -> None:
         for name, value in values.items():
             writer.add_scalar(f"train/{name}", value, done)
-        if progress is not None:
-            progress(done, total, values)
 
     with SummaryWriter(str(folder)) as writer:
+        takers.insert(0, log)
         yield report
 
 

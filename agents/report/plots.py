@@ -124,6 +124,31 @@ def plot_convergence(
     return _write(path, figure)
 
 
+def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
+    """Draw learning curves, a panel per reported value, and write them as PNG.
+
+    Args:
+        path: File to write.
+        curves: By training: ``frames``, and each value it reported after so many.
+    """
+    values = [name for name in next(iter(curves.values())) if name != "frames"]
+    figure = _figure(4.5 * len(values), 3.2)
+    panels = figure.subplots(1, len(values), squeeze=False)[0]
+    for panel, value in zip(panels, values, strict=True):
+        for i, (training, curve) in enumerate(curves.items()):
+            panel.plot(curve["frames"], curve[value], lw=1.3, label=training, **line_style(i))
+        panel.set_xlabel("frames", fontsize=9)
+        panel.set_ylabel(f"{value} in training", fontsize=9)
+        if min(min(curve[value]) for curve in curves.values()) > 0.0:
+            panel.set_yscale("log")
+        panel.grid(color="0.93")
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.tick_params(labelsize=8)
+    if len(curves) > 1:
+        panels[0].legend(fontsize=8)
+    return _write(path, figure)
+
+
 def line_style(index: int) -> dict[str, str]:
     """Colour and dashes of a policy by its position in the ranking."""
     dashes = _DASHES[index // len(PALETTE) % len(_DASHES)]

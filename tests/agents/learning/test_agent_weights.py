@@ -81,7 +81,11 @@ def test_damaged_file(agent: Path, suffix: str, content: bytes | None, message: 
         ({"width": 10**9}, r"width \(=1000000000\): .* less than or equal to 65536"),
         ({"width": 9}, r"do not fit the network: [^\n]*weight[^\n]*\Z"),
         ({"sha256": 7}, r"the hash of .* \(=7\.\.\.\)"),
-        ({"context": {"resolution": [4]}}, r"trained with resolution = \[4\]"),
+        (
+            {"context": {"observation": "uint8", "resolution": [4]}},
+            r"trained with resolution = \[4\]",
+        ),
+        ({"context": {"resolution": [4]}}, "trained with observation = None"),
         ({"kind": "ppo"}, "must be a regression agent of format 1, got 'ppo'"),
     ],
 )

@@ -102,7 +102,8 @@ def test_trained_once(agent: str, tmp_path: Path) -> None:
     training.train_agent(config, out, progress=lambda done, total, values: calls.append(done))
     assert calls[-1] == {"regression": 24, "ppo": 32}[agent]
     names = {path.name for path in out.parent.iterdir()}
-    assert names == {f"{agent}-0.1.json", f"{agent}-0.1.safetensors"}  # no checkpoint is left
+    # No checkpoint is left.
+    assert names == {f"{agent}-0.1{ending}" for ending in (".csv", ".json", ".safetensors")}
     assert training.is_trained(config, out)
     training.train_agent(config, out, progress=lambda *_: pytest.fail("trained again"))
     # Another training, or a damaged file, is not taken for this one.
