@@ -143,7 +143,7 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
             panel.set_yscale("log")
         panel.grid(color="0.93")
         panel.spines[["top", "right"]].set_visible(False)
-        panel.tick_params(labelsize=8)
+        panel.tick_params(which="both", labelsize=8)
     if len(curves) > 1:
         panels[0].legend(fontsize=8)
     return _write(path, figure)
