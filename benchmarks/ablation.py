@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import runpy
 import tempfile
-from collections import deque
-from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from agents.learning.learning_curve import LearningCurve, load_curve
+from agents.report.plots import learning_figure
 from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, table
 from benchmarks.isolated import ROOT
+from simulator.utils.files import sibling
 
 #: The training that all variants start from.
 CONFIG = ROOT / "configs" / "video" / "ppo.yaml"
@@ -47,18 +48,12 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     from agents.report.result_table import overall_ranking
 
     training, environment = VARIANTS.get(variant, ({}, {}))
-    curve: list[tuple[int, float]] = []
-
-    def progress(done: int, total: int, values: dict[str, float]) -> None:
-        if not curve or done - curve[-1][0] >= total // 50:
-            curve.append((done, values["reward"]))
-
     name = "".join(c if c.isalnum() else "-" for c in variant)
     out = RUNS.parent / "bench_ablation" / f"{name}-{frames}-{seed}"
     out.parent.mkdir(parents=True, exist_ok=True)
     begun = time.perf_counter()
     if variant == RECURRENT:
-        policy = _train_recurrent(f"{out}.safetensors", frames, seed, progress)
+        policy = _train_recurrent(out, frames, seed)
     else:
         base = load_config(CONFIG)
         changed = {"total_timesteps": frames, "seed": seed, **training}
@@ -69,7 +64,7 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
                 "training": {**base.training, **changed},
             }
         )
-        train_agent(config, out, progress=progress)
+        train_agent(config, out)
         policy = f"ppo:{out}"
     seconds = time.perf_counter() - begun
     plan = load_plan("video")
@@ -89,22 +84,20 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
         "ci95": rank.score.pair,
         "by_light": {k: float(g.mean(axis=0).sum() / s.sum()) for k, (g, s) in gains.items()},
         "training_s": seconds,
-        "curve": curve,
+        "curve": load_curve(sibling(out, ".csv")),
     }
 
 
-def _train_recurrent(
-    weights: str, frames: int, seed: int, progress: Callable[[int, int, dict[str, float]], None]
-) -> str:
-    """Trains the example's agent, and names it."""
-    recent: deque[float] = deque(maxlen=50)
+def _train_recurrent(out: Path, frames: int, seed: int) -> str:
+    """Trains the example's agent, with a learning curve, and names it."""
+    curve = LearningCurve(sibling(out, ".csv"))
 
     def callback(variables: dict[str, Any], _: Any) -> bool:
-        recent.append(float(np.mean(variables["rewards"])))
-        done = variables["self"].num_timesteps
-        progress(done, frames, {"reward": float(np.mean(recent))})
+        reward = float(np.mean(variables["rewards"]))
+        curve(variables["self"].num_timesteps, frames, {"reward": reward})
         return True
 
+    weights = sibling(out, ".safetensors")
     runpy.run_path(str(PROGRAM))["train"](weights, frames, seed, callback)
     return f"{PROGRAM}:RecurrentAgent?weights={weights}"
 
@@ -121,21 +114,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
         )
         for variant in (*VARIANTS, RECURRENT)
     ]
-
-
-def curves(rows: list[Row]) -> Figure:
-    """Mean reward over the frames of each training."""
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    axis = figure.subplots()
-    for row in rows:
-        if row["curve"]:
-            frames, rewards = np.array(row["curve"]).T
-            smooth = np.convolve(rewards, np.ones(3) / 3.0, mode="valid")
-            axis.plot(frames[1:-1], smooth, label=row["variant"])
-    axis.set(xlabel="frames", ylabel="mean reward in training")
-    axis.grid(color="0.93")
-    axis.legend(fontsize=8)
-    return figure
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
@@ -162,8 +140,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "in place of the readings, and logits that are linear in it; its other hyperparameters "
         "are PPO's.",
     ]
+    picture = learning_figure({row["variant"]: row["curve"] for row in rows})
     kept = [{k: v for k, v in row.items() if k != "curve"} for row in rows]
-    return Report(kept, page, {"frames": frames}, {"ablation.png": curves(rows)})
+    return Report(kept, page, {"frames": frames}, {"ablation.png": picture})
 
 
 BENCHMARK = Benchmark(

@@ -134,8 +134,7 @@ class EvaluationPlan(Configuration):
                 options = self.options(condition)
                 options.make_grid(), options.make_camera(), options.make_scorer()
                 options.make_lighting()
-                late = condition.delay
-                late = max(late.values()) if isinstance(late, Mapping) else late
+                late = max(options.delays)
                 if late >= self.frames:
                     raise ValueError(
                         f"`delay` (={late}) must be below `frames` (={self.frames}): no decision "

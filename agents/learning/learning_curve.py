@@ -33,20 +33,19 @@ class LearningCurve:
             dict(zip(known, row, strict=True)) for row in zip(*known.values(), strict=True)
         ]
         self._recent: list[dict[str, float]] = []
-        self._begun: int | None = None
 
     def __call__(self, done: int, total: int, values: dict[str, float]) -> None:
         """Take in what the training reports after `done` of `total` frames."""
-        if self._begun is None:  # what another training left here, or this one after its checkpoint
-            columns = {"frames", *values}
-            self._rows = [r for r in self._rows if r["frames"] < done and r.keys() == columns]
-            self._begun = done
+        # What another training left here, or this one after its checkpoint.
+        while self._rows and not self._goes_on(done, values):
+            self._rows.pop()
         self._recent.append(values)
-        if done < total and done - self._begun < total / ROWS:
+        last = self._rows[-1]["frames"] if self._rows else 0
+        if done != total and done - last < total / ROWS:
             return
         means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
         self._rows.append({"frames": done, **means})
-        self._recent, self._begun = [], done
+        self._recent = []
         text = io.StringIO()
         writer = csv.DictWriter(text, self._rows[-1], lineterminator="\n")
         writer.writeheader()
@@ -54,6 +53,11 @@ class LearningCurve:
             shown = {name: f"{value:.6g}" for name, value in row.items()}
             writer.writerow({**shown, "frames": int(row["frames"])})
         write_atomically(self.path, text.getvalue())
+
+    def _goes_on(self, done: int, values: dict[str, float]) -> bool:
+        """Whether the last row is of this training, from before `done` frames."""
+        last = self._rows[-1]
+        return last["frames"] < done and last.keys() == {"frames", *values}
 
 
 def load_curve(path: Path) -> dict[str, list[float]]:

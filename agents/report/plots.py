@@ -125,10 +125,14 @@ def plot_convergence(
 
 
 def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Path:
-    """Draw learning curves, a panel per reported value, and write them as PNG.
+    """Write `learning_figure` as PNG."""
+    return _write(path, learning_figure(curves))
+
+
+def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figure:
+    """Learning curves, a panel per reported value.
 
     Args:
-        path: File to write.
         curves: By training: ``frames``, and each value it reported after so many.
     """
     values = [name for name in next(iter(curves.values())) if name != "frames"]
@@ -146,7 +150,7 @@ def plot_learning(path: Path, curves: Mapping[str, Mapping[str, Sequence[float]]
         panel.tick_params(which="both", labelsize=8)
     if len(curves) > 1:
         panels[0].legend(fontsize=8)
-    return _write(path, figure)
+    return figure
 
 
 def line_style(index: int) -> dict[str, str]:
