@@ -420,6 +420,7 @@ def _construct(
             f"`policy` (={name!r}): {cls.__name__} is not a policy, it has no {methods}; "
             "derive it from agents.Policy"
         )
+    _check_task(cls, name, context)
     _check_options(cls, name, options, fixed)
     options = {**fixed, **options}
     try:
@@ -441,6 +442,18 @@ def _construct(
             raise type(error)(f"`policy` (={name!r}): {error}") from error
         raise  # our own errors say which argument is wrong
     return policy
+
+
+def _check_task(cls: Any, name: str, context: PolicyContext) -> None:
+    """Raises a `ValueError` if `cls` is one of ours for single frames and the task is brackets."""
+    if context.bracket is None or not cls.__module__.startswith("agents."):
+        return
+    if not cls.__module__.startswith("agents.bracketing.") and cls.__name__ != "Random":
+        kinds = ", ".join(f"{_BRACKET}:{kind}" for kind in _BRACKETS)
+        raise ValueError(
+            f"`policy` (={name!r}) is not for ae_env/ExposureBracket-v0: take random, {_BRACKET}, "
+            f"{kinds} or one of your own"
+        )
 
 
 def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str, Any]) -> None:

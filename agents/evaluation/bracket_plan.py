@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from agents.baselines import Random
 from agents.evaluation.evaluation_plan import (
     MAX_SCENES,
     MAX_SEED,
@@ -190,7 +189,7 @@ def run_bracket_plan(
     Raises:
         ValueError: If a policy is unknown or does not fit the environment; before any work.
     """
-    from agents.bracketing.policies import Bracketing, run_brackets
+    from agents.bracketing.policies import run_brackets
 
     if not plan.policies:
         raise ValueError("`policies` (=[]) must hold at least one policy")
@@ -202,13 +201,6 @@ def run_bracket_plan(
         with closing(plan.make_envs(budget, scenes)) as envs:
             context = PolicyContext.from_envs(envs)
             made = [(policy, name, make_policy(name, context)) for policy, name in members]
-            for _, name, one in made:
-                built_in = type(one).__module__.startswith("agents.")
-                if built_in and not isinstance(one, Bracketing | Random):
-                    raise ValueError(
-                        f"`policy` (={name!r}) is not for {ENV_ID}: take random, bracket, "
-                        "bracket:fixed, bracket:hasinoff, bracket:planned or one of your own"
-                    )
             for j, (policy, name, one) in enumerate(made):
                 if progress is not None:
                     done = i * len(made) + j
