@@ -191,7 +191,8 @@ def list_policies() -> list[str]:
     metering = [f"{m}:{p}" for m in METERS for p in PROGRAMS]
     oracles = [f"{_ORACLE}:{knows}" for knows in _KNOWN]
     agc = [f"{RPI_AGC}:{p}" for p in MANUAL_PROGRAMS]
-    return sorted([*_SIMPLE, *_LEARNT, *oracles, *metering, *agc])
+    video = [f"{agent}:{VIDEO}" for agent in _LEARNT]
+    return sorted([*_SIMPLE, *_LEARNT, *video, *oracles, *metering, *agc])
 
 
 def is_metering(name: str) -> bool:
@@ -480,8 +481,8 @@ def _unknown(name: str) -> str:
         f"`policy` (={name!r}) must be one of {', '.join((*_SIMPLE, _ORACLE))}; a meter "
         f"({', '.join(METERS)}), alone or with a program ({', '.join(f':{p}' for p in PROGRAMS)}); "
         f"{RPI_AGC}, alone or with {', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
-        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :PATH; {_BRACKET}, alone or with "
-        f"{', '.join(f':{kind}' for kind in _BRACKETS)} or :PATH; "
+        f"{_RECORDED}:FOLDER; regression or ppo, alone or with :{VIDEO} or :PATH; {_BRACKET}, "
+        f"alone or with {', '.join(f':{kind}' for kind in _BRACKETS)} or :PATH; "
         f"package.module:Class or path.py:Class{hint}"
     )
 
