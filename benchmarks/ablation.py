@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import runpy
 import tempfile
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -91,10 +92,11 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
 def _train_recurrent(out: Path, frames: int, seed: int) -> str:
     """Trains the example's agent, with a learning curve, and names it."""
     curve = LearningCurve(sibling(out, ".csv"))
+    recent: deque[float] = deque(maxlen=50)  # as PPO reports it
 
     def callback(variables: dict[str, Any], _: Any) -> bool:
-        reward = float(np.mean(variables["rewards"]))
-        curve(variables["self"].num_timesteps, frames, {"reward": reward})
+        recent.append(float(np.mean(variables["rewards"])))
+        curve(variables["self"].num_timesteps, frames, {"reward": float(np.mean(recent))})
         return True
 
     weights = sibling(out, ".safetensors")

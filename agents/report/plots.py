@@ -136,20 +136,21 @@ def learning_figure(curves: Mapping[str, Mapping[str, Sequence[float]]]) -> Figu
         curves: By training: ``frames``, and each value it reported after so many.
     """
     values = [name for name in next(iter(curves.values())) if name != "frames"]
-    figure = _figure(4.5 * len(values), 3.2)
+    figure = _figure(max(7.5, 4.5 * len(values)), 3.6)
     panels = figure.subplots(1, len(values), squeeze=False)[0]
     for panel, value in zip(panels, values, strict=True):
         for i, (training, curve) in enumerate(curves.items()):
             panel.plot(curve["frames"], curve[value], lw=1.3, label=training, **line_style(i))
         panel.set_xlabel("frames", fontsize=9)
         panel.set_ylabel(f"{value} in training", fontsize=9)
-        if min(min(curve[value]) for curve in curves.values()) > 0.0:
+        if value != "reward":  # an error, which falls
             panel.set_yscale("log")
         panel.grid(color="0.93")
         panel.spines[["top", "right"]].set_visible(False)
         panel.tick_params(which="both", labelsize=8)
     if len(curves) > 1:
-        panels[0].legend(fontsize=8)
+        lines = panels[0].get_lines()
+        figure.legend(lines, list(curves), loc="outside lower center", ncols=4, fontsize=8)
     return figure
 
 
