@@ -211,7 +211,7 @@ def training_seeds(name: str) -> list[str]:
         name: ``"ppo"``, ``"regression"`` or ``"bracket"`` for all seeds that come with the package;
             ``"ppo:video"`` or ``"regression:video"`` for those of `AutoExposureVideo-v0`;
             ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself. Options
-            of the name are those of each.
+            of the name are those of each; with ``ensemble=true`` they decide together, as one.
 
     Raises:
         ValueError: If no file matches a pattern.
@@ -221,12 +221,21 @@ def training_seeds(name: str) -> list[str]:
     """
     base, mark, options = str(name).partition("?")
     head, _, tail = base.partition(":")
-    if head not in _WITH_WEIGHTS or (tail not in ("", VIDEO) and "*" not in tail):
+    if (
+        head not in _WITH_WEIGHTS
+        or is_ensemble(name)
+        or (tail not in ("", VIDEO) and "*" not in tail)
+    ):
         return [name]
     files = weight_files(_shipped(head, tail) + "*" if tail in ("", VIDEO) else tail)
     if not files:
         raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {tail!r}")
     return [f"{head}:{file}{mark}{options}" for file in files]
+
+
+def is_ensemble(name: str) -> bool:
+    """Whether `name` asks for all trainings of a learnt agent as one agent."""
+    return split_options(name)[1].get("ensemble") is True
 
 
 def weight_files(pattern: str) -> list[str]:
@@ -380,7 +389,8 @@ def _with_weights(
     name: str, head: str, tail: str, device: str, options: dict[str, Any]
 ) -> dict[str, Any]:
     """`options` of a learnt agent with its weights, where no network is given."""
-    if "*" in tail:
+    together = options.get("ensemble") is True
+    if "*" in tail and not together:
         raise ValueError(
             f"`policy` (={name!r}) is a pattern, so several agents: it is for evaluations; "
             "`training_seeds` lists the names of the single ones"
@@ -389,7 +399,7 @@ def _with_weights(
         return options
     weights = tail
     if tail in ("", VIDEO):
-        weights = f"{_shipped(head, tail)}{PRETRAINED_SEEDS[0]}"
+        weights = f"{_shipped(head, tail)}{'*' if together else PRETRAINED_SEEDS[0]}"
     return {"weights": weights, "device": device, **options}
 
 

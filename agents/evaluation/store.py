@@ -171,7 +171,8 @@ def _own_files(base: str) -> list[Path]:
     if head.endswith(".py"):
         return _with_neighbours(Path(head).expanduser())
     if head in ("ppo", "regression"):
-        return _named_files(training_seeds(base)[0].partition(":")[2])
+        names = training_seeds(base)
+        return [file for name in names for file in _named_files(name.partition(":")[2])]
     if head == "recorded":
         return _named_files(tail)
     if tail and "." in head:

@@ -7,6 +7,7 @@ each weighted by the network's own confidence.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
+from ae_env.utils.checks import check_flag
 from agents.foresight import Floats, Foresight, LightTracker
 from agents.learning.agent_weights import NetworkPolicy, trained_grid
 from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
@@ -88,6 +90,31 @@ class ScoreRegressor(nn.Module):
         return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE)
 
 
+class Ensemble(nn.Module):
+    """Several trainings as one network (Lakshminarayanan et al., NeurIPS 2017).
+
+    A training's score counts with the precision that it gives it; their mean precision is that of
+    the ensemble.
+
+    Args:
+        members: Networks of the same inputs and states.
+    """
+
+    def __init__(self, members: Sequence[nn.Module]) -> None:
+        super().__init__()
+        self.members = nn.ModuleList(members)
+
+    def forward(
+        self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """As of `ScoreRegressor`."""
+        found = [member(codes, settings, sensors) for member in self.members]
+        scores = torch.stack([score for score, _ in found])
+        precision = torch.exp(-torch.stack([log_variance for _, log_variance in found]))
+        weighted = (precision * scores).sum(dim=0) / precision.sum(dim=0)
+        return weighted, -precision.mean(dim=0).log()
+
+
 def observation_tensors(
     observations: Observations, device: torch.device | str = "cpu"
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
@@ -122,6 +149,7 @@ class RegressionPolicy(NetworkPolicy):
             that promises most in the frames that its controls are in effect in. ``"trend"``: an
             alpha-beta filter expects it; ``"learnt"``: the forecasters that come with the package
             (`LightForecaster`); or the file of another one, or a pattern of several.
+        ensemble: `weights` is a pattern of several trainings, which decide together (`Ensemble`).
     """
 
     kind = "regression"
@@ -133,7 +161,15 @@ class RegressionPolicy(NetworkPolicy):
         network: nn.Module | None = None,
         device: str = "cpu",
         foresight: str = "none",
+        ensemble: bool = False,
     ) -> None:
+        check_flag("ensemble", ensemble)
+        if ensemble and network is None:
+            files = weight_files(str(weights))
+            if not files:
+                raise ValueError(f"`weights` (={str(weights)!r}): no .safetensors file fits")
+            members = [RegressionPolicy(context, file, device=device).network for file in files]
+            weights, network = None, Ensemble(members)
         self.foresight = foresight
         self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):

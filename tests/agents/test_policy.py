@@ -54,6 +54,8 @@ def test_every_listed_name_makes_a_policy(context):
         ("spot?damping=0&damping=0", r"option 'damping' is given twice"),
         ("rpi_agc?constraint=shadow", r"`constraint` \(='shadow'\).*did you mean 'shadows'"),
         ("rpi-agc", r"did you mean 'rpi_agc'"),
+        ("regression:runs/no-*?ensemble=true", r"`weights` .*: no .safetensors file fits"),
+        ("ppo?ensemble=true", r"PPOPolicy does not take the option 'ensemble'"),
         ("recorded", r"must be a folder of raws: 'recorded:FOLDER'"),
     ],
 )
