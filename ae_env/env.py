@@ -33,6 +33,7 @@ from ae_env.scorers import Scorer
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.checks import check_actions, check_seed, check_word
 from simulator.camera import CameraProfile
+from simulator.capture.batch import MODULES
 
 logger = logging.getLogger(__name__)
 
@@ -70,6 +71,20 @@ class AutoExposureBase(SpecProperty):
         return self.core.first_scenes
 
     @property
+    def scene_ids(self) -> tuple[str, ...]:
+        """Names of all scenes, of sequences of all frames, by ``info["scene_id"]`` of a vector
+        environment.
+        """
+        return self.core.scene_ids
+
+    @property
+    def module_names(self) -> tuple[str, ...]:
+        """Steps of the simulator, joined by ``"+"``, by ``info["modules"]`` of a vector
+        environment.
+        """
+        return MODULES
+
+    @property
     def delays(self) -> tuple[int, int, int]:
         """Frames after the next until an action's ISO, exposure time and f-number are in effect."""
         return self.core.options.delays
@@ -85,6 +100,13 @@ class AutoExposureBase(SpecProperty):
     def score_table(self, env_index: int = 0) -> ScoreTable:
         """Expected scores in an environment's current frame, with standard errors and parts."""
         return self.core.score_table(env_index)
+
+    def info_of(self, columns: dict[str, Any], row: int) -> dict[str, Any]:
+        """The info of one environment, plain numbers and names, from the columns of many."""
+        info = _row(columns, row)
+        info["scene_id"] = self.scene_ids[info["scene_id"]]
+        info["modules"] = self.module_names[info["modules"]]
+        return info
 
     def _pictures(self, num_envs: int) -> tuple[np.ndarray, ...] | None:
         """The latest captures, developed, one per environment; None without a render mode."""
@@ -283,13 +305,13 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         super().reset(seed=check_seed(seed))
         self.core.begin(_FIRST, [self.np_random], [chosen])
         self._last = self.core.observe(_FIRST)
-        return _first(self._last.observation), single_info(self._last.info, 0)
+        return _first(self._last.observation), self.info_of(self._last.info, 0)
 
     def step(self, action: np.int64) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes the next frame with the state `action`."""
         ended = self.core.transition(_FIRST, check_actions("action", action, ())[None])
         self._last = self.core.observe(_FIRST)
-        info = single_info(self._last.info, 0)
+        info = self.info_of(self._last.info, 0)
         reward = float(self._last.reward[0])
         return _first(self._last.observation), reward, bool(ended[0]), False, info
 
@@ -315,9 +337,8 @@ def _first(observation: Observation) -> Observation:
     return {name: values[0] for name, values in observation.items()}
 
 
-def single_info(columns: dict[str, Any], row: int) -> dict[str, Any]:
-    """Row `row` of the info columns as the plain numbers that one environment returns."""
+def _row(columns: dict[str, Any], row: int) -> dict[str, Any]:
     return {
-        name: single_info(values, row) if isinstance(values, dict) else values.item(row)
+        name: _row(values, row) if isinstance(values, dict) else values.item(row)
         for name, values in columns.items()
     }

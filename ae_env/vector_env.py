@@ -45,7 +45,9 @@ class AutoExposureVectorEnv(
 ):
     """`num_envs` episodes of `AutoExposureEnv`, photographed in batches.
 
-    Environment i behaves exactly as a single environment seeded with ``seed + i``.
+    Environment i behaves exactly as a single environment seeded with ``seed + i``. Its info holds
+    numbers only, as wrappers for torch and JAX need: ``scene_id`` and ``modules`` are indices into
+    `scene_ids` and `module_names`.
 
     Args:
         num_envs: Number of episodes side by side.
@@ -281,8 +283,8 @@ class AutoExposureVectorEnv(
     def _vector_info(self, columns: dict[str, Any], env_indices: np.ndarray) -> dict[str, Any]:
         """Info columns of `env_indices` in the layout of Gymnasium's vector environments.
 
-        Every column has one entry per environment, 0 or None for those that are not in
-        `env_indices`, and a mask beside it.
+        Every column has one entry per environment, 0 for those that are not in `env_indices`, and
+        a mask beside it.
         """
         info: dict[str, Any] = {}
         masks = np.zeros((len(columns), self.num_envs), dtype=bool)
@@ -291,8 +293,7 @@ class AutoExposureVectorEnv(
             if isinstance(values, dict):
                 values = self._vector_info(values, env_indices)
             elif len(env_indices) < self.num_envs:
-                empty = None if values.dtype == object else 0
-                some, values = values, np.full(self.num_envs, empty, values.dtype)
+                some, values = values, np.zeros(self.num_envs, values.dtype)
                 values[env_indices] = some
             info[name], info[f"_{name}"] = values, mask
         return info

@@ -28,6 +28,11 @@ FRAME_GAP = 1.0 / 60.0
 BRACKET_NUMBERS = ("time_left", "frames_left", "white", "noisy")
 #: A merged sample whose standard deviation is a larger share of it counts as noisy.
 NOISY = 0.1
+#: What is kept of the frames of each episode, n long.
+_PROGRESS = (
+    *("_numbers", "_gains", "_noise", "_left", "_clock", "_first_middle", "_middle", "_count"),
+    *("_fresh", "_quality", "_error", "_unseen", "_white", "_noisy"),
+)
 _STAY = Taps(np.zeros(4, np.int64), np.zeros(4, np.int64), np.array([1, 0, 0, 0], np.float32))
 
 
@@ -52,11 +57,19 @@ class BracketCore(EpisodeCore):
         num_envs: Number of episodes side by side.
         budget: Time that all frames of an episode may take together [s].
         max_frames: Frames of an episode at most.
+        scenes: As of `EpisodeCore`.
     """
 
-    def __init__(self, options: EnvOptions, num_envs: int, budget: float, max_frames: int) -> None:
+    def __init__(
+        self,
+        options: EnvOptions,
+        num_envs: int,
+        budget: float,
+        max_frames: int,
+        scenes: list[Scene] | None = None,
+    ) -> None:
         self.shown, self.budget, self.max_frames = options.observation, budget, max_frames
-        super().__init__(replace(options, observation="dn"), num_envs)
+        super().__init__(replace(options, observation="dn"), num_envs, scenes)
         size = (num_envs, max_frames, 4, options.resolution, options.resolution)
         self._numbers = np.zeros(size, np.uint16)
         self._gains = np.zeros((num_envs, max_frames))
@@ -74,6 +87,19 @@ class BracketCore(EpisodeCore):
         self._black, self._span = (
             torch.from_numpy(a.astype(np.float32))[:, None, None] for a in (black, span)
         )
+
+    def _arguments(self) -> dict[str, Any]:
+        limits = {"budget": self.budget, "max_frames": self.max_frames}
+        shown = replace(self.options, observation=self.shown)
+        return super()._arguments() | limits | {"options": shown}
+
+    def _progress(self) -> dict[str, Any]:
+        return super()._progress() | {name: getattr(self, name) for name in _PROGRESS}
+
+    def _resume(self, progress: Mapping[str, Any]) -> None:
+        super()._resume(progress)
+        for name in _PROGRESS:
+            getattr(self, name)[:] = progress[name]
 
     @property
     def stop(self) -> int:

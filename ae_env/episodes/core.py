@@ -7,6 +7,7 @@ actions, and `EpisodeCore.observe`, which photographs, scores and reports.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -63,7 +64,8 @@ class Frames:
 
     Args:
         observation: Arrays by name, n long; new ones every time.
-        info: Columns by name, n long; ``rewards`` is a dictionary of columns.
+        info: Columns of numbers by name, n long; ``rewards`` is a dictionary of columns.
+            ``scene_id`` and ``modules`` are indices into `EpisodeCore.scene_ids` and `MODULES`.
         reward: (n,) float64.
         raw: (n, 4, R, R) the whole frames, also where less of them is observed.
     """
@@ -77,18 +79,24 @@ class Frames:
 class EpisodeCore:
     """Scenes, grid, camera and scorer, and the episodes that run on them.
 
+    A pickle holds its arguments and where the episodes are; scenes are loaded, and everything else
+    is worked out again, where it is unpickled.
+
     Args:
         options: The environment's arguments.
         num_envs: Number of episodes side by side.
+        scenes: Those of `options` where they are loaded already.
     """
 
-    def __init__(self, options: EnvOptions, num_envs: int) -> None:
+    def __init__(
+        self, options: EnvOptions, num_envs: int, scenes: list[Scene] | None = None
+    ) -> None:
         self.options = options
         self.grid = options.make_grid()
         self.camera = options.make_camera()
         self.scorer = options.make_scorer()
         self.lighting = options.make_lighting()
-        self.scenes = options.load_scenes()
+        self.scenes = options.load_scenes() if scenes is None else scenes
         self.tables = ScoreTables(
             self.grid,
             self.camera,
@@ -101,7 +109,7 @@ class EpisodeCore:
         self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
         self._allowed = np.stack([allowed_states(scene, len(self.grid)) for scene in self.scenes])
         self._draws = Draws(options, self.first_scenes, len(self.grid))
-        self._scene_ids = np.array([scene.scene_id for scene in self.scenes], object)
+        self.scene_ids = tuple(scene.scene_id for scene in self.scenes)
         states = self.grid.states
         apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
         self._settings = encode_settings(apex)
@@ -137,6 +145,26 @@ class EpisodeCore:
             static=self._static,
             expected=options.reward == "expected",
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self._arguments(), self._progress())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> EpisodeCore:
+        progress = copy.deepcopy(self._progress(), memo)
+        return _restored(type(self), {**self._arguments(), "scenes": self.scenes}, progress)
+
+    def _arguments(self) -> dict[str, Any]:
+        """What the constructor makes the same core from."""
+        return {"options": self.options, "num_envs": len(self.episodes.begun)}
+
+    def _progress(self) -> dict[str, Any]:
+        """Where the episodes are."""
+        return {"episodes": self.episodes.columns()}
+
+    def _resume(self, progress: Mapping[str, Any]) -> None:
+        for name, values in progress["episodes"].items():
+            getattr(self.episodes, name)[:] = values
+        self._set_light_index(np.flatnonzero(self.episodes.begun))
 
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
@@ -278,7 +306,7 @@ class EpisodeCore:
             normals = columns.pop("sensor_normals")
             observation["sensors"] = encode_sensors(speed, focus_drive, normals)
         rewards, reward = self._reward(env_indices, columns)
-        info: dict[str, Any] = {"scene_id": self._scene_ids[episodes.scene[env_indices]]}
+        info: dict[str, Any] = {"scene_id": episodes.scene[env_indices]}
         info["state"] = states
         info |= zip(_STATE_INFO, self._bounds[:, states], strict=True)
         info |= columns | {"rewards": rewards}
@@ -454,3 +482,11 @@ class EpisodeCore:
             )
             self._tables.put(key, table, table.nbytes)
         return table
+
+
+def _restored(
+    kind: type[EpisodeCore], arguments: dict[str, Any], progress: Mapping[str, Any]
+) -> EpisodeCore:
+    core = kind(**arguments)
+    core._resume(progress)
+    return core

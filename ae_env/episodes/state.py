@@ -108,6 +108,10 @@ class Episodes:
         )
         self.frame[env_indices] += 1
 
+    def columns(self) -> dict[str, np.ndarray]:
+        """All arrays by name; what the episodes are, and where."""
+        return {name: v for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+
     def __getitem__(self, env_index: int) -> Episode:
         return Episode(**{name: getattr(self, name).item(env_index) for name in _FIELDS})
 

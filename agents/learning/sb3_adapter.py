@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from ae_env.env import single_info
 from agents.learning.augmentation import moved
 
 
@@ -33,6 +32,7 @@ class SB3VectorAdapter(VecEnv):
             raise ValueError(f"`envs` must have autoreset_mode='SAME_STEP', got {mode}")
         self.envs = envs
         self.render_mode = envs.render_mode
+        self._info_of = cast(Any, envs.unwrapped).info_of
         self._actions: np.ndarray | None = None
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
@@ -42,7 +42,8 @@ class SB3VectorAdapter(VecEnv):
         names = {name for own in self._options for name in own}
         options = {name: [own.get(name) for own in self._options] for name in names}
         observations, infos = self.envs.reset(seed=seeds, options=options)
-        self.reset_infos = [self._info(infos, i) for i in range(self.num_envs)]
+        columns = _columns(infos)
+        self.reset_infos = [self._info_of(columns, i) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return observations
@@ -55,26 +56,20 @@ class SB3VectorAdapter(VecEnv):
         """Takes the step and returns observations, float32 rewards, dones and infos."""
         observations, rewards, terminated, truncated, infos = self.envs.step(self._actions)
         dones = terminated | truncated
-        final = infos.get("final_obs")
+        final, columns = infos.get("final_obs"), _columns(infos)
+        last = _columns(infos.get("final_info", {}))
+        info_of = self._info_of
         rows: list[dict[str, Any]] = []
         for i in range(self.num_envs):
             row: dict[str, Any] = {"TimeLimit.truncated": bool(truncated[i] and not terminated[i])}
             if dones[i] and final is not None:
-                self.reset_infos[i] = self._info(infos, i)
-                row |= self._info(infos["final_info"], i)
+                self.reset_infos[i] = info_of(columns, i)
+                row |= info_of(last, i)
                 row["terminal_observation"] = final[i]
             else:
-                row |= self._info(infos, i)
+                row |= info_of(columns, i)
             rows.append(row)
         return observations, rewards.astype(np.float32), dones, rows
-
-    @staticmethod
-    def _info(infos: dict[str, Any], index: int) -> dict[str, Any]:
-        skipped = ("final_obs", "final_info")
-        columns = {k: v for k, v in infos.items() if not k.startswith("_") and k not in skipped}
-        nested = {k: v for k, v in columns.items() if isinstance(v, dict)}
-        info = single_info({k: v for k, v in columns.items() if k not in nested}, index)
-        return info | {k: SB3VectorAdapter._info(v, index) for k, v in nested.items()}
 
     def close(self) -> None:
         """Closes the vector environment."""
@@ -146,3 +141,12 @@ class MovedFrames(VecEnvWrapper):
 
     def _shown(self, observations: Any) -> dict[str, np.ndarray]:
         return {**observations, "raw": moved(observations["raw"], self.rng)}
+
+
+def _columns(infos: dict[str, Any]) -> dict[str, Any]:
+    """The columns of a vector environment's info, without their masks and the final ones."""
+    return {
+        name: _columns(values) if isinstance(values, dict) else values
+        for name, values in infos.items()
+        if not name.startswith(("_", "final_"))
+    }

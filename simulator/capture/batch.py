@@ -27,6 +27,15 @@ from simulator.optics.blur_kernels import Blur, blur_many
 from simulator.settings import CameraSettings
 from simulator.utils.threads import in_shares
 
+#: The steps of a capture that a scene may not need, in order; the exposure always runs.
+_STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
+_NOISE_BIT = 1 << _STEPS.index("noise")
+#: Names of the steps that made a frame, joined by ``"+"``: one entry for each combination.
+MODULES = tuple(
+    "+".join(["exposure", *(name for bit, name in enumerate(_STEPS) if index >> bit & 1)])
+    for index in range(1 << len(_STEPS))
+)
+
 
 @dataclass
 class FrameStatistics:
@@ -39,7 +48,7 @@ class FrameStatistics:
             to it; in flickering light, that of the frame's mean light.
         predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
             light without noise only what is left out.
-        modules: Names of the steps that ran, joined by ``"+"``.
+        modules: (B,) int64 index into `MODULES`: the steps that ran.
         source_noise: (B, 2, 4) shot and read noise that the source brings to the frame.
         keys: Keys of the noise, uint64.
     """
@@ -293,9 +302,12 @@ def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
     return statistics.relative_excess_variance(exposure.ratio, source, target)
 
 
-def _modules(exposure: Exposure, noise: bool) -> str:
-    names = ["exposure", *(step.name for step in exposure.steps if step.runs)]
-    return "+".join(names + ["noise"] * noise)
+def _modules(exposure: Exposure, noise: bool) -> int:
+    """Index into `MODULES`."""
+    found = noise * _NOISE_BIT
+    for step in exposure.steps:
+        found |= step.runs << _STEPS.index(step.name)
+    return found
 
 
 class _Rows:
@@ -309,7 +321,7 @@ class _Rows:
         excess_variance: As in `FrameStatistics`; NaN where it depends on blurred light that is not
             made yet.
         predicted_error: As in `FrameStatistics`.
-        modules: Names of the steps, joined by ``"+"``.
+        modules: As in `FrameStatistics`.
         light: (4, H, W) that is exposed; where it is blurred, until its scene blurs another.
         remaining_variance: `Exposure.remaining_variance` of that light; None for all.
         blurs: Whether the light must be blurred; else it is the scene's own.
@@ -320,10 +332,11 @@ class _Rows:
     def __init__(self, count: int) -> None:
         self.gain, self.excess_variance = np.full(count, np.nan), np.zeros(count)
         self.predicted_error = np.zeros(count)
+        self.modules = np.zeros(count, np.int64)
         self.table, self.blurs = np.zeros((count, 5, 4), np.float32), np.zeros(count, bool)
         self.any_blurs = False
-        objects = np.empty((4, count), object)
-        self.modules, self.light, self.remaining_variance, self.exposure = objects
+        objects = np.empty((3, count), object)
+        self.light, self.remaining_variance, self.exposure = objects
 
     def forget(self, rows: slice) -> None:
         """Makes `rows` unknown."""

@@ -60,13 +60,28 @@ def assert_same(first: Any, second: Any, where: str = "") -> None:
     assert_equal(first, second, where, rtol=1e-8, atol=1e-12)
 
 
+def named(envs: Any, results: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What `envs` returned, with names in its info as single environments have them."""
+    tables = {"scene_id": envs.unwrapped.scene_ids, "modules": envs.unwrapped.module_names}
+
+    def names(info: dict[str, Any]) -> dict[str, Any]:
+        info = {k: names(v) if isinstance(v, dict) else v for k, v in info.items()}
+        for key, table in tables.items():
+            if key in info:
+                known = zip(info[key], info[f"_{key}"], strict=True)
+                info[key] = np.array([table[i] if shown else None for i, shown in known], object)
+        return info
+
+    return (*results[:-1], names(results[-1]))
+
+
 def check_parity(seed: int, steps: int, mode: str = "SAME_STEP", **arguments: Any) -> None:
     """The native vector environment shows what single ones show, out of step with each other."""
     make = functools.partial(make_worker_env, **arguments)
     envs = make_envs(autoreset_mode=mode, **arguments)
     reference = SyncVectorEnv([make] * 3, autoreset_mode=AutoresetMode[mode], copy=True)
     assert envs.metadata["autoreset_mode"] == AutoresetMode[mode]
-    assert_same(envs.reset(seed=seed), reference.reset(seed=seed), "reset")
+    assert_same(named(envs, envs.reset(seed=seed)), reference.reset(seed=seed), "reset")
     rng, states = np.random.default_rng(seed), envs.single_action_space.n
     finished = np.zeros(3, dtype=bool)
     for step in range(steps):
@@ -74,8 +89,9 @@ def check_parity(seed: int, steps: int, mode: str = "SAME_STEP", **arguments: An
         mask |= [False, step == 1, False]  # from here on the episodes end at different steps
         if mask.any():
             options = {"reset_mask": mask, "state": 1}
-            assert_same(*(e.reset(options=dict(options)) for e in (envs, reference)), "again")
+            mine, theirs = (e.reset(options=dict(options)) for e in (envs, reference))
+            assert_same(named(envs, mine), theirs, "again")
         actions = rng.integers(states, size=3)
         mine, theirs = envs.step(actions), reference.step(actions)
-        assert_same(mine, theirs, f"step {step}")
+        assert_same(named(envs, mine), theirs, f"step {step}")
         finished = mine[2] | mine[3]

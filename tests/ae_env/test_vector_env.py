@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.wrappers.vector import NumpyToTorch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,10 +85,12 @@ def test_reset_options_per_environment() -> None:
     envs = make_envs()
     ids = [envs.unwrapped.scenes[i].scene_id for i in (0, 2, 4)]
     _, info = envs.reset(seed=0, options={"scene": ids, "state": [1, 2, 3]})
-    assert info["scene_id"].tolist() == ids
+    names = envs.unwrapped.scene_ids
+    assert [names[i] for i in info["scene_id"]] == ids
     np.testing.assert_array_equal(envs.unwrapped.states, [1, 2, 3])
     _, info = envs.reset(options={"scene": ids[1], "state": 9})
-    assert (info["scene_id"].tolist(), info["state"].tolist()) == ([ids[1]] * 3, [9] * 3)
+    assert [names[i] for i in info["scene_id"]] == [ids[1]] * 3
+    assert info["state"].tolist() == [9] * 3
     states = torch.tensor([4, 5, 6])
     for own, wanted in ((states, [4, 5, 6]), (deque([4, 5, 6]), [4, 5, 6]), (states[0], [4] * 3)):
         envs.reset(options={"state": own})
@@ -186,3 +189,13 @@ def test_episodes_do_not_depend_on_their_index(
     if noise:
         shown = {tuple(frame[0].tobytes() for frame in frames) for frames in first}
         assert len(shown) == len(seeds)
+
+
+def test_wrappers_that_turn_everything_into_tensors_work() -> None:
+    """Their info holds numbers only."""
+    for mode in ("NEXT_STEP", "DISABLED"):  # Gymnasium's `final_obs` is an array of objects
+        envs = NumpyToTorch(make_envs(autoreset_mode=mode, max_episode_steps=1))
+        _, info = envs.reset(seed=0)
+        assert info["modules"].dtype == torch.int64
+        *_, info = envs.step(torch.tensor([5, 6, 7]))
+        assert info["rewards"]["score"].shape == (3,)

@@ -210,7 +210,7 @@ def test_forbidden_states_are_masked_never_best_and_never_drawn() -> None:
     envs = make_envs(64, scenes=[free, holes], motion="none", depth="far", with_oracle=True)
     assert envs.action_masks().all()  # before the first reset
     _, info = envs.reset(seed=0)
-    shows_holes = info["scene_id"] == "holes"
+    shows_holes = info["scene_id"] == envs.scene_ids.index("holes")
     assert 10 < shows_holes.sum() < 54
     wanted = np.where(shows_holes[:, None], allowed, True)
     np.testing.assert_array_equal(envs.action_masks(), wanted)
@@ -256,3 +256,10 @@ def test_expected_rewards_are_the_tables(lighting: str, monkeypatch: pytest.Monk
         assert asked == []
         assert reward == pytest.approx(env.expected_scores()[state], abs=1e-6)
         asked.clear()
+
+
+def test_a_pickle_holds_no_scenes_that_have_a_name() -> None:
+    envs = make_envs(2, scenes="bundled:small")
+    envs.reset(seed=0)
+    light = sum(scene.light.nbytes for scene in envs.scenes)
+    assert len(pickle.dumps(envs)) < 0.5 * light

@@ -12,7 +12,7 @@ import torch
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import batch as batch_module
 from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.batch import CaptureBatch
+from simulator.capture.batch import MODULES, CaptureBatch
 from simulator.capture.sensor import Transitions, noise_balance, record
 from simulator.noise.generator import Noise, noise_keys, single_normals
 
@@ -92,7 +92,7 @@ def test_frames_are_those_of_each_scene_alone(noise: Noise | None, cache_light: 
             modules = ["exposure", *["aperture"] * (exposure.opened_to is not None)]
             modules += ["defocus"] * (exposure.defocus_px > 0)
             modules += ["motion_blur"] * (exposure.motion_px > 0) + ["noise"] * bool(noise)
-            assert found.modules[i] == "+".join(modules)
+            assert MODULES[found.modules[i]] == "+".join(modules)
             seen |= set(modules)
             balance = noise_balance(prepared(i).blurred_light.blurred(exposure), exposure)
             excess = balance.relative_excess_variance if noise else 0.0
