@@ -22,6 +22,7 @@ from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
 from ae_env.scenes.stored import cached_scenes
 from simulator.camera import CameraProfile
 from simulator.utils.cache import cache_key
+from simulator.utils.threads import in_shares
 
 logger = logging.getLogger(__name__)
 
@@ -87,10 +88,17 @@ def _make(
     size: Size,
     kinds: Sequence[str],
 ) -> Iterator[Scene]:
-    logger.info("making the bundled scenes of split %r for camera %s", split, camera.name)
-    for kind, index in _procedural(split, size):
-        if kind in kinds:
-            yield drape(_procedural_scene(kind, index, camera)).resized(resolution, crop)
+    logger.warning("drawing the bundled scenes (%s), once for this camera and resolution", split)
+    drawn = [(kind, index) for kind, index in _procedural(split, size) if kind in kinds]
+    made: list[Scene | None] = [None] * len(drawn)
+
+    def draw_some(first: int, last: int) -> None:
+        for i in range(first, last):
+            scene = _procedural_scene(*drawn[i], camera)
+            made[i] = drape(scene).resized(resolution, crop)
+
+    in_shares(draw_some, len(drawn))
+    yield from (scene for scene in made if scene is not None)
     photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
         for scene in photograph_scenes(photograph, camera):

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from simulator.utils.jit import kernel
+
 #: Number of times that the leaves cover the frame; gaps show the ground.
 _COVERAGE = 3.0
 #: A square of this half side has about the area of the unit disc.
 _SQUARE_HALF_SIDE = 0.886
-#: Candidate pixels tested at a time: small enough for the processor's caches.
-_CHUNK = 16_384
 
 
 @dataclass(frozen=True)
@@ -123,11 +123,7 @@ def paint_leaves(
     centre_x: np.ndarray,
     shape: np.ndarray,
 ) -> np.ndarray:
-    """(size, size) label of the topmost leaf at each pixel, 0 for the ground.
-
-    The candidates of the leaves' bounding boxes are laid out one after the other in painting
-    order, many leaves at once, and the last assignment to a pixel stays.
-    """
+    """(size, size) label of the topmost leaf at each pixel, 0 for the ground."""
     angle, elongation, is_box = shape
     cosine, sine = np.abs(np.cos(angle)), np.abs(np.sin(angle))
     along, across = radius * elongation, radius / elongation  # semi-axes
@@ -143,33 +139,39 @@ def paint_leaves(
     left = np.clip(np.ceil(centre_x - reach_x), 0, size).astype(np.int32)
     width = np.clip(np.floor(centre_x + reach_x) + 1, 0, size).astype(np.int32) - left
     bottom, width = np.maximum(bottom, top), np.maximum(width, 0)
-    count = (bottom - top) * width
-    end = np.cumsum(count)
-
     scale = np.stack([np.cos(angle), np.sin(angle)]) / radius
-    u_x, u_y = (scale / elongation).astype(np.float32)
-    v_y, v_x = (scale * elongation).astype(np.float32)
+    turned = np.stack([*(scale / elongation), *(scale * elongation)]).astype(np.float32)
     centre = np.stack([centre_y, centre_x]).astype(np.float32)
-    label = np.zeros(size * size, np.int32)
-    first = 0
-    while first < len(radius):
-        offset = int(end[first] - count[first])
-        last = max(int(np.searchsorted(end, offset + _CHUNK, side="right")), first + 1)
-        counts = count[first:last]
-        leaf = np.repeat(np.arange(first, last, dtype=np.int32), counts)
-        within = np.arange(len(leaf), dtype=np.int32)
-        within -= (end - count - offset).astype(np.int32)[leaf]
-        row = within // width[leaf]
-        y = row + top[leaf]
-        x = within - row * width[leaf] + left[leaf]
-        dy, dx = y - centre[0][leaf], x - centre[1][leaf]
-        u = dx * u_x[leaf] + dy * u_y[leaf]
-        v = dy * v_y[leaf] - dx * v_x[leaf]
-        square = np.maximum(np.abs(u), np.abs(v)) < _SQUARE_HALF_SIDE
-        inside = np.where(boxes[leaf], square, u * u + v * v < 1.0)
-        label[(y * size + x)[inside]] = leaf[inside] + 1
-        first = last
-    return label.reshape(size, size)
+    label = np.zeros((size, size), np.int32)
+    _paint(label, np.stack([top, bottom, left, left + width]), centre, turned, boxes)
+    return label
+
+
+@kernel(boundscheck=False)
+def _paint(label, bounds, centre, turned, boxes):  # type: ignore[no-untyped-def]
+    """Writes the number of each leaf, from 1, over those before it.
+
+    Args:
+        label: (H, W) int32, changed in place.
+        bounds: (4, N) first row, end of the rows, first column, end of the columns.
+        centre: (2, N) float32 row and column.
+        turned: (4, N) float32 factors of dx and dy along the leaf, and of dy and dx across it.
+        boxes: (N,) whether it is a box.
+    """
+    for leaf in range(len(boxes)):
+        u_x, u_y, v_y, v_x = turned[0, leaf], turned[1, leaf], turned[2, leaf], turned[3, leaf]
+        for y in range(bounds[0, leaf], bounds[1, leaf]):
+            dy = np.float64(y) - centre[0, leaf]
+            for x in range(bounds[2, leaf], bounds[3, leaf]):
+                dx = np.float64(x) - centre[1, leaf]
+                u = dx * u_x + dy * u_y
+                v = dy * v_y - dx * v_x
+                if boxes[leaf]:
+                    inside = max(abs(u), abs(v)) < _SQUARE_HALF_SIDE
+                else:
+                    inside = u * u + v * v < 1.0
+                if inside:
+                    label[y, x] = leaf + 1
 
 
 def _texture(

@@ -25,6 +25,7 @@ from agents.cli.simulate import simulate
 from agents.cli.sweep import sweep
 from agents.cli.train_agent import train
 from agents.cli.train_simulator import train_simulator
+from agents.cli.warm_up import warm_up
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -35,7 +36,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(film, cache),
+    *(film, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

@@ -21,7 +21,7 @@ from numba import types
 from numba.core import event
 
 logger = logging.getLogger(__name__)
-_PACKAGE = __name__.partition(".")[0]
+_PACKAGES = ("simulator", "ae_env")
 #: Folder of the packages.
 _ROOT = Path(__file__).parents[2]
 #: The modules and names of imports from this project, one line or in parentheses.
@@ -87,12 +87,20 @@ def _checksum(module: Path) -> int:
 
 
 class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
-    """Logs each kernel of this package before it is compiled: its first call takes seconds."""
+    """Says that kernels are compiled, which takes seconds, and logs each one of this package."""
+
+    said = False
 
     def on_start(self, event: Any) -> None:
         """Numba is about to compile a function, not to load one from its cache."""
         function = event.data["dispatcher"].py_func
-        if function.__module__.partition(".")[0] == _PACKAGE:
+        if function.__module__.partition(".")[0] in _PACKAGES:
+            if not self.said:
+                logger.warning(
+                    "compiling the simulator, once on this machine (10 to 20 s; `ae-env warm-up` "
+                    "does it beforehand)"
+                )
+                self.said = True
             logger.info("compiling %s.%s", function.__module__, function.__name__)
 
     def on_end(self, event: Any) -> None:
