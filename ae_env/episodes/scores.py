@@ -16,6 +16,9 @@ from simulator.capture.batch import CaptureBatch, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.noise.noise_level_function import NoiseLevelFunction
 
+#: From so many new captures on, each is scored alone; below, all states of their lights are.
+_MANY = 8
+
 
 class PartScores:
     """Scores the captures of running episodes.
@@ -53,11 +56,11 @@ class PartScores:
         self.scenes, self.episodes, self._static = scenes, episodes, static
         self._code_scores, self._others = tables.code_scores, tables.others
         others = self._others
-        # By `Episodes.light_index` and state; and which lights have been scored.
+        # By `Episodes.light_index` and state; and which have been scored.
         lights = len(scenes) + len(episodes.light_index)
         self._known = [] if others is None else others.names("light", "blur")
         self._scores = np.zeros((lights, len(self.grid), len(self._known)))
-        self._scored = np.zeros(lights, bool)
+        self._scored = np.zeros((lights, len(self.grid)), bool)
         self._means = np.full((lights, len(self.grid), 3), np.nan)
         self._box_factors = np.array([scene.box_factor for scene in scenes])
         self.reads_images = not tables.closed_form and not expected
@@ -65,7 +68,7 @@ class PartScores:
         self._expected = expected
         self.reads_codes = self._measures and not expected
         self.reads_pixels = self.reads_images or (
-            not static and others is not None and any(map(reads_pixels, others.parts.values()))
+            others is not None and any(map(reads_pixels, others.parts.values()))
         )
 
     def forget(self, lights: np.ndarray) -> None:
@@ -97,7 +100,7 @@ class PartScores:
         captures: Captures | None = None
         if self.reads_images or not self._static or self._code_scores.reads_captures:
             captures = self._captures(env_indices, gains, rows, brought)
-        scores = self._known_scores(env_indices, captures)
+        scores = self._known_scores(env_indices, captures, gains, brought)
         if self._measures:
             states = self.episodes.state[env_indices]
             if codes is None:
@@ -112,18 +115,40 @@ class PartScores:
         return {f"score:{name}": values for name, values in scores.items()}
 
     def _known_scores(
-        self, env_indices: np.ndarray, captures: Captures | None
+        self,
+        env_indices: np.ndarray,
+        captures: Captures | None,
+        gains: np.ndarray,
+        brought: np.ndarray,
     ) -> dict[str, np.ndarray]:
-        """Scores of the parts that look at no frame."""
+        """Scores of the parts that look at no frame; in static light, cached."""
         if self._others is None or not self._known:
             return {}
         if not self._static and captures is not None:
             found = self._others.score_parts(None, captures, ("light", "blur"))
             return {name: values.numpy() for name, values in found.items()}
         lights, states = self.episodes.light_index[env_indices], self.episodes.state[env_indices]
-        if not self._scored[lights].all():
-            self._score(env_indices)
+        new = np.flatnonzero(~self._scored[lights, states])
+        if len(new) >= _MANY:
+            own = self._captures(env_indices[new], gains[new], None, brought[new])
+            found = self._others.score_parts(None, own, ("light", "blur"))
+            columns = [found[name].numpy() for name in self._known]
+            self._scores[lights[new], states[new]] = np.stack(columns, axis=1)
+            self._scored[lights[new], states[new]] = True
+        else:
+            self._score_all_states(env_indices[new])
         return dict(zip(self._known, self._scores[lights, states].T, strict=True))
+
+    def _score_all_states(self, env_indices: np.ndarray) -> None:
+        """Scores every state of the lights of `env_indices`: one by one takes longer."""
+        for env_index in env_indices.tolist():
+            light, scene = (
+                int(of_each[env_index])
+                for of_each in (self.episodes.light_index, self.episodes.scene)
+            )
+            parts = self.tables.known_parts(self.scenes[scene], self._prepared(light))
+            self._scores[light] = np.stack([parts[name] for name in self._known], axis=1)
+            self._scored[light] = True
 
     def _expected_means(
         self, env_indices: np.ndarray, boxes: np.ndarray, rows: np.ndarray | None
@@ -165,15 +190,3 @@ class PartScores:
             source_noise=noises,
             noisy=self.tables.noise,
         )
-
-    def _score(self, env_indices: np.ndarray) -> None:
-        """Scores the parts that look at no frame, where the lights of `env_indices` lack them."""
-        lights, first = np.unique(self.episodes.light_index[env_indices], return_index=True)
-        missing = ~self._scored[lights]
-        lights, first = lights[missing], first[missing]
-        for light, env_index in zip(lights.tolist(), env_indices[first].tolist(), strict=True):
-            episode = self.episodes[env_index]
-            parts = self.tables.known_parts(self.scenes[episode.scene], self._prepared(light))
-            for column, name in enumerate(self._known):
-                self._scores[light, :, column] = parts[name]
-        self._scored[lights] = True

@@ -21,7 +21,10 @@ COMMANDS = [
     "sweep",
     "train",
 ]
-COMMANDS.append("train-simulator")
+COMMANDS += ["train-simulator", "warm-up"]
+#: Those that write no folder of results, and those that draw nothing at random.
+NO_OUT = ("cache", "scenes", "scorers", "warm-up")
+NO_SEED = (*NO_OUT, "convert-nima")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
 from agents import Policy
@@ -52,8 +55,8 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert result.exit_code == 0
     text = re.sub(r"\x1b\[[0-9;]*m", "", result.output)
     assert re.search(rf"Example: \W?ae-env {command} ", text)
-    assert ("--out" in text) == (command not in ("cache", "scenes", "scorers"))
-    assert ("--seed" in text) == (command not in ("cache", "scenes", "scorers", "convert-nima"))
+    assert ("--out" in text) == (command not in NO_OUT)
+    assert ("--seed" in text) == (command not in NO_SEED)
 
 
 def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
