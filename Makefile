@@ -1,6 +1,8 @@
 # make demo   sets up .venv and runs the quickstart
 # make test   sets up .venv and runs the test suite
 # make check  lint, format and types
+# make dist   the wheel and the source distribution, in dist/
+# make check-dist  installs the wheel in a new environment and runs every command there
 # make bench  the measurements in docs/results, except the long training
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -8,7 +10,7 @@ VENV := .venv
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
 
-.PHONY: demo test check format bench clean $(VENV)
+.PHONY: demo test check format dist check-dist bench clean $(VENV)
 
 demo: $(STAMP)
 	$(BIN)/ae-env quickstart
@@ -24,6 +26,13 @@ check: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+dist: $(STAMP)
+	rm -rf dist build/lib
+	$(BIN)/python -m build
+
+check-dist: dist
+	.ci/check-dist $(PYTHON)
 
 bench: $(STAMP)
 	$(BIN)/ae-env bench scorers

@@ -9,6 +9,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from ae_env.registration import register_envs
+from ae_env.utils.packages import check_package
+
+check_package("simulator")
 
 if TYPE_CHECKING:
     from ae_env import lighting as lighting

@@ -49,6 +49,14 @@ def find_preset(name: str | PathLike[str], kind: str = "env") -> Path:
     )
 
 
+def find_config(path: Path) -> Path:
+    """The YAML file at `path`; of one below ``configs/`` that is not there, the package's own."""
+    if path.is_file() or path.parts[:1] != ("configs",) or ".." in path.parts:
+        return path
+    files = (folder.joinpath(*path.parts[1:]) for folder in _FOLDERS)
+    return next((file for file in files if file.is_file()), path)
+
+
 def load_preset(name: str | PathLike[str]) -> dict[str, Any]:
     """Arguments of the environment from a preset of ``configs/env``.
 

@@ -13,9 +13,11 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 
+from ae_env import __version__
 from ae_env.utils.checks import UserCodeError
 from agents.cli.bench import bench
 from agents.cli.cache_command import cache
+from agents.cli.console import print_line
 from agents.cli.evaluate import evaluate
 from agents.cli.film import film
 from agents.cli.quickstart import quickstart
@@ -99,11 +101,20 @@ def _one_line(error: Exception) -> str:
     return f"{type(error).__name__}: {text}; `ae-env --debug` shows where"
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        print_line(f"ae-env {__version__}")
+        raise typer.Exit
+
+
 @app.callback(
     help="Train and judge auto-exposure on simulated raws. Start with `ae-env quickstart`."
 )
 def _options(
     debug: Annotated[bool, typer.Option(help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", callback=_version, is_eager=True)
+    ] = False,
 ) -> None:
     # `main` looks for the option itself: it must know before the arguments are parsed.
-    del debug
+    del debug, version

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ae_env.utils.presets import find_config
 from agents.cli.console import (
     Device,
     OwnSeed,
@@ -44,7 +45,7 @@ def train(
     from simulator.utils.files import sibling
 
     device = torch_device(device)
-    agent = load_config(config)
+    agent = load_config(find_config(config))
     file = sibling(out, ".json")
     make_folder(file.parent, file=file)
     if seed is not None:

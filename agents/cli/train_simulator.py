@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ae_env.utils.presets import find_config
 from agents.cli.console import (
     Device,
     OwnSeed,
@@ -51,7 +52,7 @@ def train_simulator(
     from simulator.training.config import load_config
     from simulator.training.train import load_start, train_and_save
 
-    training = load_config(config)
+    training = load_config(find_config(config))
     if seed is not None:
         training = training.model_copy(update={"seed": seed})
     if training.start is not None:

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import ae_env
 from ae_env.options import EnvOptions
 from ae_env.scenes.loading import BUNDLED, BUNDLED_PARTS
+from ae_env.utils.presets import find_config
 from tests.ae_env.environments import ID, SMALL
 
 PRESETS = ae_env.list_presets()
@@ -77,3 +78,15 @@ def test_every_package_and_the_presets_are_installed() -> None:
     assert set(setuptools["packages"]) == found | {"ae_env.configs"}
     assert setuptools["package-dir"] == {"ae_env.configs": "configs"}
     assert setuptools["package-data"]["ae_env.configs"] == ["**/*.yaml"]
+
+
+def test_a_config_of_the_package_is_found_from_anywhere(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = find_config(Path("configs/simulator/nano.yaml"))
+    assert shipped.is_file()
+    for own in ("configs/none.yaml", "configs/../configs/ppo.yaml", "ppo.yaml"):
+        assert find_config(Path(own)) == Path(own)
+    mine = Path("configs/ppo.yaml")
+    mine.parent.mkdir()
+    mine.touch()
+    assert find_config(mine) == mine

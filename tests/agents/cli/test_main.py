@@ -1,3 +1,4 @@
+import importlib.metadata
 import re
 import runpy
 from pathlib import Path
@@ -57,6 +58,11 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert re.search(rf"Example: \W?ae-env {command} ", text)
     assert ("--out" in text) == (command not in NO_OUT)
     assert ("--seed" in text) == (command not in NO_SEED)
+
+
+def test_the_version_is_that_of_the_distribution(ae_env) -> None:
+    code, out, _ = ae_env("--version")
+    assert (code, out.strip()) == (0, f"ae-env {importlib.metadata.version('ae-env')}")
 
 
 def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:

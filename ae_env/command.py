@@ -1,0 +1,17 @@
+"""The program ``ae-env``: finds the command line among the packages that are installed together."""
+
+from __future__ import annotations
+
+import importlib
+
+from ae_env.utils.packages import check_package
+
+
+def main() -> None:
+    """Runs `agents.cli.main`.
+
+    Raises:
+        ImportError: If another package of the name comes first on ``sys.path``.
+    """
+    check_package("agents")
+    importlib.import_module("agents.cli.main").main()
