@@ -21,6 +21,7 @@ from agents.cli.console import print_line
 from agents.cli.evaluate import evaluate
 from agents.cli.film import film
 from agents.cli.quickstart import quickstart
+from agents.cli.record import record
 from agents.cli.scenes import scenes
 from agents.cli.scorers import convert_nima, scorers
 from agents.cli.simulate import simulate
@@ -38,7 +39,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(film, cache, warm_up),
+    *(film, record, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

@@ -16,6 +16,7 @@ COMMANDS = [
     "evaluate",
     "film",
     "quickstart",
+    "record",
     "scenes",
     "scorers",
     "simulate",

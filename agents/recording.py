@@ -1,0 +1,167 @@
+"""Episodes of a policy as a Minari dataset, for offline reinforcement learning and imitation."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from agents.episodes import checked_states, errors_of
+from agents.policy import Policy
+
+#: The variable that names Minari's folder.
+_ROOT = "MINARI_DATASETS_PATH"
+#: Minari's form of a name: namespaces, the dataset and its version.
+_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
+
+
+def check_dataset_id(dataset_id: str) -> None:
+    """Checks the name of a dataset that is to be written.
+
+    Raises:
+        ValueError: If it is none, or there is a dataset of that name.
+        ImportError: If the extra ``minari`` is not installed.
+    """
+    if not _ID.fullmatch(dataset_id):
+        raise ValueError(
+            f"`out` (={dataset_id!r}) must be a name of Minari, such as 'ae_env/matrix-v0'"
+        )
+    if dataset_id in _minari().list_local_datasets():
+        raise ValueError(
+            f"`out` (={dataset_id!r}) is there already: take a higher version, or remove it with "
+            f"`minari delete {dataset_id}`"
+        )
+
+
+def record_dataset(
+    policy: Policy,
+    name: str,
+    task: str,
+    options: Mapping[str, Any],
+    dataset_id: str,
+    *,
+    episodes: int,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> Any:
+    """Runs `policy` and writes what it saw, chose and got.
+
+    Observations are stored as they are, not as JPEG. Every episode has its ``seed`` and, as its
+    reset option, its scene: ``env.reset(seed=seed, options=options)`` begins it again.
+
+    Args:
+        policy: The policy, for one environment.
+        name: The policy's name, which the dataset has as that of its algorithm.
+        task: Id of the environment, such as ``"ae_env/AutoExposure-v0"``.
+        options: Arguments of the environment, JSON values.
+        dataset_id: Name of the dataset in Minari's folder (MINARI_DATASETS_PATH names another). It
+            appears there when all episodes are recorded.
+        episodes: How many; episode i has the seed ``seed + i``.
+        seed: Of the first.
+        progress: Called with the episodes that are done, and all.
+
+    Returns:
+        The `minari.MinariDataset`.
+
+    Raises:
+        ValueError: See `check_dataset_id`.
+        ImportError: If the extra ``minari`` is not installed.
+        UserCodeError: If the policy raises, or chooses what is no allowed state.
+    """
+    check_dataset_id(dataset_id)
+    minari = _minari()
+    root = Path(minari.storage.get_dataset_path(""))
+    root.mkdir(parents=True, exist_ok=True)
+    oracle = {"with_oracle": True} if getattr(policy, "privileged", False) else {}
+    with (
+        closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
+        tempfile.TemporaryDirectory(dir=root, prefix=".unfinished-") as folder,
+    ):
+
+        def recorded() -> Iterator[Any]:
+            for episode in range(episodes):
+                if progress is not None:
+                    progress(episode, episodes)
+                columns = _record_episode(env, policy, name, seed + episode)
+                yield minari.data_collector.EpisodeBuffer(id=episode, **columns)
+
+        with _datasets_in(folder), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that there is no author's address
+            minari.create_dataset_from_buffers(
+                dataset_id,
+                recorded(),
+                env=env,
+                algorithm_name=name,
+                description=f"{episodes} episodes of {name} in {task}, seeds from {seed}",
+                requirements=["ae-env"],
+                data_format="hdf5",
+                jpeg_encoding=False,
+            )
+        namespace = dataset_id.rpartition("/")[0]
+        if namespace and namespace not in minari.namespace.list_local_namespaces():
+            minari.namespace.create_namespace(namespace)
+        Path(folder, dataset_id).rename(root / dataset_id)
+    if progress is not None:
+        progress(episodes, episodes)
+    return minari.load_dataset(dataset_id)
+
+
+@contextmanager
+def _datasets_in(folder: str) -> Iterator[None]:
+    """Within, Minari writes to `folder`: a dataset is moved to its place when it is finished."""
+    before = os.environ.get(_ROOT)
+    os.environ[_ROOT] = folder
+    try:
+        yield
+    finally:
+        os.environ.pop(_ROOT)
+        if before is not None:
+            os.environ[_ROOT] = before
+
+
+def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int) -> dict[str, Any]:
+    """What `minari.data_collector.EpisodeBuffer` holds of one episode."""
+    observation, info = env.reset(seed=seed)
+    seen = {key: [value] for key, value in observation.items()}
+    scene: str = info["scene_id"]
+    steps: dict[str, list[Any]]
+    steps = {"actions": [], "rewards": [], "terminations": [], "truncations": []}
+    with errors_of(name, "reset"):
+        policy.reset(1, seed=seed)
+    done = False
+    while not done:
+        shown = {key: np.asarray(value)[None] for key, value in observation.items()}
+        masks = np.asarray(env.unwrapped.action_masks())[None]  # type: ignore[attr-defined]
+        told: dict[str, Any] = {}
+        if getattr(policy, "privileged", False):
+            told = {"info": {"oracle_state": np.array([info["oracle_state"]])}}
+        with errors_of(name, "act"):
+            actions = policy.act(shown, masks, **told)
+        state = checked_states(name, actions, masks)[0]
+        observation, reward, terminated, truncated, info = env.step(state)
+        done = terminated or truncated
+        for values, value in zip(
+            steps.values(), (state, reward, terminated, truncated), strict=True
+        ):
+            values.append(value)
+        for key, value in observation.items():
+            seen[key].append(value)
+    return {"seed": seed, "options": {"scene": scene}, "observations": seen, **steps}
+
+
+def _minari() -> Any:
+    try:
+        return importlib.import_module("minari")
+    except ImportError as error:
+        raise ImportError(
+            "datasets need Minari: install the extra with pip install 'ae-env[minari]'"
+        ) from error

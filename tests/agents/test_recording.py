@@ -1,0 +1,68 @@
+"""Minari datasets: what is in them, and that nothing unfinished stays."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from ae_env import UserCodeError
+from agents import Policy, PolicyContext, make_policy
+from agents.recording import record_dataset
+
+TASK = "ae_env/AutoExposure-v0"
+SMALL = {"scenes": "bundled:small", "resolution": 36, "split": "test"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def context() -> PolicyContext:
+    return PolicyContext.from_envs(gym.make_vec(f"ae_env:{TASK}", num_envs=1, **SMALL))
+
+
+@pytest.mark.parametrize("name", ["centre_weighted:P", "oracle"])
+def test_recorded_episodes_happen_again(name: str, folder: Path, context: PolicyContext) -> None:
+    policy = make_policy(name, context)
+    dataset = record_dataset(policy, name, TASK, SMALL, "ae/mine-v0", episodes=3, seed=5)
+    assert (dataset.total_episodes, dataset.total_steps) == (3, 24)
+    assert dataset.storage.metadata["algorithm_name"] == name
+    env = dataset.recover_environment()
+    seeds, rewards = [], []
+    for episode, metadata in zip(
+        dataset.iterate_episodes(), dataset.storage.get_episode_metadata(range(3)), strict=True
+    ):
+        seeds.append(metadata["seed"])
+        shown, _ = env.reset(seed=int(metadata["seed"]), options=metadata["options"])
+        for step in range(len(episode.actions)):
+            for key, value in shown.items():
+                np.testing.assert_array_equal(episode.observations[key][step], value)
+            shown, reward, *_ = env.step(episode.actions[step])
+            rewards.append(reward - episode.rewards[step])
+        assert episode.truncations.tolist() == [False] * 7 + [True]
+    assert seeds == [5, 6, 7]
+    np.testing.assert_allclose(rewards, 0.0, atol=1e-9)
+
+
+class Stops(Policy):
+    def act(self, observations, action_masks=None):
+        raise KeyError("lost")
+
+
+def test_what_is_unfinished_is_removed(folder: Path, context: PolicyContext) -> None:
+    with pytest.raises(UserCodeError, match=r"'stops'.*KeyError: 'lost'"):
+        record_dataset(Stops(context), "stops", TASK, SMALL, "mine-v0", episodes=1)
+    assert list(folder.iterdir()) == []
+
+
+def test_names_are_checked_first(folder: Path, context: PolicyContext) -> None:
+    policy = make_policy("random", context)
+    with pytest.raises(ValueError, match=r"`out` \(='mine'\) must be a name of Minari"):
+        record_dataset(policy, "random", TASK, SMALL, "mine", episodes=1)
+    record_dataset(policy, "random", TASK, SMALL, "mine-v0", episodes=1)
+    with pytest.raises(ValueError, match=r"`out` \(='mine-v0'\) is there already"):
+        record_dataset(policy, "random", TASK, SMALL, "mine-v0", episodes=1)
