@@ -19,6 +19,7 @@ from agents.cli.bench import bench
 from agents.cli.cache_command import cache
 from agents.cli.console import print_line
 from agents.cli.evaluate import evaluate
+from agents.cli.export import export
 from agents.cli.film import film
 from agents.cli.quickstart import quickstart
 from agents.cli.record import record
@@ -39,7 +40,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(film, record, cache, warm_up),
+    *(film, record, export, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

@@ -157,9 +157,9 @@ def _absolute(signal: torch.Tensor, ev100: torch.Tensor) -> torch.Tensor:
 def _count(codes: torch.Tensor) -> torch.Tensor:
     """Shares (B, 256) of the codes (B, ...) int64 of each frame."""
     flat = codes.flatten(1)
-    flat = flat + 256 * torch.arange(len(flat), device=flat.device)[:, None]
-    counts = torch.bincount(flat.flatten(), minlength=256 * len(flat))
-    return counts.view(len(flat), 256).float() / flat.shape[1]
+    counts = torch.zeros(flat.shape[0], 256, device=flat.device)
+    ones = torch.ones_like(flat, dtype=counts.dtype)
+    return counts.scatter_add(1, flat, ones) / flat.shape[1]
 
 
 def _spread(shares: torch.Tensor, luminance: torch.Tensor) -> torch.Tensor:
@@ -167,9 +167,9 @@ def _spread(shares: torch.Tensor, luminance: torch.Tensor) -> torch.Tensor:
     place = ((luminance - _BINS[0]) / (_BINS[1] - _BINS[0])).clamp(0.0, len(_BINS) - 1.001)
     below = place.long()
     weight = place - below
-    bins = shares.new_zeros(len(shares), len(_BINS))
-    bins.scatter_add_(1, below, shares * (1.0 - weight))
-    return bins.scatter_add_(1, below + 1, shares * weight)
+    bins = shares.new_zeros(shares.shape[0], len(_BINS))
+    bins = bins.scatter_add(1, below, shares * (1.0 - weight))
+    return bins.scatter_add(1, below + 1, shares * weight)
 
 
 def _apex_table(grid: ExposureGrid) -> torch.Tensor:
@@ -238,12 +238,12 @@ class StateHead(nn.Module):
             light: (B, LIGHT_NUMBERS) histograms of it, see `ExposureFeatures.light`.
             sensors: (B, 2) in [-1, 1]; None where they are not observed.
         """
-        states = self.states.expand(len(features), -1, -1)  # (B, S, 4)
+        states = self.states.expand(features.shape[0], -1, -1)  # (B, S, 4)
         if self.has_sensors:
             if sensors is None:
                 raise ValueError("`sensors` must be given: the network was made for them")
             states = torch.cat([states, self._blur(sensors)], dim=2)
-        histograms = light.view(len(light), _HISTOGRAMS, len(_BINS))
+        histograms = light.view(light.shape[0], _HISTOGRAMS, len(_BINS))
         shares = torch.einsum("bhi,isl->bshl", histograms, self.exposed).flatten(2)
         of_state = self.from_state(states) + self.from_light(shares)  # (B, S, width)
         hidden = torch.relu(self.from_features(features)[:, None] + of_state)

@@ -14,6 +14,7 @@ COMMANDS = [
     "cache",
     "convert-nima",
     "evaluate",
+    "export",
     "film",
     "quickstart",
     "record",
@@ -26,7 +27,7 @@ COMMANDS = [
 COMMANDS += ["train-simulator", "warm-up"]
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "warm-up")
-NO_SEED = (*NO_OUT, "convert-nima")
+NO_SEED = (*NO_OUT, "convert-nima", "export")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
 from agents import Policy

@@ -1,0 +1,1 @@
+"""Agents on a camera: exported to ONNX, and run without torch."""

@@ -1,0 +1,162 @@
+"""From a trained agent to one ONNX file that `agents.onboard.controller.Controller` runs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES
+from agents.learning.ppo import PPOPolicy
+from agents.learning.regression import SAME_LIGHT_EV, RegressionPolicy
+from agents.metering.reading import BLACK_SIGNAL, SATURATED_STEP_EV, TARGET_SIGNAL, WHITE_SIGNAL
+from agents.onboard.controller import FORMAT, METADATA
+from agents.policy import Policy
+from simulator.utils.files import write_atomically
+
+
+class _RegressionGraph(nn.Module):
+    """Scores, their precision, and the light that an average meter reads [EV100]."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+        self.ranges: torch.Tensor
+        self.register_buffer("ranges", torch.tensor(SETTINGS_RANGES, dtype=torch.float32))
+
+    def forward(
+        self, raw: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        codes = raw.float() / 255.0
+        scores, log_variance = self.network(codes, settings, sensors)
+        return scores, torch.exp(-log_variance), self._metered(codes, settings)
+
+    def _metered(self, codes: torch.Tensor, settings: torch.Tensor) -> torch.Tensor:
+        """`agents.metering`'s average meter."""
+        signal = (1.0 + PEDESTAL) * codes[:, 1:3].square() - PEDESTAL
+        saturated = (signal >= WHITE_SIGNAL).float().mean(dim=(1, 2, 3))
+        level = (signal.mean(dim=(1, 2, 3)).clamp(min=BLACK_SIGNAL) / TARGET_SIGNAL).log2()
+        low, high = self.ranges.unbind(dim=1)
+        apex = low + (settings + 1.0) * 0.5 * (high - low)
+        ev100 = (3.0 * apex[:, 0]).round() / 3.0 + apex[:, 1] - (apex[:, 2] - 5.0)
+        return ev100 + level + SATURATED_STEP_EV * saturated
+
+
+class _PPOGraph(nn.Module):
+    """Logits of the states."""
+
+    def __init__(self, network: Any) -> None:
+        super().__init__()
+        self.extractor = network.pi_features_extractor
+        self.latent, self.logits = network.mlp_extractor, network.action_net
+
+    def forward(
+        self, raw: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        shown = {"raw": raw.float() / 255.0, "settings": settings}
+        if sensors is not None:
+            shown["sensors"] = sensors
+        logits: torch.Tensor = self.logits(self.latent.forward_actor(self.extractor(shown)))
+        return logits
+
+
+def export_agent(policy: Policy, path: str | Path) -> Path:
+    """Writes an agent as one ONNX file: the observation goes in as it is, for any batch.
+
+    Args:
+        policy: A `RegressionPolicy` without foresight, or a `PPOPolicy` without a history.
+        path: The ``.onnx`` file.
+
+    Returns:
+        The file.
+
+    Raises:
+        ImportError: If the extra ``onnx`` is not installed.
+        ValueError: If the agent cannot be exported, or does not look at pixels.
+    """
+    file = Path(path)
+    if file.suffix != ".onnx":
+        raise ValueError(f"`out` (={str(path)!r}) must end in .onnx")
+    graph = _graph(policy)
+    onnx = _onnx()
+    context = policy.context
+    shape = context.observation_space["raw"].shape or ()
+    arguments = [torch.zeros(2, *shape, dtype=torch.uint8), torch.zeros(2, 3)]
+    names = ["raw", "settings"]
+    if context.has_sensors:
+        arguments.append(torch.zeros(2, 2))
+        names.append("sensors")
+    outputs = ["logits"] if isinstance(policy, PPOPolicy) else ["scores", "precision", "ev100"]
+    batch = torch.export.Dim("batch", min=1)
+    program = _exported(graph.eval(), tuple(arguments), names, outputs, batch)
+    model = program.model_proto
+    card = {
+        "format": FORMAT,
+        "kind": "ppo" if isinstance(policy, PPOPolicy) else "regression",
+        "states": [[s.iso, s.exposure_time, s.f_number] for s in context.grid],
+        "frame_shape": list(shape),
+        "sensors": context.has_sensors,
+        "same_light_ev": SAME_LIGHT_EV,
+        "pedestal": PEDESTAL,
+        "ranges": {"settings": SETTINGS_RANGES.tolist(), "sensors": SENSOR_RANGES.tolist()},
+    }
+    onnx.helper.set_model_props(model, {METADATA: json.dumps(card)})
+    onnx.checker.check_model(model, full_check=True)
+    return write_atomically(file, model.SerializeToString())
+
+
+def _graph(policy: Policy) -> nn.Module:
+    if "histogram" in policy.context.observation_space.spaces:
+        raise ValueError("`policy`: agents that observe pixels can be exported, not statistics")
+    if isinstance(policy, RegressionPolicy):
+        if policy.foresight != "none":
+            raise ValueError(
+                f"`policy` (={policy.name!r}): export it without `foresight`, which is no part of "
+                "the network"
+            )
+        return _RegressionGraph(policy.network)
+    if isinstance(policy, PPOPolicy):
+        if policy.network.features_extractor.features.history:
+            raise ValueError(f"`policy` (={policy.name!r}) has a history, which is not exported")
+        return _PPOGraph(policy.network)
+    raise ValueError(f"`policy` (={policy.name!r}) must be a regression or a PPO agent")
+
+
+def _exported(
+    graph: nn.Module, arguments: tuple[Any, ...], names: list[str], outputs: list[str], batch: Any
+) -> Any:
+    quiet = logging.getLogger("torch.onnx")
+    level = quiet.level
+    quiet.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            return torch.onnx.export(
+                graph,
+                arguments,
+                input_names=names,
+                output_names=outputs,
+                dynamic_shapes=tuple({0: batch} for _ in arguments),
+                dynamo=True,
+                verbose=False,
+            )
+    finally:
+        quiet.setLevel(level)
+
+
+def _onnx() -> Any:
+    try:
+        import onnx
+        import onnxscript  # noqa: F401  (torch's exporter needs it)
+    except ImportError as error:
+        raise ImportError(
+            "the export needs ONNX: install the extra with pip install 'ae-env[onnx]'"
+        ) from error
+    return onnx

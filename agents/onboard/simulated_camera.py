@@ -1,0 +1,104 @@
+"""A camera with Picamera2's interface whose frames the simulator makes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ae_env.scenes import Scene
+from ae_env.scorers.score_table import prepare_scene
+from simulator.camera import CameraProfile
+from simulator.raw.image import unpack_mosaic
+from simulator.settings import CameraSettings
+
+
+class _Request:
+    """A completed capture, as Picamera2 hands it out."""
+
+    def __init__(self, mosaic: NDArray[np.uint16], metadata: dict[str, Any]) -> None:
+        self._mosaic, self._metadata = mosaic, metadata
+
+    def get_metadata(self) -> dict[str, Any]:
+        """What the frame was taken with: ``ExposureTime`` [us] and ``AnalogueGain``."""
+        return dict(self._metadata)
+
+    def make_array(self, name: str) -> NDArray[np.uint16]:
+        """The mosaic (H, W) of digital numbers."""
+        if name != "raw":
+            raise ValueError(f"`name` (={name!r}) must be 'raw'")
+        return self._mosaic
+
+    def release(self) -> None:
+        """Nothing to give back."""
+
+
+class SimulatedCamera:
+    """Photographs a scene through Picamera2's `set_controls` and `capture_request`.
+
+    As on a real one, settings take frames to arrive, are rounded to what the sensor can do, and
+    frames are dropped.
+
+    Args:
+        scene: What is before the camera.
+        camera: The body.
+        f_number: Its fixed aperture.
+        delay: Frames between `set_controls` and the first frame that has them.
+        gains: Light of each frame relative to the scene's own; the last one stays.
+        dropped: Numbers of frames that never reach `capture_request`.
+        line_time: Exposure times are whole multiples of it [s].
+        gain_steps: Analogue gains are ``gain_steps / (gain_steps - n)``, as an imx477's.
+        seed: Of the noise.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: CameraProfile,
+        f_number: float,
+        *,
+        delay: int = 2,
+        gains: Sequence[float] = (1.0,),
+        dropped: Collection[int] = (),
+        line_time: float = 1e-5,
+        gain_steps: int = 1024,
+        seed: int = 0,
+    ) -> None:
+        self.camera, self.f_number, self.gains = camera, f_number, gains
+        self.dropped, self.line_time, self.gain_steps, self.seed = (
+            dropped,
+            line_time,
+            gain_steps,
+            seed,
+        )
+        self.frame = 0
+        self._prepared = prepare_scene(scene, camera)
+        first = {"ExposureTime": 1e4, "AnalogueGain": 1.0}
+        self._pending = deque([first] * (delay + 1))
+
+    def set_controls(self, controls: dict[str, float]) -> None:
+        """Asks for ``ExposureTime`` [us] and ``AnalogueGain``; the newest request stays."""
+        self._pending[-1] = {**self._pending[-1], **controls}
+
+    def capture_request(self) -> _Request:
+        """The next frame that is not dropped."""
+        while True:
+            frame, self.frame = self.frame, self.frame + 1
+            given = self._pending.popleft()
+            self._pending.append(self._pending[-1] if self._pending else given)
+            if frame not in self.dropped:
+                return self._photograph(frame, given)
+
+    def _photograph(self, frame: int, asked: dict[str, float]) -> _Request:
+        lines = max(1, round(asked["ExposureTime"] / 1e6 / self.line_time))
+        steps = self.gain_steps
+        gain = steps / (steps - round(steps - steps / max(asked["AnalogueGain"], 1.0)))
+        time = lines * self.line_time
+        settings = CameraSettings(100.0 * gain, time, self.f_number)
+        light = self.gains[min(frame, len(self.gains) - 1)]
+        found = self._prepared.expose([settings], seed=self.seed + frame, gain=np.array([light]))
+        mosaic = unpack_mosaic(found[0], self.camera)
+        return _Request(mosaic, {"ExposureTime": round(time * 1e6), "AnalogueGain": gain})
