@@ -23,7 +23,7 @@ BENCHMARKS = (
         "defects",
         "denoising",
     ),
-    *("libcamera", "ptc", "scorers", "simulator", "stability", "throughput", "transfer"),
+    *("libcamera", "onboard", "ptc", "scorers", "simulator", "stability", "throughput", "transfer"),
     "work_precision",
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.

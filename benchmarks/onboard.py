@@ -1,0 +1,139 @@
+"""Exported agents against themselves in torch: decisions, numbers, size and time, for one camera."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from agents import PolicyContext, make_policy
+from agents.learning.regression import observation_tensors
+from agents.onboard.controller import Controller
+from agents.onboard.export import export_agent
+from benchmarks.harness import Benchmark, Part, Report, Row, table
+
+#: Episodes, in light that jumps by `STOPS` in the middle, and their frames.
+EPISODES, FRAMES, STOPS = 64, 16, 4.0
+#: Decisions whose time is measured, one camera alone, the two in turns.
+TIMED = 400
+#: Frames that are averaged to what the agent sees: packed height and width.
+FRAME_SIZES = ((64, 64), (240, 320), (760, 1014), (1520, 2028))
+
+
+def measure(policy: str, seed: int, quick: bool) -> Row:
+    """One agent, over episodes on test scenes."""
+    torch.set_num_threads(1)
+    count = 8 if quick else EPISODES
+    envs = gym.make_vec(
+        "ae_env:ae_env/AutoExposure-v0",
+        num_envs=count,
+        split="test",
+        max_episode_steps=None,
+        lighting={"kind": "step", "stops": STOPS, "at": FRAMES // 2},
+    )
+    agent = make_policy(policy, PolicyContext.from_envs(envs))
+    with tempfile.TemporaryDirectory() as folder:
+        file = export_agent(agent, Path(folder, "agent.onnx"))
+        size, controller, alone = file.stat().st_size, Controller(file, count), Controller(file)
+    agent.reset(count)
+    shown, _ = envs.reset(seed=seed)
+    same, error = 0, 0.0
+    for _ in range(FRAMES):
+        actions = agent.act(shown)
+        same += int((controller.act(**shown) == actions).sum())
+        error = max(error, _difference(agent, controller, shown))
+        shown, *_ = envs.step(actions)
+    one = {name: values[:1] for name, values in shown.items()}
+    times: dict[str, list[float]] = {"torch": [], "onnx": []}
+    agent.reset(1)
+    for _ in range(TIMED // 10 if quick else TIMED):
+        for name, act in (("torch", lambda: agent.act(one)), ("onnx", lambda: alone.act(**one))):
+            begun = perf_counter()
+            act()
+            times[name].append(perf_counter() - begun)
+    row: Row = {"policy": policy, "bytes": size, "decisions": count * FRAMES, "same": same}
+    row |= {"largest_difference": error}
+    return row | {f"us_{name}": 1e6 * float(np.median(values)) for name, values in times.items()}
+
+
+def _difference(agent: Any, controller: Controller, shown: dict[str, Any]) -> float:
+    """Largest difference between the scores, or the logits, of the two."""
+    found = controller._session.run(None, shown)[0]
+    with torch.inference_mode():
+        if agent.kind == "ppo":
+            tensors, _ = agent.network.obs_to_tensor(dict(shown))
+            wanted = agent.network.get_distribution(tensors).distribution.logits.numpy()
+            wanted, found = (x - x.max(axis=1, keepdims=True) for x in (wanted, found))
+        else:
+            wanted = agent.network(*observation_tensors(shown))[0].numpy()
+    return float(np.abs(found - wanted).max())
+
+
+def encoding(quick: bool) -> list[Row]:
+    """Time to average a frame to what the agent sees, by its size."""
+    envs = gym.make_vec("ae_env:ae_env/AutoExposure-v0", num_envs=1, scenes="bundled:small")
+    agent = make_policy("ppo", PolicyContext.from_envs(envs))
+    with tempfile.TemporaryDirectory() as folder:
+        controller = Controller(export_agent(agent, Path(folder, "agent.onnx")))
+    rows = []
+    for height, width in FRAME_SIZES:
+        planes = np.random.default_rng(0).random((4, height, width), dtype=np.float32)
+        times = []
+        for _ in range(3 if quick else 15):
+            begun = perf_counter()
+            controller.encode_frame(planes)
+            times.append(perf_counter() - begun)
+        rows.append({"height": height, "width": width, "ms": 1e3 * float(np.median(times))})
+    return rows
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """Each agent, and the frames."""
+    agents = [
+        Part(name, measure, {"policy": name, "seed": seed, "quick": quick}, threads=1)
+        for name in ("regression", "ppo")
+    ]
+    return [*agents, Part("frames", encoding, {"quick": quick}, threads=1)]
+
+
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the rows of both agents."""
+    frames = results["frames"]
+    rows: list[Row] = [row for name, row in results.items() if name != "frames"]
+    for row in rows:
+        row["speedup"] = row["us_torch"] / row["us_onnx"]
+    columns = {
+        "agent": "{policy}",
+        "file [MB]": lambda row: f"{row['bytes'] / 1e6:.2f}",
+        "same decisions": "{same} of {decisions}",
+        "largest difference": "{largest_difference:.1e}",
+        "torch [us]": "{us_torch:.0f}",
+        "Controller [us]": "{us_onnx:.0f}",
+        "torch / Controller": "{speedup:.1f}",
+    }
+    page = [
+        "The agents of the package, exported with `ae-env export` and run by "
+        "`agents.onboard.Controller` (NumPy and ONNX Runtime, no torch), beside themselves in "
+        f"torch: {EPISODES} episodes on unseen scenes, {FRAMES} frames each, in light that jumps "
+        f"by {STOPS:g} EV. Differences are of scores (regression) and logits (PPO). Times are of "
+        "one decision of one camera on one core, medians, measured in turns.",
+        table(rows, columns),
+        "What a camera's frame takes to become the 64 x 64 that the agents look at, before that:",
+        table(frames, {"planes": "4 x {height} x {width}", "ms": "{ms:.2f}"}),
+    ]
+    return Report([*rows, *frames], page)
+
+
+BENCHMARK = Benchmark(
+    name="onboard",
+    title="Agents on a camera",
+    parts=parts,
+    report=report,
+    code=("agents/onboard", "agents/learning", "benchmarks/onboard"),
+)
+run = BENCHMARK.run
