@@ -1,4 +1,4 @@
-"""Exported agents against themselves in torch: decisions, numbers, size and time, for one camera."""
+"""Exported agents beside themselves in torch: decisions, numbers, size, time of one camera."""
 
 from __future__ import annotations
 
