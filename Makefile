@@ -7,12 +7,13 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
+BASE := $(VENV)/.base
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
 
 .PHONY: demo test check format dist check-dist bench clean $(VENV)
 
-demo: $(STAMP)
+demo: $(BASE)
 	$(BIN)/ae-env quickstart
 
 test: $(STAMP)
@@ -48,12 +49,17 @@ bench: $(STAMP)
 
 $(VENV): $(STAMP)
 
-# Made again when it is missing or older than what it is made from.
-$(STAMP): pyproject.toml constraints.txt
+# Made again when it is missing or older than what it is made from. Without the extras, which tests
+# and measurements need:
+$(BASE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("ae-env needs Python 3.11 or newer: make PYTHON=/path/to/python3.11" if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	touch $(BASE)
+
+$(STAMP): $(BASE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) quickstart build *.egg-info
+	rm -rf $(VENV) quickstart build dist *.egg-info
