@@ -88,6 +88,14 @@ def test_torchrl(task: str) -> None:
     assert not done[:-1].any()
 
 
+def test_torchrl_makes_environments_itself() -> None:
+    """It tries arguments of its own first, and expects a TypeError of whoever has none of them."""
+    from torchrl.envs import GymEnv, SerialEnv
+
+    envs = SerialEnv(2, lambda: GymEnv("ae_env/AutoExposure-v0", frame_skip=2, **SMALL))
+    assert envs.rollout(3)["next", "reward"].shape == (2, 3, 1)
+
+
 def test_the_recurrent_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It trains, its weights come back, and a reset forgets the episode."""
     make_vec = gym.make_vec
