@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image, ImageDraw, ImageFont
 
 from ae_env.grid import ExposureGrid
@@ -143,7 +142,7 @@ def contact_sheet(
             "on one contact sheet"
         )
     paths = _checked_paths(path, len(grid))
-    scene = _averaged(scene, CAPTURE_PIXELS)
+    scene = scene.averaged(max(1, min(scene.light.shape[1:]) // CAPTURE_PIXELS))
     tables = ScoreTables(grid, camera, make_scorer(scorer))
     moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
     table = tables.table(scene, **moves)
@@ -167,24 +166,6 @@ def _checked_paths(path: Any, count: int) -> dict[str, list[int]]:
             raise ValueError(f"`path` of {name!r} (={values.tolist()}) must be in [0, {count})")
         paths[str(name)] = values.tolist()
     return paths
-
-
-def _averaged(scene: Scene, size: int) -> Scene:
-    """`scene` box-averaged by the largest whole factor that leaves at least `size` pixels."""
-    factor = min(scene.light.shape[1:]) // size
-    if factor < 2:
-        return scene
-    mask = scene.saturated
-    if mask is not None:
-        mask = F.max_pool2d(mask[None].float(), factor)[0].bool()
-    return replace(
-        scene,
-        light=F.avg_pool2d(scene.light.double(), factor).float(),
-        nlf=scene.nlf.scaled(1.0 / factor**2),
-        box_factor=scene.box_factor * factor,
-        saturated=mask,
-        layout=None if scene.layout is None else scene.layout.averaged(factor),
-    )
 
 
 def _focus(scene: Scene, defocus: float) -> str:

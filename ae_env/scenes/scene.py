@@ -471,27 +471,56 @@ class Scene:
         if k == 1 and height == width == resolution:
             return self
         top, left = (height - k * resolution) // 2, (width - k * resolution) // 2
-        window = (slice(top, top + k * resolution), slice(left, left + k * resolution))
-        tiles = (resolution, k, resolution, k)
+        rows, columns = (slice(start, start + k * resolution) for start in (top, left))
+        return self.cut(rows, columns).averaged(k)
 
-        def averaged(planes: torch.Tensor) -> torch.Tensor:  # (..., H, W) to (..., R, R)
-            part = planes[..., window[0], window[1]]
-            return part.reshape(*planes.shape[:-2], *tiles).double().mean(dim=(-3, -1))
+    def cut(self, rows: slice, columns: slice) -> Scene:
+        """The part of this scene in these `rows` and `columns` of packed pixels."""
+
+        def part(planes: torch.Tensor | None) -> torch.Tensor | None:
+            return None if planes is None else planes[..., rows, columns]
+
+        return replace(
+            self,
+            light=self.light[..., rows, columns],
+            saturated=part(self.saturated),
+            denoised=part(self.denoised),
+            residual=None,  # of the whole frame
+            defocus_map=part(self.defocus_map),
+            layout=None if self.layout is None else self.layout.cut(rows, columns),
+        )
+
+    def averaged(self, k: int) -> Scene:
+        """This scene with k x k pixels per plane averaged into one, as `resized` states them.
+
+        Rows and columns at the end that fill no such square are left out.
+        """
+        if k == 1:
+            return self
+        height, width = (side // k for side in self.light.shape[1:])
+        if not min(height, width):
+            raise ValueError(f"`k` (={k!r}) must be at most the sides of scene {self.scene_id!r}")
+        tiles = (height, k, width, k)
+
+        def mean(planes: torch.Tensor) -> torch.Tensor:  # (..., H, W) to (..., H / k, W / k)
+            whole = planes[..., : height * k, : width * k]
+            return whole.reshape(*planes.shape[:-2], *tiles).double().mean(dim=(-3, -1))
 
         mask, found, layout = self.saturated, self.defocus_map, self.layout
         if mask is not None:
-            mask = mask[window].reshape(tiles).permute(0, 2, 1, 3).flatten(2).any(dim=2)
+            mask = mask[: height * k, : width * k]
+            mask = mask.reshape(tiles).permute(0, 2, 1, 3).flatten(2).any(dim=2)
         if layout is not None:
-            layout = layout.cut(*window).averaged(k)
+            layout = layout.cut(slice(height * k), slice(width * k)).averaged(k)
         return replace(
             self,
-            light=averaged(self.light).float(),
+            light=mean(self.light).float(),
             nlf=self.nlf.scaled(1.0 / k**2),
             box_factor=self.box_factor * k,
             saturated=mask,
-            denoised=None if self.denoised is None else averaged(self.denoised).float(),
+            denoised=None if self.denoised is None else mean(self.denoised).float(),
             residual=None,  # of the finer pixels
-            defocus_map=None if found is None else averaged(found.square()).sqrt().float() / k,
+            defocus_map=None if found is None else mean(found.square()).sqrt().float() / k,
             layout=layout,
         )
 

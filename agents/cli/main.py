@@ -29,6 +29,7 @@ from agents.cli.simulate import simulate
 from agents.cli.sweep import sweep
 from agents.cli.train_agent import train
 from agents.cli.train_simulator import train_simulator
+from agents.cli.view import view
 from agents.cli.warm_up import warm_up
 
 app = typer.Typer(
@@ -40,7 +41,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(film, record, export, cache, warm_up),
+    *(view, film, record, export, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
     from simulator.raw.image import RawImage
     from simulator.settings import CameraSettings
 
-#: Quarter turns to the left that turn a picture upright, by LibRaw's code.
-_TURNS = {3: 2, 5: 1, 6: -1}
-
 Weights = Annotated[
     str,
     typer.Option(
@@ -157,6 +154,14 @@ def make_simulator(weights: str, device: str, cache: bool) -> CameraSimulator:
     return CameraSimulator.from_pretrained(weights, device=device, cache=where)
 
 
+def check_depth(depth: str, weights: str) -> None:
+    """Raises a `ValueError` if `depth` is unknown to us, or needs networks that are not there."""
+    if depth not in ("far", "unknown"):
+        raise ValueError(f"`depth` (={depth!r}) must be 'far' or 'unknown'")
+    if depth == "unknown" and weights == "none":
+        raise ValueError("`depth` (='unknown') needs networks: leave out `--weights none`")
+
+
 def source_settings(
     iso: float | None, shutter: str | None, aperture: str | None
 ) -> CameraSettings | None:
@@ -179,6 +184,7 @@ def _write_png(path: Path, raw: RawImage) -> Path:
     from PIL import Image
 
     from simulator import render_srgb
+    from simulator.raw.develop import quarter_turns
 
     picture = Image.fromarray(render_srgb(raw).permute(1, 2, 0).cpu().numpy())
     aspect = raw.metadata.get("pixel_aspect", 1.0)
@@ -189,5 +195,5 @@ def _write_png(path: Path, raw: RawImage) -> Path:
         )
         print_line(f"pixels are {aspect:g} times as wide as high: the PNG is stretched")
         picture = picture.resize((width, height), Image.Resampling.BICUBIC)
-    upright = np.rot90(np.asarray(picture), _TURNS.get(raw.metadata.get("flip", 0), 0))
+    upright = np.rot90(np.asarray(picture), quarter_turns(raw))
     return save_picture(path, Image.fromarray(np.ascontiguousarray(upright)))

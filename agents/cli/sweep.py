@@ -23,6 +23,7 @@ from agents.cli.simulate import (
     SourceIso,
     SourceShutter,
     Weights,
+    check_depth,
     make_simulator,
     source_settings,
 )
@@ -60,7 +61,7 @@ def sweep(
     from ae_env.scenes import Scene
     from simulator import read_raw, write_dng
 
-    _check_depth(depth, weights)
+    check_depth(depth, weights)
     check_tolerance(tolerance)
     device = torch_device(device)
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
@@ -82,14 +83,6 @@ def sweep(
                 task(i + 1, len(grid))
         files["DNGs"] = out
     print_files(files)
-
-
-def _check_depth(depth: str, weights: str) -> None:
-    """Raises a `ValueError` if `depth` is unknown to us, or needs networks that are not there."""
-    if depth not in ("far", "unknown"):
-        raise ValueError(f"`depth` (={depth!r}) must be 'far' or 'unknown'")
-    if depth == "unknown" and weights == "none":
-        raise ValueError("`depth` (='unknown') needs networks: leave out `--weights none`")
 
 
 def _small_scene(scene: Scene, weights: str, depth: str, cache: bool) -> Scene:

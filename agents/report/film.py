@@ -35,6 +35,8 @@ class Recording:
         ev100: EV100 of the settings of every frame.
         best: EV100 of the best state of every frame.
         scores: Score of every frame.
+        states: Index of the state of every frame.
+        regrets: Best state's expected score less that of the frame's state, of every frame.
     """
 
     name: str
@@ -42,6 +44,8 @@ class Recording:
     ev100: list[float] = field(default_factory=list)
     best: list[float] = field(default_factory=list)
     scores: list[float] = field(default_factory=list)
+    states: list[int] = field(default_factory=list)
+    regrets: list[float] = field(default_factory=list)
 
 
 def record(
@@ -79,6 +83,8 @@ def record(
         found.ev100.append(float(info["ev100"][0]))
         found.best.append(float(base.grid.ev100[info["oracle_state"][0]]))
         found.scores.append(float(info["rewards"]["score"][0]))
+        found.states.append(int(info["state"][0]))
+        found.regrets.append(float(info["regret"][0]))
     return found
 
 

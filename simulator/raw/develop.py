@@ -121,6 +121,14 @@ def render_srgb(
     return encoded.mul_(255.0).round_().to(torch.uint8)
 
 
+def quarter_turns(raw: RawImage) -> int:
+    """Quarter turns to the left that turn a picture of `raw` upright, as `numpy.rot90` takes them.
+
+    Files state how the camera was held in LibRaw's code, ``metadata["flip"]``.
+    """
+    return {3: 2, 5: 1, 6: -1}.get(raw.metadata.get("flip", 0), 0)
+
+
 def balance(images: torch.Tensor, white_balance: Gains) -> torch.Tensor:
     """White-balance packed raws and clip their highlights to white.
 

@@ -1,0 +1,233 @@
+"""The page: the bar with the scene's name, the scene picker, files in and out, and its two tabs."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import tempfile
+import uuid
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fastapi import Response
+from nicegui import app, run, ui
+
+from agents.viewer.episode_page import EpisodePage
+from agents.viewer.exposure_page import ExposurePage
+from agents.viewer.library import Library
+from agents.viewer.pictures import ViewedScene
+from simulator import CameraSimulator
+from simulator.camera_simulator import Depth
+
+#: Largest file that is taken [byte].
+_LARGEST_UPLOAD = 300_000_000
+#: Pictures that wait to be fetched, at most.
+_WAITING = 256
+_STYLE = Path(__file__).with_name("page.css")
+
+
+@dataclass
+class Options:
+    """What `ae-env view` was asked for.
+
+    Args:
+        library: The scenes.
+        simulator: Shared by all tabs of the browser.
+        depth: See `ViewedScene`.
+        tolerance: See `ViewedScene`.
+        scorer: See `ViewedScene`.
+    """
+
+    library: Library
+    simulator: CameraSimulator
+    depth: Depth
+    tolerance: float
+    scorer: str
+    thumbnails: dict[str, bytes] = field(default_factory=dict)
+
+    def viewed(self, library: Library, name: str) -> ViewedScene:
+        """The scene called `name`, to be shown."""
+        return ViewedScene(
+            library.open(name),
+            self.simulator,
+            depth=self.depth,
+            tolerance=self.tolerance,
+            scorer=self.scorer,
+        )
+
+
+class PictureStore:
+    """Pictures under addresses of their own, the latest `_WAITING` of them."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[str, bytes] = OrderedDict()
+        app.get("/frame/{key}")(self.fetch)
+
+    def address(self, jpeg: bytes) -> str:
+        """Address that `jpeg` can be fetched from."""
+        key = uuid.uuid4().hex
+        self._kept[key] = jpeg
+        while len(self._kept) > _WAITING:
+            self._kept.popitem(last=False)
+        return f"/frame/{key}"
+
+    def fetch(self, key: str) -> Response:
+        """What the browser gets."""
+        if key not in self._kept:
+            return Response(status_code=404)
+        return Response(
+            self._kept[key], media_type="image/jpeg", headers={"Cache-Control": "no-store"}
+        )
+
+
+_pictures: PictureStore | None = None
+
+
+async def show_page(options: Options) -> None:
+    """Puts the page together, for one tab of the browser."""
+    global _pictures
+    if _pictures is None:
+        _pictures = PictureStore()
+    ui.add_css(_STYLE.read_text())
+    await Page(options, _pictures).build()
+
+
+class Page:
+    """One tab of the browser.
+
+    Args:
+        options: What is shown.
+        pictures: Where pictures are fetched from.
+    """
+
+    def __init__(self, options: Options, pictures: PictureStore) -> None:
+        self._options, self._pictures = options, pictures
+        # Uploads belong to their tab.
+        self._library = Library(list(options.library.entries.values()), options.library.first)
+        self._folder = Path(tempfile.mkdtemp(prefix="ae-env-view-"))
+        self._exposure = ExposurePage(pictures.address)
+        self._episode = EpisodePage(pictures.address)
+        self._viewed: ViewedScene | None = None
+
+    async def build(self) -> None:
+        """Builds the page, and opens the first scene."""
+        client = ui.context.client
+        client.on_delete(lambda: shutil.rmtree(self._folder, ignore_errors=True))
+        with ui.element("header").classes("bar"):
+            self._title = ui.label("ae-env view").classes("title")
+            self._picker = self._scene_picker()
+            ui.button("Scenes", icon="photo_library", on_click=self._open_picker).props("dense")
+            upload = ui.upload(
+                auto_upload=True,
+                max_file_size=_LARGEST_UPLOAD,
+                on_upload=self._take_upload,
+                on_rejected=lambda: ui.notify(
+                    f"a raw may have {_LARGEST_UPLOAD // 10**6} MB at most", type="negative"
+                ),
+            ).classes("hidden")
+            ui.button(
+                "Open raw", icon="upload", on_click=lambda: upload.run_method("pickFiles")
+            ).props("dense")
+            self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")
+        with ui.tabs().props("dense align=left") as tabs:
+            exposure, episode = ui.tab("Exposure"), ui.tab("Episode")
+        with ui.tab_panels(tabs, value=exposure, animated=False).classes("w-full bg-transparent"):
+            with ui.tab_panel(exposure).classes("p-0"):
+                self._exposure.build()
+            with ui.tab_panel(episode).classes("p-0"):
+                self._episode.build()
+        await client.connected()
+        await self._open(self._library.first)
+
+    def _scene_picker(self) -> ui.dialog:
+        with ui.dialog() as dialog, ui.card().classes("w-full"):
+            ui.label("Scenes").classes("title")
+            self._thumbs = ui.element("div").classes("thumbs w-full")
+        self._listed: set[str] = set()
+        return dialog
+
+    async def _open_picker(self) -> None:
+        self._picker.open()
+        with self._thumbs:
+            for name in self._library.names:
+                if name in self._listed:
+                    continue
+                self._listed.add(name)
+                button = ui.element("button").classes("thumb")
+                with button:
+                    image = ui.element("img").props('alt=""')
+                    ui.label(name)
+                button.on("click", lambda name=name: self._pick(name))
+                asyncio.get_running_loop().create_task(self._fill(image, name))
+
+    async def _fill(self, image: ui.element, name: str) -> None:
+        """Puts the thumbnail of the scene called `name` into `image`."""
+        shared = name in self._options.library.entries
+        known = self._options.thumbnails if shared else {}
+        try:
+            if name not in known:
+                found = await run.io_bound(self._thumbnail, name)
+                if found is None:  # the program ends
+                    return
+                known[name] = found
+        except (ValueError, OSError):
+            return  # a file that cannot be read says so when it is opened
+        image.props["src"] = self._pictures.address(known[name])
+        image.update()
+
+    def _thumbnail(self, name: str) -> bytes:
+        return self._options.viewed(self._library, name).thumbnail()
+
+    async def _pick(self, name: str) -> None:
+        self._picker.close()
+        await self._open(name)
+
+    async def _open(self, name: str) -> None:
+        self._title.text = f"{name} ..."
+        try:
+            viewed = await run.io_bound(self._options.viewed, self._library, name)
+        except (ValueError, OSError) as error:
+            self._title.text = self._viewed.scene.scene_id if self._viewed else "ae-env view"
+            _complain(error)
+            return
+        if viewed is None:
+            return
+        self._viewed = viewed
+        self._title.text = name
+        self._episode.show_scene(viewed)
+        await self._exposure.show_scene(viewed)
+
+    async def _take_upload(self, event: Any) -> None:
+        event.sender.reset()
+        name = Path(event.file.name).name
+        path = Path(tempfile.mkdtemp(dir=self._folder), name)
+        await event.file.save(path)
+        try:
+            own = await run.io_bound(self._library.add, path, name)
+        except (ValueError, OSError) as error:
+            path.unlink(missing_ok=True)
+            _complain(error)
+            return
+        if own is not None:
+            await self._open(own)
+
+    async def _download(self) -> None:
+        if self._viewed is None:
+            return
+        view = self._exposure.view
+        name = Path(self._viewed.scene.scene_id).stem
+        path = Path(tempfile.mkdtemp(dir=self._folder), f"{name}-simulated.dng")
+        self._save.props("loading")
+        try:
+            await run.io_bound(self._viewed.write_dng, path, view)
+            ui.download.file(path)
+        except (ValueError, OSError) as error:
+            _complain(error)
+        finally:
+            self._save.props(remove="loading")
+
+
+def _complain(error: Exception) -> None:
+    ui.notify(" ".join(str(error).split()), type="negative", multi_line=True, timeout=10_000)

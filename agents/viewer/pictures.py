@@ -1,0 +1,291 @@
+"""What the page shows of one scene: captures, histograms, readouts, plans and scores."""
+
+from __future__ import annotations
+
+import io
+import math
+import threading
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene
+from ae_env.scorers.registry import make_scorer
+from ae_env.scorers.score_table import ScoreTable, ScoreTables
+from agents.viewer.library import Shown
+from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, write_dng
+from simulator.camera_simulator import Depth
+from simulator.capture.plan import SimulationPlan
+from simulator.raw.develop import render_srgb
+
+#: Largest picture of a whole frame, height and width [packed pixel].
+FRAME_SIZE = (512, 768)
+#: Part of the frame that is shown pixel by pixel, height and width [packed pixel].
+WINDOW_SIZE = (128, 192)
+#: Pixels a side that scores are found at, as in the environment.
+SCORED_PIXELS = 64
+#: Bins of a histogram.
+BINS = 64
+#: Signal of the mid grey that noise is stated at.
+MID_GREY = 0.12
+#: Colours of clipped pixels: a plane at white, a plane at or below black.
+_WHITE_MARK, _BLACK_MARK = (255, 0, 200), (0, 120, 255)
+#: Share of the planes' span above which a sample counts as white, below which as black.
+_AT_WHITE, _AT_BLACK = 1.0 - 1e-4, 1e-6
+_THUMBNAIL = (96, 64)
+
+
+@dataclass(frozen=True)
+class View:
+    """What one picture shows.
+
+    Args:
+        settings: Of the camera.
+        speed: Image speed [frame heights per second].
+        defocus: Diameter of the defocus disc at f/4 [pixel of a 64-pixel frame].
+        clipping: Whether clipped pixels are marked.
+        centre: Middle of the part shown pixel by pixel, down and to the right, as shares of the
+            upright picture; None for the whole frame.
+    """
+
+    settings: CameraSettings
+    speed: float = 0.0
+    defocus: float = 0.0
+    clipping: bool = False
+    centre: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A simulated capture, developed.
+
+    Args:
+        jpeg: The picture.
+        aspect: Its width by its height.
+        capture: (4, H, W) the capture.
+        milliseconds: Time the capture took, and its development.
+    """
+
+    jpeg: bytes
+    aspect: float
+    capture: torch.Tensor
+    milliseconds: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Readout:
+    """Numbers about a capture.
+
+    Args:
+        plan: How it was simulated.
+        score: Expected score.
+        snr: Signal to noise of mid grey, of one photosite [dB].
+        motion: Length of the motion streak [packed pixel of the sensor].
+        defocus: Diameter of the defocus disc [packed pixel of the sensor].
+        white: Share of the samples at white.
+        black: Share of the samples at or below black.
+        histogram: (4, `BINS`) share of each plane's samples, from black to white.
+    """
+
+    plan: SimulationPlan
+    score: float
+    snr: float
+    motion: float
+    defocus: float
+    white: float
+    black: float
+    histogram: np.ndarray
+
+
+class ViewedScene:
+    """One scene, ready to be shown at any settings.
+
+    Args:
+        shown: The scene.
+        simulator: The simulator; its networks run where a plan asks for them.
+        depth: See `CameraSimulator.prepare`.
+        tolerance: See `CameraSimulator.prepare`.
+        scorer: Name of the scorer, as `make_scorer` takes it.
+    """
+
+    def __init__(
+        self,
+        shown: Shown,
+        simulator: CameraSimulator,
+        *,
+        depth: Depth = "far",
+        tolerance: float = 0.1,
+        scorer: str = "balanced",
+    ) -> None:
+        self.scene, self.turns = shown.scene, shown.turns
+        self._simulator, self._depth, self._tolerance = simulator, depth, tolerance
+        self._scorer = make_scorer(scorer)
+        self._prepared: dict[object, PreparedScene] = {}
+        self._tables: dict[object, ScoreTable] = {}
+        self._lock = threading.RLock()  # one capture at a time: more would share the cores
+
+    @cached_property
+    def small(self) -> Scene:
+        """The scene averaged to at most `FRAME_SIZE`; what fills no whole pixel is left out."""
+        sides = zip(self.scene.light.shape[1:], FRAME_SIZE, strict=True)
+        return self.scene.averaged(max(math.ceil(side / most) for side, most in sides))
+
+    @cached_property
+    def scored(self) -> Scene:
+        """The scene as an environment shows it to a policy."""
+        return self.scene.resized(min(SCORED_PIXELS, *self.scene.light.shape[1:]))
+
+    def best(self) -> CameraSettings:
+        """Settings of the default grid's state with the highest score."""
+        grid = ExposureGrid.default()
+        return grid[self.table(View(grid[0])).oracle]
+
+    def picture(self, view: View) -> Picture:
+        """The capture that `view` asks for."""
+        with self._lock:
+            begun = perf_counter()
+            prepared = self._part(view)
+            (capture,) = prepared.expose([view.settings])
+            taken = perf_counter()
+            image = self._developed(capture, view)
+            jpeg = _jpeg(image, quality=88 if view.centre is None else 95)
+            times = 1e3 * (taken - begun), 1e3 * (perf_counter() - taken)
+            return Picture(jpeg, image.shape[1] / image.shape[0], capture, times)
+
+    def readout(self, view: View, capture: torch.Tensor) -> Readout:
+        """The numbers about `capture`, which `view` asked for."""
+        with self._lock:
+            prepared, camera = self._part(view), self.scene.camera
+            exposure = prepared.exposure(view.settings)
+            noise = camera.nlf(view.settings.iso)
+            variance = noise.read[1] + noise.shot[1] * MID_GREY
+            values = capture.reshape(4, -1)
+            counts = [torch.histc(plane, BINS, 0.0, 1.0).numpy() for plane in values]
+            return Readout(
+                plan=prepared.plan(view.settings),
+                score=float(self.table(view, view.settings).mean[0]),
+                snr=20.0 * math.log10(MID_GREY / math.sqrt(variance)) if variance else math.inf,
+                motion=exposure.motion_px * prepared.box_factor / self.scene.box_factor,
+                defocus=exposure.defocus_px * prepared.box_factor / self.scene.box_factor,
+                white=float((values >= _AT_WHITE).float().mean()),
+                black=float((values <= _AT_BLACK).float().mean()),
+                histogram=np.stack(counts) / values.shape[1],
+            )
+
+    def table(self, view: View, settings: CameraSettings | None = None) -> ScoreTable:
+        """Scores of `settings` alone, or of the default grid's states, moving as in `view`."""
+        with self._lock:
+            key = (settings, view.speed, view.defocus)
+            if key not in self._tables:
+                grid = ExposureGrid.default()
+                if settings is not None:
+                    values = (settings.iso,), (settings.exposure_time,), (settings.f_number,)
+                    grid = ExposureGrid(*values)
+                tables = ScoreTables(grid, self.scene.camera, self._scorer)
+                self._tables[key] = tables.table(
+                    self.scored, speed=view.speed, defocus=view.defocus
+                )
+            return self._tables[key]
+
+    def raw(self, view: View) -> RawImage:
+        """The full frame at the settings of `view`, at the sensor's resolution."""
+        with self._lock:
+            height = self.scene.light.shape[1]
+            return self._simulator.simulate(
+                self._prepare(self.scene),
+                view.settings,
+                image_speed=view.speed,
+                defocus=view.defocus * height / SCORED_PIXELS,
+            )
+
+    def write_dng(self, path: Path, view: View) -> Path:
+        """Writes the full frame as a DNG."""
+        write_dng(path, self.raw(view))
+        return path
+
+    def thumbnail(self) -> bytes:
+        """A small JPEG of the scene at the exposure that it asks for."""
+        grid = ExposureGrid.default()
+        settings = grid[grid.nearest(self.scene.ev100)]
+        factor = max(1, min(self.scene.light.shape[1:]) // _THUMBNAIL[1])
+        small = self.scene.averaged(factor)
+        capture = replace(small, denoised=None).prepared.expected(settings)
+        image = render_srgb(_raw(small, settings, capture.clamp(0.0, 1.0)), "half")
+        return _jpeg(self._upright(image.permute(1, 2, 0).numpy()), quality=80)
+
+    def _prepare(self, scene: Scene) -> PreparedScene:
+        return self._simulator.prepare(scene.prepared, depth=self._depth, tolerance=self._tolerance)
+
+    def _part(self, view: View) -> PreparedScene:
+        """What `view` looks at, prepared: the networks run once for the frame and once a window."""
+        if view.centre is None:
+            key: object = None
+            scene = self.small
+        else:
+            rows, columns = self._window(view.centre)
+            key = (rows.start, columns.start)
+            scene = self.scene.cut(rows, columns)
+        if key not in self._prepared:
+            if len(self._prepared) > 8:
+                self._prepared = {k: p for k, p in self._prepared.items() if k is None}
+            self._prepared[key] = self._prepare(scene)
+        prepared = self._prepared[key]
+        whole = self.small if key is None else self.scene
+        height = whole.light.shape[1]
+        return replace(
+            prepared,
+            image_speed=view.speed * height / prepared.light.shape[1],  # heights of what is shown
+            defocus=view.defocus * height / SCORED_PIXELS,
+        )
+
+    def _window(self, centre: tuple[float, float]) -> tuple[slice, slice]:
+        down, right = _unturned(centre, self.turns)
+        found = []
+        for share, side, size in zip(
+            (down, right), self.scene.light.shape[1:], WINDOW_SIZE, strict=True
+        ):
+            start = round(min(max(share * side - size / 2, 0), max(side - size, 0)))
+            found.append(slice(start, min(start + size, side)))
+        return found[0], found[1]
+
+    def _developed(self, capture: torch.Tensor, view: View) -> np.ndarray:
+        raw = _raw(self.scene, view.settings, capture)
+        whole = view.centre is None
+        image = render_srgb(raw, "half" if whole else "malvar").permute(1, 2, 0).numpy()
+        if view.clipping:
+            image = image.copy()
+            scale = 1 if whole else 2
+            for clipped, colour in (
+                ((capture <= _AT_BLACK).all(dim=0), _BLACK_MARK),
+                ((capture >= _AT_WHITE).any(dim=0), _WHITE_MARK),
+            ):
+                mask = clipped.numpy().repeat(scale, 0).repeat(scale, 1)
+                image[mask] = colour
+        return self._upright(image)
+
+    def _upright(self, image: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(np.rot90(image, self.turns))
+
+
+def _raw(scene: Scene, settings: CameraSettings, capture: torch.Tensor) -> RawImage:
+    return RawImage(capture, settings, scene.camera, white_balance=scene.white_balance)
+
+
+def _unturned(point: tuple[float, float], turns: int) -> tuple[float, float]:
+    """Where `point` of the upright picture lies in the frame, both as shares down and right."""
+    down, right = point
+    for _ in range(turns % 4):
+        down, right = right, 1.0 - down
+    return down, right
+
+
+def _jpeg(image: np.ndarray, quality: int) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()

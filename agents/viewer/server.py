@@ -1,0 +1,118 @@
+"""Serves the page to this machine's browser alone."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+from http.cookies import SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from nicegui import app, ui
+
+from agents.viewer.page import Options, show_page
+
+HOST = "127.0.0.1"
+_COOKIE = "ae-env-view"
+
+
+class TokenGuard:
+    """Refuses every request that does not bring the token of this start.
+
+    The address that is printed brings it in its query; a cookie keeps it for what the page loads.
+    Other names for this machine are refused, too: a foreign page may make its own name lead here.
+
+    Args:
+        app: The application behind it (ASGI).
+        token: What has to be brought.
+        port: Where the page is served.
+    """
+
+    def __init__(self, app: Any, token: str, port: int) -> None:
+        self._app, self._token = app, token
+        self._cookie = f"{_COOKIE}-{port}"  # cookies are shared between ports
+        self._hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        """Passes a request on, or refuses it."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {key.decode().lower(): value.decode("latin-1") for key, value in scope["headers"]}
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        cookie = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
+        origin = headers.get("origin")
+        own = headers.get("host") in self._hosts
+        own = own and (origin is None or urlsplit(origin).netloc in self._hosts)
+        by_query = own and self._is_token(given)
+        if not (by_query or (own and cookie is not None and self._is_token(cookie.value))):
+            await _refuse(scope, receive, send)
+            return
+
+        async def with_cookie(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                extra = [(b"referrer-policy", b"no-referrer")]
+                if by_query:
+                    value = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
+                    extra.append((b"set-cookie", value.encode()))
+                message = {**message, "headers": [*message["headers"], *extra]}
+            await send(message)
+
+        await self._app(scope, receive, with_cookie)
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), self._token.encode())
+
+
+async def _refuse(scope: Any, receive: Any, send: Any) -> None:
+    if scope["type"] == "websocket":
+        await receive()
+        await send({"type": "websocket.close", "code": 1008})
+        return
+    text = b"Open the address that `ae-env view` printed: it brings the token."
+    headers = [(b"content-type", b"text/plain; charset=utf-8")]
+    await send({"type": "http.response.start", "status": 403, "headers": headers})
+    await send({"type": "http.response.body", "body": text})
+
+
+def free_port(port: int) -> int:
+    """`port`, or any free one for 0.
+
+    Raises:
+        ValueError: If something listens there already.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise ValueError(
+                f"`port` (={port}) must be free: {error.strerror}; 0 takes any"
+            ) from None
+        return int(probe.getsockname()[1])
+
+
+def serve(options: Options, port: int, open_browser: bool, tell: Any) -> None:
+    """Serves the page until it is stopped.
+
+    Args:
+        options: What the page shows.
+        port: From `free_port`.
+        open_browser: Whether to open the page in the default browser.
+        tell: Called with the address once it is served.
+    """
+    token = secrets.token_urlsafe(16)
+    path = f"/?token={token}"
+    app.add_middleware(TokenGuard, token=token, port=port)
+    app.on_startup(lambda: tell(f"http://{HOST}:{port}{path}"))
+    ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
+    ui.run(
+        host=HOST,
+        port=port,
+        reload=False,
+        show=path if open_browser else False,
+        show_welcome_message=False,
+        uvicorn_logging_level="error",
+        reconnect_timeout=10.0,
+    )

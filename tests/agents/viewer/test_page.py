@@ -1,0 +1,240 @@
+"""The page in a real Chromium: what a user does, and what the page must not do."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from urllib.parse import urlsplit
+
+import pytest
+import torch
+
+from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
+#: Time within which a page does what it is asked, on a busy machine [ms].
+PATIENCE = 60_000
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """Address of a page that shows the bundled scenes."""
+    log = tmp_path_factory.mktemp("view") / "log.txt"
+    command = [sys.executable, "-m", "agents.cli", "view", "bundled:small", "--no-open"]
+    # NiceGUI serves itself differently where it finds itself under test.
+    env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    with log.open("w") as file:
+        process = subprocess.Popen(
+            [*command, "--weights", "none"], stdout=file, stderr=subprocess.STDOUT, env=env
+        )
+    try:
+        for _ in range(600):
+            found = re.search(r"open (http\S+)", log.read_text())
+            if found or process.poll() is not None:
+                break
+            time.sleep(0.1)
+        assert found, log.read_text()
+        yield found.group(1)
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+    assert "Traceback" not in log.read_text()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as driver:
+        options = ["--no-sandbox"] if os.geteuid() == 0 else []
+        found = driver.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def page(address, browser):
+    """The page, loaded; nothing may go wrong in its console, nothing may be asked of others."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(PATIENCE)
+    opened = context.new_page()
+    wrong: list[str] = []
+    opened.on("console", lambda m: wrong.append(m.text) if m.type in ("error", "warning") else None)
+    opened.on("pageerror", lambda error: wrong.append(str(error)))
+    opened.on("request", lambda r: hosts.add(urlsplit(r.url).netloc or r.url[:5]))
+    hosts: set[str] = set()
+    opened.goto(address)
+    ready(opened)
+    yield opened
+    context.close()
+    assert wrong == []
+    assert hosts - {"data:", "blob:"} == {urlsplit(address).netloc}
+
+
+def ready(page):
+    page.wait_for_selector(".stage img[src]")
+    page.wait_for_selector(".state.shown")
+
+
+def picture(page):
+    return page.locator(".stage img").first.get_attribute("src")
+
+
+def changed(page, source):
+    page.wait_for_function(
+        "s => document.querySelector('.stage img').src.indexOf(s) < 0", arg=source
+    )
+
+
+def slider(page, name):
+    return page.locator(f"[aria-label='{name}'] [tabindex='0']")
+
+
+def test_slides_by_keyboard_and_shows_another_picture(page):
+    before = picture(page)
+    slider(page, "ISO").focus()
+    page.keyboard.press("ArrowRight")
+    changed(page, before)
+    page.get_by_text("ISO 125,").wait_for()  # in the plan
+
+
+def test_shows_the_state_that_is_clicked(page):
+    page.locator("button[aria-label^='ISO 6400, 1/2 s, f/4']").click()
+    page.locator("button.shown[aria-label^='ISO 6400, 1/2 s, f/4']").wait_for()
+    page.get_by_text(re.compile(r"^\d+\.\d+% at white")).wait_for()
+
+
+def test_starts_at_the_best_state(page):
+    scores = {
+        button.get_attribute("aria-label"): float(button.inner_text().split()[-1])
+        for button in page.locator(".state").all()
+    }
+    assert len(scores) == 64
+    shown = page.locator(".state.shown")
+    assert "★" in shown.inner_text()
+    assert float(shown.inner_text().split()[-1]) == max(scores.values())
+
+
+def test_zooms_to_the_pixels_and_back(page):
+    before = picture(page)
+    page.locator(".stage img").first.click(position={"x": 100, "y": 100})
+    changed(page, before)
+    page.locator(".stage.pixels").wait_for()
+    before = picture(page)
+    slider(page, "Across").focus()
+    for _ in range(20):
+        page.keyboard.press("ArrowRight")
+    changed(page, before)
+    page.keyboard.press("Escape")
+    page.locator("body").press("z")
+    page.locator(".stage.whole").wait_for()
+
+
+def test_compares_two_states_with_a_divider(page):
+    page.get_by_text("Compare with this (P)").click()
+    over = page.locator(".stage .over")
+    over.wait_for()
+    pinned = over.get_attribute("src")
+    before = picture(page)
+    slider(page, "Shutter").focus()
+    page.keyboard.press("ArrowRight")
+    changed(page, before)
+    assert over.get_attribute("src") == pinned
+    page.locator("input.divider").focus()
+    page.keyboard.press("Home")
+    assert over.evaluate("e => getComputedStyle(e).clipPath") == "inset(0px 0px 0px 0%)"
+
+
+def test_marks_where_a_policy_stands(page):
+    page.get_by_label(re.compile("Mark where policies")).click()
+    page.get_by_role("option", name="average", exact=True).click()
+    page.get_by_text(re.compile(r"^A average: ISO")).wait_for()
+    assert page.locator(".state", has_text="A").count() == 1
+
+
+def test_plays_an_episode_of_two_policies(page):
+    page.get_by_role("tab", name="Episode").click()
+    for label, name in (("policy A", "average"), ("policy B", "rpi_agc")):
+        page.get_by_label(label).fill(name)
+        page.keyboard.press("Enter")
+    page.get_by_label("frames").fill("6")
+    page.get_by_role("button", name="Run").click()
+    page.get_by_text("frame 6 of 6").wait_for()
+    assert page.get_by_text(re.compile(r"^A average: .* regret")).count() == 1
+    assert page.get_by_text(re.compile(r"^B rpi_agc: .* regret")).count() == 1
+    assert page.locator(".chart polyline").count() == 3 + 2 + 2
+    page.get_by_label("policy A").fill("averagee")
+    page.keyboard.press("Enter")
+    page.get_by_role("button", name="Run").click()
+    page.get_by_text(re.compile("did you mean")).wait_for()
+
+
+def test_a_bad_file_is_refused_and_the_page_lives(page, tmp_path):
+    bad = tmp_path / "holiday.dng"
+    bad.write_bytes(b"not a raw at all" * 100)
+    page.locator("input[type=file]").set_input_files(bad)
+    page.locator(".q-notification", has_text="holiday.dng").wait_for()
+    test_shows_the_state_that_is_clicked(page)
+
+
+def test_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
+    camera = get_camera("nikon_z6")
+    light = torch.linspace(0.02, 0.6, 96).repeat(4, 64, 1)
+    raw = RawImage(light, CameraSettings(100, 1 / 64, 4), camera, nlf=camera.nlf(100))
+    write_dng(tmp_path / "ramp.dng", raw)
+    page.locator("input[type=file]").set_input_files(tmp_path / "ramp.dng")
+    page.get_by_text("ramp.dng", exact=True).first.wait_for()
+    page.locator("button[aria-label^='ISO 400, 1/1000 s, f/8']").click()
+    page.locator("button.shown[aria-label^='ISO 400, 1/1000 s, f/8']").wait_for()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="DNG").click()
+    download.value.save_as(tmp_path / "back.dng")
+    back = read_raw(tmp_path / "back.dng")
+    assert (back.settings.iso, back.settings.f_number) == (400, 8)
+    assert back.data.shape == light.shape
+    # 4 times the ISO, a quarter of the light by the aperture, 64/1000 of it by the time
+    assert float(back.data.mean()) == pytest.approx(0.31 * 64 / 1000, rel=0.02)
+
+
+def test_two_tabs_show_different_scenes(page, address):
+    other = page.context.new_page()
+    other.goto(address)
+    ready(other)
+    other.get_by_role("button", name="Scenes").click()
+    thumb = other.locator(".thumb").nth(3)
+    thumb.locator("img[src]").wait_for()
+    name = thumb.inner_text()
+    thumb.click()
+    other.locator(".title", has_text=name).first.wait_for()
+    assert page.locator(".title").first.inner_text() != name
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_fits_the_width(page, width):
+    page.set_viewport_size({"width": width, "height": 844})
+    page.wait_for_timeout(200)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+@pytest.mark.parametrize(
+    ("token", "host"), [("", None), ("wrong", None), (None, "example.org"), (None, "evil.test:80")]
+)
+def test_refuses_whoever_lacks_the_token_or_has_another_name(address, token, host):
+    parts = urlsplit(address)
+    query = parts.query if token is None else f"token={token}"
+    request = urllib.request.Request(f"http://{parts.netloc}/?{query}")
+    if host is not None:
+        request.add_header("Host", host)
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request, timeout=30)
