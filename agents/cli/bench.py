@@ -24,6 +24,7 @@ BENCHMARKS = (
         "denoising",
     ),
     *("libcamera", "onboard", "ptc", "scorers", "simulator", "stability", "throughput", "transfer"),
+    "viewer",
     "work_precision",
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.

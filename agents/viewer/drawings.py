@@ -33,13 +33,10 @@ def histogram(shares: np.ndarray, height: int = 96) -> str:
 
 
 def chart(lines: Mapping[str, Sequence[float]], low: float, high: float, height: int = 110) -> str:
-    """Values over the frames of an episode; the names of `lines` are their colours."""
+    """Values over the frames of an episode, as HTML; the names of `lines` are their colours."""
     drawn = [_line(values, colour, height, low, high) for colour, values in lines.items()]
-    labels = [
-        f'<text x="4" y="{y}" fill="#ccc" font-size="13">{value:.3g}</text>'
-        for y, value in ((13, high), (height - 4, low))
-    ]
-    return _svg(drawn + labels, height)
+    ends = f'<span class="high">{high:.3g}</span><span class="low">{low:.3g}</span>'
+    return _svg(drawn, height) + ends
 
 
 def _line(

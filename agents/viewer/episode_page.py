@@ -41,17 +41,13 @@ class EpisodePage:
         """Puts the tab together."""
         with ui.element("div").classes("column w-full"):
             with ui.element("div").classes("bar"):
+                choices = "".join(f'<option value="{name}">' for name in NAMES)
+                ui.html(choices, sanitize=False, tag="datalist").props("id=policies")
                 self._policies = [
-                    ui.select(
-                        list(NAMES),
-                        label=f"policy {letter}",
-                        value=NAMES[2 * i],
-                        with_input=True,
-                        new_value_mode="add-unique",
-                    )
-                    .props("dense")
+                    ui.input(f"policy {letter}", value=name)
+                    .props("dense list=policies")
                     .classes("w-72")
-                    for i, letter in enumerate("AB")
+                    for letter, name in zip("AB", (NAMES[0], NAMES[2]), strict=True)
                 ]
                 self._light = ui.select(list(LIGHTS), label="light", value="shadows").props("dense")
                 self._frames = ui.number("frames", value=_FRAMES, min=2, max=512, precision=0)
@@ -94,7 +90,7 @@ class EpisodePage:
     async def _record(self) -> None:
         if self._viewed is None:
             return
-        viewed, names = self._viewed, [str(select.value) for select in self._policies]
+        viewed, names = self._viewed, [str(field.value) for field in self._policies]
         names = list(dict.fromkeys(names))  # a policy beside itself is shown once
         light = str(self._light.value)
         self._run.props("loading")

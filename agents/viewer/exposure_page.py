@@ -32,7 +32,7 @@ F_NUMBERS = (4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.0)
 POLICIES = (*METERS, *(f"matrix:{name}" for name in PROGRAMS), "rpi_agc", "regression", "ppo")
 _LETTERS = "ABCDEFGH"
 _DIVIDE = (
-    "(e) => e.target.closest('.column').querySelector('.stage')"
+    "(e) => e.target.closest('.columns').querySelector('.stage')"
     ".style.setProperty('--cut', e.target.value + '%')"
 )
 
@@ -60,9 +60,9 @@ class ExposurePage:
     def build(self) -> None:
         """Puts the tab together."""
         with ui.element("div").classes("columns"):
-            with ui.element("div").classes("column"):
+            with ui.element("div").classes("column looked-at"):
                 self._build_picture()
-            with ui.element("div").classes("column"):
+            with ui.element("div").classes("column controls"):
                 self._iso = self._setting("ISO", ISOS, lambda v: f"{v:g}")
                 self._time = self._setting("Shutter", TIMES, format_exposure_time)
                 self._f_number = self._setting("Aperture", F_NUMBERS, lambda v: f"f/{v:g}")
@@ -73,6 +73,8 @@ class ExposurePage:
                     "Motion of the image in frame heights a second; defocus at f/4, in pixels of a "
                     "frame 64 pixels high."
                 ).classes("note")
+            with ui.element("div").classes("column"):
+                self._build_readouts()
         ui.keyboard(on_key=self._on_key)
 
     def _build_picture(self) -> None:
@@ -101,6 +103,10 @@ class ExposurePage:
         self._across = self._amount("Across", 1.0, 0.01, "{:.0%}", self._move)
         self._down = self._amount("Down", 1.0, 0.01, "{:.0%}", self._move)
         self._pinned = ui.label().classes("note")
+        self._show_compared(None)
+        self._show_window()
+
+    def _build_readouts(self) -> None:
         self._histogram = ui.html(sanitize=False).props(
             'role=img aria-label="histogram of the raw planes"'
         )
@@ -110,8 +116,6 @@ class ExposurePage:
                 ui.label(name).classes("name")
                 self._facts[name] = ui.label()
         self._plan = ui.label().classes("plan")
-        self._show_compared(None)
-        self._show_window()
 
     def _setting(self, name: str, values: Any, show: Callable[[Any], str]) -> Any:
         with ui.element("div").classes("setting"):
@@ -159,7 +163,7 @@ class ExposurePage:
                 on_change=self._mark,
             )
             self._names.props("dense use-chips").classes("w-full")
-        self._legend = ui.label().classes("note")
+        self._legend = ui.label().classes("note legend")
 
     def _build_state(self, state: int) -> None:
         button = ui.element("button").classes("state")
@@ -273,7 +277,9 @@ class ExposurePage:
             letters = [_LETTERS[i] for i, s in enumerate(self._marks.values()) if s == state]
             score = float(table.mean[state])
             background, ink = score_colour(score)
-            label.text = f"{'★' * (state == best)}{''.join(letters)} {score:.2f}".strip()
+            label.text = f"{'★' * (state == best)}{''.join(letters)} {score:.2f}".replace(
+                " 0.", " ."
+            ).strip()
             button.style(f"background:{background};color:{ink}")
             button.props["aria-label"] = f"{_GRID[state]}: score {score:.2f}"
             if _GRID[state] == view.settings:
@@ -363,7 +369,7 @@ class ExposurePage:
         if viewed is not self._viewed:
             return
         self._marks = {name: self._marks[name] for name in names if name in self._marks}
-        self._legend.text = "   ".join(
+        self._legend.text = "\n".join(
             f"{letter} {name}: {_GRID[state]}"
             for letter, (name, state) in zip(_LETTERS, self._marks.items(), strict=False)
         )

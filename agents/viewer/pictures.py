@@ -161,18 +161,17 @@ class ViewedScene:
     def readout(self, view: View, capture: torch.Tensor) -> Readout:
         """The numbers about `capture`, which `view` asked for."""
         with self._lock:
-            prepared, camera = self._part(view), self.scene.camera
-            exposure = prepared.exposure(view.settings)
-            noise = camera.nlf(view.settings.iso)
+            settings, height = view.settings, self.scene.light.shape[1]
+            noise = self.scene.camera.nlf(settings.iso)
             variance = noise.read[1] + noise.shot[1] * MID_GREY
             values = capture.reshape(4, -1)
             counts = [torch.histc(plane, BINS, 0.0, 1.0).numpy() for plane in values]
             return Readout(
-                plan=prepared.plan(view.settings),
-                score=float(self.table(view, view.settings).mean[0]),
+                plan=self._part(view).plan(settings),
+                score=float(self.table(view, settings).mean[0]),
                 snr=20.0 * math.log10(MID_GREY / math.sqrt(variance)) if variance else math.inf,
-                motion=exposure.motion_px * prepared.box_factor / self.scene.box_factor,
-                defocus=exposure.defocus_px * prepared.box_factor / self.scene.box_factor,
+                motion=view.speed * height * settings.exposure_time,
+                defocus=view.defocus * height / SCORED_PIXELS * 4.0 / settings.effective_f_number,
                 white=float((values >= _AT_WHITE).float().mean()),
                 black=float((values <= _AT_BLACK).float().mean()),
                 histogram=np.stack(counts) / values.shape[1],

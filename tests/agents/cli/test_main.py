@@ -24,9 +24,9 @@ COMMANDS = [
     "sweep",
     "train",
 ]
-COMMANDS += ["train-simulator", "warm-up"]
+COMMANDS += ["train-simulator", "view", "warm-up"]
 #: Those that write no folder of results, and those that draw nothing at random.
-NO_OUT = ("cache", "scenes", "scorers", "warm-up")
+NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
 NO_SEED = (*NO_OUT, "convert-nima", "export")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\

@@ -167,7 +167,6 @@ def test_plays_an_episode_of_two_policies(page):
     page.get_by_role("tab", name="Episode").click()
     for label, name in (("policy A", "average"), ("policy B", "rpi_agc")):
         page.get_by_label(label).fill(name)
-        page.keyboard.press("Enter")
     page.get_by_label("frames").fill("6")
     page.get_by_role("button", name="Run").click()
     page.get_by_text("frame 6 of 6").wait_for()
@@ -175,7 +174,6 @@ def test_plays_an_episode_of_two_policies(page):
     assert page.get_by_text(re.compile(r"^B rpi_agc: .* regret")).count() == 1
     assert page.locator(".chart polyline").count() == 3 + 2 + 2
     page.get_by_label("policy A").fill("averagee")
-    page.keyboard.press("Enter")
     page.get_by_role("button", name="Run").click()
     page.get_by_text(re.compile("did you mean")).wait_for()
 

@@ -1,0 +1,170 @@
+"""From a key on a slider of `ae-env view` to the new picture, measured in Chromium."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from time import perf_counter, sleep
+from typing import Any
+
+import numpy as np
+import torch.nn.functional as F
+
+from ae_env.scenes import load_scenes
+from agents.viewer.library import find_scenes
+from agents.viewer.pictures import View, ViewedScene
+from benchmarks.harness import Benchmark, Part, Report, Row, table
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, write_dng
+
+#: Raws, height and width [packed pixel]; the last is averaged to half its sides on the page.
+SIZES = ((256, 384), (512, 768), (1024, 1536))
+#: Keys pressed on each slider, and the time between two [ms].
+KEYS, PAUSE = 24, 500
+SLIDERS = ("ISO", "Shutter", "Aperture")
+_WATCH = """() => {
+  window.times = []; window.begun = 0;
+  document.addEventListener('keydown', () => { window.begun = performance.now(); }, true);
+  document.querySelector('.stage img').addEventListener('load', () => {
+    requestAnimationFrame(() => {
+      if (window.begun) { window.times.push(performance.now() - window.begun); window.begun = 0; }
+    });
+  });
+}"""
+
+
+def measure(height: int, width: int, seed: int, quick: bool) -> Row:
+    """One raw: in the page, in Python and as one command."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = _raw(Path(folder, "scene.dng"), height, width, seed)
+        times, load = _in_browser(path, 4 if quick else KEYS)
+        python = _in_python(path, 4 if quick else KEYS)
+        begun = perf_counter()
+        options = ["--iso", "400", "--shutter", "1/125", "--aperture", "5.6"]
+        files = ["-o", f"{folder}/out.dng", "--png", f"{folder}/out.png"]
+        subprocess.run(
+            [*_program("simulate"), str(path), *options, *files], check=True, capture_output=True
+        )
+        command = 1e3 * (perf_counter() - begun)
+    row: Row = {"height": height, "width": width, "keys": len(times), "command_ms": command}
+    row |= {"median_ms": float(np.median(times)), "p95_ms": float(np.quantile(times, 0.95))}
+    return row | {"python_ms": float(np.median(python)), "load_ms": load}
+
+
+def _raw(path: Path, height: int, width: int, seed: int) -> Path:
+    """A raw of a bundled scene, enlarged to `height` and `width`, with its camera's noise."""
+    camera = get_camera("nikon_z6")
+    scene = load_scenes("bundled:small", "test", camera=camera, resolution=None)[0]
+    settings = CameraSettings(100, 2.0 ** -round(scene.ev100 - 4), 4)
+    scale = max(height / scene.light.shape[1], width / scene.light.shape[2])
+    light = F.interpolate(scene.light[None], scale_factor=scale, mode="bilinear")[0]
+    light = light[:, :height, :width] / scene.reference.exposure_time * settings.exposure_time
+    clean = RawImage(light.clamp(0, 1), settings, camera, white_balance=scene.white_balance)
+    write_dng(path, CameraSimulator(device="cpu").simulate(clean, settings, seed=seed))
+    return path
+
+
+def _program(command: str) -> list[str]:
+    return [sys.executable, "-m", "agents.cli", command]
+
+
+def _in_browser(path: Path, keys: int) -> tuple[list[float], float]:
+    """Times of `keys` keys on each slider [ms], and that of the page's first picture."""
+    from playwright.sync_api import sync_playwright
+
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        raise ValueError("this benchmark needs Chromium: apt install chromium")
+    log = path.with_suffix(".log")
+    with log.open("w") as file:
+        process = subprocess.Popen(
+            [*_program("view"), str(path), "--no-open"], stdout=file, stderr=subprocess.STDOUT
+        )
+    try:
+        while not (found := re.search(r"open (http\S+)", log.read_text())):
+            if process.poll() is not None:
+                raise RuntimeError(log.read_text())
+            sleep(0.1)
+        with sync_playwright() as driver:
+            options = ["--no-sandbox"] if os.geteuid() == 0 else []
+            browser = driver.chromium.launch(executable_path=chromium, args=options)
+            page = browser.new_page(viewport={"width": 1280, "height": 900})
+            begun = perf_counter()
+            page.goto(found.group(1))
+            page.wait_for_selector(".stage img[src]", timeout=120_000)
+            load = 1e3 * (perf_counter() - begun)
+            page.wait_for_selector(".state.shown", timeout=120_000)
+            page.evaluate(_WATCH)
+            times: list[float] = []
+            for name in SLIDERS:
+                page.locator(f"[aria-label='{name}'] [tabindex='0']").focus()
+                for i in range(keys):
+                    page.keyboard.press("ArrowRight" if i % 8 < 4 else "ArrowLeft")
+                    page.wait_for_timeout(PAUSE)
+            times = page.evaluate("window.times")
+            browser.close()
+    finally:
+        process.terminate()
+        process.wait(20)
+    return times, load
+
+
+def _in_python(path: Path, count: int) -> list[float]:
+    """Times of the same pictures without a browser [ms]."""
+    library = find_scenes(str(path))
+    viewed = ViewedScene(library.open(library.first), CameraSimulator.from_pretrained(device="cpu"))
+    settings = viewed.best()
+    views = [View(CameraSettings(iso, settings.exposure_time, 5.6)) for iso in (400, 500, 640, 800)]
+    times = []
+    for i in range(count + 1):
+        begun = perf_counter()
+        viewed.picture(views[i % len(views)])
+        times.append(1e3 * (perf_counter() - begun))
+    return times[1:]  # the first one prepares the scene
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """Each size."""
+    return [
+        Part(f"{h}x{w}", measure, {"height": h, "width": w, "seed": seed, "quick": quick})
+        for h, w in (SIZES[:1] if quick else SIZES)
+    ]
+
+
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report, of the rows of all sizes."""
+    rows: list[Row] = list(results.values())
+    for row in rows:
+        row["speedup"] = row["command_ms"] / row["median_ms"]
+    columns = {
+        "raw": "4 x {height} x {width}",
+        "key to picture, median [ms]": "{median_ms:.0f}",
+        "95 % within [ms]": "{p95_ms:.0f}",
+        "of it simulated and developed [ms]": "{python_ms:.0f}",
+        "`ae-env simulate` [ms]": "{command_ms:.0f}",
+        "simulate / page": "{speedup:.0f}",
+        "first picture [ms]": "{load_ms:.0f}",
+    }
+    page = [
+        "`ae-env view` in Chromium, on this machine: from a key on a slider to the first frame of "
+        f"the screen after the new picture has loaded, {KEYS} keys on each of the sliders "
+        f"{', '.join(SLIDERS)}. Beside it the same pictures made in Python without a browser, and "
+        "one by the command `ae-env simulate`, which starts a program and writes a DNG and a PNG "
+        "of all pixels. Raws of more than 512 x 768 packed pixels are averaged down on the page.",
+        table(rows, columns),
+    ]
+    return Report(rows, page)
+
+
+BENCHMARK = Benchmark(
+    name="viewer",
+    title="The viewer's latency",
+    parts=parts,
+    report=report,
+    code=("agents/viewer", "agents/cli/view", "benchmarks/viewer"),
+)
+run = BENCHMARK.run

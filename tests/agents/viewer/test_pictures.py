@@ -1,0 +1,129 @@
+"""What is shown of a scene: turned, cut, marked, measured."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ae_env.scenes import Scene
+from agents.viewer.library import Entry, Library, Shown, find_scenes
+from agents.viewer.pictures import WINDOW_SIZE, View, ViewedScene
+from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, get_camera
+
+CAMERA = get_camera("nikon_z6")
+SETTINGS = CameraSettings(100, 1 / 64, 4)
+
+
+def viewed(light, turns=0, camera=CAMERA):
+    scene = Scene.from_array(light, SETTINGS, camera, scene_id="made")
+    return ViewedScene(Shown(scene, turns), CameraSimulator(device="cpu"))
+
+
+def image(picture):
+    return np.asarray(Image.open(io.BytesIO(picture.jpeg))).astype(float)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, -1])
+def test_the_window_lies_where_the_upright_picture_was_clicked(turns):
+    light = torch.full((4, 700, 900), 0.02)
+    light[:, 120:124, 700:704] = 0.9  # a spot
+    seen = viewed(light, turns)
+    whole = image(seen.picture(View(SETTINGS))).mean(axis=2)
+    down, right = np.unravel_index(whole.argmax(), whole.shape)
+    centre = ((down + 0.5) / whole.shape[0], (right + 0.5) / whole.shape[1])
+    window = image(seen.picture(View(SETTINGS, centre=centre))).mean(axis=2)
+    assert sorted(window.shape) == sorted(2 * side for side in WINDOW_SIZE)
+    found = np.argwhere(window > 0.8 * window.max()).mean(axis=0)
+    np.testing.assert_allclose(found, np.array(window.shape) / 2, atol=8)
+
+
+def test_the_whole_frame_is_averaged_to_the_size_of_the_page():
+    seen = viewed(torch.rand(4, 1025, 1100, generator=torch.Generator().manual_seed(0)))
+    assert seen.picture(View(SETTINGS)).capture.shape == (4, 341, 366)  # thirds
+
+
+def test_clipped_pixels_are_marked():
+    light = torch.full((4, 64, 64), 0.1)
+    light[:, :32, :32] = 3.0
+    light[:, 32:, 32:] = -0.1
+    shown = image(viewed(light).picture(View(SETTINGS, clipping=True)))
+    assert shown[:28, :28].std(axis=(0, 1)).max() < 3
+    np.testing.assert_allclose(shown[16, 16], (255, 0, 200), atol=8)
+    np.testing.assert_allclose(shown[48, 48], (0, 120, 255), atol=8)
+    assert np.ptp(shown[16, 48]) < 40  # grey stays grey
+
+
+def test_numbers_of_a_flat_scene():
+    seen = viewed(torch.full((4, 64, 64), 0.25))
+    view = View(CameraSettings(100, 1 / 16, 4), speed=0.5, defocus=4.0)
+    picture = seen.picture(view)
+    readout = seen.readout(view, picture.capture)
+    assert (readout.white, readout.black) == (pytest.approx(1.0, abs=0.6), 0.0)
+    assert readout.motion == pytest.approx(0.5 * 64 / 16)  # speed, height, time
+    assert readout.defocus == pytest.approx(4.0)
+    dark = View(CameraSettings(100, 1 / 128, 4))
+    readout = seen.readout(dark, seen.picture(dark).capture)
+    assert readout.histogram.argmax(axis=1).tolist() == [8] * 4  # 0.125 of white, in 64 bins
+    np.testing.assert_allclose(readout.histogram.sum(axis=1), 1.0)
+    nlf = CAMERA.nlf(100)
+    snr = 20 * math.log10(0.12 / math.sqrt(nlf.read[1] + nlf.shot[1] * 0.12))
+    assert readout.snr == pytest.approx(snr)
+
+
+def test_a_window_moves_as_the_frame_does():
+    seen = viewed(torch.full((4, 512, 384), 0.1))
+    view = View(CameraSettings(100, 1 / 16, 4), speed=0.5, defocus=2.0)
+    for centre in (None, (0.5, 0.5)):
+        shown = View(view.settings, view.speed, view.defocus, centre=centre)
+        readout = seen.readout(shown, seen.picture(shown).capture)
+        assert readout.motion == pytest.approx(0.5 * 512 / 16)
+        assert readout.defocus == pytest.approx(2.0 * 512 / 64)
+
+
+def test_the_best_state_has_the_highest_score():
+    light = torch.rand(4, 96, 96, generator=torch.Generator().manual_seed(1)) * 0.3
+    seen = viewed(light)
+    best = seen.best()
+    scores = seen.table(View(best)).mean
+    assert seen.table(View(best), best).mean[0] == pytest.approx(scores.max(), abs=1e-6)
+
+
+def test_a_library_reads_a_scene_when_it_is_opened_and_keeps_few():
+    reads: list[str] = []
+
+    def read(name):
+        def make():
+            reads.append(name)
+            scene = Scene.from_array(
+                torch.zeros(4, 2, 2), SETTINGS, CAMERA, scene_id=name, nlf=NoiseLevelFunction.zero()
+            )
+            return Shown(scene)
+
+        return make
+
+    library = Library([Entry(name, read(name)) for name in "abcdef"])
+    assert reads == []
+    for name in "abcdefef":
+        assert library.open(name).scene.scene_id == name
+    assert reads == list("abcdef")
+    library.open("a")
+    assert reads == list("abcdefa")
+
+
+@pytest.mark.parametrize("what", ["snow-9999", "/no/such/file.dng", "bundeld"])
+def test_what_is_no_scene_is_refused(what):
+    with pytest.raises(ValueError, match=r"`what` \(="):
+        find_scenes(what)
+
+
+def test_a_scene_is_found_by_its_id():
+    library = find_scenes("bundled:small")
+    other = library.names[5]
+    found = find_scenes(other)
+    assert found.first == other
+    assert other in found.names
