@@ -1,6 +1,7 @@
 # make demo   sets up .venv and runs the quickstart
 # make test   sets up .venv and runs the test suite
 # make check  lint, format and types
+# make docs   the site, in build/site
 # make dist   the wheel and the source distribution, in dist/
 # make check-dist  installs the wheel in a new environment and runs every command there
 # make bench  the measurements in docs/results, except the long training
@@ -11,13 +12,13 @@ BASE := $(VENV)/.base
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
 
-.PHONY: demo test check format dist check-dist bench clean $(VENV)
+.PHONY: demo test check format docs dist check-dist bench clean $(VENV)
 
 demo: $(BASE)
 	$(BIN)/ae-env quickstart
 
 test: $(STAMP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(STAMP)
 	$(BIN)/ruff check .
@@ -27,6 +28,10 @@ check: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: $(STAMP)
+	$(BIN)/sphinx-build --fail-on-warning --keep-going -d build/doctrees docs build/site
+	@echo "open build/site/index.html"
 
 dist: $(STAMP)
 	rm -rf dist build/lib
