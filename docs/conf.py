@@ -7,12 +7,10 @@ import inspect
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 from docutils import nodes
 from myst_parser.parsers.sphinx_ import MystParser
 from sphinx.application import Sphinx
-from sphinx.util.docutils import SphinxDirective
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
@@ -25,7 +23,7 @@ author = copyright = "The ae-env developers"
 version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build"]
+exclude_patterns = ["conf.py"]
 html_theme = "furo"
 html_title = f"ae-env {release}"
 html_copy_source = False
@@ -34,8 +32,8 @@ default_role = "code"
 
 myst_heading_anchors = 4
 myst_enable_extensions = ["html_image"]
-# Results show tables of lengths that no lexer knows.
-suppress_warnings = ["misc.highlighting_failure"]
+# Parts of reports begin below the level of a title.
+suppress_warnings = ["myst.header"]
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
@@ -57,20 +55,15 @@ CONTENTS = {
     "The simulator": [
         *("simulator", "networks", "dataset", "colour", "performance", "stability"),
     ],
-    "More": ["gallery", "results/README", "api/simulator", "api/ae_env", "api/agents"],
+    "More": [
+        "gallery",
+        "results/README",
+        "ae-bench/v1",
+        "api/simulator",
+        "api/ae_env",
+        "api/agents",
+    ],
 }
-
-
-class DocstringPage(SphinxDirective):
-    """``docstring``: the Markdown of a class's docstring, which is a page of its own."""
-
-    required_arguments = 1
-
-    def run(self) -> list[nodes.Node]:
-        """The parsed docstring."""
-        module, _, name = self.arguments[0].partition(":")
-        text = inspect.getdoc(getattr(importlib.import_module(module), name)) or ""
-        return self.parse_text_to_nodes(text, allow_section_headings=True)
 
 
 class ScriptParser(MystParser):
@@ -95,9 +88,15 @@ def script_to_markdown(script: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def docstring(found: re.Match[str]) -> str:
+    """The docstring of the class that a block ``{docstring} module:Class`` names."""
+    text = inspect.getdoc(getattr(importlib.import_module(found[1]), found[2])) or ""
+    return re.sub(r"^(#+ )", r"#\1", text, flags=re.MULTILINE)  # below the title of its task
+
+
 def on_source_read(app: Sphinx, name: str, source: list[str]) -> None:
-    """Adds the side bar to the index, and makes plain text of links to folders of the code."""
-    text = source[0]
+    """Puts in docstrings and the side bar, and makes plain text of links to the code."""
+    text = re.sub(r"```\{docstring\} ([\w.]+):(\w+)\n```", docstring, source[0])
     if name == "index":
         for caption, pages in CONTENTS.items():
             listed = "\n".join(pages)
@@ -117,13 +116,12 @@ def _link(app: Sphinx, name: str, found: re.Match[str]) -> str:
     if "://" in target or target.startswith("#"):
         return found[0]
     path = (HERE / Path(name).parent / target.partition("#")[0]).resolve()
-    page_of_site = path.suffix == ".md" and path.is_relative_to(HERE)
-    return found[0] if page_of_site or (path.is_file() and path.suffix != ".md") else text
+    page = path.suffix in (".md", ".py")  # pages of this site, or files of the repository
+    return found[0] if path.is_relative_to(HERE) or (path.is_file() and not page) else text
 
 
 def setup(app: Sphinx) -> None:
-    """Adds what this site needs beyond its extensions."""
-    app.add_directive("docstring", DocstringPage)
+    """Registers scripts as pages, and what is done to every page."""
     app.add_source_suffix(".py", "script")
     app.add_source_parser(ScriptParser)
     app.connect("source-read", on_source_read)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 import typer
@@ -20,13 +21,24 @@ import yaml
 from ae_env.scorers import make_scorer
 from agents.cli.main import app
 from agents.learning.training import AgentConfig
+from simulator import (
+    BayerPattern,
+    CameraProfile,
+    CameraSettings,
+    NoiseLevelFunction,
+    RawImage,
+    get_camera,
+    write_dng,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 PAGES += [ROOT / "docs" / "results" / "README.md"]
-#: Pages that a user reads to do a job; their code runs.
+#: Pages that a user reads to do a job.
 JOBS = [ROOT / "README.md", *(ROOT / "docs" / f"{n}.md" for n in ("train", "judge"))]
 SCORER_PAGE = ROOT / "docs" / "plug-in-a-scorer.md"
+#: Pages that are scripts.
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 SMALL = {"scenes": "bundled:snow", "resolution": 36}
 
 
@@ -36,7 +48,7 @@ def _name(page: Path) -> str:
 
 def _blocks(page: Path, language: str) -> list[str]:
     """Fenced blocks of a language, but for those marked `<!-- not run: reason -->`."""
-    pattern = rf"^(<!-- not run: .+ -->\n)?```{language}\n(.*?)^```$"
+    pattern = rf"^(<!-- not run: [^\n]+ -->\n)?```{language}\n(.*?)^```$"
     found = re.findall(pattern, page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     return [code for mark, code in found if not mark]
 
@@ -86,11 +98,29 @@ def test_printed_examples_are_those_in_the_folder() -> None:
     assert {"train_ppo.py", "my_policy.py"} <= set(names)
 
 
+def _write_files(folder: Path) -> None:
+    """Writes the files that pages read: raws, and samples of an industrial camera."""
+    nlf = {100: NoiseLevelFunction(shot=(2e-4,) * 4, read=(1e-6,) * 4)}
+    levels: Any = {"black_level": (256,) * 4, "white_level": 4095, "bit_depth": 12}
+    bench = CameraProfile(name="bench", cfa=BayerPattern.GBRG, nlf_by_iso=nlf, **levels)
+    light = torch.rand(4, 64, 96, generator=torch.Generator().manual_seed(0)) * 0.5
+    settings = CameraSettings(100, 1 / 64, 4.0)
+    write_dng(folder / "frame.dng", RawImage(light, settings, bench))
+    write_dng(folder / "IMG_0001.dng", RawImage(light, settings, get_camera("nikon_z6")))
+    for suffix in (".CRW", ".CR2"):  # a raw is known by its content
+        (folder / f"IMG_0001{suffix}").write_bytes((folder / "IMG_0001.dng").read_bytes())
+    samples = np.random.default_rng(0).integers(256, 4096, (512, 768), dtype=np.uint16)
+    samples.tofile(folder / "frame_768x512_rggb.raw")
+
+
 def _run(code: str, folder: Path) -> None:
     """Runs a page where nobody has imported `ae_env`, with few scenes and small frames."""
+    # The agents of the package look at 64 x 64 pixels.
+    small = SMALL if "regression" not in code else {"scenes": SMALL["scenes"]}
+    _write_files(folder)
 
     def with_few(make: Any) -> Any:
-        return lambda name, **arguments: make(name, **{**arguments, **SMALL})
+        return lambda name, **arguments: make(name, **{**arguments, **small})
 
     os.chdir(folder)
     torch.set_num_threads(1)
@@ -101,14 +131,19 @@ def _run(code: str, folder: Path) -> None:
     exec(compile(code, "page.py", "exec"), {"__name__": "__main__"})
 
 
-@pytest.mark.parametrize("page", JOBS, ids=_name)
+WITH_CODE = [page for page in PAGES if page != SCORER_PAGE and _blocks(page, "python")]
+
+
+@pytest.mark.parametrize("page", [*WITH_CODE, *TUTORIALS], ids=_name)
 def test_code_runs_as_printed(page: Path, tmp_path: Path, forkserver: Any) -> None:
-    code = "\n".join(_blocks(page, "python"))
+    code = page.read_text() if page.suffix == ".py" else "\n".join(_blocks(page, "python"))
     for printed, short in (
         (r"STEPS = [\d_]+", "STEPS = 64"),
         (r"n_steps=256\)\.learn\([\d_]+\)", "n_steps=64).learn(64)"),
         (r"num_envs=64", "num_envs=4"),
+        (r"episodes=32|reset\(32\)", lambda found: found[0].replace("32", "4")),
         (r'"bundled"', '"bundled:snow"'),
+        (r"EPISODES = \d+", "EPISODES = 4"),
         (r'"resolution": 64', '"resolution": 36'),
     ):
         code = re.sub(printed, short, code)

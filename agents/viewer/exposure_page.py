@@ -280,7 +280,8 @@ class ExposurePage:
             label.text = f"{'★' * (state == best)}{''.join(letters)} {score:.2f}".replace(
                 " 0.", " ."
             ).strip()
-            button.style(f"background:{background};color:{ink}")
+            size = 12 if len(label.text) <= 6 else 9
+            button.style(f"background:{background};color:{ink};font-size:{size}px")
             button.props["aria-label"] = f"{_GRID[state]}: score {score:.2f}"
             if _GRID[state] == view.settings:
                 button.classes(add="shown")
@@ -368,7 +369,8 @@ class ExposurePage:
             self._spinner.visible = False
         if viewed is not self._viewed:
             return
-        self._marks = {name: self._marks[name] for name in names if name in self._marks}
+        chosen = [str(name) for name in self._names.value or []]  # more may have come meanwhile
+        self._marks = {name: self._marks[name] for name in chosen if name in self._marks}
         self._legend.text = "\n".join(
             f"{letter} {name}: {_GRID[state]}"
             for letter, (name, state) in zip(_LETTERS, self._marks.items(), strict=False)

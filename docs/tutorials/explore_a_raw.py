@@ -32,7 +32,9 @@ print(raw.settings, raw.camera.name, tuple(raw.data.shape))
 shot, read = raw.noise.shot[1], raw.noise.read[1]
 for signal in (0.01, 0.12, 0.9):
     noise = (read + shot * signal) ** 0.5
-    print(f"green at {signal:5.0%} of white: noise {noise:.4f}, signal to noise {signal / noise:.0f}")
+    print(
+        f"green at {signal:5.0%} of white: noise {noise:.4f}, signal to noise {signal / noise:.0f}"
+    )
 
 # %% [markdown]
 # A plan says which steps a change of settings takes, which error that has in units of the target's

@@ -64,7 +64,9 @@ for name, policy in policies.items():
         columns.append(info["regret"])
     regret[name] = np.stack(columns, axis=1)  # (episode, frame)
     chosen[name] = info["ev100"] - envs.unwrapped.grid.ev100[info["oracle_state"]]
-    print(f"{name:20} mean regret {regret[name].mean():.3f}, last frame {regret[name][:, -1].mean():.3f}")
+    print(
+        f"{name:20} mean regret {regret[name].mean():.3f}, last frame {regret[name][:, -1].mean():.3f}"
+    )
 
 # %% [markdown]
 # How far each policy's exposure is from the best state's in the last frame, in EV; to the right is darker:
