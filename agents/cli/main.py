@@ -24,6 +24,7 @@ from agents.cli.film import film
 from agents.cli.quickstart import quickstart
 from agents.cli.record import record
 from agents.cli.scenes import scenes
+from agents.cli.score_tables import score_tables
 from agents.cli.scorers import convert_nima, scorers
 from agents.cli.simulate import simulate
 from agents.cli.sweep import sweep
@@ -41,14 +42,22 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(view, film, record, export, cache, warm_up),
+    *(view, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
 app.add_typer(scenes, name="scenes")
 
 #: Commands that go on where they were stopped.
-_RESUMING = ("quickstart", "train", "train-simulator", "evaluate", "bench", "scenes")
+_RESUMING = (
+    "quickstart",
+    "train",
+    "train-simulator",
+    "evaluate",
+    "bench",
+    "scenes",
+    "score-tables",
+)
 #: Errors about the user's options and files.
 _USAGE = (ValueError, FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 #: Exit status after Ctrl-C, and after SIGTERM.

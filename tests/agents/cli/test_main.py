@@ -24,7 +24,7 @@ COMMANDS = [
     "sweep",
     "train",
 ]
-COMMANDS += ["train-simulator", "view", "warm-up"]
+COMMANDS += ["train-simulator", "score-tables", "view", "warm-up"]
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
 NO_SEED = (*NO_OUT, "convert-nima", "export")

@@ -1,0 +1,283 @@
+"""Score tables and captures of many files, shard by shard, in one process or on a Ray cluster.
+
+A shard is a few files. Its results are written when it is whole, so that a run that was stopped
+continues with the shards that are missing, and a worker that is lost costs one shard's work.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.folder import find_files
+from ae_env.scenes.loading import SceneNetworks
+from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
+from simulator import get_camera
+from simulator.utils.files import write_atomically
+
+#: What is known of a run besides its shards.
+PLAN = "plan.json"
+_LOCAL, _RAY = "local", "ray"
+
+
+@dataclass(frozen=True)
+class ShardPlan:
+    """What a run does; every shard is made from it and its own number alone.
+
+    Args:
+        files: Raws and radiance maps, as the workers find them.
+        names: Of the files, in the tables.
+        out: Folder of the results, which all workers reach.
+        per_shard: Files of a shard.
+        resolution: Packed pixels a side that scenes are averaged to.
+        camera: Camera that radiance maps are photographed with; a raw has its own.
+        grid: Name of the exposure grid.
+        scorer: Name of the scorer.
+        weights: Networks that take the noise out of raws, or ``"none"``.
+        captures: Whether to write the captures, too.
+        seed: Seed of their noise.
+    """
+
+    files: tuple[str, ...]
+    names: tuple[str, ...]
+    out: str
+    per_shard: int = 16
+    resolution: int = 64
+    camera: str = "nikon_z6"
+    grid: str = "default"
+    scorer: str = "balanced"
+    weights: str = "compact"
+    captures: bool = False
+    seed: int = 0
+
+    @classmethod
+    def of(cls, what: str, out: Path, **options: Any) -> ShardPlan:
+        """The plan for a file, folder or glob of raws and radiance maps."""
+        base, files = find_files(what)
+        names = [str(f.relative_to(base)) if f != base else f.name for f in files]
+        paths = tuple(str(file.resolve()) for file in files)
+        return cls(paths, tuple(names), str(out.resolve()), **options)
+
+    @property
+    def shards(self) -> range:
+        """Numbers of the shards."""
+        return range(-(-len(self.files) // self.per_shard))
+
+    def table(self, shard: int) -> Path:
+        """Where a shard's score tables are; the file is written last."""
+        return Path(self.out, f"tables-{shard:05d}.parquet")
+
+    def missing(self) -> list[int]:
+        """Shards that are still to be made."""
+        return [shard for shard in self.shards if not self.table(shard).exists()]
+
+    def begin(self) -> None:
+        """Writes the plan, or checks that the folder's is the same.
+
+        Raises:
+            ValueError: If the folder holds the results of another plan.
+        """
+        path, text = Path(self.out, PLAN), json.dumps(asdict(self), indent=1)
+        if path.exists() and path.read_text(encoding="utf-8") != text:
+            raise ValueError(
+                f"`out` (={self.out!r}) holds the tables of other files or options, see {PLAN}: "
+                "give another folder, or delete that one"
+            )
+        write_atomically(path, text.encode())
+
+
+class ShardWriter:
+    """Makes shards; what does not depend on the shard is loaded once.
+
+    Args:
+        plan: What to do.
+    """
+
+    def __init__(self, plan: ShardPlan) -> None:
+        self.plan = plan
+        self._grid = ExposureGrid.from_spec(plan.grid)
+        self._camera = get_camera(plan.camera)
+        self._scorer = make_scorer(plan.scorer)
+        self._tables: dict[str, ScoreTables] = {}
+
+    @cached_property
+    def _networks(self) -> SceneNetworks:
+        return SceneNetworks(self.plan.weights)
+
+    def write(self, shard: int) -> dict[str, Any]:
+        """Writes one shard.
+
+        Returns:
+            How many scenes and files that could not be read it has, how long it took [s], and
+            which machine and process made it.
+        """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        begun, plan = perf_counter(), self.plan
+        columns: dict[str, list[Any]] = {}
+        bad: list[dict[str, str]] = []
+        frames: dict[str, torch.Tensor] = {}
+        scenes = 0
+        first = shard * plan.per_shard
+        for path, name in list(zip(plan.files, plan.names, strict=True))[
+            first : first + plan.per_shard
+        ]:
+            try:
+                found = self._scenes(path)
+            except (ValueError, OSError) as error:
+                bad.append({"file": name, "error": " ".join(str(error).split())})
+                continue
+            for scene in found:
+                tables = self._score_tables(scene)
+                for column, values in self._rows(name, scene, tables.table(scene)).items():
+                    columns.setdefault(column, []).extend(values)
+                if plan.captures:
+                    frames[f"{name}:{scene.scene_id}"] = self._captures(scene)
+                scenes += 1
+        stem = f"{shard:05d}"
+        if frames:
+            write_atomically(Path(plan.out, f"captures-{stem}.safetensors"), save(frames))
+        if bad:
+            text = "".join(json.dumps(line) + "\n" for line in bad)
+            write_atomically(Path(plan.out, f"bad-{stem}.jsonl"), text.encode())
+        sink = pa.BufferOutputStream()
+        pq.write_table(pa.table(columns), sink)
+        write_atomically(plan.table(shard), sink.getvalue().to_pybytes())
+        seconds = perf_counter() - begun
+        return {
+            "shard": shard,
+            "scenes": scenes,
+            "bad": len(bad),
+            "seconds": seconds,
+            "node": socket.gethostname(),
+            "process": os.getpid(),
+        }
+
+    def _scenes(self, path: str) -> list[Scene]:
+        scenes = load_scenes(path, "all", camera=self._camera, resolution=self.plan.resolution)
+        if self.plan.weights == "none":
+            return scenes
+        return [self._networks.denoised(scene) for scene in scenes]
+
+    def _score_tables(self, scene: Scene) -> ScoreTables:
+        key = repr(scene.camera)
+        if key not in self._tables:
+            self._tables = {key: ScoreTables(self._grid, scene.camera, self._scorer)}
+        return self._tables[key]
+
+    def _rows(self, name: str, scene: Scene, table: ScoreTable) -> dict[str, list[Any]]:
+        count, states = len(self._grid), self._grid.states
+        return {
+            "file": [name] * count,
+            "scene": [scene.scene_id] * count,
+            "state": list(range(count)),
+            "iso": [s.iso for s in states],
+            "exposure_time": [s.exposure_time for s in states],
+            "f_number": [s.f_number for s in states],
+            "ev100": self._grid.ev100.tolist(),
+            "score": table.mean.tolist(),
+            **{f"score_{part}": values.tolist() for part, values in table.parts.items()},
+            "best": (np.arange(count) == table.oracle).tolist(),
+        }
+
+    def _captures(self, scene: Scene) -> torch.Tensor:
+        """(S, 4, R, R) int32 digital numbers of every state's capture."""
+        camera = scene.camera
+        frames = prepare_scene(scene, camera).expose(self._grid.states, seed=self.plan.seed)
+        black, span = (torch.tensor(v).reshape(4, 1, 1) for v in (camera.black_level, camera.span))
+        return (frames * span + black).round().to(torch.int32)
+
+
+def run(
+    plan: ShardPlan, on: str, progress: Callable[[int, int], None], workers: int = 1
+) -> list[dict[str, Any]]:
+    """Makes the shards that are missing.
+
+    Args:
+        plan: What to do.
+        on: ``"local"``: in this process; ``"ray"``: on a Ray of this machine alone; an address
+            such as ``"ray://head:10001"`` or ``"auto"``: on that cluster.
+        progress: Called with the shards that are done, and all.
+        workers: Processes on the cluster.
+
+    Returns:
+        What `ShardWriter.write` tells of each shard that was made.
+    """
+    plan.begin()
+    todo = plan.missing()
+    progress(len(plan.shards) - len(todo), len(plan.shards))
+    if not todo:
+        return []
+    made = []
+    for told in _local(plan, todo) if on == _LOCAL else _on_ray(plan, todo, on, workers):
+        made.append(told)
+        progress(len(plan.shards) - len(todo) + len(made), len(plan.shards))
+    return made
+
+
+def _local(plan: ShardPlan, todo: list[int]) -> Iterator[dict[str, Any]]:
+    writer = ShardWriter(plan)
+    for shard in todo:
+        yield writer.write(shard)
+
+
+class _RayWorker:
+    """A `ShardWriter` in a process of the cluster, one thread each."""
+
+    def __init__(self, plan: ShardPlan) -> None:
+        torch.set_num_threads(1)
+        self._writer = ShardWriter(plan)
+
+    def __call__(self, batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        import ray
+
+        node = ray.get_runtime_context().get_node_id()
+        told = [self._writer.write(int(shard)) | {"node": node} for shard in batch["shard"]]
+        return {name: np.array([one[name] for one in told]) for name in told[0]}
+
+
+def _on_ray(
+    plan: ShardPlan, todo: list[int], address: str, workers: int
+) -> Iterator[dict[str, Any]]:
+    try:
+        import ray
+    except ModuleNotFoundError:
+        raise ImportError(
+            "a cluster needs the extra ray, in an environment of its own: pip install 'ae-env[ray]'"
+        ) from None
+    if not ray.is_initialized():
+        if address == _RAY:
+            ray.init(num_cpus=workers, include_dashboard=False, object_store_memory=2**28)
+        else:
+            ray.init(address=address)
+    # Few workers for the whole run, each with its networks and its compiled code: one cache of
+    # numba's per node, beside the installed package. Ray starts a lost one anew and gives its
+    # shard to another.
+    dataset = ray.data.from_items(
+        [{"shard": shard} for shard in todo], override_num_blocks=len(todo)
+    )
+    done = dataset.map_batches(
+        _RayWorker,
+        fn_constructor_args=(plan,),
+        batch_size=1,
+        compute=ray.data.ActorPoolStrategy(size=workers),
+        num_cpus=1,
+        scheduling_strategy="SPREAD",
+    )
+    for row in done.iter_rows():
+        yield dict(row)

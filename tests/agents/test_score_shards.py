@@ -1,0 +1,138 @@
+"""Score tables of many files: what a shard holds, and what is lost when something goes wrong."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from agents.score_shards import ShardPlan, ShardWriter, _on_ray, run
+from simulator import CameraSettings, RawImage, get_camera, write_dng
+
+pq = pytest.importorskip("pyarrow.parquet")
+FILES = 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Raws of ever more light, one of which is none."""
+    path = tmp_path_factory.mktemp("raws")
+    camera, noise = get_camera("nikon_z6"), torch.Generator().manual_seed(0)
+    for i in range(FILES):
+        light = torch.rand(4, 48, 64, generator=noise) * 0.02 * 2**i
+        raw = RawImage(light.clamp(max=1.0), CameraSettings(100, 1 / 64, 4), camera)
+        write_dng(path / f"night-{i}.dng", raw)
+    (path / "night-3.dng").write_bytes(b"no raw")
+    return path
+
+
+def make(folder: Path, out: Path, **options: Any) -> ShardPlan:
+    out.mkdir(exist_ok=True)
+    given: dict[str, Any] = {"per_shard": 2, "resolution": 36, "weights": "none", "captures": True}
+    return ShardPlan.of(str(folder), out, **(given | options))
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(out.glob("*-0*"))}
+
+
+@pytest.fixture(scope="module")
+def done(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("local")
+    run(make(folder, out), "local", lambda *_: None)
+    return out
+
+
+def test_every_state_of_every_scene_is_in_the_tables(done: Path) -> None:
+    table = pq.read_table(done / "tables-00000.parquet").to_pydict()
+    assert table["file"] == ["night-0.dng"] * 64 + ["night-1.dng"] * 64
+    assert table["state"] == [*range(64), *range(64)]
+    assert (table["iso"][20], table["f_number"][20]) == (400, 4.0)  # (1 * 4 + 1) * 4 + 0
+    assert sum(table["best"]) == 2
+    score = np.reshape(table["score"], (2, 64))
+    best = np.reshape(table["best"], (2, 64))
+    assert (score[best] == score.max(axis=1)).all()
+    ev100 = np.reshape(table["ev100"], (2, 64))[best]
+    assert ev100[1] >= ev100[0]  # more light, less exposure
+
+
+def test_captures_are_the_digital_numbers_of_the_states(done: Path) -> None:
+    frames = load_file(done / "captures-00002.safetensors")
+    name = next(name for name in frames if name.startswith("night-4.dng"))
+    numbers, camera = frames[name].double(), get_camera("nikon_z6")
+    assert numbers.shape == (64, 4, 36, 36)
+    mean = (numbers[0].mean() - camera.black_level[0]) / (
+        camera.white_level - camera.black_level[0]
+    )
+    # ISO 100, 1/1000 s, f/4: 64/1000 of the light of the file, half of 0.32 in the mean
+    assert float(mean) == pytest.approx(0.16 * 64 / 1000, rel=0.03)
+
+
+def test_a_file_that_cannot_be_read_is_on_the_side(done: Path) -> None:
+    (bad,) = done.glob("bad-*")
+    assert bad.name == "bad-00001.jsonl"
+    assert "night-3.dng" in bad.read_text()
+    assert set(pq.read_table(done / "tables-00001.parquet")["file"].to_pylist()) == {"night-2.dng"}
+
+
+def test_a_run_continues_with_the_shards_that_are_missing(folder: Path, tmp_path: Path) -> None:
+    plan = make(folder, tmp_path)
+    run(plan, "local", lambda *_: None)
+    whole = contents(tmp_path)
+    plan.table(1).unlink()
+    seen: list[tuple[int, int]] = []
+    made = run(plan, "local", lambda done, total: seen.append((done, total)))
+    assert [one["shard"] for one in made] == [1]
+    assert seen == [(2, 3), (3, 3)]
+    assert contents(tmp_path) == whole
+    assert run(plan, "local", lambda *_: None) == []
+
+
+def test_a_folder_of_another_plan_is_refused(folder: Path, done: Path) -> None:
+    with pytest.raises(ValueError, match=r"`out` .* holds the tables of other files or options"):
+        run(make(folder, done, scorer="mertens"), "local", lambda *_: None)
+
+
+def test_a_shard_with_no_file_that_can_be_read_is_an_empty_table(
+    folder: Path, tmp_path: Path
+) -> None:
+    plan = make(folder, tmp_path, per_shard=1)
+    told = ShardWriter(plan).write(3)
+    assert (told["scenes"], told["bad"]) == (0, 1)
+    assert pq.read_table(plan.table(3)).num_rows == 0
+
+
+@pytest.mark.slow
+def test_a_cluster_of_two_nodes_loses_nothing_with_a_worker(
+    folder: Path, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray", reason="needs the extra ray, in an environment of its own")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    import ray
+    from ray.cluster_utils import Cluster
+
+    options = {"num_cpus": 2, "object_store_memory": 2**27}
+    cluster = Cluster(initialize_head=True, head_node_args=options)
+    try:
+        cluster.add_node(**options)
+        ray.init(address=cluster.address)
+        plan = make(folder, tmp_path / "ray", per_shard=1)
+        plan.begin()
+        nodes, killed = set(), 0
+        for told in _on_ray(plan, plan.missing(), "auto", 2):
+            nodes.add(told["node"])
+            if not killed:
+                killed = int(told["process"])
+                os.kill(killed, signal.SIGKILL)
+        assert len(nodes) == 2
+        assert plan.missing() == []
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    alone = make(folder, tmp_path / "alone", per_shard=1)
+    run(alone, "local", lambda *_: None)
+    assert contents(tmp_path / "ray") == contents(tmp_path / "alone")
