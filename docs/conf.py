@@ -50,7 +50,7 @@ CONTENTS = {
     ],
     "The environment": [
         *("tasks", "environment", "scenes", "scorers", "policies", "agents"),
-        *("evaluation", "ae-bench", "clients", "offline"),
+        *("evaluation", "ae-bench", "clients", "offline", "scale"),
     ],
     "The simulator": [
         *("simulator", "networks", "dataset", "colour", "performance", "stability"),

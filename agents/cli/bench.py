@@ -18,6 +18,7 @@ BENCHMARKS = (
         "agents",
         "bracketing",
         "brackets",
+        "cluster",
         "colour_checker",
         "convergence",
         "defects",

@@ -1,0 +1,89 @@
+"""`ae-env score-tables` on Ray beside one process: raws per second, and what starting costs."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+
+from agents.score_shards import ShardPlan
+from agents.score_shards import run as make_shards
+from benchmarks.harness import Benchmark, Part, Report, Row, table
+from simulator import CameraSettings, RawImage, get_camera, write_dng
+
+#: Raws, their height and width [packed pixel], and how many of them are a shard.
+FILES, SIZE, PER_SHARD = 128, (512, 768), 8
+
+
+def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
+    """All raws, from nothing to the last shard."""
+    files = 16 if quick else FILES
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        raws, out = Path(folder, "raws"), Path(folder, "out")
+        raws.mkdir()
+        out.mkdir()
+        noise, camera = torch.Generator().manual_seed(seed), get_camera("nikon_z6")
+        for i in range(files):
+            light = torch.rand(4, *SIZE, generator=noise) * 2.0 ** -(i % 8)
+            write_dng(raws / f"{i}.dng", RawImage(light, CameraSettings(400, 1 / 64, 4), camera))
+        plan = ShardPlan.of(str(raws), out, per_shard=PER_SHARD)
+        begun = perf_counter()
+        made = make_shards(plan, on, lambda *_: None, workers)
+        seconds = perf_counter() - begun
+    busy = sum(float(one["seconds"]) for one in made)
+    return {"on": on, "workers": workers, "files": files, "seconds": seconds, "busy": busy}
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One process, and Ray with one and two workers."""
+    return [
+        Part(f"{on}-{n}", measure, {"on": on, "workers": n, "seed": seed, "quick": quick})
+        for on, n in (("local", 1), ("ray", 1), ("ray", 2))
+    ]
+
+
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """The report; overhead is the time in which no shard was being made."""
+    rows: list[Row] = list(results.values())
+    alone = rows[0]["seconds"]
+    for row in rows:
+        row["rate"] = row["files"] / row["seconds"]
+        row["speedup"] = alone / row["seconds"]
+        row["overhead"] = row["seconds"] - row["busy"] / row["workers"]
+        row["steady_rate"] = row["workers"] * row["files"] / row["busy"]
+        # One core for each worker.
+        row["core_hours"] = 1e6 * row["busy"] / row["files"] / 3600
+    columns = {
+        "on": "{on}, workers: {workers}",
+        "raws": "{files}",
+        "time [s]": "{seconds:.1f}",
+        "raws / s": "{rate:.1f}",
+        "times one process": "{speedup:.2f}",
+        "of it no shard was made [s]": "{overhead:.1f}",
+        "raws / s without that": "{steady_rate:.1f}",
+        "core hours for a million raws": "{core_hours:.1f}",
+    }
+    page = [
+        f"`ae-env score-tables` of {rows[0]['files']} raws of 4 x {SIZE[0]} x {SIZE[1]} packed "
+        "pixels, read, averaged to 64 x 64, their noise taken out, and scored in 64 states; "
+        f"{PER_SHARD} raws a shard, one thread a worker. The time on Ray begins before Ray is "
+        "started on this machine.",
+        table(rows, columns),
+    ]
+    return Report(rows, page)
+
+
+BENCHMARK = Benchmark(
+    name="cluster",
+    title="Score tables on Ray",
+    parts=parts,
+    report=report,
+    code=("agents/score_shards", "benchmarks/cluster"),
+)
+run = BENCHMARK.run
