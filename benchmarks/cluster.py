@@ -16,7 +16,7 @@ from benchmarks.harness import Benchmark, Part, Report, Row, table
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 #: Raws, their height and width [packed pixel], and how many of them are a shard.
-FILES, SIZE, PER_SHARD = 128, (512, 768), 8
+FILES, SIZE, PER_SHARD = 512, (512, 768), 8
 
 
 def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
@@ -25,6 +25,7 @@ def measure(on: str, workers: int, seed: int, quick: bool) -> Row:
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
+        os.environ["AE_ENV_CACHE"] = str(Path(folder, "cache"))  # nobody uses another's results
         raws, out = Path(folder, "raws"), Path(folder, "out")
         raws.mkdir()
         out.mkdir()
