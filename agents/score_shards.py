@@ -6,6 +6,7 @@ continues with the shards that are missing, and a worker that is lost costs one 
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import socket
@@ -218,6 +219,8 @@ def run(
     Returns:
         What `ShardWriter.write` tells of each shard that was made.
     """
+    if on != _LOCAL:
+        _require_ray()
     plan.begin()
     todo = plan.missing()
     progress(len(plan.shards) - len(todo), len(plan.shards))
@@ -228,6 +231,14 @@ def run(
         made.append(told)
         progress(len(plan.shards) - len(todo) + len(made), len(plan.shards))
     return made
+
+
+def _require_ray() -> None:
+    """Raises an `ImportError` that names the extra, unless Ray is there."""
+    if importlib.util.find_spec("ray") is None:
+        raise ImportError(
+            "a cluster needs the extra ray, in an environment of its own: pip install 'ae-env[ray]'"
+        )
 
 
 def _local(plan: ShardPlan, todo: list[int]) -> Iterator[dict[str, Any]]:
@@ -254,12 +265,8 @@ class _RayWorker:
 def _on_ray(
     plan: ShardPlan, todo: list[int], address: str, workers: int
 ) -> Iterator[dict[str, Any]]:
-    try:
-        import ray
-    except ModuleNotFoundError:
-        raise ImportError(
-            "a cluster needs the extra ray, in an environment of its own: pip install 'ae-env[ray]'"
-        ) from None
+    import ray
+
     if not ray.is_initialized():
         if address == _RAY:
             ray.init(num_cpus=workers, include_dashboard=False, object_store_memory=2**28)

@@ -16,6 +16,7 @@ from ae_env.scenes.radiance import RADIANCE_SUFFIXES
 from ae_env.utils.checks import did_you_mean
 from simulator import get_camera, read_raw
 from simulator.raw.develop import quarter_turns
+from simulator.utils.files import RAW_SUFFIXES
 
 #: Camera in whose colours named scenes and radiance maps are made, as the environment's default.
 CAMERA = "nikon_z6"
@@ -115,7 +116,8 @@ def find_scenes(what: str) -> Library:
     Raises:
         ValueError: If it is none of these.
     """
-    if Path(what).exists() or any(sign in what for sign in "*?"):
+    known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
+    if Path(what).exists() or Path(what).suffix.lower() in known or any(s in what for s in "/*?"):
         base, files = find_files(what)
         entries: list[Entry] = []
         for path in files:

@@ -115,9 +115,16 @@ def test_a_library_reads_a_scene_when_it_is_opened_and_keeps_few():
     assert reads == list("abcdefa")
 
 
-@pytest.mark.parametrize("what", ["snow-9999", "/no/such/file.dng", "bundeld"])
-def test_what_is_no_scene_is_refused(what):
-    with pytest.raises(ValueError, match=r"`what` \(="):
+@pytest.mark.parametrize(
+    ("what", "why"),
+    [
+        ("snow-9999", "must be a raw, a radiance map"),
+        ("IMG_0001.dng", "must name an existing file"),
+        ("no/such/folder", "must name an existing file"),
+    ],
+)
+def test_what_is_no_scene_is_refused(what, why):
+    with pytest.raises(ValueError, match=why):
         find_scenes(what)
 
 
