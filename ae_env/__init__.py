@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from ae_env.wrappers import VectorControlActions as VectorControlActions
     from ae_env.wrappers import VectorRelativeActions as VectorRelativeActions
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 #: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {

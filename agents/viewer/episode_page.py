@@ -13,8 +13,8 @@ from PIL import Image
 from ae_env.grid import ExposureGrid
 from agents.report.film import FRAME_RATE, Recording
 from agents.viewer.drawings import BEST, POLICIES, chart
-from agents.viewer.episodes import LIGHTS, STILL, play
-from agents.viewer.pictures import ViewedScene
+from agents.viewer.playing import LIGHTS, STILL, play
+from agents.viewer.viewed_scene import ViewedScene
 
 #: Policies that are offered; others are typed.
 NAMES = (

@@ -11,8 +11,8 @@ from nicegui import run, ui
 from ae_env.grid import ExposureGrid
 from agents.policy import METERS, PROGRAMS
 from agents.viewer.drawings import histogram, score_colour
-from agents.viewer.episodes import SETTLED, settled
-from agents.viewer.pictures import Picture, Readout, View, ViewedScene
+from agents.viewer.playing import SETTLED, settled
+from agents.viewer.viewed_scene import Picture, Readout, View, ViewedScene
 from simulator import CameraSettings
 from simulator.settings import format_exposure_time
 

@@ -17,7 +17,7 @@ from nicegui import app, run, ui
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage
 from agents.viewer.library import Library
-from agents.viewer.pictures import ViewedScene
+from agents.viewer.viewed_scene import ViewedScene
 from simulator import CameraSimulator
 from simulator.camera_simulator import Depth
 

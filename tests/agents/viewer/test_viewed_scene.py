@@ -12,7 +12,7 @@ from PIL import Image
 
 from ae_env.scenes import Scene
 from agents.viewer.library import Entry, Library, Shown, find_scenes
-from agents.viewer.pictures import WINDOW_SIZE, View, ViewedScene
+from agents.viewer.viewed_scene import WINDOW_SIZE, View, ViewedScene
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, get_camera
 
 CAMERA = get_camera("nikon_z6")
