@@ -82,10 +82,11 @@ figure.savefig("judge_a_meter.png", dpi=80)
 # ![EV error of four meters](judge_a_meter.png)
 #
 # One kind of light and one seed tell little. The command does the whole protocol: conditions of light and delay,
-# confidence intervals over source groups, a ranking, a report with pictures:
+# confidence intervals over source groups, a ranking, a report with pictures. It wants the class in a file of its own,
+# such as `my_meter.py`, because the file is run wherever the policy is:
 #
 # ```
-# ae-env evaluate --policy judge_a_meter.py:ForTheHighlights --policy matrix:tuned
+# ae-env evaluate --policy my_meter.py:ForTheHighlights --policy matrix:tuned
 # ```
 #
 # What its columns mean, and options of the built-in policies: [judge](../judge.md).
