@@ -28,7 +28,9 @@ def score_tables(
     workers: Annotated[int, typer.Option(help="Processes on Ray.", min=1)] = 2,
     per_shard: Annotated[int, typer.Option(help="Files of a shard.", min=1)] = 16,
     resolution: Annotated[int, typer.Option(help="Packed pixels a side.", min=1)] = 64,
-    grid: Annotated[str, typer.Option(help="Exposure grid: default, video, bracket.")] = "default",
+    grid: Annotated[
+        str, typer.Option(help="Exposure grid: default, third_stop, video, bracket.")
+    ] = "default",
     scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
     camera: Annotated[str, typer.Option(help="Camera for radiance maps.")] = "nikon_z6",
     weights: Annotated[
@@ -44,6 +46,7 @@ def score_tables(
     Example: `ae-env score-tables path/to/raws -o tables`
     """
     from ae_env.grid import ExposureGrid
+    from ae_env.scenes.loading import check_weights
     from ae_env.scorers import make_scorer
     from agents.score_shards import ShardPlan, run
     from simulator import get_camera
@@ -57,6 +60,8 @@ def score_tables(
     if on not in ("local", "ray", "auto") and "://" not in on and ":" not in on:
         raise ValueError(f"`on` (={on!r}) must be local, ray, auto or the address of a cluster")
     ExposureGrid.from_spec(grid), make_scorer(scorer), get_camera(camera)
+    if weights != "none":
+        check_weights(weights)
     plan = ShardPlan.of(
         what,
         out,
@@ -73,9 +78,14 @@ def score_tables(
     begun = perf_counter()
     with progress_bars() as progress, progress("shards") as task:
         made = run(plan, on, task, workers)
+    if not made:
+        print_line("every shard was there already")
+        return
     scenes, bad = (sum(int(one[name]) for one in made) for name in ("scenes", "bad"))
     seconds = perf_counter() - begun
     print_line(f"{scenes} scenes in {seconds:.1f} s, {bad} files that could not be read")
     if bad:
         print_line(f"which and why: {out}/bad-*.jsonl")
+    if not scenes:
+        raise RuntimeError("none of these files could be made a scene")
     print_files({"score tables": out / "tables-*.parquet"})

@@ -100,6 +100,7 @@ class ExposurePage:
             self._pixels = ui.switch("Raw pixels (Z)", on_change=self._zoom)
             self._compare = ui.switch("Compare with this (P)", on_change=self._pin)
             self._spinner = ui.spinner(size="sm")
+            self._spinner.visible = False
         self._across = self._amount("Across", 1.0, 0.01, "{:.0%}", self._move)
         self._down = self._amount("Down", 1.0, 0.01, "{:.0%}", self._move)
         self._pinned = ui.label().classes("note")
