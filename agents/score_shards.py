@@ -135,9 +135,8 @@ class ShardWriter:
         frames: dict[str, torch.Tensor] = {}
         scenes = 0
         first = shard * plan.per_shard
-        for path, name in list(zip(plan.files, plan.names, strict=True))[
-            first : first + plan.per_shard
-        ]:
+        own = slice(first, first + plan.per_shard)
+        for path, name in zip(plan.files[own], plan.names[own], strict=True):
             try:
                 found = self._scenes(path)
             except (ValueError, OSError) as error:
@@ -197,11 +196,11 @@ class ShardWriter:
         }
 
     def _captures(self, scene: Scene) -> torch.Tensor:
-        """(S, 4, R, R) int32 digital numbers of every state's capture."""
+        """(S, 4, R, R) uint16 digital numbers of every state's capture."""
         camera = scene.camera
         frames = prepare_scene(scene, camera).expose(self._grid.states, seed=self.plan.seed)
         black, span = (torch.tensor(v).reshape(4, 1, 1) for v in (camera.black_level, camera.span))
-        return (frames * span + black).round().to(torch.int32)
+        return (frames * span + black).round().to(torch.uint16)
 
 
 def run(

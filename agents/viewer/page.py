@@ -38,6 +38,8 @@ class Options:
         depth: See `ViewedScene`.
         tolerance: See `ViewedScene`.
         scorer: See `ViewedScene`.
+        thumbnails: JPEGs of scenes that were asked for, by name.
+        folder: For uploads and downloads; None for the system's.
     """
 
     library: Library
@@ -46,6 +48,7 @@ class Options:
     tolerance: float
     scorer: str
     thumbnails: dict[str, bytes] = field(default_factory=dict)
+    folder: str | None = None
 
     def viewed(self, library: Library, name: str) -> ViewedScene:
         """The scene called `name`, to be shown."""
@@ -106,7 +109,7 @@ class Page:
         self._options, self._pictures = options, pictures
         # Uploads belong to their tab.
         self._library = Library(list(options.library.entries.values()), options.library.first)
-        self._folder = Path(tempfile.mkdtemp(prefix="ae-env-view-"))
+        self._folder = Path(tempfile.mkdtemp(dir=options.folder))
         self._exposure = ExposurePage(pictures.address)
         self._episode = EpisodePage(pictures.address)
         self._viewed: ViewedScene | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hmac
 import secrets
 import socket
+import tempfile
 from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -107,11 +108,17 @@ def serve(options: Options, port: int, open_browser: bool, tell: Any) -> None:
     app.add_middleware(TokenGuard, token=token, port=port)
     app.on_startup(lambda: tell(f"http://{HOST}:{port}{path}"))
     ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
+    # Uploads and downloads are gone with the program, however its pages were left.
+    with tempfile.TemporaryDirectory(prefix="ae-env-view-") as options.folder:
+        _run(port, path if open_browser else False)
+
+
+def _run(port: int, show: str | bool) -> None:
     ui.run(
         host=HOST,
         port=port,
         reload=False,
-        show=path if open_browser else False,
+        show=show,
         show_welcome_message=False,
         uvicorn_logging_level="error",
         reconnect_timeout=10.0,
