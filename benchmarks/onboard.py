@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from ae_env.observation import decode_observation, encode_observation
 from agents import PolicyContext, make_policy
 from agents.learning.regression import observation_tensors
 from agents.onboard.controller import Controller
@@ -23,6 +24,8 @@ EPISODES, FRAMES, STOPS = 64, 16, 4.0
 TIMED = 400
 #: Frames that are averaged to what the agent sees: packed height and width.
 FRAME_SIZES = ((64, 64), (240, 320), (760, 1014), (1520, 2028))
+#: Sides of the frame that the agents are given less and less of.
+SIDES = (64, 32, 16, 8, 4, 2)
 
 
 def measure(policy: str, seed: int, quick: bool) -> Row:
@@ -59,6 +62,46 @@ def measure(policy: str, seed: int, quick: bool) -> Row:
     row: Row = {"policy": policy, "bytes": size, "decisions": count * FRAMES, "same": same}
     row |= {"largest_difference": error}
     return row | {f"us_{name}": 1e6 * float(np.median(values)) for name, values in times.items()}
+
+
+def smaller(policy: str, seed: int, quick: bool) -> list[Row]:
+    """Scores of an agent that sees its frame averaged to fewer pixels, in the same episodes."""
+    torch.set_num_threads(1)
+    count = 8 if quick else EPISODES
+    envs = gym.make_vec(
+        "ae_env:ae_env/AutoExposure-v0",
+        num_envs=count,
+        split="test",
+        max_episode_steps=None,
+        lighting={"kind": "step", "stops": STOPS, "at": FRAMES // 2},
+    )
+    agent = make_policy(policy, PolicyContext.from_envs(envs))
+    rows: list[Row] = []
+    for side in SIDES:
+        agent.reset(count)
+        shown, _ = envs.reset(seed=seed)
+        scores = np.zeros(count)
+        for _ in range(FRAMES):
+            shown, reward, *_ = envs.step(
+                agent.act({**shown, "raw": _averaged(shown["raw"], side)})
+            )
+            scores += reward / FRAMES
+        rows.append({"policy": policy, "side": side, "scores": scores.tolist()})
+    whole = np.array(rows[0]["scores"])
+    for row in rows:
+        lost = whole - np.array(row.pop("scores"))
+        row |= {"score": float((whole - lost).mean()), "lost": float(lost.mean())}
+        row["error"] = float(lost.std(ddof=1) / np.sqrt(count))
+    return rows
+
+
+def _averaged(codes: np.ndarray, side: int) -> np.ndarray:
+    """Frames (B, 4, R, R) uint8 whose light is averaged to `side` pixels a side, and shown at R."""
+    count, planes, size, _ = codes.shape
+    box = size // side
+    light = decode_observation(codes).reshape(count, planes, side, box, side, box).mean(axis=(3, 5))
+    shown = encode_observation(torch.from_numpy(light)).numpy()
+    return shown.repeat(box, axis=2).repeat(box, axis=3)
 
 
 def _difference(agent: Any, controller: Controller, shown: dict[str, Any]) -> float:
@@ -98,13 +141,18 @@ def parts(seed: int, quick: bool) -> list[Part]:
         Part(name, measure, {"policy": name, "seed": seed, "quick": quick}, threads=1)
         for name in ("regression", "ppo")
     ]
-    return [*agents, Part("frames", encoding, {"quick": quick}, threads=1)]
+    smaller_frames = [
+        Part(f"smaller {name}", smaller, {"policy": name, "seed": seed, "quick": quick}, threads=1)
+        for name in ("regression", "ppo")
+    ]
+    return [*agents, *smaller_frames, Part("frames", encoding, {"quick": quick}, threads=1)]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the rows of both agents."""
     frames = results["frames"]
-    rows: list[Row] = [row for name, row in results.items() if name != "frames"]
+    rows: list[Row] = [results[name] for name in ("regression", "ppo")]
+    less = [row for name in ("regression", "ppo") for row in results[f"smaller {name}"]]
     for row in rows:
         row["speedup"] = row["us_torch"] / row["us_onnx"]
     columns = {
@@ -125,8 +173,20 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         table(rows, columns),
         "What a camera's frame takes to become the 64 x 64 that the agents look at, before that:",
         table(frames, {"planes": "4 x {height} x {width}", "ms": "{ms:.2f}"}),
+        "How small a frame is enough: the same episodes, the light of the agents' frame averaged "
+        "to fewer pixels (and repeated to 64 x 64, which the networks take). The score that this "
+        "loses is a mean over episodes with its standard error.",
+        table(
+            less,
+            {
+                "agent": "{policy}",
+                "pixels": "{side} x {side}",
+                "mean score": "{score:.4f}",
+                "lost": "{lost:.4f} +- {error:.4f}",
+            },
+        ),
     ]
-    return Report([*rows, *frames], page)
+    return Report([*rows, *less, *frames], page)
 
 
 BENCHMARK = Benchmark(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ae_env.scenes.scene import Scene
-from ae_env.scorers.pixel_blur import layout_blur, stacked
+from ae_env.scorers.pixel_blur import PixelBlur, layout_blur, stacked
 from ae_env.scorers.protocol import Captures
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -59,19 +59,24 @@ def describe_captures(
     own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
     blur = np.hypot(blur, own)  # exactly `blur` where they are 0
     moves = [ALONG_ROWS] * len(scenes) if movements is None else movements
-    numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
-    parts = [
-        layout_blur(scene, move, speed=v, times=t, discs=d, own=o)
-        for scene, move, v, (t, d, o) in zip(scenes, moves, speed.tolist(), numbers, strict=True)
-    ]
+    parts: list[PixelBlur | None] = []
+    if discs.any() or any(move.subject_speed for move in moves):
+        numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
+        parts = [
+            layout_blur(scene, move, speed=v, times=t, discs=d, own=o)
+            for scene, move, v, (t, d, o) in zip(
+                scenes, moves, speed.tolist(), numbers, strict=True
+            )
+        ]
     pixel_blur = stacked(parts, blur)
+    nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
     return Captures(
         settings=settings,
         scene_ids=[c.scene_id for c in scenes],
         scene_light=torch.stack([c.clean_light for c in scenes]) if light is None else light,
         ratio=torch.from_numpy(np.array(ratios) * gain),
-        nlf=[camera.nlf(s.iso) for s in settings],
+        nlf=[nlfs[s.iso] for s in settings],
         proper_ev=torch.from_numpy(np.array([c.ev100 for c in scenes]) + np.log2(gain)),
         blur_px=torch.from_numpy(blur) if pixel_blur is None else pixel_blur.rms_px,
         white_balance=torch.tensor([c.white_balance for c in scenes]),
