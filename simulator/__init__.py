@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from simulator.capture.plan import SimulationPlan as SimulationPlan
     from simulator.capture.prepared_scene import PreparedScene as PreparedScene
     from simulator.noise.noise_level_function import NoiseLevelFunction as NoiseLevelFunction
+    from simulator.optics.thin_lens import Lens as Lens
+    from simulator.optics.thin_lens import defocus as defocus
     from simulator.raw.decoding import RawFileError as RawFileError
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
@@ -31,11 +33,13 @@ __all__ = [
     "CameraProfile",
     "CameraSettings",
     "CameraSimulator",
+    "Lens",
     "NoiseLevelFunction",
     "PreparedScene",
     "RawFileError",
     "RawImage",
     "SimulationPlan",
+    "defocus",
     "develop",
     "estimate_nlf",
     "exposure_ratio",
@@ -55,6 +59,7 @@ _MODULES = {
     "capture.plan": ["SimulationPlan"],
     "capture.prepared_scene": ["PreparedScene"],
     "noise.noise_level_function": ["NoiseLevelFunction"],
+    "optics.thin_lens": ["Lens", "defocus"],
     "raw.decoding": ["RawFileError"],
     "raw.develop": ["develop", "render_srgb"],
     "raw.dng": ["write_dng"],

@@ -133,6 +133,27 @@ def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> N
         raise ValueError(f"{given} cannot be written: {error.strerror}") from error
 
 
+def check_outputs(raw: Path, **files: tuple[Path | None, str]) -> None:
+    """Raises a `ValueError` unless each file has its ending and is not `raw` itself.
+
+    Args:
+        raw: The file that is read.
+        files: By the name of the option, the file or None, and its ending.
+    """
+    for name, (path, suffix) in files.items():
+        if path is not None and path.suffix.lower() != suffix:
+            raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
+        if path is not None and path.resolve() == raw.resolve():
+            raise ValueError(f"`{name}` (={str(path)!r}) must not be the raw itself")
+
+
+def make_folders(**files: Path | None) -> None:
+    """`make_folder` of each file that is given, by the name of its option."""
+    for name, path in files.items():
+        if path is not None:
+            make_folder(path.parent, name=name, file=path)
+
+
 def torch_device(name: str) -> str:
     """The torch device called `name`, checked."""
     import torch

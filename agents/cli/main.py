@@ -21,8 +21,10 @@ from agents.cli.console import print_line
 from agents.cli.evaluate import evaluate
 from agents.cli.export import export
 from agents.cli.film import film
+from agents.cli.hdr import hdr
 from agents.cli.quickstart import quickstart
 from agents.cli.record import record
+from agents.cli.refocus import refocus
 from agents.cli.scenes import scenes
 from agents.cli.score_tables import score_tables
 from agents.cli.scorers import convert_nima, scorers
@@ -42,7 +44,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(view, film, record, export, score_tables, cache, warm_up),
+    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

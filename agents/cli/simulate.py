@@ -12,8 +12,9 @@ import typer
 from agents.cli.console import (
     Device,
     Seed,
+    check_outputs,
     console,
-    make_folder,
+    make_folders,
     parse_f_number,
     parse_seconds,
     print_files,
@@ -24,6 +25,8 @@ from agents.cli.console import (
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 
 if TYPE_CHECKING:
+    import torch
+
     from simulator.camera_simulator import CameraSimulator
     from simulator.raw.image import RawImage
     from simulator.settings import CameraSettings
@@ -95,18 +98,11 @@ def simulate(
     check_tolerance(tolerance)
     settings = CameraSettings(iso, parse_seconds(shutter), parse_f_number(aperture))
     device = torch_device(device)
-    for name, path in (("out", out), ("png", png)):
-        suffix = ".dng" if name == "out" else ".png"
-        if path is not None and path.suffix.lower() != suffix:
-            raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
-        if path is not None and path.resolve() == raw.resolve():
-            raise ValueError(f"`{name}` (={str(path)!r}) must not be the raw itself")
+    check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     if noise == "sensor":
         source.camera.read_noise(iso)  # refuses a camera without its calibration
-    for name, path in (("out", out), ("png", png)):
-        if path is not None:
-            make_folder(path.parent, name=name, file=path)
+    make_folders(out=out, png=png)
     simulator = make_simulator(weights, device, cache)
     prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
@@ -120,7 +116,7 @@ def simulate(
     write_dng(out, result)
     files = {"DNG": out}
     if png is not None:
-        files["PNG"] = _write_png(png, result)
+        files["PNG"] = write_png(png, result)
     print_files(files)
 
 
@@ -179,14 +175,21 @@ def source_settings(
     )
 
 
-def _write_png(path: Path, raw: RawImage) -> Path:
+def write_png(path: Path, raw: RawImage) -> Path:
+    """Writes a raw's developed picture; see `write_upright`."""
+    from simulator import render_srgb
+
+    return write_upright(path, raw, render_srgb(raw))
+
+
+def write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
+    """Writes `srgb` (3, 2H, 2W) uint8, a picture of `raw`, upright and with square pixels."""
     import numpy as np
     from PIL import Image
 
-    from simulator import render_srgb
     from simulator.raw.develop import quarter_turns
 
-    picture = Image.fromarray(render_srgb(raw).permute(1, 2, 0).cpu().numpy())
+    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
     aspect = raw.metadata.get("pixel_aspect", 1.0)
     if aspect != 1.0:  # no pixel is left out: the picture grows along the pixels' longer side
         width, height = (

@@ -1,0 +1,218 @@
+"""HDR from one raw of a radiance map, against the map's own light, fused alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+
+from agents.applications.exposure_fusion import fuse
+from agents.applications.hdr import bracket_exposures, developed, hdr_picture
+from benchmarks.captures import psnr
+from benchmarks.fidelity.defocus import equal_exposure
+from benchmarks.fidelity.models import checksums, held_out_scenes
+from benchmarks.harness import Benchmark, Part, Report, Row, table
+from simulator import CameraSimulator, RawImage, get_camera
+from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+
+CAMERA, F_NUMBER = "nikon_z6", 8.0
+ISOS = (100, 1600, 6400)
+#: Kinds of scenes whose light is synthetic, or was clipped by a sensor.
+NOT_MAPS = ("depth", "mosaic", "draped")
+#: Range of the light [stops] from which a scene counts as of high dynamic range.
+HIGH_RANGE = 10.0
+#: Light below this is left out of the error of radiance, relative to the raw's white.
+DARKEST = 2.0**-8
+METHODS = {
+    "single": "the raw, developed",
+    "scaled": "one raw, its noise kept, Lee",
+    "ours": "**one raw, `ae-env hdr`, Lee**",
+    "bracket": "17 captures, Lee",
+    "merged": "17 captures merged at least noise, Lee",
+    "ours mertens": "one raw, `ae-env hdr`'s bracket, Mertens",
+    "bracket mertens": "17 captures, Mertens",
+}
+
+
+def _scenes(quick: bool) -> list[ReferenceScene]:
+    """Views of held-out radiance maps."""
+    scenes = [s for s in held_out_scenes(CAMERA, quick) if s.kind == "radiance" and s.pitch == 2]
+    groups = {scene.group: scene for scene in reversed(scenes)}
+    return list(groups.values())[: 2 if quick else None]
+
+
+@torch.no_grad()
+def measure(iso: int, seed: int, quick: bool) -> list[Row]:
+    """All scenes at one ISO."""
+    camera = get_camera(CAMERA)
+    reference = ReferenceCamera(camera)
+    simulator = CameraSimulator.from_pretrained("large", cache=None)
+    exposures, rows = bracket_exposures(), []
+    for scene in _scenes(quick):
+        settings = equal_exposure(scene.reference, iso, F_NUMBER)
+        light = reference.blurred_light(scene, F_NUMBER)
+        unclipped = reference.expose(light, scene.reference, settings)
+        look = {"white_balance": scene.white_balance}
+        truth = RawImage(unclipped, settings, camera, **look)
+        captures = [
+            reference.capture(
+                scene,
+                replace(settings, exposure_time=settings.exposure_time * 2.0**ev),
+                seed,
+                light=light,
+            ).sample
+            for ev in exposures
+        ]
+        raw = RawImage(captures[exposures.index(0.0)], settings, camera, **look)
+        begun = time.perf_counter()
+        ours = hdr_picture(raw, simulator=simulator)
+        seconds = time.perf_counter() - begun
+        merged = _merged(captures, exposures, raw)
+        taken = [developed(replace(raw, data=capture)) for capture in captures]
+        mine = [developed(replace(raw, data=ours.radiance), ev) for ev in exposures]
+        right = [developed(truth, ev) for ev in exposures]
+        fused, mertens = fuse(right), _mertens(right)
+        pictures = {
+            "single": (developed(raw), fused),
+            "scaled": (fuse([developed(raw, ev) for ev in exposures]), fused),
+            "ours": (ours.fused, fused),
+            "bracket": (fuse(taken), fused),
+            "merged": (fuse([developed(replace(raw, data=merged), ev) for ev in exposures]), fused),
+            "ours mertens": (_mertens(mine), mertens),
+            "bracket mertens": (_mertens(taken), mertens),
+        }
+        lights = {"single": raw.data, "ours": ours.radiance, "merged": merged}
+        low, high = np.quantile(unclipped.clamp(min=1e-9).numpy(), [0.001, 0.999])
+        for method, (picture, wanted) in pictures.items():
+            row: Row = {"scene": scene.scene_id, "group": scene.group, "iso": iso}
+            row |= {"stops": float(np.log2(high / low)), "method": method}
+            row |= {"psnr": psnr(picture, wanted), "ssim": _ssim(picture, wanted)}
+            if method in lights:
+                row["radiance_ev"] = _radiance_error(lights[method], unclipped)
+            rows.append(row | ({"seconds": seconds} if method == "ours" else {}))
+    return rows
+
+
+def _merged(captures: Sequence[Tensor], exposures: Sequence[float], raw: RawImage) -> Tensor:
+    """Radiance of real captures: exposure^2 over variance of all that are not saturated."""
+    shot, read = (torch.tensor(v)[:, None, None] for v in (raw.noise.shot, raw.noise.read))
+    total, weights = torch.zeros_like(captures[0]), torch.zeros_like(captures[0])
+    for capture, ev in zip(captures, exposures, strict=True):
+        ratio = 2.0**ev
+        variance = shot * capture.clamp(min=0.0) + read
+        weight = torch.where(capture < 0.99, ratio**2 / variance, 0.0)
+        total, weights = total + weight * capture / ratio, weights + weight
+    darkest = captures[0] / 2.0 ** exposures[0]
+    return torch.where(weights > 0, total / weights.clamp(min=1e-12), darkest)
+
+
+def _mertens(pictures: Sequence[Tensor]) -> Tensor:
+    import cv2
+
+    codes = [p.mul(255.0).round().byte().permute(1, 2, 0).numpy() for p in pictures]
+    fused = cv2.createMergeMertens().process(codes)
+    return torch.from_numpy(fused).permute(2, 0, 1).clamp(0.0, 1.0)
+
+
+def _ssim(picture: Tensor, wanted: Tensor) -> float:
+    pair = picture.numpy(), wanted.numpy()
+    return float(structural_similarity(*pair, channel_axis=0, data_range=1.0))
+
+
+def _radiance_error(light: Tensor, truth: Tensor) -> float:
+    """Root mean square error of log2 of the light [EV], where it is not too dark."""
+    shown = truth > DARKEST
+    error = light[shown].clamp(min=2.0**-12).log2() - truth[shown].log2()
+    return float(error.double().square().mean().sqrt())
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One part for each ISO."""
+    isos = ISOS[1:2] if quick else ISOS
+    return [
+        Part(
+            f"ISO {iso}",
+            measure,
+            {"iso": iso, "seed": seed, "quick": quick},
+            depends=checksums("large"),
+        )
+        for iso in isos
+    ]
+
+
+def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
+    """Means over the scenes, by ISO, and by the range of the light."""
+    rows: list[Row] = [row for part in results.values() for row in part]
+    means = []
+    for method, label in METHODS.items():
+        mean: Row = {"method": label}
+        for iso in sorted({row["iso"] for row in rows}):
+            for high in (False, True):
+                some = [
+                    row
+                    for row in rows
+                    if (row["method"], row["iso"]) == (method, iso)
+                    and (row["stops"] >= HIGH_RANGE) == high
+                ]
+                key = f"ISO {iso} {'high' if high else 'low'}"
+                for name in ("psnr", "ssim", "radiance_ev"):
+                    values = [row[name] for row in some if name in row]
+                    mean[f"{key} {name}"] = float(np.mean(values)) if values else None
+                mean[f"{key} scenes"] = len(some)
+        means.append(mean)
+    keys = [
+        f"ISO {iso} {level}"
+        for iso in sorted({r["iso"] for r in rows})
+        for level in ("low", "high")
+    ]
+    columns: dict[str, Any] = {"picture": "{method}"}
+    errors: dict[str, Any] = {"light": "{method}"}
+    for key in keys:
+        if means[0][f"{key} scenes"]:
+            columns[key] = _cell(key, "psnr", "ssim")
+            errors[key] = _cell(key, "radiance_ev")
+    seconds = float(np.median([row["seconds"] for row in rows if "seconds" in row]))
+    counts = {level: means[0][f"{keys[i]} scenes"] for i, level in enumerate(("low", "high"))}
+    page = [
+        "Views of held-out radiance maps, 256 x 256 sensor pixels, exposed for their incident "
+        "light by the reference camera. A picture is compared to the one that the map's own light, "
+        "without noise and not clipped by a sensor, gives in the same fusion (bracket of -4 to "
+        "+4 EV in half stops). 17 captures: a bracket that the reference camera really takes, "
+        "which knows the highlights that one raw has lost. Lee: of 2018, ours. Mertens: OpenCV's. "
+        f"High: {HIGH_RANGE:g} stops and more between the 0.1 and 99.9 % quantiles of the light "
+        f"({counts['high']} scenes; low {counts['low']}). PSNR [dB] / SSIM of the sRGB picture, "
+        f"means. `ae-env hdr`'s own part takes {seconds:.2f} s for such a view.",
+        table(means, columns),
+        f"Error of the radiance itself: root mean square of log2 [EV], where it is above "
+        f"2^{np.log2(DARKEST):.0f} of the raw's white:",
+        table([m for m in means if any(m[f"{k} radiance_ev"] is not None for k in keys)], errors),
+    ]
+    return Report([*rows, *means], page)
+
+
+def _cell(key: str, *names: str) -> Any:
+    digits = {"psnr": 1, "ssim": 3, "radiance_ev": 3}
+
+    def cell(row: Row) -> str:
+        values = [row[f"{key} {name}"] for name in names]
+        return " / ".join(
+            "-" if v is None else f"{v:.{digits[n]}f}" for n, v in zip(names, values, strict=True)
+        )
+
+    return cell
+
+
+BENCHMARK = Benchmark(
+    name="hdr",
+    title="HDR from one raw",
+    parts=parts,
+    report=report,
+    code=("agents/applications", "benchmarks/hdr"),
+)
+run = BENCHMARK.run
