@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from agents.applications.exposure_fusion import fuse
@@ -20,8 +19,6 @@ from simulator.utils.files import write_atomically
 
 #: Ends and step of the bracket [EV].
 STOPS, STEP = 4.0, 0.5
-#: What is saturated is raised to this many times the white of the darkest picture.
-_WHITE = 2.0
 
 
 class HdrPicture(NamedTuple):
@@ -48,8 +45,9 @@ def hdr_picture(
 ) -> HdrPicture:
     """Simulates a bracket of `raw`, each picture with little noise, and fuses it.
 
-    Pixels that are saturated in the raw are white in every picture of the bracket, the darkest too:
-    nothing is known of them but that they are bright.
+    What is saturated in the raw is taken as a neutral highlight, brighter than white where every
+    plane is clipped (`simulator.raw.highlights`). To hold it white in the darkest pictures too costs
+    5 dB around it: of two validation views with clipped light, 33.5 dB instead of 38.3.
 
     Args:
         raw: The photograph.
@@ -64,10 +62,9 @@ def hdr_picture(
     simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
     prepared = simulator.prepare(raw, tolerance=0.0)
     light = prepared.denoised[-1].light if prepared.denoised else prepared.light
-    white = _white_where_saturated(raw, light, stops)
 
     # 8 bits a sample: the pictures of a large raw fill the memory.
-    codes = [render_srgb(_exposed(replace(raw, data=white), ev)) for ev in exposures]
+    codes = [render_srgb(_exposed(replace(raw, data=light), ev)) for ev in exposures]
 
     def bracket() -> Iterator[Tensor]:
         for picture in codes:
@@ -100,17 +97,6 @@ def developed(raw: RawImage, ev: float = 0.0) -> Tensor:
 
 def _exposed(raw: RawImage, ev: float) -> RawImage:
     return replace(raw, data=(raw.data * 2.0**ev).clamp(max=1.0))
-
-
-def _white_where_saturated(raw: RawImage, light: Tensor, stops: float) -> Tensor:
-    """`light`, so bright where the raw is saturated that the darkest picture shows it white."""
-    saturated = raw.saturated.to(light.device)
-    if not bool(saturated.any()):
-        return light
-    red, green, blue = raw.white_balance
-    gains = np.array([red, green, green, blue])
-    white = torch.from_numpy(_WHITE * 2.0**stops * gains.max() / gains).to(light)
-    return torch.where(saturated, torch.maximum(light, white[:, None, None]), light)
 
 
 def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:

@@ -64,7 +64,7 @@ def hdr(
     count, saturated = len(picture.exposures), float(source.saturated.float().mean())
     print_line(
         f"fused {count} simulated pictures, {picture.exposures[0]:+g} to "
-        f"{picture.exposures[-1]:+g} EV; {saturated:.2%} of the pixels are white in all of them"
+        f"{picture.exposures[-1]:+g} EV; {saturated:.2%} of the raw is saturated: its light there is an estimate"
     )
     files = {"EXR": write_exr(out, linear_rgb(source, picture.radiance))}
     if png is not None:
