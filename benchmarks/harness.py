@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 
 from agents.cli.console import print_files, progress_bars
@@ -226,6 +227,19 @@ def write_picture(path: Path, figure: Figure) -> Path:
     figure.savefig(stream, format="png")
     path.parent.mkdir(parents=True, exist_ok=True)
     return write_palette_png(path, Image.open(stream))
+
+
+def side_by_side(pictures: Mapping[str, torch.Tensor]) -> Figure:
+    """Pictures (3, H, W), uint8 or in [0, 1], of one size, each below its title."""
+    height, width = next(iter(pictures.values())).shape[-2:]
+    shape = (3.0 * len(pictures), 3.0 * height / width + 0.3)
+    figure = Figure(figsize=shape, dpi=110, layout="constrained")
+    axes = figure.subplots(1, len(pictures), squeeze=False)[0]
+    for axis, (title, picture) in zip(axes, pictures.items(), strict=True):
+        axis.imshow(picture.permute(1, 2, 0).numpy())
+        axis.set_title(title, fontsize=9)
+        axis.axis("off")
+    return figure
 
 
 def data_folder(name: str) -> Path:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -17,7 +18,7 @@ from agents.applications.hdr import bracket_exposures, developed, hdr_picture
 from benchmarks.captures import psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums, held_out_scenes
-from benchmarks.harness import Benchmark, Part, Report, Row, table
+from benchmarks.harness import Benchmark, Part, Report, Row, side_by_side, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
@@ -97,6 +98,33 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
                 row["radiance_ev"] = _radiance_error(lights[method], unclipped)
             rows.append(row | ({"seconds": seconds} if method == "ours" else {}))
     return rows
+
+
+@torch.no_grad()
+def picture(seed: int, quick: bool) -> Figure:
+    """The scene with the most light above the raw's white."""
+    camera, iso = get_camera(CAMERA), ISOS[1]
+    reference, found = ReferenceCamera(camera), []
+    for scene in _scenes(quick):
+        settings = equal_exposure(scene.reference, iso, F_NUMBER)
+        light = reference.blurred_light(scene, F_NUMBER)
+        unclipped = reference.expose(light, scene.reference, settings)
+        dark = float((unclipped < 2.0**-6).double().mean())
+        found.append((min(dark, 10.0 * float((unclipped > 1.0).double().mean())), scene, unclipped))
+    _, scene, unclipped = max(found, key=lambda entry: entry[0])
+    settings = equal_exposure(scene.reference, iso, F_NUMBER)
+    look = {"white_balance": scene.white_balance}
+    raw = RawImage(reference.capture(scene, settings, seed).sample, settings, camera, **look)
+    simulator = CameraSimulator.from_pretrained("large", cache=None)
+    right = [developed(replace(raw, data=unclipped), ev) for ev in bracket_exposures()]
+    return side_by_side(
+        {
+            f"the raw, developed (ISO {iso})": developed(raw),
+            "its noise kept, fused": fuse([developed(raw, ev) for ev in bracket_exposures()]),
+            "ae-env hdr": hdr_picture(raw, simulator=simulator).fused,
+            "the map's own light, fused": fuse(right),
+        }
+    )
 
 
 def _merged(captures: Sequence[Tensor], exposures: Sequence[float], raw: RawImage) -> Tensor:
@@ -193,7 +221,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         f"2^{np.log2(DARKEST):.0f} of the raw's white:",
         table([m for m in means if any(m[f"{k} radiance_ev"] is not None for k in keys)], errors),
     ]
-    return Report([*rows, *means], page)
+    page.insert(2, "![a raw, fused with its noise, by ae-env hdr, and its light fused](hdr.png)")
+    figure = picture(meta["seed"], meta["quick"])
+    return Report([*rows, *means], page, figures={"hdr.png": figure})
 
 
 def _cell(key: str, *names: str) -> Any:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from ae_env.scenes.reference_scenes import depth_photographs
@@ -16,8 +18,8 @@ from agents.applications.refocus import refocus
 from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums, weights
-from benchmarks.harness import Benchmark, Part, Report, Row, data_root, table
-from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
+from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.disc_bank import DiscBank, added_blur
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
@@ -122,6 +124,28 @@ def _methods(
     }
 
 
+@torch.no_grad()
+def picture(seed: int) -> Figure:
+    """A scene at f/11 and at the widest aperture: estimated, known and true depth."""
+    camera, iso, f_number = get_camera(CAMERA), ISOS[0], F_NUMBERS[-1]
+    scene = depth_photographs(camera, data=data_root())[0]
+    reference = ReferenceCamera(camera)
+    settings = equal_exposure(scene.reference, iso, F_SOURCE)
+    sample = reference.capture(scene, settings, seed).sample
+    raw = RawImage(sample, settings, camera, white_balance=scene.white_balance)
+    simulator = CameraSimulator.from_pretrained("large", cache=None)
+    methods = _methods(raw, scene, f_number, simulator, seed)
+    truth = reference.capture(scene, equal_exposure(scene.reference, iso, f_number), seed).mean
+    shown = {
+        f"the raw, f/{F_SOURCE:g}": sample,
+        f"f/{f_number:g}, depth estimated": methods["ours unknown"](),
+        f"f/{f_number:g}, depth given": methods["ours given"](),
+        f"f/{f_number:g}, thin lens": truth,
+    }
+    pictures = {name: render_srgb(replace(raw, data=data)) for name, data in shown.items()}
+    return side_by_side(pictures)
+
+
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each scene."""
     count = len(depth_photographs(get_camera(CAMERA), data=data_root()))
@@ -170,7 +194,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "The paper's module is trained by `configs/simulator/paper.yaml` (on f/11 to f/4); it "
         "stands here where `runs/simulator/paper` holds its weights.",
     ]
-    return Report([*rows, *means], page)
+    page.insert(2, "![a scene at f/11, and opened to f/1.4](refocus.png)")
+    return Report([*rows, *means], page, figures={"refocus.png": picture(meta["seed"])})
 
 
 def _cell(f_number: float) -> Callable[[Row], str]:

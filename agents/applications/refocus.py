@@ -51,17 +51,10 @@ def refocus(
         ValueError: If the aperture closes, if `depth` and `lens` do not come together or do not
             fit `raw`, or if the camera's pixel pitch is needed and not known.
     """
+    check_refocus(raw, f_number, depth, lens)
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
     opened = source.effective_f_number / target.effective_f_number
-    if opened < 1.0:
-        raise ValueError(
-            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:g}: "
-            "closing the aperture would have to sharpen"
-        )
-    if (depth is None) != (lens is None):
-        given = "lens" if depth is None else "depth"
-        raise ValueError(f"`{given}` must come with both of `depth` and `lens`")
     known = None if depth is None or lens is None else _known_blur(raw, depth, lens)
     simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
     prepared = simulator.prepare(raw, tolerance=0.0)
@@ -85,8 +78,22 @@ def refocus(
     return replace(raw, data=data, settings=settings, metadata=metadata)
 
 
-def _known_blur(raw: RawImage, depth: np.ndarray, lens: Lens) -> torch.Tensor:
-    """Signed circle of confusion (H, W) at the raw's own aperture [packed pixel]."""
+def check_refocus(
+    raw: RawImage, f_number: float, depth: np.ndarray | None = None, lens: Lens | None = None
+) -> None:
+    """Raises the `ValueError` that `refocus` does, before any work."""
+    source = raw.settings
+    target = CameraSettings(source.iso, source.exposure_time, f_number)
+    if target.effective_f_number > source.effective_f_number:
+        raise ValueError(
+            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:g}: "
+            "closing the aperture would have to sharpen"
+        )
+    if depth is None and lens is None:
+        return
+    if depth is None or lens is None:
+        given = "lens" if depth is None else "depth"
+        raise ValueError(f"`{given}` must come with both of `depth` and `lens`")
     height, width = raw.data.shape[-2:]
     fits = (height, width), (2 * height, 2 * width)
     if not isinstance(depth, np.ndarray) or depth.shape not in fits:
@@ -97,15 +104,20 @@ def _known_blur(raw: RawImage, depth: np.ndarray, lens: Lens) -> torch.Tensor:
         )
     if depth.dtype.kind not in "uif" or not (depth > lens.focal_length).all():
         raise ValueError(
-            f"`depth` must be distances above the focal length ({lens.focal_length:g} m), got "
-            f"{float(np.nanmin(depth)):g} m at least"
+            f"`depth` (the least is {depth.min()} m) must be distances above the focal length, "
+            f"{lens.focal_length:g} m"
         )
     if raw.camera.pixel_pitch_um is None:
         raise ValueError(
             f"`raw`: the pixel pitch of {raw.camera.name!r} is not known; give it one with "
             "dataclasses.replace(camera, pixel_pitch_um=...)"
         )
+
+
+def _known_blur(raw: RawImage, depth: np.ndarray, lens: Lens) -> torch.Tensor:
+    """Signed circle of confusion (H, W) at the raw's own aperture [packed pixel]."""
+    assert raw.camera.pixel_pitch_um is not None
     pitch = 2e-6 * raw.camera.pixel_pitch_um * raw.box_factor
     metres = torch.from_numpy(np.asarray(depth, np.float64))
     blur = lens.circle_of_confusion(metres, raw.settings.effective_f_number) / pitch
-    return F.avg_pool2d(blur[None], blur.shape[0] // height)[0]
+    return F.avg_pool2d(blur[None], len(blur) // raw.data.shape[-2])[0]

@@ -64,8 +64,10 @@ def hdr(
     count, saturated = len(picture.exposures), float(source.saturated.float().mean())
     print_line(
         f"fused {count} simulated pictures, {picture.exposures[0]:+g} to "
-        f"{picture.exposures[-1]:+g} EV; {saturated:.2%} of the raw is saturated: its light there is an estimate"
+        f"{picture.exposures[-1]:+g} EV"
     )
+    if saturated:
+        print_line(f"highlights: {saturated:.2%} of the raw is saturated: its light is estimated")
     files = {"EXR": write_exr(out, linear_rgb(source, picture.radiance))}
     if png is not None:
         files["PNG"] = write_upright(png, source, (picture.fused * 255.0).round().byte())

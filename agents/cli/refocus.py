@@ -74,6 +74,7 @@ def refocus(
     Example: `ae-env refocus IMG_0001.CRW --aperture 1.4 -o out.dng --png out.png`
     """
     from agents.applications.depth_map import read_depth
+    from agents.applications.refocus import check_refocus
     from agents.applications.refocus import refocus as refocused
     from agents.cli.simulate import make_simulator, source_settings, write_png
     from simulator import read_raw, write_dng
@@ -104,6 +105,7 @@ def refocus(
                 f"`pixel-pitch` (=None) must be given: that of {source.camera.name!r} is not known"
             )
         lens = _lens(source, metres, focus, focal_length)
+    check_refocus(source, f_number, metres, lens)
     make_folders(out=out, png=png)
     result = refocused(
         source,

@@ -1,0 +1,87 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from agents.applications.exposure_fusion import _weight, fuse
+from agents.applications.hdr import bracket_exposures, developed, hdr_picture, linear_rgb, write_exr
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
+
+CAMERA = get_camera("nikon_z6")
+SETTINGS = CameraSettings(100, 1 / 64, 8)
+
+
+def test_pictures_that_are_alike_fuse_to_themselves() -> None:
+    picture = torch.rand(3, 70, 91, generator=torch.Generator().manual_seed(0))
+    # The pyramid is taken apart and put together again, whatever the weights.
+    torch.testing.assert_close(fuse([picture] * 3), picture, atol=1e-5, rtol=0)
+
+
+def test_flat_pictures_weigh_as_the_formula_says() -> None:
+    # Lee et al. 2018: w1 = exp(-(Y - (1 - m))^2 / (2 s^2)), s = 0.75 (m[n + 1] - m[n - 1]), twice
+    # the only distance at the ends; all of a flat picture has one brightness, so w2 is the same.
+    means = [0.1, 0.5, 0.7]
+    widths = 0.75 * np.array([2 * 0.4, 0.6, 2 * 0.2])
+    weights = np.exp(-((np.array(means) - (1 - np.array(means))) ** 2) / (2 * widths**2))
+    expected = float((weights * means).sum() / weights.sum())
+    fused = fuse([torch.full((3, 40, 50), mean) for mean in means])
+    np.testing.assert_allclose(fused.numpy(), expected, atol=2e-4)
+
+
+def test_rare_brightnesses_weigh_more() -> None:
+    luma = torch.full((10, 10), 0.2)
+    luma[0, :5] = 0.4
+    weight = _weight(luma, mean=0.7, width=0.5)
+    # Both lie as far from 1 - 0.7 as each other; one is 19 times as frequent.
+    np.testing.assert_allclose(float(weight[0, 0] / weight[5, 5]), 19.0, rtol=1e-4)
+
+
+def test_a_function_that_yields_pictures() -> None:
+    pictures = [torch.full((3, 20, 20), value) for value in (0.2, 0.6)]
+    assert fuse(lambda: iter(pictures)).equal(fuse(pictures))
+    with pytest.raises(ValueError, match="must be at least 2"):
+        fuse(pictures[:1])
+
+
+def test_bracket_exposures() -> None:
+    assert bracket_exposures()[0] == -4.0
+    assert len(bracket_exposures()) == 17
+    steps = [b - a for a, b in itertools.pairwise(bracket_exposures(1.0, 0.3))]
+    np.testing.assert_allclose(steps, 0.3)
+    for stops, step in ((0.0, 0.5), (11.0, 0.5), (float("nan"), 0.5), (1.0, 2.0), (1.0, 0.0)):
+        with pytest.raises(ValueError, match=r"`(stops|step)`"):
+            bracket_exposures(stops, step)
+
+
+def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
+    stripes = (torch.arange(96) // 8 % 2).float()
+    light = torch.empty(4, 96, 128)
+    light[..., :64] = 0.002 + 0.002 * stripes[None, :, None]  # deep shadow
+    light[..., 64:] = 0.80 + 0.15 * stripes[None, :, None]
+    raw = RawImage(light, SETTINGS, CAMERA)
+    picture = hdr_picture(raw, simulator=CameraSimulator(device="cpu"))
+    single = render_srgb(raw).float() / 255.0
+    for columns in (slice(40, 88), slice(168, 216)):
+        contrast = [float(p[1, 20:-20, columns].std()) for p in (single, picture.fused)]
+        assert contrast[1] > 1.3 * contrast[0]
+    assert picture.fused[1, :, 168:216].mean() > picture.fused[1, :, 40:88].mean()
+
+
+def test_the_sensor_clips_each_picture() -> None:
+    raw = RawImage(torch.full((4, 8, 8), 0.5), SETTINGS, CAMERA)
+    assert developed(raw, 2.0).min() == 1.0
+    assert developed(raw, -2.0).equal(
+        developed(RawImage(torch.full((4, 8, 8), 0.125), SETTINGS, CAMERA))
+    )
+
+
+def test_radiance_as_an_exr(tmp_path) -> None:
+    openexr = pytest.importorskip("OpenEXR")
+    raw = RawImage(torch.full((4, 6, 8), 0.1), SETTINGS, CAMERA, white_balance=(2.0, 1.0, 1.5))
+    grey = torch.tensor([0.5, 1.0, 1.0, 2 / 3])[:, None, None].expand(4, 6, 8) * 3.0
+    image = linear_rgb(raw, grey)
+    np.testing.assert_allclose(image, 3.0, rtol=1e-5)  # grey stays grey, above white
+    path = write_exr(tmp_path / "out.exr", image)
+    with openexr.File(str(path)) as file:
+        np.testing.assert_array_equal(file.channels()["RGB"].pixels, image)
