@@ -13,19 +13,20 @@ from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from ae_env.scenes.reference_scenes import reference_scenes
 from agents.applications.exposure_fusion import fuse
 from agents.applications.hdr import bracket_exposures, developed, hdr_picture
 from benchmarks.captures import psnr
 from benchmarks.fidelity.defocus import equal_exposure
-from benchmarks.fidelity.models import checksums, held_out_scenes
-from benchmarks.harness import Benchmark, Part, Report, Row, side_by_side, table
+from benchmarks.fidelity.models import checksums
+from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 CAMERA, F_NUMBER = "nikon_z6", 8.0
 ISOS = (100, 1600, 6400)
-#: Kinds of scenes whose light is synthetic, or was clipped by a sensor.
-NOT_MAPS = ("depth", "mosaic", "draped")
+#: Side of a view [packed pixel].
+SIZE = 128
 #: Range of the light [stops] from which a scene counts as of high dynamic range.
 HIGH_RANGE = 10.0
 #: Light below this is left out of the error of radiance, relative to the raw's white.
@@ -42,9 +43,9 @@ METHODS = {
 
 
 def _scenes(quick: bool) -> list[ReferenceScene]:
-    """Views of held-out radiance maps."""
-    scenes = [s for s in held_out_scenes(CAMERA, quick) if s.kind == "radiance" and s.pitch == 2]
-    groups = {scene.group: scene for scene in reversed(scenes)}
+    """Views of held-out radiance maps, one of each."""
+    scenes = reference_scenes("test", get_camera(CAMERA), number=0, size=SIZE, data=data_root())
+    groups = {s.group: s for s in reversed(scenes) if s.kind == "radiance" and s.pitch == 2}
     return list(groups.values())[: 2 if quick else None]
 
 

@@ -46,14 +46,15 @@ def measure(number: int, seed: int, quick: bool) -> list[Row]:
     scene = depth_photographs(camera, data=data_root())[number]
     reference = ReferenceCamera(camera)
     simulator = CameraSimulator.from_pretrained("large", cache=None)
-    rows = []
+    rows, edges = [], _edges(reference, scene)
+    f_numbers = F_NUMBERS[-1:] if quick else F_NUMBERS
+    light = {n: reference.blurred_light(scene, n) for n in f_numbers}
     for iso in ISOS[:1] if quick else ISOS:
         source = reference.capture(scene, equal_exposure(scene.reference, iso, F_SOURCE), seed)
         raw = RawImage(source.sample, source.settings, camera)
-        for f_number in F_NUMBERS[-1:] if quick else F_NUMBERS:
+        for f_number in f_numbers:
             settings = equal_exposure(scene.reference, iso, f_number)
-            truth = reference.capture(scene, settings, seed).mean
-            edges = _edges(reference, scene)
+            truth = reference.capture(scene, settings, seed, light=light[f_number]).mean
             for method, opened in _methods(raw, scene, f_number, simulator, seed).items():
                 begun = time.perf_counter()
                 picture = clipped(opened(), camera)

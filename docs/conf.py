@@ -54,6 +54,7 @@ CONTENTS = {
     ],
     "The simulator": [
         *("simulator", "networks", "dataset", "colour", "performance", "stability"),
+        *("refocus", "hdr"),
     ],
     "More": [
         "gallery",

@@ -43,11 +43,12 @@ def disc_area(f_number: float, depth: float) -> float:
 
 
 def test_a_light_behind_the_focus_becomes_a_disc_that_keeps_its_energy(simulator) -> None:
-    light = torch.full((4, 161, 161), 0.01)
-    light[:, 80, 80] = 0.9
+    dark = 160.0 / CAMERA.span[0]  # whole digital numbers: rounding errors would add up
+    light = torch.full((4, 161, 161), dark)
+    light[:, 80, 80] = dark + 0.89
     raw = make_raw(light)
     out = refocus(raw, 1.4, depth=np.full((161, 161), 2.2), lens=LENS, simulator=simulator)
-    disc = out.data[1, 68:93, 68:93].double() - 0.01  # rounding would add up over more
+    disc = out.data[1, 68:93, 68:93].double() - dark
     assert out.settings.f_number == 1.4
     assert out.settings.exposure_time == pytest.approx(1 / 64 / 16)
     np.testing.assert_allclose(float(disc.sum()), 0.89, rtol=0.01)
