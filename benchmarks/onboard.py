@@ -28,17 +28,22 @@ FRAME_SIZES = ((64, 64), (240, 320), (760, 1014), (1520, 2028))
 SIDES = (64, 32, 16, 8, 4, 2)
 
 
-def measure(policy: str, seed: int, quick: bool) -> Row:
-    """One agent, over episodes on test scenes."""
-    torch.set_num_threads(1)
-    count = 8 if quick else EPISODES
-    envs = gym.make_vec(
+def _envs(count: int) -> Any:
+    """Episodes on unseen scenes, in light that jumps in the middle."""
+    return gym.make_vec(
         "ae_env:ae_env/AutoExposure-v0",
         num_envs=count,
         split="test",
         max_episode_steps=None,
         lighting={"kind": "step", "stops": STOPS, "at": FRAMES // 2},
     )
+
+
+def measure(policy: str, seed: int, quick: bool) -> Row:
+    """One agent, over episodes on test scenes."""
+    torch.set_num_threads(1)
+    count = 8 if quick else EPISODES
+    envs = _envs(count)
     agent = make_policy(policy, PolicyContext.from_envs(envs))
     with tempfile.TemporaryDirectory() as folder:
         file = export_agent(agent, Path(folder, "agent.onnx"))
@@ -68,13 +73,7 @@ def smaller(policy: str, seed: int, quick: bool) -> list[Row]:
     """Scores of an agent that sees its frame averaged to fewer pixels, in the same episodes."""
     torch.set_num_threads(1)
     count = 8 if quick else EPISODES
-    envs = gym.make_vec(
-        "ae_env:ae_env/AutoExposure-v0",
-        num_envs=count,
-        split="test",
-        max_episode_steps=None,
-        lighting={"kind": "step", "stops": STOPS, "at": FRAMES // 2},
-    )
+    envs = _envs(count)
     agent = make_policy(policy, PolicyContext.from_envs(envs))
     rows: list[Row] = []
     for side in SIDES:
