@@ -141,7 +141,6 @@ class EpisodeCore:
             self.scenes,
             self.episodes,
             self._captures,
-            self._prepared,
             static=self._static,
             expected=options.reward == "expected",
         )

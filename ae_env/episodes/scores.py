@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -30,7 +30,6 @@ class PartScores:
         scenes: Scenes that are photographed.
         episodes: The episodes that photograph them.
         batch: What photographs them.
-        prepared: The scene of a `Episodes.light_index` in its episode.
         static: Whether the light never changes.
         expected: Whether the parts that are measured on frames are replaced by their expectation.
 
@@ -46,13 +45,11 @@ class PartScores:
         scenes: Sequence[Scene],
         episodes: Episodes,
         batch: CaptureBatch,
-        prepared: Callable[[int], PreparedScene],
         *,
         static: bool,
         expected: bool,
     ) -> None:
         self.tables, self.grid, self.batch = tables, tables.grid, batch
-        self._prepared = prepared
         self.scenes, self.episodes, self._static = scenes, episodes, static
         self._code_scores, self._others = tables.code_scores, tables.others
         others = self._others
@@ -61,6 +58,7 @@ class PartScores:
         self._known = [] if others is None else others.names("light", "blur")
         self._scores = np.zeros((lights, len(self.grid), len(self._known)))
         self._scored = np.zeros((lights, len(self.grid)), bool)
+        self._of_light: dict[int, dict[str, np.ndarray]] = {}  # by scene; see `_light_scores`
         self._means = np.full((lights, len(self.grid), 3), np.nan)
         self._box_factors = np.array([scene.box_factor for scene in scenes])
         self.reads_images = not tables.closed_form and not expected
@@ -146,9 +144,23 @@ class PartScores:
                 int(of_each[env_index])
                 for of_each in (self.episodes.light_index, self.episodes.scene)
             )
-            parts = self.tables.known_parts(self.scenes[scene], self._prepared(light))
+            prepared = self.batch.prepared_scene(light)
+            parts = self._light_scores(scene, prepared)
+            parts |= self.tables.known_parts(self.scenes[scene], prepared, kinds=("blur",))
             self._scores[light] = np.stack([parts[name] for name in self._known], axis=1)
             self._scored[light] = True
+
+    def _light_scores(self, scene: int, prepared: PreparedScene) -> dict[str, np.ndarray]:
+        """Scores of the parts that depend on the light alone: no episode changes them.
+
+        The blur averages the noise that a source brings, so only those without it are cached.
+        """
+        known = self._of_light.get(scene)
+        if known is None:
+            known = self.tables.known_parts(self.scenes[scene], prepared, kinds=("light",))
+            if prepared.nlf.is_zero:
+                self._of_light[scene] = known
+        return dict(known)
 
     def _expected_means(
         self, env_indices: np.ndarray, boxes: np.ndarray, rows: np.ndarray | None

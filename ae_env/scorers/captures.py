@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -121,6 +122,8 @@ class SceneCaptures:
         movement: Movement = ALONG_ROWS,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
+        source_noise: Sequence[NoiseLevelFunction] | None = None,
+        noisy: bool = True,
     ) -> Captures:
         """Captures of consecutive states of a grid.
 
@@ -132,6 +135,8 @@ class SceneCaptures:
             movement: Directions of the image's motion, and the subject's own.
             gain: Light relative to the scene's own, one or (S,).
             row_gain: (S, H), see `describe_captures`.
+            source_noise: See `Captures`.
+            noisy: See `Captures`.
         """
         known = self._known(scene, states)
         height, own = scene.light.shape[-2], known.captures.blur_px.numpy()
@@ -143,19 +148,19 @@ class SceneCaptures:
             blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
         else:
             blur = pixel_blur.rms_px.numpy()
-        captures = replace(
+        light: dict[str, Any] = {}
+        if isinstance(gain, np.ndarray) or gain != 1.0:
+            light["ratio"] = torch.from_numpy(known.captures.ratio.numpy() * gain)
+            light["proper_ev"] = torch.from_numpy(known.captures.proper_ev.numpy() + np.log2(gain))
+        return replace(
             known.captures,
             scene_light=self._light(scene, len(states)),
             blur_px=torch.from_numpy(blur),
-            pixel_blur=pixel_blur,
-        )
-        if not isinstance(gain, np.ndarray) and gain == 1.0 and row_gain is None:
-            return captures
-        return replace(
-            captures,
-            ratio=torch.from_numpy(captures.ratio.numpy() * gain),
-            proper_ev=torch.from_numpy(captures.proper_ev.numpy() + np.log2(gain)),
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
+            source_noise=source_noise,
+            noisy=noisy,
+            pixel_blur=pixel_blur,
+            **light,
         )
 
     def _known(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:

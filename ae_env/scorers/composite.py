@@ -265,7 +265,8 @@ def _checked(name: str, scores: Any, count: int) -> torch.Tensor:
             found = f"{tuple(scores.shape)} {scores.dtype}"
         raise UserCodeError(f"scorer {name!r} returned {found}: it must return a tensor ({count},)")
     found64: torch.Tensor = scores.detach().to("cpu", torch.float64)
-    if not bool(((found64 >= -ROUNDING) & (found64 <= 1 + ROUNDING)).all()):
+    low, high = (float(value) for value in found64.aminmax()) if count else (0.0, 1.0)
+    if not (low >= -ROUNDING and high <= 1 + ROUNDING):  # NaN is not
         raise UserCodeError(f"scorer {name!r} returned {_describe_range(found64)}: rule is [0, 1]")
     return found64.clamp(0.0, 1.0)
 

@@ -27,7 +27,7 @@ class PixelBlur(NamedTuple):
     @property
     def rms_px(self) -> torch.Tensor:
         """(B,) root mean square extent over the pixels [pixel of the frame]."""
-        return (self.levels.square() * self.shares).sum(dim=1).sqrt()
+        return self.levels.square().mul_(self.shares).sum(dim=1).sqrt_()
 
 
 def layout_blur(
@@ -53,14 +53,17 @@ def layout_blur(
     if layout is None or not (discs.any() or movement.subject_speed):
         return None
     counted = layout.shares
-    motion = np.repeat((speed * times * height)[:, None], len(counted.share), axis=1)
+    own_square = own**2
+    rest = ((speed * times * height) ** 2 + own_square)[:, None]
     if movement.subject_speed:
         extent = movement.subject_extent(speed, times) * height
-        motion = np.where(counted.subject, extent[:, None], motion)
-    defocus = np.minimum(discs[:, None] * counted.defocus, DIAMETERS[-1])  # as in the frame
-    squares = motion**2 + defocus**2 + own[:, None] ** 2  # (S, K)
+        rest = np.where(counted.subject, (extent**2 + own_square)[:, None], rest)
+    levels = np.minimum(np.multiply.outer(discs, counted.defocus), DIAMETERS[-1])  # as in the frame
+    levels *= levels
+    levels += rest
+    np.sqrt(levels, out=levels)  # (S, K)
     shares = torch.from_numpy(counted.share).expand(len(times), -1)
-    return PixelBlur(torch.from_numpy(np.sqrt(squares)), shares)
+    return PixelBlur(torch.from_numpy(levels), shares)
 
 
 def stacked(parts: Sequence[PixelBlur | None], blur_px: np.ndarray) -> PixelBlur | None:

@@ -21,7 +21,7 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import SceneCaptures
 from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.composite import CompositeScorer, is_own
-from ae_env.scorers.protocol import Captures, reads_pixels
+from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
 from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
@@ -219,17 +219,18 @@ class ScoreTables:
         *,
         gain: float | np.ndarray = 1.0,
         row_gain: np.ndarray | None = None,
+        kinds: tuple[DependsOn, ...] = ("light", "blur"),
     ) -> dict[str, np.ndarray]:
-        """Scores (S,) of those parts that look at no frame; see `table`."""
+        """Scores (S,) of those parts that look at no frame but depend on `kinds`; see `table`."""
         others = self.others
-        names = [] if others is None else others.names("light", "blur")
+        names = [] if others is None else others.names(*kinds)
         if others is None or not names:
             return {}
         looks = any(reads_pixels(others.parts[name]) for name in names)
         chunks = []
         for part in _slices(len(self.grid), _CHUNK if looks else len(self.grid)):
             captures = self._described(scene, prepared, part, gain, row_gain)
-            scores = others.score_parts(None, captures, ("light", "blur"))
+            scores = others.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}
 
@@ -244,17 +245,17 @@ class ScoreTables:
         """Facts of the captures of the states `part` of the grid."""
         states = self.grid.states[part]
         gains = np.broadcast_to(gain, len(self.grid))[part]
-        captures = self._captures.describe(
+        return self._captures.describe(
             scene,
             states,
             speed=prepared.image_speed,
             defocus=prepared.defocus * 64.0 / prepared.light.shape[-2],
             movement=prepared.movement,
-            gain=gains,
+            gain=gains if isinstance(gain, np.ndarray) else gain,
             row_gain=None if row_gain is None else row_gain[part],
+            source_noise=source_noises(prepared, states, gains),
+            noisy=self.noise,
         )
-        noises = source_noises(prepared, states, gains)
-        return replace(captures, source_noise=noises, noisy=self.noise)
 
     def _expected_means(
         self, prepared: PreparedScene, gain: float | np.ndarray, row_gain: np.ndarray | None

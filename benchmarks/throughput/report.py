@@ -15,6 +15,7 @@ from benchmarks.throughput.steps import KERNEL, LOOKUP, SCENES
 #: Frame size and case that the targets for steps are about.
 SIZE, CASE, NUM_ENVS = 128, "vector env, cached scene", 64
 STEPS_PER_SECOND, TIMES_KERNEL, RATIO_TO_BEFORE = 5000.0, 1.5, 0.97
+RESET_IN_STEPS = 3.0
 FULL_FRAME_MIB, TIMES_LIBRAW = 2048.0, 2.0
 #: An exponent counts as linear up to here, if two standard errors lead down to 1.
 _LINEAR = 1.1
@@ -26,9 +27,16 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by name of the part."""
     steps = [row for name, own in results.items() if name.startswith("steps ") for row in own]
     paired = [row for name, own in results.items() if name.startswith("paired ") for row in own]
+    resets = results.get("resets", [])
     curves, frames = growth.curves(results), full_frame.rows(results)
-    targets = list(_targets(steps, paired, curves, frames))
-    more = {"scenes": SCENES, "growth": curves, "full_frame": frames, "targets": targets}
+    targets = list(_targets(steps, resets, paired, curves, frames))
+    more = {
+        "scenes": SCENES,
+        "resets": resets,
+        "growth": curves,
+        "full_frame": frames,
+        "targets": targets,
+    }
     page = [
         f"Frames are packed raws of four planes, companded to uint8; the scenes are `{SCENES}`.",
         "![Steps per second](throughput.png)",
@@ -45,6 +53,10 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "between the quartiles. The error is the largest difference of a value between an episode "
         "in the batch and the same episode alone. *Cached scene*: neither motion nor defocus.",
         *sections(steps, _step_title, lambda own: table(own, _STEP_COLUMNS)),
+        "## Resets",
+        "Whole episodes of 8 steps with random actions, in motion and out of focus, 64 x 64, one "
+        "thread, the default scenes, each seen before; medians.",
+        table(resets, _RESET_COLUMNS),
         "## Growth of cost",
         "Each point in a process of its own. Memory is the peak above what the process held with "
         "all libraries loaded. Exponents: least squares on logarithms over the upper two decades, "
@@ -79,6 +91,15 @@ _STEP_COLUMNS: dict[str, Any] = {
     "of lookup": "{ratio_to_lookup:.3f}",
     "spread": "{spread:.0%}",
     "error": "{error_codes:g}",
+}
+_RESET_COLUMNS: dict[str, Any] = {
+    "case": "{case}",
+    "envs": "{num_envs}",
+    "reset [ms]": "{reset_ms:.2f}",
+    "step [ms]": "{step_ms:.2f}",
+    "reset in steps": "{ratio:.2f}",
+    "of the means": "{ratio_of_means:.2f}",
+    "spread": "{spread:.0%}",
 }
 _CURVE_COLUMNS: dict[str, Any] = {
     "curve": "{name}",
@@ -148,13 +169,21 @@ def _step(rows: list[Row], case: str = CASE, num_envs: int = NUM_ENVS) -> Row | 
     return next((row for row in rows if wanted.items() <= row.items()), None)
 
 
-def _targets(steps: list[Row], paired: list[Row], curves: list[Row], frames: list[Row]) -> Any:
+def _targets(
+    steps: list[Row],
+    resets: list[Row],
+    paired: list[Row],
+    curves: list[Row],
+    frames: list[Row],
+) -> Any:
     row = _step(steps)
     if row is not None:
         where = f"{NUM_ENVS} environments at {SIZE} x {SIZE}, cached scene, {CORES} threads"
         speed, times = row["steps_per_second"], 1.0 / row["ratio_to_kernel"]
         yield _target(f"steps per second, {where}", speed, STEPS_PER_SECOND, at_least=True)
         yield _target(f"time over that of the fused kernel, {where}", times, TIMES_KERNEL)
+    for row in resets:
+        yield _target(f"reset in steps, {cell(row, '{case}')}", row["ratio"], RESET_IN_STEPS)
     for row in paired:
         what = f"speed over that of before: {row['case']}, threads: {row['threads']}"
         yield _target(what, row["ratio_to_before"], RATIO_TO_BEFORE, at_least=True)

@@ -201,6 +201,10 @@ class CaptureBatch:
             keys=keys,
         )
 
+    def prepared_scene(self, index: int) -> PreparedScene:
+        """The scene `index` in its own light, as it is photographed."""
+        return self._light(index).prepared
+
     # -- planning -----------------------------------------------------------------------------
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:

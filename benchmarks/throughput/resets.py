@@ -1,0 +1,70 @@
+"""What a reset costs beside a step: with 8 frames an episode, it is one frame in nine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import ae_env  # noqa: F401  registers the environment
+from benchmarks.harness import Part, Row, quartiles
+from benchmarks.throughput.steps import ID
+
+#: Environments, episodes that warm up (each scene must have been seen) and episodes that are timed.
+CASES = ((1, 3000, 400), (64, 100, 100))
+QUICK_CASES = ((1, 100, 20), (64, 5, 5))
+#: Steps of an episode after its reset.
+STEPS = 8
+
+
+def parts(seed: int, quick: bool) -> list[Part]:
+    """One part: resets and steps of whole episodes in turns."""
+    return [Part("resets", measure_resets, {"seed": seed, "quick": quick}, threads=1)]
+
+
+def measure_resets(seed: int, quick: bool) -> list[Row]:
+    """Rows of one environment and of 64, in motion and out of focus, with random actions."""
+    return [
+        _row(count, warm, timed, seed) for count, warm, timed in (QUICK_CASES if quick else CASES)
+    ]
+
+
+def _row(num_envs: int, warm: int, timed: int, seed: int) -> Row:
+    reset, step = _episodes(num_envs, seed)
+    for _ in range(warm):
+        reset()
+    resets, steps = [], []
+    for _ in range(timed):
+        resets.append(_seconds(reset))
+        steps += [_seconds(step) for _ in range(STEPS)]
+    low, middle, high = quartiles(resets)
+    return {
+        "case": "one environment" if num_envs == 1 else "vector env",
+        "num_envs": num_envs,
+        "reset_ms": middle * 1e3,
+        "step_ms": quartiles(steps)[1] * 1e3,
+        "ratio": middle / quartiles(steps)[1],
+        "ratio_of_means": float(np.mean(resets) / np.mean(steps)),
+        "spread": (high - low) / middle,
+    }
+
+
+def _episodes(num_envs: int, seed: int) -> tuple[Callable[[], Any], Callable[[], Any]]:
+    """Functions that reset the environments and that take a step of them."""
+    rng = np.random.default_rng(seed)
+    if num_envs == 1:
+        env = gym.make(ID).unwrapped
+        env.reset(seed=seed)
+        return env.reset, lambda: env.step(rng.integers(64))
+    envs = gym.make_vec(ID, num_envs=num_envs, max_episode_steps=None)
+    envs.reset(seed=seed)
+    return envs.reset, lambda: envs.step(rng.integers(64, size=num_envs))
+
+
+def _seconds(action: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    action()
+    return time.perf_counter() - start
