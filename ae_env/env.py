@@ -11,6 +11,7 @@ import numpy as np
 
 from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.episodes.draws import check_options
+from ae_env.episodes.recorded import RECORDED
 from ae_env.episodes.state import Episode
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting
@@ -82,7 +83,7 @@ class AutoExposureBase(SpecProperty):
         """Steps of the simulator, joined by ``"+"``, by ``info["modules"]`` of a vector
         environment.
         """
-        return MODULES
+        return (*MODULES, RECORDED)
 
     @property
     def delays(self) -> tuple[int, int, int]:

@@ -16,10 +16,11 @@ from ae_env.scenes.loading import (
     NAMED,
     SceneNetworks,
     check_weights,
-    is_sequence,
+    has_frames,
     without_noise,
 )
 from ae_env.scenes.photographed import photographed
+from ae_env.scenes.recorded import RecordedOptions
 from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
@@ -117,6 +118,32 @@ class EnvOptions:
         for name, weight in self.costs.items():
             check_word("costs", name, COSTS)
             check_number(f"costs[{name!r}]", weight, 0.0, MAX_COST)
+        if self.recorded is not None:
+            self._check_recorded()
+
+    def _check_recorded(self) -> None:
+        """Real captures have the light, the motion and the noise that they have."""
+        defaults = {
+            "motion": ("random", "none"),
+            "depth": ("random", "far"),
+            "lighting": ("static",),
+            "noise": (True,),
+            "source": ("light",),
+        }
+        for name, allowed in defaults.items():
+            value = getattr(self, name)
+            if not any(value is word or value == word for word in allowed):
+                raise ValueError(
+                    f"`{name}` (={value!r}) must be left at its default for recorded scenes: their "
+                    "captures are real, nothing of them is simulated"
+                )
+        object.__setattr__(self, "motion", "none")
+        object.__setattr__(self, "depth", "far")
+
+    @property
+    def recorded(self) -> RecordedOptions | None:
+        """The folder of recorded grids, where the scenes are some."""
+        return RecordedOptions.of(self.scenes)
 
     @classmethod
     def from_kwargs(cls, kwargs: Mapping[str, Any]) -> EnvOptions:
@@ -141,12 +168,15 @@ class EnvOptions:
         return self.delay, self.delay, self.delay
 
     def make_grid(self) -> ExposureGrid:
-        """The exposure grid.
+        """The exposure grid; by default, of recorded scenes, that of their captures.
 
         Raises:
             ValueError: If a value of it cannot be shown by an observation's ``settings``.
         """
-        grid = ExposureGrid.from_spec(self.grid)
+        if self.recorded is not None and self.grid == "default":
+            grid = self.recorded.grid
+        else:
+            grid = ExposureGrid.from_spec(self.grid)
         _check_shown(grid)
         return grid
 
@@ -156,7 +186,7 @@ class EnvOptions:
         camera = given if isinstance(given, CameraProfile) else get_camera(given)
         if self.noise == "sensor":
             camera.read_noise(100.0)  # raises where there is no such calibration
-        return camera
+        return camera if self.recorded is None else self.recorded.camera(camera)
 
     def make_scorer(self) -> CompositeScorer:
         """The scorer."""
@@ -174,7 +204,7 @@ class EnvOptions:
     @property
     def in_sequences(self) -> bool:
         """Whether the scenes are frames of sequences, which follow each other in an episode."""
-        return is_sequence(self.scenes)
+        return has_frames(self.scenes)
 
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; of sequences, all frames.
@@ -204,6 +234,7 @@ class EnvOptions:
             resolution=self.resolution,
             crop=self.crop,
             resize=resize,
+            grid=None if self.recorded is None else self.make_grid(),
         )
         if self.source == "raw":
             scenes = [photographed(scene) if scene.noise_free else scene for scene in scenes]

@@ -146,8 +146,11 @@ def contact_sheet(
     tables = ScoreTables(grid, camera, make_scorer(scorer))
     moves: Any = {"speed": speed, "defocus": defocus, "movement": movement}
     table = tables.table(scene, **moves)
-    prepared = prepare_scene(scene, camera, **moves)
-    frames = prepared.stream(grid.states, seed=seed)
+    frames: Iterable[torch.Tensor]
+    if scene.recorded is None:
+        frames = prepare_scene(scene, camera, **moves).stream(grid.states, seed=seed)
+    else:
+        frames = scene.recorded
     pictures = [Image.fromarray(developed(frame[None], scene)[0]) for frame in frames]
     title = _title(scene, moves, grid, table)
     return _Sheet(grid, table, pictures, paths).draw(title)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ae_env.episodes.draws import Draws, allowed_states
 from ae_env.episodes.light import FrameLight
+from ae_env.episodes.recorded import RecordedBatch, nearest_recorded
 from ae_env.episodes.scores import PartScores
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.lighting import Lighting
@@ -126,23 +127,32 @@ class EpisodeCore:
         )
         self._at_rest: dict[int, PreparedScene] = {}
         frame_bytes = 16 * options.resolution**2
-        self._captures = CaptureBatch(
-            self._prepared,
-            len(self.scenes) + num_envs,
-            states,
-            self.camera,
-            noise=_NOISES[options.noise],
-            cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
-        )
+        # A recorded capture is its own expectation.
+        expected = options.reward == "expected" and options.recorded is None
+        self._captures: CaptureBatch | RecordedBatch
+        # (scenes, S) state that is shown where another is asked for; None where each can be.
+        self._shown_state: np.ndarray | None = None
+        if options.recorded is not None:
+            self._captures = RecordedBatch(self.scenes, self._prepared, self.camera)
+            self._shown_state = np.stack([nearest_recorded(s, self.grid) for s in self.scenes])
+        else:
+            self._captures = CaptureBatch(
+                self._prepared,
+                len(self.scenes) + num_envs,
+                states,
+                self.camera,
+                noise=_NOISES[options.noise],
+                cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
+            )
         #: Whether rewards are those of the tables, as some expectation has no closed form.
-        self._reads_tables = options.reward == "expected" and not self.tables.closed_form
+        self._reads_tables = expected and not self.tables.closed_form
         self._part_scores = PartScores(
             self.tables,
             self.scenes,
             self.episodes,
             self._captures,
             static=self._static,
-            expected=options.reward == "expected",
+            expected=expected,
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -232,6 +242,7 @@ class EpisodeCore:
             drawn["scene"] = self._shown_at(first, drawn["frame"])
         self._forget(env_indices)
         self.episodes.begin(env_indices, drawn)
+        self._show_recorded(env_indices)
         self._set_light_index(env_indices)
 
     def _forget(self, env_indices: np.ndarray) -> None:
@@ -273,7 +284,15 @@ class EpisodeCore:
         self.episodes.act(env_indices, actions)
         if self._sequence is not None:
             self._show_next(env_indices)
+        self._show_recorded(env_indices)
         return np.zeros(len(env_indices), bool)
+
+    def _show_recorded(self, env_indices: np.ndarray) -> None:
+        """Puts a state that was not recorded right: the nearest one that was is shown."""
+        if self._shown_state is not None:
+            episodes = self.episodes
+            wanted = episodes.scene[env_indices], episodes.state[env_indices]
+            episodes.state[env_indices] = self._shown_state[wanted]
 
     def _show_next(self, env_indices: np.ndarray) -> None:
         """Shows the scene of the current frame in each of `env_indices`."""

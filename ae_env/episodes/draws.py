@@ -46,7 +46,7 @@ class Draws:
         self._options, self._num_states = options, num_states
         self._index = {scene.scene_id: i for i, scene in enumerate(scenes)}
         if options.in_sequences:  # which have a name of their own
-            self._index |= {scene.group: i for i, scene in enumerate(scenes)}
+            self._index |= {s.sequence: i for i, s in enumerate(scenes) if s.sequence}
         self._ids = [scene.scene_id for scene in scenes]
         self._speeds = np.array([scene.median_speed for scene in scenes])
         # States that a scene allows come first in its row, in order.

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from ae_env.episodes.recorded import RecordedBatch
 from ae_env.episodes.state import Episodes
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import describe_captures
@@ -44,7 +45,7 @@ class PartScores:
         tables: ScoreTables,
         scenes: Sequence[Scene],
         episodes: Episodes,
-        batch: CaptureBatch,
+        batch: CaptureBatch | RecordedBatch,
         *,
         static: bool,
         expected: bool,
@@ -169,6 +170,7 @@ class PartScores:
         lights, states = self.episodes.light_index[env_indices], self.episodes.state[env_indices]
         missing = np.isnan(self._means[lights, states, 0]) | (not self._static)
         if missing.any():
+            assert isinstance(self.batch, CaptureBatch)  # recorded frames are measured
             transitions = self.batch.transitions(lights[missing], states[missing])
             gains = None if rows is None else rows[missing]
             found = self._code_scores.expected(transitions, states[missing], boxes[missing], gains)

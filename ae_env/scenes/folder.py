@@ -169,6 +169,7 @@ def sequence_scenes(
     groups = {path: sequences[path.parent] for path in files}
     reader = _Reader(base, _scene_names(base, files), groups, options, request)
     scenes, _ = _read_all(spec, files, reader, "")
+    scenes = [replace(scene, sequence=scene.group) for scene in scenes]
     log_groups(str(spec), scenes)
     return scenes_of_split(spec, scenes, request.split)
 
@@ -185,11 +186,12 @@ def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
     """First and last frame, (F,) int64 each, of the sequence that each of F frames belongs to.
 
     Args:
-        scenes: As `sequence_scenes` returns them: those of one group follow each other.
+        scenes: As `sequence_scenes` returns them: those of one sequence follow each other. A scene
+            of none is one of its own.
     """
-    groups = [scene.group for scene in scenes]
-    begins = [i for i, group in enumerate(groups) if i == 0 or groups[i - 1] != group]
-    lengths = np.diff([*begins, len(groups)])
+    names = [scene.sequence or scene.scene_id for scene in scenes]
+    begins = [i for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
+    lengths = np.diff([*begins, len(names)])
     first = np.repeat(begins, lengths)
     return first, first + np.repeat(lengths, lengths) - 1
 

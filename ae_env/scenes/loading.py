@@ -14,9 +14,11 @@ from typing import Any, get_args
 
 import torch
 
+from ae_env.grid import ExposureGrid
 from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
 from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
+from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest
 from ae_env.utils.checks import did_you_mean
 from ae_env.utils.user_code import load_attribute
@@ -53,6 +55,7 @@ def load_scenes(
     resolution: int | None = 64,
     crop: Crop = "box",
     resize: Resize = Scene.resized,
+    grid: ExposureGrid | None = None,
 ) -> list[Scene]:
     """The scenes that `spec` names, of one split, all at one resolution.
 
@@ -70,7 +73,10 @@ def load_scenes(
             - a list of `Scene`;
             - a mapping ``{"path": file, folder or glob, ...}`` with any fields of `FolderOptions`;
             - a mapping ``{"sequence": folder or glob, ...}`` likewise: the raws of each folder are
-              the frames of one scene over time (`ae_env.scenes.folder`).
+              the frames of one scene over time (`ae_env.scenes.folder`);
+            - ``"recorded:FOLDER"`` or a mapping ``{"recorded": folder, ...}``: grids whose every
+              state is a real capture (`ae_env.scenes.recorded_files` has the layouts), with the
+              ``iso``, ``exposure_time`` and ``f_number`` of files that do not state theirs.
 
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
@@ -81,6 +87,7 @@ def load_scenes(
         crop: ``"box"`` averages the central square down; ``"native"`` cuts out its middle.
         resize: Called with each scene at its finest resolution, `resolution` and `crop`; see
             `SceneNetworks.resized` for another than the default.
+        grid: States of recorded grids; by default all that their captures have.
 
     Returns:
         At least one scene, in a stable order, with unique ids.
@@ -95,7 +102,10 @@ def load_scenes(
         hint = "; `simulator.get_camera` gives one by name"
         raise ValueError(f"`camera` (={camera!r}) must be a CameraProfile{hint}")
     request = SceneRequest(split, camera, resolution, crop, resize)
-    if isinstance(spec, Mapping):
+    recorded = RecordedOptions.of(spec)
+    if recorded is not None:
+        scenes = recorded_scenes(recorded, request, grid or recorded.grid)
+    elif isinstance(spec, Mapping):
         load = sequence_scenes if is_sequence(spec) else folder_scenes
         path, options = _options(spec)
         scenes = load(path, request, options)
@@ -122,6 +132,11 @@ def load_scenes(
 def is_sequence(spec: object) -> bool:
     """Whether `spec` asks for scenes whose frames are raws of their own."""
     return isinstance(spec, Mapping) and "sequence" in spec
+
+
+def has_frames(spec: object) -> bool:
+    """Whether the scenes of `spec` may be frames that follow each other."""
+    return is_sequence(spec) or RecordedOptions.of(spec) is not None
 
 
 def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:

@@ -116,6 +116,10 @@ class Scene:
         sampled: Whether each plane was sampled at its own place, as a sensor does. False: the four
             share their places, G1 equals G2, as in every bundled scene; averaged by a large
             `box_factor` there is hardly a difference.
+        recorded: (S, 4, H, W) float32, the real capture of each state of the grid, white is 1; zero
+            where `allowed` is False. With it nothing is simulated: environments show these frames,
+            and `light` is what they tell together. None where captures are simulated.
+        sequence: Video that it is a frame of; empty for a still scene.
         allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
             them; None for every state of any grid.
 
@@ -142,6 +146,8 @@ class Scene:
     defocus_map: torch.Tensor | None = None
     layout: Layout | None = None
     sampled: bool = False
+    recorded: torch.Tensor | None = None
+    sequence: str = ""
     allowed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -179,6 +185,14 @@ class Scene:
                     "(S,) with at least one state that is allowed"
                 )
             object.__setattr__(self, "allowed", allowed)
+        if self.recorded is not None:
+            states = None if self.allowed is None else len(self.allowed)
+            if self.allowed is None or self.recorded.shape != (states, *self.light.shape):
+                raise ValueError(
+                    f"`recorded` (shape {tuple(self.recorded.shape)}) must be (S, 4, H, W) like "
+                    f"`light`, {tuple(self.light.shape)}, with one frame for each of the "
+                    f"{states} entries of `allowed`"
+                )
 
     def _check_saturated(self) -> None:
         mask = self.saturated
@@ -256,6 +270,7 @@ class Scene:
     def content(self) -> str:
         """Digest of the light, of the networks' results for it, and of its layout."""
         tensors = {"light": self.light, "denoised": self.denoised, "defocus_map": self.defocus_map}
+        tensors["recorded"] = self.recorded
         if self.layout is not None:
             tensors |= {"layout": self.layout.defocus, "subject": self.layout.subject}
         return content_digest({name: t for name, t in tensors.items() if t is not None})
@@ -485,6 +500,7 @@ class Scene:
             light=self.light[..., rows, columns],
             saturated=part(self.saturated),
             denoised=part(self.denoised),
+            recorded=part(self.recorded),
             residual=None,  # of the whole frame
             defocus_map=part(self.defocus_map),
             layout=None if self.layout is None else self.layout.cut(rows, columns),
@@ -519,6 +535,7 @@ class Scene:
             box_factor=self.box_factor * k,
             saturated=mask,
             denoised=None if self.denoised is None else mean(self.denoised).float(),
+            recorded=None if self.recorded is None else mean(self.recorded).float(),
             residual=None,  # of the finer pixels
             defocus_map=None if found is None else mean(found.square()).sqrt().float() / k,
             layout=layout,

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from ae_env.grid import ExposureGrid
+from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import SceneCaptures
 from ae_env.scorers.code_terms import CodeScores
@@ -191,6 +192,8 @@ class ScoreTables:
             )
             prepared = replace(prepared, tolerance=self.tolerance)
         parts = self.known_parts(scene, prepared, gain=gain, row_gain=row_gain)
+        if scene.recorded is not None:
+            return self._recorded_table(scene, prepared, parts)
         if self.code_scores.parts:
             captures = None
             if self.code_scores.reads_captures:
@@ -211,6 +214,37 @@ class ScoreTables:
             parts |= {name: values.mean(axis=0) for name, values in samples.items()}
         parts = {name: parts[name] for name in self.scorer.parts}
         return ScoreTable(mean, error, parts, scene.allowed)
+
+    def _recorded_table(
+        self, scene: Scene, prepared: PreparedScene, parts: dict[str, np.ndarray]
+    ) -> ScoreTable:
+        """Scores of the captures that there are; 0 where there is none.
+
+        Args:
+            scene: With `Scene.recorded`.
+            prepared: Its merged light.
+            parts: Scores of the parts that look at no frame.
+        """
+        frames, allowed = scene.recorded, scene.allowed
+        assert frames is not None
+        assert allowed is not None
+        for part in _slices(len(self.grid), _CHUNK):
+            states = np.arange(len(self.grid))[part]
+            captures = self._described(scene, prepared, part, 1.0, None)
+            found: dict[str, np.ndarray] = {}
+            if self.code_scores.parts:
+                codes = encode_observation(frames[part]).numpy()
+                means = self.code_scores.measured(codes, states, np.zeros((len(states), 2, 4)))
+                found |= self.code_scores.scores(captures, means)
+            if self.others is not None and not self.others.closed_form:
+                shown = frames[part].clamp(0.0, 1.0)
+                scored = self.others.score_parts(shown, captures, ("image",))
+                found |= {name: values.numpy() for name, values in scored.items()}
+            for name, values in found.items():
+                parts.setdefault(name, np.zeros(len(self.grid)))[part] = values
+        mean = np.where(allowed, self.scorer.totals(parts), 0.0)
+        shown_parts = {name: np.where(allowed, parts[name], 0.0) for name in self.scorer.parts}
+        return ScoreTable(mean, np.zeros(len(self.grid)), shown_parts, allowed)
 
     def known_parts(
         self,

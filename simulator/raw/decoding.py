@@ -184,6 +184,25 @@ def _reason(error: Exception, words: str, directories: Sequence[Directory]) -> s
     return f"must be a whole raw file, but LibRaw says {reason}: {words}, truncated or damaged"
 
 
+def stated_exposure(path: Path, directories: Sequence[Directory]) -> tuple[float, float, float]:
+    """ISO, exposure time [s] and f-number that a raw states; no pixel is decoded.
+
+    Raises:
+        RawFileError: If LibRaw cannot read it.
+    """
+    try:
+        with rawpy.imread(str(path)) as raw:
+            return _exposure(raw, directories)
+    except (rawpy.LibRawError, rawpy.NotSupportedError, RuntimeError) as error:
+        raise RawFileError.of(path, _reason(error, UNKNOWN_FILE, directories)) from None
+
+
+def _exposure(raw: rawpy.RawPy, directories: Sequence[Directory]) -> tuple[float, float, float]:
+    other = raw.other
+    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
+    return iso, other.shutter_speed, other.aperture
+
+
 def _from_libraw(
     path: Path, raw: rawpy.RawPy, words: str, directories: Sequence[Directory]
 ) -> Decoded:
@@ -205,7 +224,6 @@ def _from_libraw(
     if min(mosaic.shape) < 2:
         raise RawFileError.of(path, f"must hold an image, but is empty: {words}")
     other, extra = raw.other, dict[str, Any](flip=int(sizes.flip))
-    iso = other.iso_speed if other.iso_speed != 65535 else read_long_iso(directories) or 65535.0
     if other.timestamp is not None and other.timestamp.timestamp() > 0:
         extra["datetime"] = other.timestamp.replace(tzinfo=None).isoformat()
     if np.isfinite(other.focal_length) and other.focal_length > 0:
@@ -220,7 +238,7 @@ def _from_libraw(
         white_balance_source=source,
         colour_matrix=matrix,
         colour_matrix_source=matrix_source,
-        exposure=(iso, other.shutter_speed, other.aperture),
+        exposure=_exposure(raw, directories),
         extra=extra,
     )
 

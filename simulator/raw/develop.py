@@ -81,6 +81,29 @@ def develop(
     return encoded
 
 
+def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
+    """Packed raws that `develop` turns into these pictures, without balance or colour matrix.
+
+    What a camera's own processing did besides (its tone curve, sharpening, compression) stays in.
+
+    Args:
+        pictures: (B, 3, H, W) uint8, sRGB.
+
+    Returns:
+        (B, 4, H, W) float32 in [0, 1]: each pixel becomes a packed one, its planes at one place.
+
+    >>> picture = torch.tensor([0, 17, 118, 255], dtype=torch.uint8).expand(1, 3, 1, 4)
+    >>> develop(develop_inverse(picture)).mul(255.0).round()[0, 0, 0]
+    tensor([  0.,  17., 118., 255.])
+    """
+    encoded = torch.arange(256, dtype=torch.float64) / 255.0
+    curved = ((encoded + 0.055) / 1.055) ** 2.4
+    shown = torch.where(encoded <= 0.04045, encoded / 12.92, curved)
+    # The inverse of Schlick's curve, see `apply_tone`.
+    light = shown / (PHOTOGRAPHIC_SLOPE - (PHOTOGRAPHIC_SLOPE - 1.0) * shown)
+    return light.float()[pictures.long()][:, [0, 1, 1, 2]]
+
+
 def render_srgb(
     raw: RawImage,
     demosaic: str = "malvar",

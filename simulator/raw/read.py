@@ -21,6 +21,7 @@ from simulator.raw.decoding import (
     RawFileError,
     decode_own_dng,
     decode_with_libraw,
+    stated_exposure,
 )
 from simulator.raw.dng import OwnRecord
 from simulator.raw.image import RawImage, pack_mosaic
@@ -38,7 +39,7 @@ from simulator.raw.metadata import (
     read_own_record,
 )
 from simulator.raw.noise_estimation import estimate_nlf
-from simulator.settings import CameraSettings
+from simulator.settings import CameraSettings, snap_exposure_time
 from simulator.utils.files import as_path
 
 logger = logging.getLogger(__name__)
@@ -304,3 +305,30 @@ def _noise(
     rounding = NoiseLevelFunction((0.0,) * 4, tuple(1.0 / (12.0 * s**2) for s in camera.span))  # type: ignore[arg-type]
     estimate = estimate_nlf(packed).scaled(float(box_factor**2)).at_least(rounding)
     return estimate, "blind estimate"
+
+
+def read_settings(path: str | os.PathLike[str]) -> dict[str, float]:
+    """Settings that a raw file states, without reading its pixels.
+
+    Returns:
+        ``iso``, ``exposure_time`` [s] and ``f_number``, of which those are missing that the file
+        does not state; the exposure time is the exact stop that the recorded one stands for.
+
+    Raises:
+        RawFileError: (a `ValueError`) If the file is no raw that can be read.
+    """
+    path = as_path(path)
+    try:
+        with path.open("rb") as stream:
+            directories = read_directories(stream)
+    except OSError as error:
+        raise RawFileError(f"`path` (={str(path)!r}) cannot be read: {error}") from error
+    own = read_own_record(directories)
+    if own is not None:
+        return {name: getattr(own.settings, name) for name in ("iso", "exposure_time", "f_number")}
+    stated = stated_exposure(path, directories)
+    values = dict(zip(("iso", "exposure_time", "f_number"), map(float, stated), strict=True))
+    known = {name: value for name, value in values.items() if np.isfinite(value) and value > 0}
+    if "exposure_time" in known:
+        known["exposure_time"] = snap_exposure_time(known["exposure_time"])
+    return known

@@ -1,0 +1,106 @@
+"""Recorded frames in place of simulated ones: what an environment on recorded grids runs on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from ae_env.grid import ExposureGrid
+from ae_env.observation import encode_observation
+from ae_env.scenes.scene import Scene
+from simulator.camera import CameraProfile
+from simulator.capture.batch import MODULES, FrameStatistics
+from simulator.capture.prepared_scene import PreparedScene
+from simulator.noise.generator import noise_keys
+
+#: The step that makes a recorded frame, and its index behind those of the simulator.
+RECORDED = "recorded"
+_MODULE = len(MODULES)
+#: Signal up to which a sample counts as clipped low.
+_LOW = 2.0**-10
+
+
+class RecordedBatch:
+    """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
+
+    Args:
+        scenes: Scenes with `Scene.recorded`.
+        prepared: Function that returns the merged light of a scene's index.
+        camera: The body.
+    """
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        prepared: Callable[[int], PreparedScene],
+        camera: CameraProfile,
+    ) -> None:
+        self._scenes, self._prepared = scenes, prepared
+        self._black = np.array(camera.black_level, np.float32)[:, None, None]
+        self._span = np.array(camera.span, np.float32)[:, None, None]
+        self._white = camera.white_level
+
+    def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
+        """Does nothing: recorded frames are there already."""
+
+    def forget(self, indices: np.ndarray) -> None:
+        """Does nothing: nothing is worked out."""
+
+    def prepared_scene(self, index: int) -> PreparedScene:
+        """The merged light of the scene `index`."""
+        return self._prepared(index)
+
+    def record(
+        self,
+        indices: np.ndarray,
+        states: np.ndarray,
+        seeds: np.ndarray,
+        frames: np.ndarray,
+        *,
+        row_gain: np.ndarray | None = None,
+        codes: np.ndarray | None = None,
+        numbers: np.ndarray | None = None,
+        signals: np.ndarray | None = None,
+    ) -> FrameStatistics:
+        """Copies frames to every output that is given; see `CaptureBatch.record`."""
+        pairs = zip(indices.tolist(), states.tolist(), strict=True)
+        shown = np.stack([self._frame(scene, state) for scene, state in pairs])
+        digital = np.rint(shown * self._span + self._black).clip(0.0, self._white)
+        if codes is not None:
+            encode_observation(torch.from_numpy(shown), out=torch.from_numpy(codes))
+        if numbers is not None:
+            numbers[:] = digital
+        if signals is not None:
+            signals[:] = shown
+        count, nothing = len(shown), np.zeros(len(shown))
+        return FrameStatistics(
+            clipped_low=(shown <= _LOW).reshape(count, -1).mean(axis=1),
+            clipped_high=(digital >= self._white).reshape(count, -1).mean(axis=1),
+            excess_variance=nothing,
+            predicted_error=nothing,
+            modules=np.full(count, _MODULE),
+            source_noise=np.zeros((count, 2, 4)),
+            keys=noise_keys(seeds, frames),
+        )
+
+    def _frame(self, scene: int, state: int) -> np.ndarray:
+        recorded = self._scenes[scene].recorded
+        assert recorded is not None
+        return recorded[state].numpy()
+
+
+def nearest_recorded(scene: Scene, grid: ExposureGrid) -> np.ndarray:
+    """(S,) int64: each state itself where it was recorded, else the recorded one nearest to it.
+
+    Nearest in exposure, then in the three controls, all in stops; ties to the lower ISO.
+    """
+    assert scene.allowed is not None
+    there = np.flatnonzero(scene.allowed)
+    states = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in grid.states])
+    controls = np.abs(states[:, None] - states[there]).sum(axis=-1)
+    exposure = np.abs(grid.ev100[:, None] - grid.ev100[there])
+    # A tenth of a stop of exposure is worth more than any distance of the controls.
+    distance = (exposure * 10.0).round() * 1000.0 + controls
+    return there[distance.argmin(axis=1)]

@@ -1,0 +1,272 @@
+"""Recorded grids as scenes: every state is a real capture that is looked up, never simulated."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes.recorded_files import (
+    PICTURE_SUFFIXES,
+    RecordedFile,
+    index_recorded,
+    recorded_grid,
+    state_of,
+)
+from ae_env.scenes.scene import MEAN_SIGNAL, Scene, SceneRequest
+from ae_env.scenes.split import log_groups, scenes_of_split
+from ae_env.utils.checks import check_number, did_you_mean
+from ae_env.utils.merging import SATURATED, merge
+from simulator.camera import CameraProfile
+from simulator.raw.develop import develop_inverse
+from simulator.raw.image import RawImage
+from simulator.raw.read import read_raw
+from simulator.settings import CameraSettings, exposure_ratio
+
+logger = logging.getLogger(__name__)
+
+#: How a text names a recorded grid, and the entry of a mapping that does.
+PREFIX, KEY = "recorded:", "recorded"
+
+
+@dataclass(frozen=True)
+class RecordedOptions:
+    """A folder of recorded grids.
+
+    Args:
+        folder: The folder.
+        iso: ISO of files that do not state it.
+        exposure_time: Exposure time [s] of files that do not state it.
+        f_number: F-number of files that do not state it.
+    """
+
+    folder: Path
+    iso: float | None = None
+    exposure_time: float | None = None
+    f_number: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in self.known.items():
+            check_number(name, value, 1e-9, 1e8)
+
+    @property
+    def known(self) -> dict[str, float]:
+        """The settings that are given, by name."""
+        values = {"iso": self.iso, "exposure_time": self.exposure_time, "f_number": self.f_number}
+        return {name: value for name, value in values.items() if value is not None}
+
+    @classmethod
+    def of(cls, spec: object) -> RecordedOptions | None:
+        """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing.
+
+        Raises:
+            ValueError: If it has an unknown entry.
+        """
+        if isinstance(spec, str) and spec.startswith(PREFIX):
+            return cls(Path(spec.removeprefix(PREFIX)).expanduser())
+        if not isinstance(spec, Mapping) or KEY not in spec:
+            return None
+        names = (KEY, "iso", "exposure_time", "f_number")
+        for name in spec:
+            if name not in names:
+                hint = did_you_mean(name, names)
+                raise ValueError(f"`scenes` field {name!r} must be one of {list(names)}{hint}")
+        if not isinstance(spec[KEY], str | Path):
+            raise ValueError(f"`scenes[{KEY!r}]` (={spec[KEY]!r}) must be the path of a folder")
+        settings = {name: spec[name] for name in names[1:] if name in spec}
+        return cls(Path(spec[KEY]).expanduser(), **settings)
+
+    @property
+    def files(self) -> list[RecordedFile]:
+        """Every capture of the folder; see `index_recorded`."""
+        return list(_indexed(self, _changed(self.folder)))
+
+    @property
+    def grid(self) -> ExposureGrid:
+        """Every combination of the settings of its captures."""
+        return recorded_grid(self.files)
+
+    def camera(self, default: CameraProfile) -> CameraProfile:
+        """The body that took the raws, with their noise; for pictures `default` without colours.
+
+        Args:
+            default: Whose noise developed pictures are assumed to have.
+        """
+        return _camera(self, default, _changed(self.folder))
+
+
+def _changed(folder: Path) -> int:
+    """Number that changes with the folder."""
+    return folder.stat().st_mtime_ns if folder.is_dir() else 0
+
+
+@functools.lru_cache(maxsize=8)
+def _indexed(options: RecordedOptions, changed: int) -> tuple[RecordedFile, ...]:
+    return tuple(index_recorded(options.folder, options.known))
+
+
+@functools.lru_cache(maxsize=8)
+def _camera(options: RecordedOptions, default: CameraProfile, changed: int) -> CameraProfile:
+    by_iso = {file.settings.iso: file for file in reversed(options.files)}
+    if all(file.path.suffix.lower() in PICTURE_SUFFIXES for file in by_iso.values()):
+        return replace(default, colour_matrix=None, colour_matrix_source="")
+    raws = {iso: _read(file, default) for iso, file in sorted(by_iso.items())}
+    noises = {iso: raw.camera.nlf(iso) if raw.nlf is None else raw.nlf for iso, raw in raws.items()}
+    first = next(iter(raws.values()))
+    return replace(first.camera, nlf_by_iso=noises, segments=())
+
+
+# -- scenes ---------------------------------------------------------------------------------------
+
+
+def recorded_scenes(
+    options: RecordedOptions, request: SceneRequest, grid: ExposureGrid
+) -> list[Scene]:
+    """The recorded scenes of `split`, frames of one video after the other.
+
+    Args:
+        options: The folder.
+        request: Split, camera and size. Each capture is resized before the next is read.
+        grid: The states; captures at other settings are left out, states without a capture are
+            forbidden (`Scene.allowed`).
+
+    Raises:
+        ValueError: If a capture cannot be read or has another size than its scene's others, two
+            are of one state, or a scene has fewer than two states.
+    """
+    camera = options.camera(request.camera)
+    scenes: list[Scene] = []
+    holes: dict[str, list[int]] = {}
+    for name, files in groupby(options.files, lambda file: file.scene):
+        places = _places(name, list(files), grid)
+        missing = [state for state in range(len(grid)) if state not in places]
+        if missing:
+            holes[name] = missing
+        scenes.append(_scene(name, places, grid, camera, request))
+    _log_holes(holes, grid, len(scenes))
+    log_groups(str(options.folder), scenes)
+    return scenes_of_split(options.folder, scenes, request.split)
+
+
+def _places(
+    scene: str, files: Sequence[RecordedFile], grid: ExposureGrid
+) -> dict[int, RecordedFile]:
+    """The capture of each state that has one."""
+    places: dict[int, RecordedFile] = {}
+    for file in files:
+        state = state_of(file.settings, grid)
+        if state is None:
+            continue
+        if state in places:
+            raise ValueError(
+                f"recorded scene {scene!r} must have one file for each state, but "
+                f"{str(places[state].path)!r} and {str(file.path)!r} are both {grid[state]}"
+            )
+        places[state] = file
+    if len(places) < 2:
+        raise ValueError(
+            f"recorded scene {scene!r} ({len(places)} of {len(files)} captures in the grid) must "
+            "have two states or more: settings that its files share are one state"
+        )
+    return places
+
+
+def _log_holes(holes: Mapping[str, Sequence[int]], grid: ExposureGrid, scenes: int) -> None:
+    if holes:
+        name, missing = next(iter(holes.items()))
+        logger.warning(
+            f"{len(holes)} of {scenes} recorded scenes lack states of the grid, which are "
+            f"forbidden there: {name!r} lacks {len(missing)} of {len(grid)}, "
+            f"the first is {grid[missing[0]]}"
+        )
+
+
+def _scene(
+    name: str,
+    places: Mapping[int, RecordedFile],
+    grid: ExposureGrid,
+    camera: CameraProfile,
+    request: SceneRequest,
+) -> Scene:
+    frames: dict[int, Scene] = {}
+    size, first = (0, 0), next(iter(places.values()))
+    for state, file in sorted(places.items()):
+        raw = _read(file, camera)
+        size = size if frames else (raw.data.shape[1], raw.data.shape[2])
+        if tuple(raw.data.shape[1:]) != size:
+            raise ValueError(
+                f"recorded file {str(file.path)!r} ({raw.data.shape[1]} x {raw.data.shape[2]} "
+                f"packed) must be of the size of {str(first.path)!r}, {size[0]} x {size[1]}"
+            )
+        frames[state] = request.sized(_frame(raw, grid[state], camera))
+    shape = next(iter(frames.values())).light.shape
+    recorded, allowed = torch.zeros(len(grid), *shape), np.zeros(len(grid), bool)
+    for state, frame in frames.items():
+        recorded[state], allowed[state] = frame.light, True
+    return replace(
+        _merged(list(frames.values())),
+        scene_id=name,
+        group=first.group,
+        kind=KEY,
+        source=f"{len(frames)} recorded captures",
+        recorded=recorded,
+        allowed=allowed,
+        sequence=first.sequence,
+    )
+
+
+def _frame(raw: RawImage, settings: CameraSettings, camera: CameraProfile) -> Scene:
+    """A capture as it is: its light is what was recorded, clipped."""
+    return Scene.from_array(
+        raw.data,
+        settings,
+        camera,
+        scene_id=str(settings),
+        nlf=raw.noise,
+        white_balance=raw.white_balance,
+        box_factor=raw.box_factor,
+        sampled=True,
+    )
+
+
+def _merged(frames: Sequence[Scene]) -> Scene:
+    """The light that all captures tell, at the settings of the one nearest to a right exposure."""
+    means = [abs(float(frame.light[1:3].mean()) - MEAN_SIGNAL) for frame in frames]
+    best = frames[int(np.argmin(means))]
+    gains = torch.tensor([exposure_ratio(best.reference, frame.reference) for frame in frames])
+    signals = torch.stack([frame.light for frame in frames])
+    noise = [
+        torch.tensor([getattr(f.nlf, name) for f in frames])[None] for name in ("shot", "read")
+    ]
+    light, precision = merge(signals[None], gains[None], *noise)
+    darkest = int(gains.argmin())
+    # What every capture clips is at least as bright as the darkest one shows it.
+    clipped = (signals[darkest] >= SATURATED) | (precision[0] <= 0.0)
+    light = torch.where(clipped, signals[darkest] / float(gains[darkest]), light[0])
+    return replace(best, light=light.float(), nlf=best.nlf.zero())
+
+
+# -- reading --------------------------------------------------------------------------------------
+
+
+def _read(file: RecordedFile, camera: CameraProfile) -> RawImage:
+    """The capture of `file`, of a raw as `read_raw` reads it, of a picture developed back."""
+    try:
+        if file.path.suffix.lower() not in PICTURE_SUFFIXES:
+            return read_raw(file.path, settings=file.settings)
+        with Image.open(file.path) as picture:
+            rgb = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
+        raise ValueError(f"recorded file {str(file.path)!r} cannot be read: {error}") from error
+    data = develop_inverse(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None])[0]
+    plain: Any = replace(camera, colour_matrix=None, colour_matrix_source="")
+    return RawImage(data, file.settings, plain)
