@@ -158,7 +158,10 @@ class Benchmark:
         """
         words = [seed, quick, {name: str(value) for name, value in options.items()}]
         finished = FinishedParts(RUNS / self.name, *words, code=self.code)
-        shown = "".join(f" --{name} {value}" for name, value in options.items())
+        shown = "".join(
+            f" {value}" if name == "folder" else f" --{name} {value}"
+            for name, value in options.items()
+        )
         command = f"ae-env bench {self.name}{shown}{' --quick' * quick}"
         meta = result_meta(command, seed) | {"quick": quick}
         parts = self.parts(seed, quick, **options)

@@ -105,8 +105,8 @@ class CameraSimulator:
 
     Args:
         preset: Networks with random weights to train or to time, ``"nano"``, ``"compact"``,
-            ``"large"`` or ``"paper"``; see `from_pretrained` for trained ones. None has none: noise
-            is only added, and every scene is taken as far.
+            ``"large"``, ``"paper"`` or ``"ncs"``; see `from_pretrained` for trained ones. None has
+            none: noise is only added, and every scene is taken as far.
         device: ``"auto"`` (CUDA where there is one), or any torch device.
         precision: Of the networks, ``"float32"`` or ``"bfloat16"``; everything else is float32.
         cache: Where `prepare` stores the networks' results about a source, for the next time that
@@ -150,7 +150,8 @@ class CameraSimulator:
         self._seconds: dict[str, float] = {}
         if preset is not None:
             self.noises = (self._ready(NoiseModule(preset)),)
-            self.aperture = self._ready(ApertureModule("paper" if preset == "paper" else "compact"))
+            aperture: Any = preset if preset in ("paper", "ncs") else "compact"
+            self.aperture = self._ready(ApertureModule(aperture))
 
     @property
     def noise(self) -> NoiseModule | None:
@@ -172,7 +173,8 @@ class CameraSimulator:
         Args:
             name: Largest noise module that may run, ``"nano"``, ``"compact"`` or ``"large"``; which
                 one up to it does, `tolerance` decides. Or the path of weights that
-                `ae-env train-simulator` wrote, whose noise module is the only one then.
+                `ae-env train-simulator` or `ae-env import-weights` wrote, whose noise module is the
+                only one then.
             device: See `CameraSimulator`.
             precision: See `CameraSimulator`.
             cache: See `CameraSimulator`.
@@ -278,8 +280,8 @@ class CameraSimulator:
     def denoise(self, prepared: PreparedScene, noise: NoiseModule | None = None) -> torch.Tensor:
         """The prepared scene's light (4, H, W) with little noise.
 
-        The result serves every exposure: the family commutes with exposure. The paper's network
-        does not; it is run at the exposure of the source.
+        The result serves every exposure: the family commutes with exposure. Those of the paper
+        and of its authors' code do not; they are run at the exposure of the source.
 
         Args:
             prepared: The scene.
@@ -338,7 +340,7 @@ class CameraSimulator:
     def _aperture_blur(self, prepared: PreparedScene) -> ApertureBlur:
         assert self.aperture is not None
         f_number = prepared.reference.effective_f_number
-        if self.aperture.preset == "paper":
+        if not self.aperture.has_map:
             denoised = prepared.denoised[-1] if prepared.denoised else Denoised(prepared.light)
             opened = partial(self._results.called, "opened", self.aperture)
             return NetworkApertureBlur(denoised, opened, f_number)
@@ -449,7 +451,7 @@ class CameraSimulator:
         """Runs the whole pipeline on one source, every module for this very transition.
 
         Nothing is left out and nothing shared: this is what `simulate` is an approximation of. The
-        preset ``"paper"`` clips to [0, 1] after the exposure, as the paper does.
+        presets ``"paper"`` and ``"ncs"`` clip to [0, 1] after the exposure, as the paper does.
 
         Args:
             source: A raw, a prepared scene, or a scene.

@@ -28,6 +28,7 @@ BENCHMARKS = (
     *(
         "libcamera",
         "onboard",
+        "paper",
         "ptc",
         "refocus",
         "scorers",
@@ -45,6 +46,10 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 
 def bench(
     name: Annotated[str, typer.Argument(help=", ".join(BENCHMARKS))],
+    folder: Annotated[
+        Path | None,
+        typer.Argument(help="Of paper: sequences of captures in the layout of docs/dataset.md."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder for the results; by default the checkout's docs/results."),
@@ -53,6 +58,9 @@ def bench(
     quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
     against: Annotated[
         Path | None, typer.Option(help="Of throughput: another checkout, timed in turns with this.")
+    ] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="Of paper: measure these weights, and train nothing.")
     ] = None,
     part: Annotated[
         str | None, typer.Option(help="Of transfer: agents or tables; by default both.")
@@ -72,6 +80,11 @@ def bench(
         if name != "transfer":
             raise ValueError(f"`part` (={part!r}) is an option of transfer only")
         check_word("part", part, ("agents", "tables"))
+    if name == "paper" and folder is None:
+        raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
+    for option, value in (("folder", folder), ("weights", weights)):
+        if value is not None and name != "paper":
+            raise ValueError(f"`{option}` (={str(value)!r}) is an option of paper only")
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
         raise ValueError(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
@@ -81,6 +94,11 @@ def bench(
     make_folder(out)
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name)
-    given: dict[str, Any] = {"against": against, "part": part}
+    given: dict[str, Any] = {
+        "against": against,
+        "folder": folder,
+        "weights": weights,
+        "part": part,
+    }
     options = {option: value for option, value in given.items() if value is not None}
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)

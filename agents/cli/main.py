@@ -22,6 +22,7 @@ from agents.cli.evaluate import evaluate
 from agents.cli.export import export
 from agents.cli.film import film
 from agents.cli.hdr import hdr
+from agents.cli.import_weights import import_weights
 from agents.cli.quickstart import quickstart
 from agents.cli.record import record
 from agents.cli.refocus import refocus
@@ -44,7 +45,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
+    *(import_weights, view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

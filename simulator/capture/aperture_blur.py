@@ -110,7 +110,7 @@ class MapApertureBlur:
 
 
 class NetworkApertureBlur:
-    """Runs the paper's attention U-Net for every f-number (preset ``"paper"``).
+    """Runs the paper's attention U-Net for every f-number (presets ``"paper"``, ``"ncs"``).
 
     Args:
         denoised: Light (4, H, W) with little noise.

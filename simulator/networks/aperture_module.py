@@ -10,11 +10,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from simulator.networks.denoiser import ResidualBlock
+from simulator.networks.ncs_networks import NcsAttentionUNet
 from simulator.networks.unet import AttentionUNet
 from simulator.optics.blur import box_mean, disc_blur
 from simulator.optics.disc_bank import DiscBank, added_blur
 
-AperturePreset = Literal["compact", "paper"]
+AperturePreset = Literal["compact", "paper", "ncs"]
 #: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
 DEAD_ZONE = 1.0
 #: Factor on estimated diameters, as too little blur errs more than too much: of 1, 1.1 ... 1.4
@@ -45,7 +46,8 @@ class ApertureModule(nn.Module):
     Args:
         preset: ``"compact"``: estimates a map of the circle of confusion once per scene and blurs
             with a bank of discs; ``"paper"``: the residual attention U-Net of the paper's section
-            3.3, run for every pair of f-numbers.
+            3.3, run for every pair of f-numbers; ``"ncs"``: that of the authors' released code,
+            which does not commute with exposure and is not exact on pictures without detail.
     """
 
     def __init__(self, preset: AperturePreset = "compact") -> None:
@@ -55,7 +57,10 @@ class ApertureModule(nn.Module):
                 f"`preset` (={preset!r}) must be one of {list(get_args(AperturePreset))}"
             )
         self.preset = preset
-        self.network: nn.Module = DefocusMap() if preset == "compact" else AttentionUNet()
+        if preset == "compact":
+            self.network: nn.Module = DefocusMap()
+        else:
+            self.network = AttentionUNet() if preset == "paper" else NcsAttentionUNet()
 
     def forward(
         self, image: Tensor, deviation: Tensor, f_source: Tensor, f_target: Tensor
@@ -68,11 +73,18 @@ class ApertureModule(nn.Module):
             f_source: (B,) effective f-number of `image`.
             f_target: (B,) effective f-number wanted; where it is not smaller, the image stays.
         """
-        if self.preset == "paper":
-            return self._residual(image, f_source, f_target)
+        if not self.has_map:
+            opened = self._opened if self.preset == "paper" else self._opened_as_released
+            opens = (f_target < f_source)[:, None, None, None]
+            return torch.where(opens, opened(image, f_source, f_target), image)
         diameter = self.defocus(image, deviation)
         added = added_blur(diameter, f_source[:, None, None], f_target[:, None, None])
         return DiscBank(image).blurred(added[:, None])
+
+    @property
+    def has_map(self) -> bool:
+        """Whether it estimates a map of the defocus, from which every f-number follows."""
+        return self.preset == "compact"
 
     def defocus(self, image: Tensor, deviation: Tensor) -> Tensor:
         """Circle of confusion of each pixel of the source (B, H, W) [pixel]; see `usable_defocus`.
@@ -92,7 +104,7 @@ class ApertureModule(nn.Module):
             raise ValueError(f"`preset` (={self.preset!r}) must be 'compact' to have a defocus map")
         return self.network.diameter(image, deviation)
 
-    def _residual(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
+    def _opened(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
         # One scalar per image is divided out before the network and multiplied in after it. So it
         # sees every exposure alike and commutes with exposure, like the compact one.
         scale = image.abs().mean(dim=(1, 2, 3), keepdim=True).clamp(min=1e-8) / 0.18
@@ -102,9 +114,14 @@ class ApertureModule(nn.Module):
             residual = self.network((image / scale).float(), f_numbers)
             # A picture without detail has a constant residual; without it, it stays as it is.
             flat = self.network(image.new_zeros(len(image), 4, 1, 1).float(), f_numbers)
-        residual = (residual - flat) * scale
-        opens = (f_target < f_source)[:, None, None, None]
-        return torch.where(opens, image + residual, image)
+        opened: Tensor = image + (residual - flat) * scale
+        return opened
+
+    def _opened_as_released(self, image: Tensor, f_source: Tensor, f_target: Tensor) -> Tensor:
+        f_numbers = torch.stack([f_source, f_target], dim=1).float()
+        with torch.autocast(image.device.type, enabled=False):
+            opened: Tensor = image + self.network(image.float(), f_numbers)
+        return opened
 
 
 def usable_defocus(diameter: Tensor, image: Tensor) -> Tensor:

@@ -45,7 +45,8 @@ class FullRun:
 
     Args:
         exposure: The exposure module.
-        noise: The noise module; the paper's has its input clipped to [0, 1], as in the paper.
+        noise: The noise module; that of ``"paper"`` and ``"ncs"`` has its input clipped to
+            [0, 1], as in the paper.
         aperture: The aperture module, or None to take the scene as far.
         half: Whether the networks run in bfloat16.
     """
@@ -69,7 +70,7 @@ class FullRun:
         bare = replace(prepared, denoised=(), aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = self.exposure(prepared.light[None], exposure.ratio)
-        if self.noise.preset == "paper":
+        if not self.noise.commutes:
             exposed = exposed.clamp(0.0, 1.0)
         brought = prepared.nlf.exposed(float(self.exposure.w) * exposure.ratio)
         shot, read = (torch.tensor([v]).to(exposed) for v in (brought.shot, brought.read))

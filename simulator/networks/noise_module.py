@@ -12,12 +12,16 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from simulator.capture.residual import Residual
 from simulator.networks.denoiser import SIZES, Denoiser
+from simulator.networks.ncs_networks import NcsUNet
 from simulator.networks.unet import UNet
+from simulator.noise.generator import frame_normals, noise_keys
 from simulator.optics.blur import box_mean
 
-Preset = Literal["nano", "compact", "large", "paper"]
+Preset = Literal["nano", "compact", "large", "paper", "ncs"]
 #: Side of the window that smooths the signal which the noise level is read from.
 _SMOOTHING = 5
+#: Seed of the sample of noise that the authors' network is shown.
+_SAMPLE_SEED = 1234
 
 
 def check_preset(preset: str) -> None:
@@ -32,7 +36,9 @@ class NoiseModule(nn.Module):
     Args:
         preset: ``"nano"``, ``"compact"`` or ``"large"``: one of the family of
             `simulator.networks.denoiser`, which commute with exposure; ``"paper"``: the U-Net of
-            Brooks et al. 2019 with a noise-level map, as the paper uses it (section 3.2).
+            Brooks et al. 2019 with a noise-level map, as the paper uses it (section 3.2);
+            ``"ncs"``: the U-Net of the authors' released code, which is shown a sample of the
+            noise in place of its level. The sample is the same whenever it is asked for.
     """
 
     def __init__(self, preset: Preset = "compact") -> None:
@@ -40,12 +46,15 @@ class NoiseModule(nn.Module):
         check_preset(preset)
         self.preset = preset
         self.residual: Residual | None = None  # known once it is trained
-        self.network: nn.Module = Denoiser(preset) if preset in SIZES else UNet()
+        if preset in SIZES:
+            self.network: nn.Module = Denoiser(preset)
+        else:
+            self.network = UNet() if preset == "paper" else NcsUNet()
 
     @property
     def commutes(self) -> bool:
         """Whether it commutes with exposure: denoising at any exposure gives the same light."""
-        return self.preset != "paper"
+        return self.preset in SIZES
 
     @functools.cached_property
     def operations(self) -> int:
@@ -68,13 +77,23 @@ class NoiseModule(nn.Module):
         Returns:
             (B, 4, H, W) float32.
         """
-        if self.preset == "paper":
-            level = variance_map(exposed, shot, read).sqrt()
-            result = exposed + self.network(torch.cat([exposed, level], dim=1)).float()
-        else:
+        if self.commutes:
             result = self.network(exposed, shot, read)
+        else:
+            level = variance_map(exposed, shot, read).sqrt()
+            shown = level if self.preset == "paper" else exposed + level * _sample(exposed)
+            result = exposed + self.network(torch.cat([exposed, shown], dim=1)).float()
         noisy = ((shot > 0) | (read > 0)).any(dim=1)
         return torch.where(noisy[:, None, None, None], result, exposed.float())
+
+
+def _sample(image: Tensor) -> Tensor:
+    """Standard normals (1, 4, H, W) for an image (B, 4, H, W); the same for every one of its size.
+
+    Results of the noise module are shared between captures of all seeds.
+    """
+    normals = frame_normals(int(noise_keys(_SAMPLE_SEED)[0]), tuple(image.shape[1:]))
+    return torch.from_numpy(normals)[None].to(image.device)
 
 
 def variance_map(signal: Tensor, shot: Tensor, read: Tensor) -> Tensor:

@@ -23,8 +23,8 @@ from simulator.networks.paper_baselines import DecoupledNet, ParameterConcatenat
 from simulator.utils.files import sibling, write_atomically
 
 #: Everything that can be trained: the simulator's networks in three sizes (nano and large are noise
-#: modules alone), the paper's, and the paper's two baselines.
-PRESETS = ("nano", "compact", "large", "paper", "pc", "dl")
+#: modules alone), the paper's, those of its authors' released code, and the paper's two baselines.
+PRESETS = ("nano", "compact", "large", "paper", "ncs", "pc", "dl")
 #: Increased when the networks change such that older weights no longer fit.
 FORMAT_VERSION = 2
 
@@ -160,6 +160,8 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
             hint = f"; did you mean {near[0]!r}?" if near else ""
             if str(name) in PRESETS:
                 hint = f"; train it: ae-env train-simulator configs/simulator/{name}.yaml"
+            if str(name) == "ncs":
+                hint = "; get them by: ae-env import-weights ncs FOLDER -o ncs.safetensors"
             raise ValueError(
                 f"`weights` (={str(name)!r}) must be one of {known} or the path of a .safetensors "
                 f"file with its .json; there is no {missing[0]}{hint}"

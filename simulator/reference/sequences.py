@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from collections.abc import Sequence as SequenceOf
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, Protocol, get_args
 
 import numpy as np
 
@@ -74,6 +74,14 @@ class Sequence:
         object.__setattr__(self, "settings", tuple(self.settings))
         if len(self.settings) < 2:
             raise ValueError(f"`settings` (={self.settings}) must be at least 2 captures")
+
+
+class HasSettings(Protocol):
+    """A sequence of captures, simulated or real."""
+
+    @property
+    def settings(self) -> tuple[CameraSettings, ...]:
+        """The settings of each capture."""
 
 
 @dataclass(frozen=True, order=True)
@@ -207,18 +215,20 @@ def select_pairs(
         near = difflib.get_close_matches(str(stage), known, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"`stage` (={stage!r}) must be one of {', '.join(known)}{hint}")
-    pairs = [
+    if stage == "noise":
+        return list(_little_noise(sequences, any_pairs(sequences), camera))
+    return opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
+
+
+def any_pairs(sequences: SequenceOf[HasSettings]) -> list[Pair]:
+    """Any two captures of a sequence, in either direction, in ascending order."""
+    return [
         Pair(index, source, target)
         for index, sequence in enumerate(sequences)
         for source in range(len(sequence.settings))
         for target in range(len(sequence.settings))
         if source != target
     ]
-    if stage == "noise":
-        return list(_little_noise(sequences, pairs, camera))
-    if stage == "aperture":
-        return _more_open(sequences, pairs)
-    return pairs
 
 
 def grey_signal(scene: ReferenceScene, settings: CameraSettings) -> float:
@@ -254,7 +264,10 @@ def _variance(nlf: NoiseLevelFunction, signal: float) -> float:
     return sum(r + s * signal for r, s in zip(nlf.read, nlf.shot, strict=True)) / 4
 
 
-def _more_open(sequences: SequenceOf[Sequence], pairs: list[Pair]) -> list[Pair]:
+def opening_pairs(sequences: SequenceOf[HasSettings]) -> list[Pair]:
+    """Pairs whose target is more open than the source, and up to a tenth that are as open."""
+    pairs = any_pairs(sequences)
+
     def stops(pair: Pair) -> int:
         settings = sequences[pair.sequence].settings
         return settings[pair.source].aperture_stop - settings[pair.target].aperture_stop

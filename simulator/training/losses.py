@@ -71,7 +71,7 @@ class NoiseLoss(nn.Module):
         pooled = square.mean(dim=(1, 2, 3)) / variance.mean(dim=(1, 2, 3))
         ratio = square.detach().sum(dim=(1, 2, 3)) / before.sum(dim=(1, 2, 3)).clamp(min=1e-30)
         gain = -10 * torch.log10(ratio.clamp(min=1e-6)).mean()
-        if self.noise.preset == "paper":
+        if not self.noise.commutes:
             loss = (output - batch.clean).abs().mean()
         else:
             parts = torch.stack([each, pooled])

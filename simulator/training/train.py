@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import torch
 from torch import nn
@@ -32,8 +32,8 @@ from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
 from simulator.training.calibration import calibrate
 from simulator.training.config import SimulatorConfig, StageConfig
-from simulator.training.crops import DetailCrops, DetailPicture
-from simulator.training.data import ReferencePairs, draw_sequences
+from simulator.training.crops import DetailCrops, DetailPicture, NoiseBatch
+from simulator.training.data import Batch, ReferencePairs, draw_sequences
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.files import sibling
@@ -64,6 +64,13 @@ _RISE = 0.05
 _GRADIENT_NORM = 1.0
 #: Steps between two log entries, and the memory of the running means that are logged.
 _LOG_EVERY, _SMOOTHING = 20, 0.98
+
+
+class Batches(Protocol):
+    """Pairs of captures as batches, by the number of the step."""
+
+    def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch | NoiseBatch:
+        """The pairs of one step."""
 
 
 def train_and_save(
@@ -280,7 +287,7 @@ def train_stage(
     name: str,
     loss: nn.Module,
     trained: nn.Module,
-    pairs: ReferencePairs | DetailCrops,
+    pairs: Batches,
     stage: StageConfig,
     accelerator: Accelerator,
     *,

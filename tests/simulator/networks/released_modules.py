@@ -1,0 +1,210 @@
+"""Networks of the released layout in plain torch layers, saved whole as the authors save theirs.
+
+What they compute is written down again from the layers, without our code, so that it can be
+compared with what our networks make of the same weights.
+"""
+
+from __future__ import annotations
+
+import sys
+import types
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+def pair(inputs: int, outputs: int) -> nn.Sequential:
+    def half(channels: int) -> list[nn.Module]:
+        return [nn.Conv2d(channels, outputs, 3, padding=1), nn.BatchNorm2d(outputs), nn.ReLU()]
+
+    return nn.Sequential(*half(inputs), *half(outputs))
+
+
+class ExposureNet(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.bias = nn.Parameter(torch.tensor([0.001, 0.002, 0.003, 0.004]))
+        self.linear = nn.Linear(1, 1, bias=False)
+        nn.init.constant_(self.linear.weight, 0.97)
+
+
+class Holder(nn.Module):
+    """A module with one entry, whose name and class the layout wants."""
+
+    def __init__(self, name: str, entry: nn.Module) -> None:
+        super().__init__()
+        setattr(self, name, entry)
+
+
+class UNet(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        double = {"inc": (8, 64)}
+        double |= {"down1": (64, 128), "down2": (128, 256), "down3": (256, 512)}
+        double |= {"down4": (512, 512), "up1": (1024, 256), "up2": (512, 128)}
+        double |= {"up3": (256, 64), "up4": (128, 64)}
+        for name, sizes in double.items():
+            entry: nn.Module = Holder("conv", pair(*sizes))
+            if name.startswith("down"):
+                entry = Holder("mpconv", nn.Sequential(nn.MaxPool2d(2), entry))
+            else:
+                entry = Holder("conv", entry)
+            setattr(self, name, entry)
+        self.outc = Holder("conv", nn.Conv2d(64, 4, 1))
+
+    def forward(self, x: Tensor) -> Tensor:
+        m: Any = self
+        skips = [m.inc.conv.conv(x)]
+        for down in (m.down1, m.down2, m.down3, m.down4):
+            pool, double = down.mpconv
+            skips.append(double.conv(pool(skips[-1])))
+        x = skips.pop()
+        for up in (m.up1, m.up2, m.up3, m.up4):
+            x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=True)
+            x = up.conv.conv(torch.cat([skips.pop(), x], dim=1))
+        return m.outc.conv(x)
+
+
+class Norm(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.InstanceNorm2d(channels)
+        self.style = Holder("linear", nn.Linear(2, 2 * channels))
+        with torch.no_grad():  # weights of training are small: apertures are as large as 256
+            self.style.linear.weight.mul_(0.02)  # type: ignore[union-attr,operator]
+            self.style.linear.bias[:channels] = 1.0  # type: ignore[union-attr,index]
+
+    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+        scale, shift = self.style.linear(p)[:, :, None, None].chunk(2, dim=1)  # type: ignore
+        return scale * self.norm(x) + shift
+
+
+class conv_block(nn.Module):
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.conv1, self.norm1 = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(outputs)
+        self.conv2, self.norm2 = nn.Conv2d(outputs, outputs, 3, padding=1), Norm(outputs)
+
+    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+        x = self.norm1(self.conv1(x), p).relu()
+        return self.norm2(self.conv2(x), p).relu()
+
+
+class up_conv(nn.Module):
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.up = nn.Upsample(scale_factor=2)
+        self.conv, self.norm = nn.Conv2d(inputs, outputs, 3, padding=1), Norm(outputs)
+
+    def forward(self, x: Tensor, p: Tensor) -> Tensor:
+        return self.norm(self.conv(self.up(x)), p).relu()
+
+
+class Attention_block(nn.Module):
+    def __init__(self, width: int, inner: int) -> None:
+        super().__init__()
+        for name in ("W_g_{}1", "W_x_{}1", "W_g_{}2", "W_x_{}2"):
+            setattr(self, name.format("conv"), nn.Conv2d(width, inner, 1))
+            setattr(self, name.format("norm"), Norm(inner))
+        self.psi_conv, self.psi_norm = nn.Conv2d(inner, 1, 1), Norm(1)
+        self.conv_down = nn.Conv2d(inner, inner // 4, 1, bias=False)
+        self.conv_up = nn.Conv2d(inner // 4, width, 1, bias=False)
+
+    def forward(self, g: Tensor, x: Tensor, p: Tensor) -> Tensor:
+        m: Any = self
+        joint = (m.W_g_norm1(m.W_g_conv1(g), p) + m.W_x_norm1(m.W_x_conv1(x), p)).relu()
+        place = m.psi_norm(m.psi_conv(joint), p).sigmoid()
+        mean = m.W_g_norm2(m.W_g_conv2(g), p) + m.W_x_norm2(m.W_x_conv2(x), p)
+        mean = F.adaptive_avg_pool2d(mean, 1)
+        return x * place * m.conv_up(m.conv_down(mean).relu()).sigmoid()
+
+
+class AttenUnet_style(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (32, 64, 128, 256, 512)
+        for level, (inputs, width) in enumerate(zip((6, *widths), widths, strict=False), start=1):
+            setattr(self, f"Conv{level}", conv_block(inputs, width))
+        for level, inner in ((5, 128), (4, 64), (3, 32), (2, 32)):
+            width = widths[level - 2]
+            setattr(self, f"Up{level}", up_conv(2 * width, width))
+            setattr(self, f"Att{level}", Attention_block(width, inner))
+            setattr(self, f"Up_conv{level}", conv_block(2 * width, width))
+        self.Conv = nn.Conv2d(32, 4, 1)
+
+    def forward(self, image: Tensor, p: Tensor) -> Tensor:
+        m: Any = self
+        planes = p[:, :, None, None].expand(-1, -1, *image.shape[2:])
+        skips = [m.Conv1(torch.cat([image, planes], dim=1), p)]
+        for level in (m.Conv2, m.Conv3, m.Conv4, m.Conv5):
+            skips.append(level(F.max_pool2d(skips[-1], 2), p))
+        x = skips.pop()
+        for level in (5, 4, 3, 2):
+            x = getattr(m, f"Up{level}")(x, p)
+            skip = getattr(m, f"Att{level}")(x, skips.pop(), p)
+            x = getattr(m, f"Up_conv{level}")(torch.cat([skip, x], dim=1), p)
+        return m.Conv(x)
+
+
+#: The authors' Python modules that the classes seem to come from.
+HOMES = {
+    "exposure_module": (ExposureNet,),
+    "unet_model": (UNet,),
+    "unet_parts": (Holder,),
+    "unet_attention_decouple": (Norm, conv_block, up_conv, Attention_block, AttenUnet_style),
+}
+
+
+def make_released(seed: int = 0) -> dict[str, nn.Module]:
+    """Untrained networks by the name of the demo's files, statistics of the norms not neutral."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        made = {"exp_model": ExposureNet(), "unet_model": UNet(), "ap_model": AttenUnet_style()}
+    for norm in (m for m in made["unet_model"].modules() if isinstance(m, nn.BatchNorm2d)):
+        for tensor in (norm.running_mean, norm.running_var, norm.weight, norm.bias):
+            assert tensor is not None
+            tensor.data.copy_(0.5 + torch.rand(tensor.shape, generator=generator))
+        norm.num_batches_tracked.fill_(7)  # type: ignore[union-attr]
+    return {name: module.eval() for name, module in made.items()}
+
+
+@contextmanager
+def at_home() -> Iterator[None]:
+    """While it lasts, the classes above are those of the authors' Python modules."""
+    was = {c: c.__module__ for classes in HOMES.values() for c in classes}
+    for home, classes in HOMES.items():
+        sys.modules[home] = types.ModuleType(home)
+        for own in classes:
+            own.__module__ = home
+            setattr(sys.modules[home], own.__name__, own)
+    try:
+        yield
+    finally:
+        for home in HOMES:
+            del sys.modules[home]
+        for own, module in was.items():
+            own.__module__ = module
+
+
+def save_released(
+    path: Path, module: nn.Module, *, legacy: bool = True, parallel: bool = False
+) -> Path:
+    """Writes a checkpoint as the authors' training does, by default as torch 1.3 wrote it."""
+    held = nn.DataParallel(module) if parallel else module
+    checkpoint = {
+        "model": held,
+        "iteration": 544000,
+        "optimizer": torch.optim.Adam(module.parameters()).state_dict(),
+        "learning_rate": 1e-3,
+    }
+    with at_home(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the source of the classes is not found
+        torch.save(checkpoint, path, _use_new_zipfile_serialization=not legacy)
+    return path
