@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -197,17 +197,43 @@ def _scene(
     camera: CameraProfile,
     request: SceneRequest,
 ) -> Scene:
-    frames: dict[int, Scene] = {}
-    size, first = (0, 0), next(iter(places.values()))
-    for state, file in sorted(places.items()):
+    sizes: dict[str, tuple[int, ...]] = {}
+
+    def read(file: RecordedFile) -> RawImage:
         raw = _read(file, camera)
-        size = size if frames else (raw.data.shape[1], raw.data.shape[2])
-        if tuple(raw.data.shape[1:]) != size:
+        sizes[str(file.path)] = tuple(raw.data.shape[1:])
+        (first, size), *_ = sizes.items()
+        if sizes[str(file.path)] != size:
             raise ValueError(
-                f"recorded file {str(file.path)!r} ({raw.data.shape[1]} x {raw.data.shape[2]} "
-                f"packed) must be of the size of {str(first.path)!r}, {size[0]} x {size[1]}"
+                f"recorded file {str(file.path)!r} ({sizes[str(file.path)]} packed pixels) must be "
+                f"of the size of {first!r}, {size}"
             )
-        frames[state] = request.sized(_frame(raw, grid[state], camera))
+        return raw
+
+    raws = ((state, read(file)) for state, file in sorted(places.items()))
+    first = next(iter(places.values()))
+    merged = merged_scene(name, raws, grid, camera, resize=request.sized)
+    return replace(merged, group=first.group, sequence=first.sequence)
+
+
+def merged_scene(
+    name: str,
+    raws: Iterable[tuple[int, RawImage]],
+    grid: ExposureGrid,
+    camera: CameraProfile,
+    *,
+    resize: Callable[[Scene], Scene] = lambda scene: scene,
+) -> Scene:
+    """A scene of real captures, with the light that they tell together.
+
+    Args:
+        name: Its name, and its source group.
+        raws: Captures of one size with their state of `grid`; one at a time is held.
+        grid: The states.
+        camera: The body, with the noise of its ISO speeds.
+        resize: Brings each capture to its size, before they are merged.
+    """
+    frames = {state: resize(_frame(raw, grid[state], camera)) for state, raw in raws}
     shape = next(iter(frames.values())).light.shape
     recorded, allowed = torch.zeros(len(grid), *shape), np.zeros(len(grid), bool)
     for state, frame in frames.items():
@@ -215,12 +241,11 @@ def _scene(
     return replace(
         _merged(list(frames.values())),
         scene_id=name,
-        group=first.group,
+        group=name,
         kind=KEY,
         source=f"{len(frames)} recorded captures",
         recorded=recorded,
         allowed=allowed,
-        sequence=first.sequence,
     )
 
 

@@ -30,6 +30,7 @@ BENCHMARKS = (
         "onboard",
         "paper",
         "ptc",
+        "recorded",
         "refocus",
         "scorers",
         "simulator",
@@ -48,7 +49,9 @@ def bench(
     name: Annotated[str, typer.Argument(help=", ".join(BENCHMARKS))],
     folder: Annotated[
         Path | None,
-        typer.Argument(help="Of paper: sequences of captures in the layout of docs/dataset.md."),
+        typer.Argument(
+            help="Of paper: sequences of captures (docs/dataset.md); of recorded: recorded grids."
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -82,9 +85,10 @@ def bench(
         check_word("part", part, ("agents", "tables"))
     if name == "paper" and folder is None:
         raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
-    for option, value in (("folder", folder), ("weights", weights)):
-        if value is not None and name != "paper":
-            raise ValueError(f"`{option}` (={str(value)!r}) is an option of paper only")
+    if weights is not None and name != "paper":
+        raise ValueError(f"`weights` (={str(weights)!r}) is an option of paper only")
+    if folder is not None and name not in ("paper", "recorded"):
+        raise ValueError(f"`folder` (={str(folder)!r}) is an argument of paper and recorded only")
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
         raise ValueError(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
