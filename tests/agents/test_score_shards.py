@@ -107,6 +107,7 @@ def test_a_shard_with_no_file_that_can_be_read_is_an_empty_table(
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Ray, of its own settings
 def test_a_cluster_of_two_nodes_loses_nothing_with_a_worker(
     folder: Path, done: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
