@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -142,12 +143,18 @@ def measure(name: str, folder: str, seed: int, quick: bool) -> list[Row]:
     rows: list[Row] = []
     for case in cases(held_out, seed, quick):
         groups = [group for group, belongs in GROUPS.items() if belongs(case)]
-        for method, image in estimate(case).items():
-            pair = {"sequence": case.sequence, "source": str(case.source.settings)}
-            pair["target"] = str(case.target.settings)
-            rows.append(
-                {**head, "method": method, **pair, "groups": groups, **_scores(image, case)}
-            )
+        begin = time.perf_counter()
+        estimates = estimate(case)
+        seconds = time.perf_counter() - begin
+        pair = {
+            "sequence": case.sequence,
+            "source": str(case.source.settings),
+            "target": str(case.target.settings),
+            "groups": groups,
+            "ms": 1e3 * seconds,  # of all stages together
+        }
+        for method, image in estimates.items():
+            rows.append({**head, "method": method, **pair, **_scores(image, case)})
     return rows
 
 
@@ -232,7 +239,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """Means over the pairs of each group, beside what the paper publishes."""
     rows = [row for own in results.values() for row in own]
     means = list(_means(rows))
-    presets = {row["preset"]: row["sha256"] for row in rows}
+    presets = dict.fromkeys((row["preset"], row["sha256"]) for row in rows)
+    times = {name: np.median([r["ms"] for r in rows if r["preset"] == name]) for name, _ in presets}
     page = [
         "Pairs of real captures of held-out sequences. An estimate is what a method makes of the "
         "source before the output's noise is added; it is compared with the noisy capture, as in "
@@ -248,8 +256,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         + "; ".join(f"{camera}: {text}" for camera, text in PUBLISHED.items())
         + ".",
         table(
-            ({"preset": preset, "sha": sha} for preset, sha in presets.items()),
-            {"network": "`{preset}`", "weights (SHA-256)": "`{sha:.12}`"},
+            ({"preset": name, "sha": sha, "ms": times[name]} for name, sha in presets),
+            {"network": "`{preset}`", "weights": "`{sha:.12}`", "ms a pair (median)": "{ms:.0f}"},
         ),
         "![PSNR of each method by transition](paper.png)",
     ]
