@@ -76,9 +76,10 @@ class Classifier:
         self.mean, self.std = _triple("mean", mean), _triple("std", std)
         if min(self.std) <= 0.0:
             raise ValueError(f"`std` (={std!r}) must be > 0")
+        self.batch: int | None = None  # of a network that takes no other number of pictures
         if callable(model):
             self._model: Network | tuple[str, str] = model
-            self.size, self.batch = size or INPUT_SIZE, None
+            self.size = size or INPUT_SIZE
             return
         found = find_model_file(
             "classifier",
@@ -89,7 +90,6 @@ class Classifier:
         ).resolve()
         # SHA-256 of the file: another network under the same name gives other scores.
         self._model = str(found), hashlib.sha256(found.read_bytes()).hexdigest()
-        self.batch: int | None  # of a network that takes no other number of pictures
         self.batch, own_size = _input_shape(*self._model)
         if size is not None and own_size not in (None, size):
             raise ValueError(f"`size` (={size}) must be that of {str(found)!r}, {own_size}")
