@@ -151,8 +151,9 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | f-number | 4, 5.6, 8, 11 |
 
     `action_masks()` gives the states that the current scene allows: all of them, unless the scene
-    is a recorded grid with holes (`Scene.allowed`). Another state is photographed all the same, but
-    the oracle does not count it, so its regret may be negative. Wrappers in `ae_env.wrappers` offer the
+    is one with holes (`Scene.allowed`). Another state is photographed all the same, but the oracle
+    does not count it, so its regret may be negative; on a recorded grid, the nearest state that was
+    captured is shown, as `info["state"]` says. Wrappers in `ae_env.wrappers` offer the
     controls one by one, relative steps, and continuous APEX values.
 
     ## Observation Space
