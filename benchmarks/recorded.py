@@ -345,9 +345,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "the texture (diagonal differences of neighbours). The score error is the root mean square "
         "over the states, the oracle's regret what is lost in the real scores where the best state "
         "is chosen by the simulated ones. Where a network would err more than the noise that the "
-        "source brought, the plan leaves that noise in: such frames are noisier than real ones, and "
-        "their scores count it. The scores of scaled frames do not: they take whatever noise is in "
-        "a frame for the camera's.",
+        "source brought, the plan leaves that noise in: such frames are noisier than real ones, "
+        "and their scores count it. The scores of scaled frames do not: they take whatever noise "
+        "is in a frame for the camera's.",
         table(_summary(rows), _COLUMNS),
         f"The simulated oracle loses {np.mean(regrets):.3f} in the mean, "
         f"{quartiles(regrets)[2]:.3f} at the upper quartile, {max(regrets):.3f} at most.",
@@ -372,8 +372,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             f"Of `{BOREAL}` pixels above {brackets.LINEAR_BELOW} in either frame are not compared, "
             "because the published response is not linear there ([brackets](brackets.md)); they do "
             "count in the first PSNR and in the scores. `left_c5` was taken in motion: its frames "
-            "do not lie on each other. Averaged over 4 x 4 pixels, both have so little noise that no "
-            "network runs.",
+            "do not lie on each other. Averaged over 4 x 4 pixels, both have so little noise that "
+            "no network runs.",
         )
     return Report(rows, page)
 
