@@ -151,8 +151,9 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     | f-number | 4, 5.6, 8, 11 |
 
     `action_masks()` gives the states that the current scene allows: all of them, unless the scene
-    is a recorded grid with holes (`Scene.allowed`). Another state is photographed all the same, but
-    the oracle does not count it, so its regret may be negative. Wrappers in `ae_env.wrappers` offer the
+    is one with holes (`Scene.allowed`). Another state is photographed all the same, but the oracle
+    does not count it, so its regret may be negative; on a recorded grid, the nearest state that was
+    captured is shown, as `info["state"]` says. Wrappers in `ae_env.wrappers` offer the
     controls one by one, relative steps, and continuous APEX values.
 
     ## Observation Space
@@ -209,7 +210,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     | name | default | meaning |
     |---|---|---|
-    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"package.module:name"` or list of `Scene`; `"polyhaven"`: views of real places, `"mixed"`: as many real as procedural ones |
+    | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"recorded:FOLDER"` (every state is a real capture), `"package.module:name"` or list of `Scene`; `"polyhaven"`: views of real places, `"mixed"`: as many real as procedural ones |
     | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
     | `grid` | `"default"` | `"default"`, `"third_stop"`, `"video"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 from ae_env.grid import ExposureGrid
@@ -48,7 +49,7 @@ MAX_DELAY, CONTROLS = 16, ("iso", "exposure_time", "f_number")
 _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
-#: Bundled scenes by all that decides them; the bound is on the memory of their light [byte].
+#: Scenes by all that decides them; the bound is on the memory of their light [byte].
 _LOADED: LruCache[list[Scene]] = LruCache(2**30)
 
 
@@ -140,7 +141,7 @@ class EnvOptions:
         object.__setattr__(self, "motion", "none")
         object.__setattr__(self, "depth", "far")
 
-    @property
+    @cached_property
     def recorded(self) -> RecordedOptions | None:
         """The folder of recorded grids, where the scenes are some."""
         return RecordedOptions.of(self.scenes)
@@ -209,15 +210,21 @@ class EnvOptions:
     def load_scenes(self) -> list[Scene]:
         """The scenes of the split at this resolution; of sequences, all frames.
 
-        Those with a name stay in memory for the next environment with the same arguments.
+        Those with a name, and recorded ones whose files have not changed, stay in memory for the
+        next environment with the same arguments.
         """
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
         needs_networks = finds_defocus or self.source == "raw"
         networks_key = (finds_defocus, self.simulator, self.noise) if needs_networks else ()
         size = (self.resolution, self.crop)
-        key = (self.scenes, self.split, camera, *size, self.source, *networks_key)
+        content: Any = self.scenes
         cacheable = isinstance(self.scenes, str) and self.scenes in NAMED
+        if self.recorded is not None:
+            files = self.recorded.files
+            content = self.make_grid(), tuple((f, f.path.stat().st_mtime_ns) for f in files)
+            cacheable = True
+        key = (content, self.split, camera, *size, self.source, *networks_key)
         # A user's weights may have other content next time.
         cacheable &= not needs_networks or self.simulator in (None, *SIZES)
         known = _LOADED.get(key) if cacheable else None
@@ -228,7 +235,7 @@ class EnvOptions:
         if networks is not None and finds_defocus:
             resize = networks.resized
         scenes = load_scenes(
-            self.scenes,
+            self.recorded or self.scenes,
             self.split,
             camera=camera,
             resolution=self.resolution,
@@ -236,12 +243,18 @@ class EnvOptions:
             resize=resize,
             grid=None if self.recorded is None else self.make_grid(),
         )
+        if self.recorded is None and any(scene.recorded is not None for scene in scenes):
+            raise ValueError(
+                "`scenes` must name the folder of recorded scenes ('recorded:FOLDER') to show "
+                "their captures: those of a list would be simulated"
+            )
         if self.source == "raw":
             scenes = [photographed(scene) if scene.noise_free else scene for scene in scenes]
         scenes = [self._prepared(scene, networks) for scene in scenes]
         _check_light(scenes)
         if cacheable:
-            _LOADED.put(key, list(scenes), sum(scene.light.nbytes for scene in scenes))
+            tensors = [t for s in scenes for t in (s.light, s.recorded) if t is not None]
+            _LOADED.put(key, list(scenes), sum(tensor.nbytes for tensor in tensors))
         return scenes
 
     def _prepared(self, scene: Scene, networks: SceneNetworks | None) -> Scene:

@@ -183,13 +183,16 @@ def _title(
 ) -> tuple[str, str]:
     light = "light unknown" if scene.illuminance is None else f"{scene.illuminance:,.4g} lux"
     parts = [scene.scene_id, f"{light} (EV100 {scene.ev100:.1f})"]
+    expected = "score" if scene.recorded is not None else "expected score"
+    best = f"best state: {grid[table.oracle]}, {expected} {table.mean[table.oracle]:.3f}"
+    if scene.recorded is not None:
+        return "   ·   ".join([*parts, "real captures"]), best
     speed, own = moves["speed"], moves["movement"].subject_speed
     if speed or not own:
         parts.append(f"moves {speed:.3g} frame heights/s" if speed else "nothing moves")
     if own and scene.layout is not None:
         parts.append(f"subject {own:.3g}")
     parts.append(_focus(scene, moves["defocus"]))
-    best = f"best state: {grid[table.oracle]}, expected score {table.mean[table.oracle]:.3f}"
     return "   ·   ".join(parts), best
 
 
@@ -265,8 +268,10 @@ class _Sheet:
         font = _fitting_font(draw, title[1], int(font.size) - 2, width - 2 * _MARGIN)
         draw.text((_MARGIN, 44), title[1], _FAINT, font)
         self._draw_labels(draw)
+        allowed = self.table.allowed
         for state, picture in enumerate(self.pictures):
-            self._draw_picture(sheet, draw, state, picture)
+            if allowed is None or allowed[state]:
+                self._draw_picture(sheet, draw, state, picture)
         self._draw_legend(sheet, draw)
         overlay = Image.new("RGBA", (2 * width, 2 * height))  # at twice the size: smooth lines
         self._draw_paths(ImageDraw.Draw(overlay))

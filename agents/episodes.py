@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -44,20 +44,27 @@ def make_envs(
     return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
 
 
-def training_scenes(scenes: SceneSpec, resolution: int = 64) -> tuple[SceneSpec, bool]:
-    """Scenes to train on for an evaluation on `scenes`, and whether they are others.
+def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[str, Any], bool]:
+    """Arguments of an environment to train on for an evaluation on `scenes`.
 
-    The others are the bundled ones, where `scenes` has too few source groups for a training split.
+    Returns:
+        Its ``scenes``, with the ``grid`` of recorded ones; and whether they are others, the bundled
+        ones, because `scenes` has too few source groups for a training split.
     """
     from ae_env.options import EnvOptions
     from ae_env.scenes.loading import BUNDLED, REAL
 
-    if not isinstance(scenes, str) or scenes not in (*BUNDLED, *REAL):
-        options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
-        groups = {scene.group for scene in options.load_scenes()}
-        if len(groups) < MIN_TRAINING_GROUPS:
-            return "bundled", True
-    return scenes, False
+    if isinstance(scenes, str) and scenes in (*BUNDLED, *REAL):
+        return {"scenes": scenes}, False
+    options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
+    groups = {scene.group for scene in options.load_scenes()}
+    if len(groups) >= MIN_TRAINING_GROUPS:
+        return {"scenes": scenes}, False
+    found: dict[str, Any] = {"scenes": "bundled"}
+    if options.recorded is not None:
+        grid = options.make_grid()
+        found["grid"] = {name: list(values) for name, values in asdict(grid).items()}
+    return found, True
 
 
 def scenes_of(envs: gym.vector.VectorEnv[Any, Any, Any]) -> list[Scene]:

@@ -68,6 +68,11 @@ class BracketCore(EpisodeCore):
         max_frames: int,
         scenes: list[Scene] | None = None,
     ) -> None:
+        if options.recorded is not None:
+            raise ValueError(
+                f"`scenes` (={options.scenes!r}) must not be recorded: of a bracket's frames every "
+                "state and the light behind them must be known"
+            )
         self.shown, self.budget, self.max_frames = options.observation, budget, max_frames
         super().__init__(replace(options, observation="dn"), num_envs, scenes)
         size = (num_envs, max_frames, 4, options.resolution, options.resolution)

@@ -43,7 +43,7 @@ REAL = ("polyhaven", "mixed")
 #: All scenes that have a name.
 NAMED = (*BUNDLED, *BUNDLED_PARTS, *REAL)
 #: Ways to name scenes, see `load_scenes`.
-SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any]
+SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any] | RecordedOptions
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 

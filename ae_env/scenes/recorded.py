@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ae_env.grid import ExposureGrid
-from ae_env.scenes.recorded_files import (
-    PICTURE_SUFFIXES,
-    RecordedFile,
-    index_recorded,
-    recorded_grid,
-    state_of,
-)
+from ae_env.scenes.recorded_files import RecordedFile, index_recorded, recorded_grid, state_of
 from ae_env.scenes.scene import MEAN_SIGNAL, Scene, SceneRequest
 from ae_env.scenes.split import log_groups, scenes_of_split
 from ae_env.utils.checks import check_number, did_you_mean
 from ae_env.utils.merging import SATURATED, merge
 from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw
@@ -69,10 +63,12 @@ class RecordedOptions:
         """What `spec`, an environment's `scenes`, says of recorded grids; None if nothing.
 
         Raises:
-            ValueError: If it has an unknown entry.
+            ValueError: If it has an unknown entry, or names no folder.
         """
+        if isinstance(spec, RecordedOptions):
+            return spec
         if isinstance(spec, str) and spec.startswith(PREFIX):
-            return cls(Path(spec.removeprefix(PREFIX)).expanduser())
+            spec = {KEY: spec.removeprefix(PREFIX)}
         if not isinstance(spec, Mapping) or KEY not in spec:
             return None
         names = (KEY, "iso", "exposure_time", "f_number")
@@ -80,20 +76,32 @@ class RecordedOptions:
             if name not in names:
                 hint = did_you_mean(name, names)
                 raise ValueError(f"`scenes` field {name!r} must be one of {list(names)}{hint}")
-        if not isinstance(spec[KEY], str | Path):
+        if not isinstance(spec[KEY], str | Path) or not str(spec[KEY]):
             raise ValueError(f"`scenes[{KEY!r}]` (={spec[KEY]!r}) must be the path of a folder")
         settings = {name: spec[name] for name in names[1:] if name in spec}
         return cls(Path(spec[KEY]).expanduser(), **settings)
 
-    @property
-    def files(self) -> list[RecordedFile]:
+    @cached_property
+    def files(self) -> tuple[RecordedFile, ...]:
         """Every capture of the folder; see `index_recorded`."""
-        return list(_indexed(self, _changed(self.folder)))
+        return tuple(index_recorded(self.folder, self.known))
 
-    @property
+    @cached_property
     def grid(self) -> ExposureGrid:
         """Every combination of the settings of its captures."""
         return recorded_grid(self.files)
+
+    @cached_property
+    def _body(self) -> CameraProfile | None:
+        """The body that took the raws, with their noise; None where there are only pictures."""
+        by_iso = {file.settings.iso: file for file in reversed(self.files) if not file.is_picture}
+        if not by_iso:
+            return None
+        noises: dict[float, NoiseLevelFunction] = {}
+        for iso, file in sorted(by_iso.items()):
+            raw = _read(file)
+            noises[iso] = raw.camera.nlf(iso) if raw.nlf is None else raw.nlf
+        return replace(raw.camera, nlf_by_iso=noises, segments=())
 
     def camera(self, default: CameraProfile) -> CameraProfile:
         """The body that took the raws, with their noise; for pictures `default` without colours.
@@ -101,28 +109,7 @@ class RecordedOptions:
         Args:
             default: Whose noise developed pictures are assumed to have.
         """
-        return _camera(self, default, _changed(self.folder))
-
-
-def _changed(folder: Path) -> int:
-    """Number that changes with the folder."""
-    return folder.stat().st_mtime_ns if folder.is_dir() else 0
-
-
-@functools.lru_cache(maxsize=8)
-def _indexed(options: RecordedOptions, changed: int) -> tuple[RecordedFile, ...]:
-    return tuple(index_recorded(options.folder, options.known))
-
-
-@functools.lru_cache(maxsize=8)
-def _camera(options: RecordedOptions, default: CameraProfile, changed: int) -> CameraProfile:
-    by_iso = {file.settings.iso: file for file in reversed(options.files)}
-    if all(file.path.suffix.lower() in PICTURE_SUFFIXES for file in by_iso.values()):
-        return replace(default, colour_matrix=None, colour_matrix_source="")
-    raws = {iso: _read(file, default) for iso, file in sorted(by_iso.items())}
-    noises = {iso: raw.camera.nlf(iso) if raw.nlf is None else raw.nlf for iso, raw in raws.items()}
-    first = next(iter(raws.values()))
-    return replace(first.camera, nlf_by_iso=noises, segments=())
+        return self._body or replace(default, colour_matrix=None, colour_matrix_source="")
 
 
 # -- scenes ---------------------------------------------------------------------------------------
@@ -233,7 +220,7 @@ def merged_scene(
         camera: The body, with the noise of its ISO speeds.
         resize: Brings each capture to its size, before they are merged.
     """
-    frames = {state: resize(_frame(raw, grid[state], camera)) for state, raw in raws}
+    frames = {state: resize(_frame(name, raw, grid[state], camera)) for state, raw in raws}
     shape = next(iter(frames.values())).light.shape
     recorded, allowed = torch.zeros(len(grid), *shape), np.zeros(len(grid), bool)
     for state, frame in frames.items():
@@ -249,13 +236,13 @@ def merged_scene(
     )
 
 
-def _frame(raw: RawImage, settings: CameraSettings, camera: CameraProfile) -> Scene:
+def _frame(name: str, raw: RawImage, settings: CameraSettings, camera: CameraProfile) -> Scene:
     """A capture as it is: its light is what was recorded, clipped."""
     return Scene.from_array(
         raw.data,
         settings,
         camera,
-        scene_id=str(settings),
+        scene_id=f"{name}, {settings}",
         nlf=raw.noise,
         white_balance=raw.white_balance,
         box_factor=raw.box_factor,
@@ -283,15 +270,20 @@ def _merged(frames: Sequence[Scene]) -> Scene:
 # -- reading --------------------------------------------------------------------------------------
 
 
-def _read(file: RecordedFile, camera: CameraProfile) -> RawImage:
-    """The capture of `file`, of a raw as `read_raw` reads it, of a picture developed back."""
+def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
+    """The capture of `file`, of a raw as `read_raw` reads it, of a picture developed back.
+
+    Args:
+        file: The file.
+        camera: Whose noise a picture has; a raw brings its own.
+    """
     try:
-        if file.path.suffix.lower() not in PICTURE_SUFFIXES:
+        if not file.is_picture:
             return read_raw(file.path, settings=file.settings)
         with Image.open(file.path) as picture:
             rgb = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
         raise ValueError(f"recorded file {str(file.path)!r} cannot be read: {error}") from error
+    assert camera is not None
     data = develop_inverse(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None])[0]
-    plain: Any = replace(camera, colour_matrix=None, colour_matrix_source="")
-    return RawImage(data, file.settings, plain)
+    return RawImage(data, file.settings, camera)

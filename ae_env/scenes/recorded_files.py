@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,6 +73,11 @@ class RecordedFile:
     sequence: str
     frame: int
 
+    @property
+    def is_picture(self) -> bool:
+        """Whether it is a developed picture; else it is a raw."""
+        return self.path.suffix.lower() in PICTURE_SUFFIXES
+
 
 def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFile]:
     """Every capture under `folder`, by scene, frame and settings.
@@ -86,7 +91,7 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
     """
     if not folder.is_dir():
         raise ValueError(f"`scenes` (='recorded:{folder}') must name a folder: there is none")
-    tables = _tables(folder)
+    tables = _Tables(folder)
     found = [
         _recorded(folder, path, tables, known)
         for path in sorted(folder.rglob("*"))
@@ -103,7 +108,7 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
 
 
 def _recorded(
-    folder: Path, path: Path, tables: Mapping[Path, dict[str, float]], known: Mapping[str, float]
+    folder: Path, path: Path, tables: _Tables, known: Mapping[str, float]
 ) -> RecordedFile:
     """`path` with its settings, and with what is left of its name once those are taken out."""
     parts = [*path.relative_to(folder).parts[:-1], path.stem]
@@ -113,32 +118,36 @@ def _recorded(
     states: list[int] = []  # the parts that state a setting
     for number, (part, place) in enumerate(zip(parts, places, strict=True)):
         named, rest = settings_in_name(part)
-        row = tables.get(place) or tables.get(place.with_suffix("")) or {}
+        row = tables.row(place)
         if named or row:
-            settings |= row or named
+            settings |= named | row
             states.append(number)
         left.append("" if row else rest)
-    if len(settings) < len(_SETTINGS):
-        stated = _in_file(path)
-        if not settings and stated:
-            left[-1] = ""  # a file of one state, whatever its name
-            states.append(len(parts) - 1)
-        settings = {**known, **stated, **settings}
-    missing = [name for name in _SETTINGS if name not in settings]
-    if missing:
+    try:
+        if len(settings) < len(_SETTINGS):
+            stated = _in_file(path)
+            if not settings and stated:
+                left[-1] = ""  # a file of one state, whatever its name
+                states.append(len(parts) - 1)
+            settings = {**known, **stated, **settings}
+        taken_at = CameraSettings(*(settings[name] for name in _SETTINGS))
+    except KeyError:
+        missing = [name for name in _SETTINGS if name not in settings]
         raise ValueError(
             f"recorded file {str(path)!r} does not state its {' and '.join(missing)}: name it in a "
             "settings.csv (columns file, iso, exposure_time, f_number), put it into its name "
             "(iso100_1-125s_f4) or, where it is the same in all files, give "
             "{'recorded': folder, 'iso': 100, 'f_number': 4}"
-        )
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"recorded file {str(path)!r}: {error}") from error
     names = [name for name in left if name] or [folder.resolve().name]
     subject = [name for name in left[max(states, default=-1) + 1 :] if name] or names
     frames = [match for name in names if (match := _FRAME.fullmatch(name))]
     still = [name for name in names if not _FRAME.fullmatch(name)]
     return RecordedFile(
         path=path,
-        settings=CameraSettings(*(settings[name] for name in _SETTINGS)),
+        settings=taken_at,
         scene="/".join(names),
         group="/".join(name for name in subject if not _FRAME.fullmatch(name)) or "/".join(still),
         sequence=("/".join(still) or folder.resolve().name) if frames else "",
@@ -176,16 +185,26 @@ def settings_in_name(name: str) -> tuple[dict[str, float], str]:
 # -- settings in tables and files -----------------------------------------------------------------
 
 
-def _tables(folder: Path) -> dict[Path, dict[str, float]]:
-    """Settings by file or folder, of all tables."""
-    rows: dict[Path, dict[str, float]] = {}
-    for pattern in _TABLES:
-        for table in sorted(folder.rglob(pattern)):
-            rows |= _table(folder, table)
-    return rows
+class _Tables:
+    """Settings by file or folder, of all tables in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._by_place: dict[Path, dict[str, float]] = {}
+        self._by_name: dict[str, dict[str, float]] = {}
+        for pattern in _TABLES:
+            for table in sorted(folder.rglob(pattern)):
+                for name, settings in _rows(table):
+                    self._by_place[table.parent / name] = settings
+                    self._by_name[name] = settings
+
+    def row(self, place: Path) -> dict[str, float]:
+        """Settings that a table gives the file or folder `place`; a folder anywhere by its name."""
+        found = self._by_place.get(place) or self._by_place.get(place.with_suffix(""))
+        return found or (self._by_name.get(place.name, {}) if not place.suffix else {})
 
 
-def _table(folder: Path, table: Path) -> dict[Path, dict[str, float]]:
+def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
+    """Name and settings of each row of a table."""
     try:
         with table.open(newline="", encoding="utf-8-sig") as stream:
             reader = csv.DictReader(stream)
@@ -195,27 +214,20 @@ def _table(folder: Path, table: Path) -> dict[Path, dict[str, float]]:
     names = {
         what: next((c for c in known if c in columns), None) for what, known in _COLUMNS.items()
     }
-    if None in names.values():
+    if names["file"] is None or not any(names[what] for what in _SETTINGS):
         raise ValueError(
-            f"{str(table)!r} (columns {columns}) must have the columns file, iso, exposure_time "
-            "and f_number"
+            f"{str(table)!r} (columns {columns}) must have the column file and one or more of iso, "
+            "exposure_time and f_number"
         )
-    found: dict[Path, dict[str, float]] = {}
     for number, row in enumerate(rows, start=2):
         values = {what: (row[column] or "").strip() for what, column in names.items() if column}
         try:
-            settings = {name: _number(values[name]) for name in _SETTINGS}
-            CameraSettings(**settings)
+            settings = {name: _number(values[name]) for name in _SETTINGS if values.get(name)}
+            # The states of ImageNet-ES are numbered.
+            name = values["file"]
+            yield f"param_{_number(name):g}" if names["file"] == "idx" else name, settings
         except ValueError as error:
             raise ValueError(f"{str(table)!r}, line {number}: {error}") from error
-        name = values["file"]
-        if names["file"] == "idx":  # the states of ImageNet-ES are numbered
-            name = f"param_{int(float(name))}"
-        places = [table.parent / name]
-        if not places[0].exists():
-            places = [path for path in sorted(folder.rglob(name)) if path.is_dir()]
-        found |= dict.fromkeys(places, settings)
-    return found
 
 
 def _number(text: str) -> float:

@@ -9,6 +9,7 @@
 | `defects.py` | `defects`, `analytic_*` |
 | `fidelity.py` | `fidelity` |
 | `nima.py`, `niqe.py` | `nima_aesthetic`, `nima_technical`; `niqe` |
+| `classifier.py` | `classifier` |
 | `opencv.py` | `brisque`, `keypoints`, `matches` |
 | `registry.py` | ``pyiqa:METRIC`` |
 """
@@ -27,6 +28,7 @@ from typing import Any, TypeVar
 
 import torch
 
+from ae_env.scorers.classifier import Classifier
 from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
@@ -68,6 +70,7 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "sharpness": Sharpness,
     "banding": Banding,
     "brisque": Brisque,
+    "classifier": Classifier,
     "keypoints": Keypoints,
     "matches": Matches,
     "nima_aesthetic": NimaAesthetic,

@@ -57,7 +57,8 @@ Environment = Annotated[
 Scenes = Annotated[
     str | None,
     typer.Option(
-        help="'bundled', 'polyhaven', 'mixed', or a folder or file of raws or radiance maps."
+        help="'bundled', 'polyhaven', 'mixed', a folder or file of raws or radiance maps, or "
+        "'recorded:FOLDER'."
     ),
 ]
 Split = Annotated[str | None, typer.Option(help="train, test (default) or all.")]

@@ -122,7 +122,7 @@ def run_quickstart(
     """
     from ae_env.options import EnvOptions
     from ae_env.utils.checks import check_integer
-    from agents.episodes import training_scenes
+    from agents.episodes import training_arguments
     from agents.evaluation.engine import evaluate
     from agents.evaluation.evaluation_plan import MAX_SEED
     from agents.evaluation.running import fit_policies
@@ -130,8 +130,8 @@ def run_quickstart(
 
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
     files = scene_files(scenes, on_error)
-    source, zero_shot = training_scenes(files)
-    environment = {"scenes": source, "split": "train", "resolution": 64}
+    learnt, zero_shot = training_arguments(files)
+    environment = {**learnt, "split": "train", "resolution": 64}
     with progress("scenes") as task:  # into the cache, before processes share the trainings
         task(1, 1, f"{len(EnvOptions.from_kwargs(environment).load_scenes())} to learn from")
     agents = _train(environment, out, seed, progress, device)
@@ -146,7 +146,7 @@ def run_quickstart(
         out,
         command=command,
         next_commands=next_commands(scenes, out, agents, on_error),
-        extra_meta={"trained_on": source, "zero_shot": zero_shot},
+        extra_meta={"trained_on": learnt["scenes"], "zero_shot": zero_shot},
     )
     return QuickstartResult(result, written, agents, zero_shot)
 

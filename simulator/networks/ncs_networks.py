@@ -3,7 +3,7 @@
 Both are networks of the preset `ncs`, whose weights `ae-env import-weights ncs` brings in. Layers,
 widths and arithmetic are the authors'; names and the order of planes are ours, as
 `simulator.networks.authors_weights` translates them. What they differ in from the paper is listed
-in docs/authors-weights.md.
+in docs/networks.md.
 """
 
 from __future__ import annotations

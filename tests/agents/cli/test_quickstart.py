@@ -65,7 +65,9 @@ def test_bundled_scenes_then_raws_of_ones_own(raw: RawImage, tmp_path: Path, mon
 
     # Few raws have no training split; the agents are there already.
     monkeypatch.setattr("agents.learning.training.ProcessPoolExecutor", None)
-    monkeypatch.setattr("agents.episodes.training_scenes", lambda _: ("bundled:small", True))
+    monkeypatch.setattr(
+        "agents.episodes.training_arguments", lambda _: ({"scenes": "bundled:small"}, True)
+    )
     mine = tmp_path / "my raws"
     mine.mkdir()
     for i in range(3):

@@ -1,0 +1,194 @@
+"""Scenes of real captures: their pixels, the light that they tell together, and bad input."""
+
+import logging
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ae_env.grid import ExposureGrid
+from ae_env.scenes import load_scenes
+from ae_env.scenes.recorded import RecordedOptions
+from simulator import exposure_ratio, get_camera, read_raw
+from simulator.raw.develop import develop
+from simulator.reference.reference_camera import ReferenceCamera
+from tests.ae_env.recorded_files import (
+    GRID,
+    capture,
+    write_picture,
+    write_raws,
+    write_states,
+    write_video,
+)
+from tests.simulator.training.scenes import scene as reference_scene
+
+CAMERA = get_camera("nikon_z6")
+
+
+def load(spec: object, resolution: int | None = None, **options: object):
+    return load_scenes(spec, "all", camera=CAMERA, resolution=resolution, **options)  # type: ignore[arg-type]
+
+
+def test_raws_are_shown_as_they_are(tmp_path: Path) -> None:
+    write_raws(tmp_path / "desk")
+    (scene,) = load(f"recorded:{tmp_path}")
+    assert scene.allowed.all()
+    assert (scene.kind, scene.group, scene.sequence) == ("recorded", "desk", "")
+    for state in range(len(GRID)):
+        raw = read_raw(tmp_path / "desk" / f"IMG_{state:04d}.dng")
+        torch.testing.assert_close(scene.recorded[state], raw.data, rtol=0.0, atol=0.0)
+    # Averaged as any scene is: every capture by itself.
+    (small,) = load(f"recorded:{tmp_path}", resolution=20)
+    expected = scene.recorded.reshape(8, 4, 20, 2, 20, 2).mean(dim=(3, 5))
+    torch.testing.assert_close(small.recorded, expected, rtol=0.0, atol=1e-6)
+    assert small.box_factor == 2
+
+
+def test_the_light_is_that_of_all_captures(tmp_path: Path) -> None:
+    """The oracle's exposure rests on it: it has less noise than any capture."""
+    grid = ExposureGrid((100, 1600), (1 / 1000, 1 / 250), (8,))
+    write_raws(tmp_path / "desk", tuple(grid))
+    (scene,) = load(f"recorded:{tmp_path}")
+    assert scene.nlf.is_zero
+    body, photographed = ReferenceCamera(CAMERA), reference_scene("s0", size=40, seed=0)
+    errors = []
+    for number, settings in enumerate(grid):
+        truth = body.capture(photographed, settings, 0).mean
+        alpha = exposure_ratio(settings, scene.reference)
+        errors.append(float((scene.recorded[number] - truth).std()) * alpha)
+    merged = float((scene.light - truth * alpha).std())
+    assert merged < 0.9 * min(errors)
+
+
+def test_pictures_are_developed_back(tmp_path: Path) -> None:
+    for settings in GRID:
+        name = f"iso{settings.iso:.0f}_1-{1 / settings.exposure_time:.0f}s_f{settings.f_number:g}"
+        write_picture(tmp_path / "desk" / f"{name}.png", settings)
+    (scene,) = load(f"recorded:{tmp_path}")
+    pictures = [Image.open(path) for path in sorted((tmp_path / "desk").iterdir())]
+    sums = {np.asarray(picture).astype(int).sum() for picture in pictures}
+    developed = develop(scene.recorded, scene.white_balance, scene.camera.colour_matrix)
+    shown = (developed * 255.0).round().int()
+    assert {int(rgb.sum()) for rgb in shown} == sums  # the same codes as in the files
+    assert scene.camera.nlf(100) == CAMERA.nlf(100)
+
+
+def test_pictures_by_exif_and_by_table(tmp_path: Path) -> None:
+    for number, settings in enumerate(GRID):
+        path = tmp_path / "exif" / f"IMG_{number}.jpg"
+        write_picture(path, settings, exif=("iso", "exposure_time", "f_number"))
+    write_states(tmp_path / "table", seeds=(0,))
+    (by_exif,), (by_table,) = (load(f"recorded:{tmp_path / n}") for n in ("exif", "table"))
+    assert (by_exif.scene_id, by_table.scene_id) == ("exif", "l1/n00000000/val_0")
+    torch.testing.assert_close(by_exif.recorded, by_table.recorded, rtol=0.0, atol=0.0)
+
+
+def test_the_body_of_the_raws_is_the_camera(tmp_path: Path) -> None:
+    write_raws(tmp_path / "desk")
+    body = RecordedOptions(tmp_path).camera(get_camera("canon_70d"))
+    assert body.black_level == CAMERA.black_level
+    assert set(body.nlf_by_iso) == {100.0, 1600.0}
+    # A DNG states one pair of numbers for both greens.
+    for iso in (100.0, 1600.0):
+        np.testing.assert_allclose(body.nlf(iso).shot, CAMERA.nlf(iso).shot, rtol=0.02)
+
+
+def test_states_without_a_capture_are_forbidden_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_raws(tmp_path / "a")
+    write_raws(tmp_path / "b", [s for i, s in enumerate(GRID) if i not in (2, 5)], seed=1)
+    with caplog.at_level(logging.WARNING, "ae_env.scenes.recorded"):
+        a, b = load(f"recorded:{tmp_path}")
+    assert a.allowed.all()
+    assert np.flatnonzero(~b.allowed).tolist() == [2, 5]
+    assert not b.recorded[[2, 5]].any()
+    (message,) = caplog.messages
+    assert "1 of 2 recorded scenes lack states" in message
+    assert "'b' lacks 2 of 8, the first is ISO 100, 1/125 s, f/4" in message
+    # A grid of one's own leaves out what it does not have.
+    (a, b) = load(f"recorded:{tmp_path}", grid=ExposureGrid((1600,), (1 / 1000, 1 / 125), (4,)))
+    assert a.recorded.shape[0] == b.recorded.shape[0] == 2
+    torch.testing.assert_close(a.recorded[1], capture(GRID[6]).data)
+
+
+def test_frames_of_a_video_follow_each_other(tmp_path: Path) -> None:
+    write_video(tmp_path, frames=11, times=("1-1000s", "1-60s"))
+    scenes = load({"recorded": tmp_path, "iso": 400, "f_number": 4})
+    assert [s.scene_id for s in scenes] == [f"street/frame_{i:04d}" for i in range(11)]
+    assert {(s.group, s.sequence) for s in scenes} == {("street", "street")}
+
+
+def _cut(folder: Path) -> None:
+    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+    path.write_bytes(path.read_bytes()[:300])
+
+
+def _cut_raw(folder: Path) -> None:
+    shutil.rmtree(folder / "l1")
+    write_raws(folder)
+    (folder / "IMG_0003.dng").write_bytes((folder / "IMG_0003.dng").read_bytes()[:4000])
+
+
+def _twice(folder: Path) -> None:
+    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+    shutil.copy(path, path.with_suffix(".png"))
+
+
+def _other_size(folder: Path) -> None:
+    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+    with Image.open(path) as picture:
+        picture.resize((44, 40)).save(path)
+
+
+def _no_table(folder: Path) -> None:
+    (folder / "grid-options-2x2x2.csv").unlink()
+
+
+def _one_state(folder: Path) -> None:
+    for path in (folder / "l1").iterdir():
+        if path.name != "param_3":
+            shutil.rmtree(path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_cut, r"recorded file '.*param_3.*val_1.JPEG' cannot be read: "),
+        (_cut_raw, r"recorded file '.*IMG_0003.dng' cannot be read: .*truncated"),
+        (_twice, r"'l1/n00000001/val_1' must have one file for each state, but .* are both ISO"),
+        (_other_size, r"val_1.JPEG' \(\(40, 44\) packed pixels\) must be of the size of .*, \(40,"),
+        (_no_table, r"val_0.JPEG' does not state its iso and exposure_time and f_number: name it"),
+        (_one_state, r"\(1 of 1 captures in the grid\) must have two states or more"),
+    ],
+)
+def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: str) -> None:
+    write_states(tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(ValueError, match=message) as error:
+        load(f"recorded:{tmp_path}")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("recorded:", r"`scenes\['recorded'\]` \(=''\) must be the path of a folder"),
+        ({"recorded": 3}, r"`scenes\['recorded'\]` \(=3\) must be the path"),
+        ({"recorded": "a", "isos": 3}, r"field 'isos' must be one of .*did you mean 'iso'"),
+        ({"recorded": "a", "iso": -3}, r"`iso` \(=-3\) must be"),
+        ("recorded:/no/such", r"`scenes` \(='recorded:/no/such'\) must name a folder"),
+    ],
+)
+def test_bad_options(spec: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load(spec)
+
+
+def test_a_frame_smaller_than_asked_is_named(tmp_path: Path) -> None:
+    write_raws(tmp_path / "desk", tuple(GRID)[:2])
+    with pytest.raises(ValueError, match=r"'desk, ISO 100, 1/1000 s, f/4' \(40 x 40 packed\) must"):
+        load(f"recorded:{tmp_path}", resolution=64)
