@@ -184,19 +184,9 @@ def write_png(path: Path, raw: RawImage) -> Path:
 
 def write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
     """Writes `srgb` (3, 2H, 2W) uint8, a picture of `raw`, upright and with square pixels."""
-    import numpy as np
-    from PIL import Image
+    from agents.report.upright import upright_picture
 
-    from simulator.raw.develop import quarter_turns
-
-    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
     aspect = raw.metadata.get("pixel_aspect", 1.0)
-    if aspect != 1.0:  # no pixel is left out: the picture grows along the pixels' longer side
-        width, height = (
-            round(picture.width * max(aspect, 1)),
-            round(picture.height / min(aspect, 1)),
-        )
+    if aspect != 1.0:
         print_line(f"pixels are {aspect:g} times as wide as high: the PNG is stretched")
-        picture = picture.resize((width, height), Image.Resampling.BICUBIC)
-    upright = np.rot90(np.asarray(picture), quarter_turns(raw))
-    return save_picture(path, Image.fromarray(np.ascontiguousarray(upright)))
+    return save_picture(path, upright_picture(raw, srgb))
