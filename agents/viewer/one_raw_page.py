@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -147,8 +150,8 @@ class OneRawPage:
         self._update()
         told = ""
         try:
-            made = await run.io_bound(function, raw, *options, simulator=self._simulator)
-            if made is not None and viewed is self._viewed:
+            made = await _in_background(function, raw, *options, self._simulator)
+            if viewed is self._viewed:
                 self._made |= dict.fromkeys(made.files, made)
                 self._stage.compare(made.jpeg)
                 told = f"right: {made.told}, in {perf_counter() - self._begun:.0f} s"
@@ -177,3 +180,24 @@ class OneRawPage:
             ui.notify(" ".join(str(error).split()), type="negative", multi_line=True)
         finally:
             self._saves[ending].props(remove="loading")
+
+
+async def _in_background(function: Callable[..., Made], *arguments: Any) -> Made:
+    """The result of `function`, made in a thread that the end of the program does not wait for."""
+    loop = asyncio.get_running_loop()
+    result: asyncio.Future[Made] = loop.create_future()
+
+    def tell(how: Callable[[Any], None], what: Any) -> None:
+        with suppress(RuntimeError):  # the program has ended
+            loop.call_soon_threadsafe(lambda: None if result.done() else how(what))
+
+    def work() -> None:
+        try:
+            made = function(*arguments)
+        except Exception as error:  # raised where it is awaited
+            tell(result.set_exception, error)
+        else:
+            tell(result.set_result, made)
+
+    threading.Thread(target=work, daemon=True).start()
+    return await result
