@@ -71,7 +71,7 @@ def address_of_soft_raw(tmp_path_factory):
     camera = get_camera("nikon_z6")
     raw = RawImage(light, CameraSettings(100, 1 / 64, 5.6), camera, nlf=camera.nlf(100))
     write_dng(folder / "soft.dng", raw)
-    with served(folder / "log.txt", folder / "soft.dng") as found:
+    with served(folder / "log.txt", folder / "soft.dng", "--depth", "unknown") as found:
         yield found
 
 
