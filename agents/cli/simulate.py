@@ -14,7 +14,6 @@ from agents.cli.console import (
     Seed,
     check_outputs,
     console,
-    make_folders,
     parse_f_number,
     parse_seconds,
     print_files,
@@ -102,7 +101,6 @@ def simulate(
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     if noise == "sensor":
         source.camera.read_noise(iso)  # refuses a camera without its calibration
-    make_folders(out=out, png=png)
     simulator = make_simulator(weights, device, cache)
     prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)

@@ -54,8 +54,6 @@ def recorded(raw: RawImage) -> Made:
 
 def opened(raw: RawImage, f_number: float, simulator: CameraSimulator) -> Made:
     """The raw as a wider aperture would have recorded it; the blur is estimated."""
-    if simulator.aperture is None:
-        raise ValueError("networks estimate the blur: start `ae-env view` without `--weights none`")
     result = refocus(raw, f_number, simulator=simulator)
     largest = result.metadata["largest_disc_px"]
     told = f"f/{f_number:g}, blur estimated: the widest disc has {largest:.1f} packed pixels"

@@ -316,7 +316,7 @@ def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
     page.locator("input[type=file]").set_input_files(tmp_path / "flat.dng")
     page.wait_for_selector(".stage img[src]")
     page.get_by_role("button", name="Open the aperture").click()
-    page.locator(".q-notification", has_text="without `--weights none`").wait_for()
+    page.locator(".q-notification", has_text="networks: they estimate the blur").wait_for()
     page.get_by_role("button", name="Open the aperture", disabled=False).wait_for()
 
 
