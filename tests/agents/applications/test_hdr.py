@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,6 +99,11 @@ def test_radiance_as_an_exr(tmp_path) -> None:
     grey = torch.tensor([0.5, 1.0, 1.0, 2 / 3])[:, None, None].expand(4, 6, 8) * 3.0
     image = linear_rgb(raw, grey)
     np.testing.assert_allclose(image, 3.0, rtol=1e-5)  # grey stays grey, above white
+    held = replace(raw, metadata={"flip": 6})  # LibRaw's code: turned right by a quarter
+    ramp = grey * torch.linspace(0.1, 1.0, 8)
+    upright = linear_rgb(held, ramp)
+    assert upright.shape == (8, 6, 3)
+    np.testing.assert_array_equal(upright, np.rot90(linear_rgb(raw, ramp), -1))
     path = write_exr(tmp_path / "out.exr", image)
     with openexr.File(str(path)) as file:
         np.testing.assert_array_equal(file.channels()["RGB"].pixels, image)
