@@ -90,7 +90,7 @@ def _check(raw: RawImage, f_number: float, depth: np.ndarray | None, lens: Lens 
     target = CameraSettings(source.iso, source.exposure_time, f_number)
     if target.effective_f_number > source.effective_f_number:
         raise ValueError(
-            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:g}: "
+            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:.3g}: "
             "closing the aperture would have to sharpen"
         )
     if depth is None and lens is None:

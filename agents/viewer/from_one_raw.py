@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from PIL import Image
@@ -43,7 +43,9 @@ class Made:
 
 def wider_f_numbers(raw: RawImage) -> tuple[float, ...]:
     """The marked f-numbers that are wider than the raw's, the nearest first; down to f/1.4."""
-    return tuple(n for n in reversed(_MARKED) if n < raw.settings.f_number)
+    own = raw.settings.effective_f_number  # what is marked 5.6 may be recorded as 5.66
+    settings = (replace(raw.settings, f_number=n) for n in reversed(_MARKED))
+    return tuple(s.f_number for s in settings if s.effective_f_number < own)
 
 
 def recorded(raw: RawImage) -> Made:

@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from ae_env.scenes import Scene
+from agents.viewer.from_one_raw import wider_f_numbers
 from agents.viewer.library import Entry, Library, Shown, find_scenes
 from agents.viewer.viewed_scene import WINDOW_SIZE, View, ViewedScene
 from simulator import (
@@ -163,6 +164,16 @@ def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown():
     sharp, soft = (1, slice(None), slice(60)), (1, slice(None), slice(84, None))
     assert float(unknown[sharp].std()) == pytest.approx(float(far[sharp].std()), rel=0.01)
     assert float(unknown[soft].std()) < 0.7 * float(far[soft].std())
+
+
+def test_only_wider_f_numbers_than_the_raw_s_are_offered():
+    def offered(f_number):
+        raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 1, f_number), CAMERA)
+        return wider_f_numbers(raw)
+
+    assert offered(2.8) == offered(8**0.5) == (2.5, 2.2, 2.0, 1.8, 1.6, 1.4)
+    assert offered(1.4) == offered(2**0.5) == ()
+    assert offered(16)[:2] == (14.0, 13.0)
 
 
 def test_a_scene_is_found_by_its_id():
