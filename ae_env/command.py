@@ -12,6 +12,11 @@ def main() -> None:
 
     Raises:
         ImportError: If another package of the name comes first on ``sys.path``.
+        SystemExit: With 130 after Ctrl-C, also while the libraries are loaded, which takes seconds.
     """
     check_package("agents")
-    importlib.import_module("agents.cli.main").main()
+    try:
+        program = importlib.import_module("agents.cli.main")
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    program.main()

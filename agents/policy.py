@@ -375,10 +375,20 @@ def make_policy(
         cls = _class_in_module(head, tail, name)
     else:
         raise ValueError(_unknown(base))
-    policy = _construct(cls, name, context, options, fixed)
+    policy = _construct(cls, _as_written(name), context, options, fixed)
     if named:
         policy.name = name
     return policy
+
+
+def _as_written(name: str) -> str:
+    """`name` for messages: agents that come with the package are known by no path."""
+    base, mark, options = str(name).partition("?")
+    head, _, tail = base.partition(":")
+    for kind in ("", VIDEO):
+        if head in _WITH_WEIGHTS and tail.startswith(_shipped(head, kind)):
+            return f"{head}{f':{kind}' if kind else ''}{mark}{options}"
+    return name
 
 
 def _import(module: str, name: str) -> Any:

@@ -218,8 +218,7 @@ def run(
     Returns:
         What `ShardWriter.write` tells of each shard that was made.
     """
-    if on != _LOCAL:
-        _require_ray()
+    check_engine(on)
     plan.begin()
     todo = plan.missing()
     progress(len(plan.shards) - len(todo), len(plan.shards))
@@ -232,9 +231,16 @@ def run(
     return made
 
 
-def _require_ray() -> None:
-    """Raises an `ImportError` that names the extra, unless Ray is there."""
-    if importlib.util.find_spec("ray") is None:
+def check_engine(on: str) -> None:
+    """Checks `on`, see `run`.
+
+    Raises:
+        ImportError: If it needs Ray, which is not there; names the extra.
+        ValueError: If it is neither a name nor an address.
+    """
+    if on not in (_LOCAL, _RAY, "auto") and ":" not in on:
+        raise ValueError(f"`on` (={on!r}) must be local, ray, auto or the address of a cluster")
+    if on != _LOCAL and importlib.util.find_spec("ray") is None:
         raise ImportError(
             "a cluster needs the extra ray, in an environment of its own: pip install 'ae-env[ray]'"
         )

@@ -155,6 +155,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
             f"scene {number}",
             measure,
             {"number": number, "seed": seed, "quick": quick},
+            threads=1,
             depends=checksums("large", "paper"),
         )
         for number in range(0, count, 2 if quick else 1)
@@ -190,7 +191,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "own. Means over the four: PSNR [dB] of the whole raw, and after the slash within "
         f"{EDGE_MARGIN} packed pixels of a step of depth. Plain blur: each pixel is a blend of "
         "discs of its own diameter, whatever lies before it, up to 32 pixels. Seconds are the "
-        "median for one picture, noise reduction included.",
+        "median for one picture on one core, noise reduction included.",
         table(means, columns),
         "The paper's module is trained by `configs/simulator/paper.yaml` (on f/11 to f/4); it "
         "stands here where `runs/simulator/paper` holds its weights.",

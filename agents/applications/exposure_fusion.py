@@ -10,13 +10,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import correlate1d
 from torch import Tensor
 
 #: Width of the first weight, relative to the spacing of the bracket's mean brightnesses.
 ALPHA = 0.75
-#: Levels of the pyramid, and standard deviation of the weights' smoothing [pixel].
+#: Levels of the pyramid of a picture of less than 512 pixels a side, and standard deviation of the
+#: weights' smoothing [pixel].
 LEVELS, SMOOTHING = 7, 5.0
 _BINS = 256
 _LUMA = (0.299, 0.587, 0.114)
@@ -91,11 +94,11 @@ def _weight(luma: Tensor, mean: float, width: float) -> Tensor:
 def smoothed(weight: Tensor) -> Tensor:
     """`weight` (H, W) after a Gaussian of `SMOOTHING`, borders repeated."""
     radius = int(3 * SMOOTHING)
-    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1) / SMOOTHING) ** 2)
-    taps = (taps / taps.sum()).to(weight)
-    padded = F.pad(weight[None, None], (radius,) * 4, mode="replicate")
-    rows = F.conv2d(padded, taps[None, None, None, :])
-    return F.conv2d(rows, taps[None, None, :, None])[0, 0]
+    taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / SMOOTHING) ** 2)
+    values = weight.cpu().numpy()
+    for axis in (0, 1):
+        values = correlate1d(values, taps / taps.sum(), axis=axis, mode="nearest")
+    return torch.from_numpy(values).to(weight.device)
 
 
 def _luma(picture: Tensor) -> Tensor:
@@ -106,27 +109,48 @@ def _luma(picture: Tensor) -> Tensor:
 # -- pyramids (Burt and Adelson 1983) -------------------------------------------------------------
 
 
-def _binomial(image: Tensor, gain: float = 1.0) -> Tensor:
-    """(C, H, W) after the filter [1 4 6 4 1] / 16 both ways, borders repeated."""
-    taps = gain * torch.tensor([1.0, 4.0, 6.0, 4.0, 1.0]).to(image) / 16.0
-    padded = F.pad(image[:, None], (2, 2, 2, 2), mode="replicate")
-    rows = F.conv2d(padded, taps[None, None, None, :])
-    return F.conv2d(rows, taps[None, None, :, None])[:, 0]
-
-
 def _reduce(image: Tensor) -> Tensor:
-    return _binomial(image)[:, ::2, ::2]
+    """Every second pixel of (C, H, W) after [1 4 6 4 1] / 16 both ways, borders repeated."""
+    for axis in (1, 2):
+        padded, length = _padded(image, axis, 2), image.shape[axis]
+        every_second = (slice(None),) * axis + (slice(None, None, 2),)
+        taps = [padded.narrow(axis, offset, length)[every_second] for offset in range(5)]
+        inner = (taps[1] + taps[3]).mul_(4.0).add_(taps[2], alpha=6.0)
+        image = inner.add_(taps[0]).add_(taps[4]).div_(16.0)
+    return image
 
 
 def _expand(image: Tensor, size: Sequence[int]) -> Tensor:
-    height, width = size
-    doubled = F.interpolate(image[None], scale_factor=2, mode="nearest")[0]
-    return _binomial(doubled)[:, :height, :width]
+    """(C, H, W) at twice the pixels, cut to `size`, filled in by the same filter.
+
+    Pixel k comes to lie at 2 k, where `_reduce` took it from.
+    """
+    for axis, length in zip((1, 2), size, strict=True):
+        padded = _padded(image, axis, 1)
+        before, here, after = (padded.narrow(axis, o, image.shape[axis]) for o in range(3))
+        even = (before + after).add_(here, alpha=6.0).div_(8.0)
+        odd = (here + after).div_(2.0)
+        image = torch.stack([even, odd], axis + 1).flatten(axis, axis + 1).narrow(axis, 0, length)
+    return image
+
+
+def _padded(image: Tensor, axis: int, margin: int) -> Tensor:
+    margins = (0, 0, margin, margin) if axis == 1 else (margin, margin, 0, 0)
+    return F.pad(image, margins, mode="replicate")
+
+
+def _depth(image: Tensor) -> int:
+    """Levels such that the coarsest has 4 to 8 pixels along its shorter side, at least `LEVELS`.
+
+    What is larger than a pixel of the coarsest level is weighted as a whole: with 7 levels, a flat
+    patch of a photograph of some megapixels fades from its edges to its middle.
+    """
+    return max(LEVELS, min(image.shape[-2:]).bit_length() - 2)
 
 
 def _gaussian_pyramid(image: Tensor) -> list[Tensor]:
     levels = [image]
-    while len(levels) < LEVELS and min(levels[-1].shape[-2:]) > 1:
+    while len(levels) < _depth(image) and min(levels[-1].shape[-2:]) > 1:
         levels.append(_reduce(levels[-1]))
     return levels
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from agents.applications.exposure_fusion import fuse
 from simulator import CameraSimulator, RawImage, render_srgb
-from simulator.raw.develop import srgb_from_camera
+from simulator.raw.develop import quarter_turns, srgb_from_camera
 from simulator.utils.files import write_atomically
 
 #: Ends and step of the bracket [EV].
@@ -102,8 +102,10 @@ def _exposed(raw: RawImage, ev: float) -> RawImage:
 def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
     """Linear light (H, W, 3) float32 in the primaries of sRGB, white-balanced, not clipped.
 
+    It is turned as the camera was held, as a developed picture is.
+
     Args:
-        raw: Says how it is balanced, and its camera's colours.
+        raw: Says how it is balanced and turned, and its camera's colours.
         radiance: (4, H, W), see `HdrPicture`.
     """
     gains = np.array(raw.white_balance) / min(raw.white_balance)
@@ -111,7 +113,7 @@ def linear_rgb(raw: RawImage, radiance: Tensor) -> np.ndarray:
     rgb = np.stack([red, 0.5 * (green + green2), blue], axis=-1) * gains
     if raw.camera.colour_matrix is not None:
         rgb = rgb @ srgb_from_camera(raw.camera.colour_matrix).numpy().T
-    return np.maximum(rgb, 0.0).astype(np.float32)
+    return np.maximum(np.rot90(rgb, quarter_turns(raw)), 0.0).astype(np.float32)
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> Path:

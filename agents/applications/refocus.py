@@ -49,14 +49,20 @@ def refocus(
 
     Raises:
         ValueError: If the aperture closes, if `depth` and `lens` do not come together or do not
-            fit `raw`, or if the camera's pixel pitch is needed and not known.
+            fit `raw`, if the camera's pixel pitch is needed and not known, or if neither depth nor
+            networks are there; before any work.
     """
-    check_refocus(raw, f_number, depth, lens)
+    _check(raw, f_number, depth, lens)
+    simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
+    if depth is None and simulator.aperture is None:
+        raise ValueError(
+            "`depth` (=None) must be given to a `simulator` without networks: they estimate the "
+            "blur, see CameraSimulator.from_pretrained"
+        )
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
     opened = source.effective_f_number / target.effective_f_number
     known = None if depth is None or lens is None else _known_blur(raw, depth, lens)
-    simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
     prepared = simulator.prepare(raw, tolerance=0.0)
     clean = prepared.denoised[-1].light if prepared.denoised else prepared.light
     diameter = simulator.estimate_defocus(prepared) if known is None else known
@@ -78,15 +84,13 @@ def refocus(
     return replace(raw, data=data, settings=settings, metadata=metadata)
 
 
-def check_refocus(
-    raw: RawImage, f_number: float, depth: np.ndarray | None = None, lens: Lens | None = None
-) -> None:
-    """Raises the `ValueError` that `refocus` does, before any work."""
+def _check(raw: RawImage, f_number: float, depth: np.ndarray | None, lens: Lens | None) -> None:
+    """Raises the `ValueError` of `refocus` about these arguments."""
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
     if target.effective_f_number > source.effective_f_number:
         raise ValueError(
-            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:g}: "
+            f"`f_number` (={f_number:g}) must be at most that of the raw, {source.f_number:.3g}: "
             "closing the aperture would have to sharpen"
         )
     if depth is None and lens is None:
@@ -109,8 +113,8 @@ def check_refocus(
         )
     if raw.camera.pixel_pitch_um is None:
         raise ValueError(
-            f"`raw`: the pixel pitch of {raw.camera.name!r} is not known; give it one with "
-            "dataclasses.replace(camera, pixel_pitch_um=...)"
+            f"`raw`: the pixel pitch of {raw.camera.name!r} is not known; give it, with "
+            "`--pixel-pitch` or dataclasses.replace(camera, pixel_pitch_um=...)"
         )
 
 

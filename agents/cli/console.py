@@ -107,13 +107,16 @@ def scene_files(scenes: Any, on_error: str) -> Any:
     return {**given, "on_error": on_error}
 
 
-def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> None:
+def make_folder(
+    path: Path, *, name: str = "out", file: Path | None = None, make: bool = True
+) -> None:
     """Makes a folder for results, before any work is done.
 
     Args:
         path: The folder.
         name: The option that names it.
         file: The file in the folder that the option names, if it names one.
+        make: False only checks that it could be made.
 
     Raises:
         ValueError: If nothing can be written there.
@@ -126,32 +129,33 @@ def make_folder(path: Path, *, name: str = "out", file: Path | None = None) -> N
             raise ValueError(f"{given} must {wanted} a folder, but {existing} is a file")
         if file is not None and file.is_dir():
             raise ValueError(f"{given} must be a file, but it is a folder")
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
+        with tempfile.TemporaryFile(dir=existing):
             pass
+        if make:
+            path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"{given} cannot be written: {error.strerror}") from error
 
 
 def check_outputs(raw: Path, **files: tuple[Path | None, str]) -> None:
-    """Raises a `ValueError` unless each file has its ending and is not `raw` itself.
+    """Checks that each file has its ending, is not `raw` itself and can be written; makes nothing.
+
+    Whoever writes a file makes its folder: an error before leaves none.
 
     Args:
         raw: The file that is read.
         files: By the name of the option, the file or None, and its ending.
+
+    Raises:
+        ValueError: Otherwise; says which.
     """
     for name, (path, suffix) in files.items():
         if path is not None and path.suffix.lower() != suffix:
             raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
         if path is not None and path.resolve() == raw.resolve():
             raise ValueError(f"`{name}` (={str(path)!r}) must not be the raw itself")
-
-
-def make_folders(**files: Path | None) -> None:
-    """`make_folder` of each file that is given, by the name of its option."""
-    for name, path in files.items():
         if path is not None:
-            make_folder(path.parent, name=name, file=path)
+            make_folder(path.parent, name=name, file=path, make=False)
 
 
 def torch_device(name: str) -> str:

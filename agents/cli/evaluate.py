@@ -194,7 +194,7 @@ def _run(
 
 
 def _run_brackets(plan: BracketPlan, out: Path, append: Path | None, author: str) -> None:
-    from agents.evaluation.bracket_plan import run_bracket_plan
+    from agents.evaluation.bracket_plan import check_bracket_policies, run_bracket_plan
     from agents.evaluation.evaluation_plan import plan_scenes
     from agents.report.ae_bench import append_rows, bracket_rows, check_append, check_hash
     from agents.report.bracket_report import rows_by_budget, write_bracket_report
@@ -203,6 +203,7 @@ def _run_brackets(plan: BracketPlan, out: Path, append: Path | None, author: str
     check_hash(plan, scenes)
     if append is not None and plan.policies:
         check_append(append, plan, plan.policies, author=author)
+    check_bracket_policies(plan, scenes)
     make_folder(out)
     with progress_bars() as progress, progress("evaluation") as task:
         results = run_bracket_plan(plan, scenes, progress=task)

@@ -10,7 +10,6 @@ import typer
 from agents.cli.console import (
     Device,
     check_outputs,
-    make_folders,
     print_files,
     print_line,
     torch_device,
@@ -53,7 +52,6 @@ def hdr(
     import_openexr()
     check_outputs(raw, out=(out, ".exr"), png=(png, ".png"))
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
-    make_folders(out=out, png=png)
     picture = hdr_picture(
         source,
         stops=stops,

@@ -12,7 +12,6 @@ from agents.cli.console import (
     Device,
     Seed,
     check_outputs,
-    make_folders,
     parse_f_number,
     print_files,
     print_line,
@@ -74,7 +73,6 @@ def refocus(
     Example: `ae-env refocus IMG_0001.CRW --aperture 1.4 -o out.dng --png out.png`
     """
     from agents.applications.depth_map import read_depth
-    from agents.applications.refocus import check_refocus
     from agents.applications.refocus import refocus as refocused
     from agents.cli.simulate import make_simulator, source_settings, write_png
     from simulator import read_raw, write_dng
@@ -89,8 +87,6 @@ def refocus(
         ):
             if value is not None:
                 raise ValueError(f"`{name}` (={value}) is an option of a known `--depth`")
-    if depth is None and weights == "none":
-        raise ValueError("`weights` (='none') needs a `--depth`: networks estimate the blur")
     if pixel_pitch is not None and not 0.1 <= pixel_pitch <= 100.0:
         raise ValueError(f"`pixel-pitch` (={pixel_pitch:g}) must be in [0.1, 100] micrometres")
     check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
@@ -100,13 +96,7 @@ def refocus(
         metres = read_depth(depth, kind=depth_kind, scale=depth_scale)  # type: ignore[arg-type]
         if pixel_pitch is not None:
             source = replace(source, camera=replace(source.camera, pixel_pitch_um=pixel_pitch))
-        if source.camera.pixel_pitch_um is None:
-            raise ValueError(
-                f"`pixel-pitch` (=None) must be given: that of {source.camera.name!r} is not known"
-            )
         lens = _lens(source, metres, focus, focal_length)
-    check_refocus(source, f_number, metres, lens)
-    make_folders(out=out, png=png)
     result = refocused(
         source,
         f_number,

@@ -48,7 +48,7 @@ def score_tables(
     from ae_env.grid import ExposureGrid
     from ae_env.scenes.loading import check_weights
     from ae_env.scorers import make_scorer
-    from agents.score_shards import ShardPlan, run
+    from agents.score_shards import ShardPlan, check_engine, run
     from simulator import get_camera
 
     try:
@@ -57,8 +57,7 @@ def score_tables(
         raise ImportError(
             "`ae-env score-tables` needs the extra tables: pip install 'ae-env[tables]'"
         ) from None
-    if on not in ("local", "ray", "auto") and "://" not in on and ":" not in on:
-        raise ValueError(f"`on` (={on!r}) must be local, ray, auto or the address of a cluster")
+    check_engine(on)
     ExposureGrid.from_spec(grid), make_scorer(scorer), get_camera(camera)
     if weights != "none":
         check_weights(weights)

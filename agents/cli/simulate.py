@@ -14,7 +14,6 @@ from agents.cli.console import (
     Seed,
     check_outputs,
     console,
-    make_folders,
     parse_f_number,
     parse_seconds,
     print_files,
@@ -102,7 +101,6 @@ def simulate(
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     if noise == "sensor":
         source.camera.read_noise(iso)  # refuses a camera without its calibration
-    make_folders(out=out, png=png)
     simulator = make_simulator(weights, device, cache)
     prepared = simulator.prepare(source, depth=depth, tolerance=tolerance)  # type: ignore[arg-type]
     console.print(f"source {source.settings} ({source.camera.name})", highlight=False)
@@ -184,19 +182,9 @@ def write_png(path: Path, raw: RawImage) -> Path:
 
 def write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
     """Writes `srgb` (3, 2H, 2W) uint8, a picture of `raw`, upright and with square pixels."""
-    import numpy as np
-    from PIL import Image
+    from agents.report.upright import upright_picture
 
-    from simulator.raw.develop import quarter_turns
-
-    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
     aspect = raw.metadata.get("pixel_aspect", 1.0)
-    if aspect != 1.0:  # no pixel is left out: the picture grows along the pixels' longer side
-        width, height = (
-            round(picture.width * max(aspect, 1)),
-            round(picture.height / min(aspect, 1)),
-        )
+    if aspect != 1.0:
         print_line(f"pixels are {aspect:g} times as wide as high: the PNG is stretched")
-        picture = picture.resize((width, height), Image.Resampling.BICUBIC)
-    upright = np.rot90(np.asarray(picture), quarter_turns(raw))
-    return save_picture(path, Image.fromarray(np.ascontiguousarray(upright)))
+    return save_picture(path, upright_picture(raw, srgb))

@@ -176,6 +176,21 @@ class BracketResult:
         return float((values if chosen is None else values[..., chosen]).mean())
 
 
+def check_bracket_policies(plan: BracketPlan, scenes: list[Scene]) -> None:
+    """Checks the policies of `plan` before any work.
+
+    Raises:
+        ValueError: If there is none, or one is unknown or does not fit the environment.
+    """
+    if not plan.policies:
+        raise ValueError("`policies` (=[]) must hold at least one policy")
+    with closing(plan.make_envs(plan.budgets[0], scenes[:1])) as envs:
+        context = PolicyContext.from_envs(envs)
+        for policy in plan.policies:
+            for name in training_seeds(policy):
+                make_policy(name, context)
+
+
 def run_bracket_plan(
     plan: BracketPlan, scenes: list[Scene] | None = None, *, progress: Progress | None = None
 ) -> list[BracketResult]:
@@ -191,9 +206,8 @@ def run_bracket_plan(
     """
     from agents.bracketing.policies import run_brackets
 
-    if not plan.policies:
-        raise ValueError("`policies` (=[]) must hold at least one policy")
     scenes = plan_scenes(plan.of_conditions()) if scenes is None else scenes
+    check_bracket_policies(plan, scenes)
     found: dict[str, list[list[dict[str, NDArray[np.float64]]]]] = {}
     groups = np.unique([scene.group for scene in scenes])
     members = [(policy, name) for policy in plan.policies for name in training_seeds(policy)]

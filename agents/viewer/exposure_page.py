@@ -12,6 +12,7 @@ from ae_env.grid import ExposureGrid
 from agents.policy import METERS, PROGRAMS
 from agents.viewer.drawings import histogram, score_colour
 from agents.viewer.playing import SETTLED, settled
+from agents.viewer.stage import Stage
 from agents.viewer.viewed_scene import Picture, Readout, View, ViewedScene
 from simulator import CameraSettings
 from simulator.settings import format_exposure_time
@@ -31,10 +32,6 @@ F_NUMBERS = (4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.0)
 #: Policies whose states can be marked; others are typed.
 POLICIES = (*METERS, *(f"matrix:{name}" for name in PROGRAMS), "rpi_agc", "regression", "ppo")
 _LETTERS = "ABCDEFGH"
-_DIVIDE = (
-    "(e) => e.target.closest('.columns').querySelector('.stage')"
-    ".style.setProperty('--cut', e.target.value + '%')"
-)
 
 
 class ExposurePage:
@@ -78,23 +75,14 @@ class ExposurePage:
         ui.keyboard(on_key=self._on_key)
 
     def _build_picture(self) -> None:
-        with ui.element("div").classes("stage whole") as self._stage:
-            self._image = ui.element("img").props('alt="simulated capture" draggable=false')
-            self._image.mark("picture")
-            self._over = ui.element("img").classes("over").props('alt="" draggable=false')
-            self._edge = ui.element("div").classes("edge")
-            for image in (self._image, self._over):
-                image.on(
-                    "click",
-                    self._on_click,
-                    js_handler="(e) => emit(e.offsetY / e.target.clientHeight, "
-                    "e.offsetX / e.target.clientWidth)",
-                )
-        self._divider = ui.element("input").classes("divider")
-        self._divider.props(
-            'type=range min=0 max=100 value=50 step=1 aria-label="divider between the two states"'
-        )
-        self._divider.on("input", js_handler=_DIVIDE)
+        self._stage = Stage(self._address, "simulated capture", "divider between the two states")
+        for image in self._stage.images:
+            image.on(
+                "click",
+                self._on_click,
+                js_handler="(e) => emit(e.offsetY / e.target.clientHeight, "
+                "e.offsetX / e.target.clientWidth)",
+            )
         with ui.element("div").classes("bar"):
             self._clipping = ui.switch("Clipping (C)", on_change=self._refresh)
             self._pixels = ui.switch("Raw pixels (Z)", on_change=self._zoom)
@@ -104,7 +92,6 @@ class ExposurePage:
         self._across = self._amount("Across", 1.0, 0.01, "{:.0%}", self._move)
         self._down = self._amount("Down", 1.0, 0.01, "{:.0%}", self._move)
         self._pinned = ui.label().classes("note")
-        self._show_compared(None)
         self._show_window()
 
     def _build_readouts(self) -> None:
@@ -228,7 +215,7 @@ class ExposurePage:
                 picture = await run.io_bound(viewed.picture, view)
                 if picture is None:  # the program ends
                     return
-                self._show_picture(picture, view)
+                self._stage.show(picture.jpeg, picture.aspect, "pixels" if view.centre else "whole")
                 self._done = viewed, view
                 if self.view != view:
                     continue
@@ -241,13 +228,6 @@ class ExposurePage:
         finally:
             self._busy = False
             self._spinner.visible = False
-
-    def _show_picture(self, picture: Picture, view: View) -> None:
-        self._image.props["src"] = self._address(picture.jpeg)
-        self._image.update()
-        wanted = "pixels" if view.centre else "whole"
-        self._stage.classes(replace=f"stage {wanted}")
-        self._stage.style(f"--aspect: {picture.aspect:.4f}")
 
     def _show_readout(self, readout: Readout, picture: Picture) -> None:
         self._histogram.content = histogram(readout.histogram)
@@ -344,12 +324,8 @@ class ExposurePage:
             self._show_compared(picture, f"right of the divider: {view.settings}")
 
     def _show_compared(self, picture: Picture | None, text: str = "") -> None:
-        for element in (self._over, self._edge, self._divider):
-            element.set_visibility(picture is not None)
+        self._stage.compare(None if picture is None else picture.jpeg)
         self._pinned.text = text
-        if picture is not None:
-            self._over.props["src"] = self._address(picture.jpeg)
-            self._over.update()
 
     async def _mark(self) -> None:
         if self._silent or self._viewed is None:

@@ -14,7 +14,7 @@ from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES
 from ae_env.utils.checks import did_you_mean
-from simulator import get_camera, read_raw
+from simulator import RawImage, get_camera, read_raw
 from simulator.raw.develop import quarter_turns
 from simulator.utils.files import RAW_SUFFIXES
 
@@ -22,6 +22,8 @@ from simulator.utils.files import RAW_SUFFIXES
 CAMERA = "nikon_z6"
 #: Scenes kept in memory: a raw of 24 megapixels takes 0.1 GB, with its noise reduced twice that.
 _KEPT = 4
+#: Most files that an error names.
+_MOST_NAMED = 8
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,12 @@ class Shown:
     Args:
         scene: At its finest resolution.
         turns: Quarter turns to the left that turn its picture upright.
+        raw: The photograph that it is; None for a scene that is none.
     """
 
     scene: Scene
     turns: int = 0
+    raw: RawImage | None = None
 
 
 @dataclass(frozen=True)
@@ -103,7 +107,7 @@ class Library:
 
 def _read_raw(path: Path, name: str) -> Shown:
     raw = read_raw(path)
-    return Shown(Scene.from_raw(raw, scene_id=name), quarter_turns(raw))
+    return Shown(Scene.from_raw(raw, scene_id=name), quarter_turns(raw), raw)
 
 
 def find_scenes(what: str) -> Library:
@@ -127,9 +131,7 @@ def find_scenes(what: str) -> Library:
                 name = str(path.relative_to(base)) if path.is_relative_to(base) else path.name
                 name = path.name if name == "." else name
                 entries.append(Entry(name, partial(_read_raw, path, name)))
-        if len(files) == 1:
-            entries[0].read()  # what cannot be read is refused here, not on the page
-        return Library(entries)
+        return Library(entries, _first_readable(what, entries))
     try:
         scenes = _load(what)
     except ValueError:
@@ -143,6 +145,26 @@ def find_scenes(what: str) -> Library:
             f"or the id of a bundled scene, such as {ids[0]}{hint}"
         ) from None
     return Library(_named(scenes))
+
+
+def _first_readable(what: str, entries: Sequence[Entry]) -> str:
+    """Name of the first scene that can be read: files are refused here, not on an empty page.
+
+    Raises:
+        ValueError: If none can; names them.
+    """
+    broken: list[str] = []
+    for entry in entries:
+        try:
+            entry.read()
+        except (ValueError, OSError) as error:
+            broken.append(f"{entry.name}: {error}")
+            continue
+        return entry.name
+    named = "; ".join(broken[:_MOST_NAMED])
+    if len(broken) > _MOST_NAMED:
+        named += f"; and {len(broken) - _MOST_NAMED} more"
+    raise ValueError(f"`what` (={what!r}) must hold a raw that can be read, but none can: {named}")
 
 
 def _load(spec: Any) -> list[Scene]:

@@ -1,4 +1,4 @@
-"""The page: the bar with the scene's name, the scene picker, files in and out, and its two tabs."""
+"""The page: the bar with the scene's name, the scene picker, files in and out, and its tabs."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from nicegui import app, run, ui
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage
 from agents.viewer.library import Library
+from agents.viewer.one_raw_page import OneRawPage
 from agents.viewer.viewed_scene import ViewedScene
 from simulator import CameraSimulator
 from simulator.camera_simulator import Depth
@@ -25,6 +26,8 @@ from simulator.camera_simulator import Depth
 _LARGEST_UPLOAD = 300_000_000
 #: Pictures that wait to be fetched, at most.
 _WAITING = 256
+#: Name of the tab of refocusing and HDR.
+_ONE_RAW = "Refocus, HDR"
 _STYLE = Path(__file__).with_name("page.css")
 
 
@@ -112,6 +115,7 @@ class Page:
         self._folder = Path(tempfile.mkdtemp(dir=options.folder))
         self._exposure = ExposurePage(pictures.address)
         self._episode = EpisodePage(pictures.address)
+        self._one_raw = OneRawPage(pictures.address, options.simulator, self._folder)
         self._viewed: ViewedScene | None = None
 
     async def build(self) -> None:
@@ -135,12 +139,17 @@ class Page:
             ).props("dense")
             self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")
         with ui.tabs().props("dense align=left") as tabs:
-            exposure, episode = ui.tab("Exposure"), ui.tab("Episode")
-        with ui.tab_panels(tabs, value=exposure, animated=False).classes("w-full bg-transparent"):
+            exposure, episode, one_raw = map(ui.tab, ("Exposure", "Episode", _ONE_RAW))
+        self._panels = ui.tab_panels(
+            tabs, value=exposure, animated=False, on_change=self._show_raw
+        ).classes("w-full bg-transparent")
+        with self._panels:
             with ui.tab_panel(exposure).classes("p-0"):
                 self._exposure.build()
             with ui.tab_panel(episode).classes("p-0"):
                 self._episode.build()
+            with ui.tab_panel(one_raw).classes("p-0"):
+                self._one_raw.build()
         await client.connected()
         await self._open(self._library.first)
 
@@ -200,7 +209,13 @@ class Page:
         self._viewed = viewed
         self._title.text = name
         self._episode.show_scene(viewed)
+        self._one_raw.take_scene(viewed)
         await self._exposure.show_scene(viewed)
+        await self._show_raw()
+
+    async def _show_raw(self) -> None:
+        if self._panels.value == _ONE_RAW:
+            await self._one_raw.show_raw()
 
     async def _take_upload(self, event: Any) -> None:
         event.sender.reset()

@@ -123,7 +123,7 @@ class ViewedScene:
         tolerance: float = 0.1,
         scorer: str = "balanced",
     ) -> None:
-        self.scene, self.turns = shown.scene, shown.turns
+        self.scene, self.turns, self.photograph = shown.scene, shown.turns, shown.raw
         self._simulator, self._depth, self._tolerance = simulator, depth, tolerance
         self._scorer = make_scorer(scorer)
         self._prepared: dict[object, PreparedScene] = {}

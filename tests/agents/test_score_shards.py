@@ -1,5 +1,6 @@
 """Score tables of many files: what a shard holds, and what is lost when something goes wrong."""
 
+import importlib.util
 import os
 import signal
 from pathlib import Path
@@ -104,6 +105,25 @@ def test_a_shard_with_no_file_that_can_be_read_is_an_empty_table(
     told = ShardWriter(plan).write(3)
     assert (told["scenes"], told["bad"]) == (0, 1)
     assert pq.read_table(plan.table(3)).num_rows == 0
+
+
+def test_what_cannot_run_leaves_no_folder(
+    ae_env, folder: Path, tmp_path: Path, monkeypatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name, *a: None if name == "ray" else find(name, *a)
+    )
+    out = tmp_path / "tables"
+    for on, status, message in (
+        ("ray", 1, "pip install 'ae-env[ray]'"),
+        ("ray://head:10001", 1, "pip install 'ae-env[ray]'"),
+        ("cluster", 2, "`on` (='cluster') must be local"),
+    ):
+        code, _, error = ae_env("score-tables", folder, "--on", on, "-o", out)
+        assert (code, error.count("\n")) == (status, 1)
+        assert message in error
+    assert not out.exists()
 
 
 @pytest.mark.slow

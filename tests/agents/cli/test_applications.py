@@ -1,10 +1,11 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from simulator import RawImage, read_raw
+from simulator import RawImage, read_raw, write_dng
 
 
 def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path, tmp_path: Path) -> None:
@@ -41,13 +42,18 @@ def test_hdr(ae_env, dng: Path, tmp_path: Path) -> None:
         assert picture.size == (240, 200)
 
 
-def test_bad_input_writes_nothing(ae_env, dng: Path, tmp_path: Path) -> None:
+def test_bad_input_writes_nothing(ae_env, raw: RawImage, dng: Path, tmp_path: Path) -> None:
     Image.new("L", (8, 8), 9).save(tmp_path / "small.png")
     Image.new("RGB", (8, 8)).save(tmp_path / "photo.jpg")
+    nameless = replace(raw, camera=replace(raw.camera, make="X", model="Y", pixel_pitch_um=None))
+    write_dng(tmp_path / "nameless.dng", nameless)
+    np.save(tmp_path / "fits.npy", np.ones((100, 120)))
+    fits = ("--depth", tmp_path / "fits.npy", "--focal-length", 3)
     out = tmp_path / "nowhere" / "out.dng"
     depth = ("--depth", tmp_path / "small.png", "--focal-length", 3)
     for arguments, message in (
         ((dng, "--aperture", 8), "must be at most that of the raw, 5.6"),
+        ((tmp_path / "nameless.dng", "--aperture", 1.4, *fits), "with `--pixel-pitch`"),
         ((dng, "--aperture", 1.4, *depth), "must be (100, 120) or (200, 240)"),
         ((dng, "--aperture", 1.4, *depth[:2]), "`focal-length` (=None) must be given"),
         ((dng, "--aperture", 1.4, *depth, "--focus", "9,9"), "a pixel X,Y"),
@@ -55,7 +61,7 @@ def test_bad_input_writes_nothing(ae_env, dng: Path, tmp_path: Path) -> None:
         ((dng, "--aperture", 1.4, "--focus", "2"), "`focus` (=2) is an option of a known"),
         ((dng, "--aperture", 1.4, "--depth", tmp_path / "no.png"), "no such file"),
         ((dng, "--aperture", "wide"), "must be an f-number"),
-        ((dng, "--aperture", 1.4, "--weights", "none"), "`weights`"),
+        ((dng, "--aperture", 1.4, "--weights", "none"), "without networks"),
         ((tmp_path / "photo.jpg", "--aperture", 1.4), "photo.jpg"),
     ):
         code, _, error = ae_env("refocus", *arguments, "-o", out)

@@ -34,6 +34,16 @@ def test_the_same_episodes_for_all_policies_and_means_by_group() -> None:
     np.testing.assert_allclose(more.values["quality"], mean)
 
 
+def test_a_policy_for_single_frames_is_refused_as_it_was_written(ae_env, tmp_path: Path) -> None:
+    """The name, no path of the package; and no empty folder stays."""
+    small = ("--preset", "bracket", "--scenes", "bundled:small", "--resolution", 36)
+    for policy in ("regression", "ppo", "matrix"):
+        code, _, error = ae_env("evaluate", *small, "--policy", policy)
+        assert (code, error.count("\n")) == (2, 1)
+        assert f"`policy` (='{policy}') is not for ae_env/ExposureBracket-v0" in error
+    assert not (tmp_path / "evaluation").exists()
+
+
 def test_scores_and_differences_by_hand() -> None:
     groups = np.array([f"g{i}" for i in range(16)])
     quality = np.linspace(0.5, 0.8, 16)

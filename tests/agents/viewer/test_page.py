@@ -11,12 +11,15 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import contextmanager
 from urllib.parse import urlsplit
 
 import pytest
 import torch
+from PIL import Image
 
 from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
+from simulator.optics.blur import disc_blur
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
@@ -24,17 +27,14 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt insta
 PATIENCE = 60_000
 
 
-@pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    """Address of a page that shows the bundled scenes."""
-    log = tmp_path_factory.mktemp("view") / "log.txt"
-    command = [sys.executable, "-m", "agents.cli", "view", "bundled:small", "--no-open"]
+@contextmanager
+def served(log, *arguments):
+    """Address of the page that `ae-env view` serves, until it is stopped."""
+    command = [sys.executable, "-m", "agents.cli", "view", *map(str, arguments), "--no-open"]
     # NiceGUI serves itself differently where it finds itself under test.
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     with log.open("w") as file:
-        process = subprocess.Popen(
-            [*command, "--weights", "none"], stdout=file, stderr=subprocess.STDOUT, env=env
-        )
+        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=env)
     try:
         for _ in range(600):
             found = re.search(r"open (http\S+)", log.read_text())
@@ -54,6 +54,28 @@ def address(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """Address of a page that shows the bundled scenes."""
+    log = tmp_path_factory.mktemp("view") / "log.txt"
+    with served(log, "bundled:small", "--weights", "none") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def address_of_soft_raw(tmp_path_factory):
+    """Address of a page that shows one raw at f/5.6, sharp on the left, soft on the right."""
+    folder = tmp_path_factory.mktemp("soft")
+    tiles = torch.rand(1, 24, 36, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.05
+    light = tiles.repeat_interleave(4, 1).repeat_interleave(4, 2).expand(4, 96, 144).clone()
+    light[..., 72:] = disc_blur(light, 6.0)[..., 72:]
+    camera = get_camera("nikon_z6")
+    raw = RawImage(light, CameraSettings(100, 1 / 64, 5.6), camera, nlf=camera.nlf(100))
+    write_dng(folder / "soft.dng", raw)
+    with served(folder / "log.txt", folder / "soft.dng", "--depth", "unknown") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
 def browser():
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as driver:
@@ -63,8 +85,8 @@ def browser():
         found.close()
 
 
-@pytest.fixture
-def page(address, browser):
+@contextmanager
+def opened(address, browser):
     """The page, loaded; nothing may go wrong in its console, nothing may be asked of others."""
     context = browser.new_context(viewport={"width": 1280, "height": 900})
     context.set_default_timeout(PATIENCE)
@@ -80,6 +102,21 @@ def page(address, browser):
     context.close()
     assert wrong == []
     assert hosts - {"data:", "blob:"} == {urlsplit(address).netloc}
+
+
+@pytest.fixture
+def page(address, browser):
+    with opened(address, browser) as found:
+        yield found
+
+
+@pytest.fixture
+def soft_page(address_of_soft_raw, browser):
+    """The page of the soft raw, at the tab of what one raw gives."""
+    with opened(address_of_soft_raw, browser) as found:
+        found.get_by_role("tab", name="Refocus, HDR").click()
+        found.wait_for_selector(".stage img[src]")
+        yield found
 
 
 def ready(page):
@@ -205,6 +242,84 @@ def test_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
     assert float(back.data.mean()) == pytest.approx(0.31 * 64 / 1000, rel=0.02)
 
 
+def saved(page, ending, folder):
+    """The file that the button gives."""
+    with page.expect_download() as download:
+        page.get_by_role("button", name=f"save {ending.upper()}").click()
+    path = folder / download.value.suggested_filename
+    assert path.suffix == f".{ending}"
+    download.value.save_as(path)
+    return path
+
+
+def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
+    page = soft_page
+    assert page.get_by_role("button", name="save DNG").is_disabled()
+    slider(page, "Wider aperture").focus()
+    thirds = (1.4, 1.6, 1.8, 2.0, 2.2, 2.5, 2.8, 3.2, 3.5)
+    for f_number in thirds:
+        page.get_by_text(f"f/{f_number:g}", exact=True).wait_for()
+        page.keyboard.press("ArrowLeft")
+    page.get_by_text("f/4", exact=True).wait_for()
+    page.keyboard.press("ArrowRight")
+    page.get_by_text("f/3.5", exact=True).wait_for()
+    page.get_by_role("button", name="Open the aperture").focus()
+    page.keyboard.press("Enter")
+    over = page.locator(".stage .over[src]")
+    over.wait_for()
+    page.get_by_text(re.compile(r"^right: f/3.5, blur estimated: the widest disc has")).wait_for()
+    assert over.get_attribute("src") != picture(page)
+    back = read_raw(saved(page, "dng", tmp_path))
+    assert back.settings.f_number == 3.5
+    assert back.data.shape == (4, 96, 144)
+    # Blur takes the contrast of the soft half; the sharp one is as it was recorded.
+    first = page.locator(".stage .over").get_attribute("src")
+    slider(page, "Wider aperture").focus()
+    for f_number in thirds[::-1][1:]:
+        page.keyboard.press("ArrowRight")
+        page.get_by_text(f"f/{f_number:g}", exact=True).wait_for()
+    page.get_by_role("button", name="Open the aperture").click()
+    page.get_by_text(re.compile(r"^right: f/1.4, blur")).wait_for()
+    assert over.get_attribute("src") != first
+    wider = read_raw(saved(page, "dng", tmp_path))
+    assert wider.settings.f_number == 1.4
+    assert wider.data[:, 8:-8, :60].equal(back.data[:, 8:-8, :60])
+    assert wider.data[1, :, 84:].std() < 0.8 * back.data[1, :, 84:].std()
+
+
+def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    soft_page.get_by_role("button", name="Fuse a bracket").click()
+    soft_page.locator(".stage .over[src]").wait_for()
+    soft_page.get_by_text(re.compile(r"^right: 17 simulated pictures, -4 to \+4 EV")).wait_for()
+    with openexr.File(str(saved(soft_page, "exr", tmp_path))) as file:
+        assert file.channels()["RGB"].pixels.shape == (96, 144, 3)
+    with Image.open(saved(soft_page, "png", tmp_path)) as fused:
+        assert fused.size == (288, 192)
+
+
+def test_the_page_lives_while_the_aperture_opens(soft_page):
+    soft_page.get_by_role("button", name="Open the aperture").click()
+    soft_page.get_by_text(re.compile(r"^opening the aperture, 0\.1 megapixels \.\.\. ")).wait_for()
+    soft_page.get_by_role("tab", name="Exposure").click()
+    test_shows_the_state_that_is_clicked(soft_page)
+
+
+def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
+    camera = get_camera("nikon_z6")
+    raw = RawImage(torch.full((4, 32, 48), 0.2), CameraSettings(100, 1 / 64, 4), camera)
+    page.get_by_role("tab", name="Refocus, HDR").click()
+    page.get_by_text("Only a raw can be opened or fused").wait_for()
+    for name in ("Open the aperture", "Fuse a bracket"):
+        assert page.get_by_role("button", name=name).is_disabled()
+    write_dng(tmp_path / "flat.dng", raw)
+    page.locator("input[type=file]").set_input_files(tmp_path / "flat.dng")
+    page.wait_for_selector(".stage img[src]")
+    page.get_by_role("button", name="Open the aperture").click()
+    page.locator(".q-notification", has_text="networks: they estimate the blur").wait_for()
+    page.get_by_role("button", name="Open the aperture", disabled=False).wait_for()
+
+
 def test_two_tabs_show_different_scenes(page, address):
     other = page.context.new_page()
     other.goto(address)
@@ -219,8 +334,10 @@ def test_two_tabs_show_different_scenes(page, address):
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_fits_the_width(page, width):
+@pytest.mark.parametrize("tab", ["Exposure", "Refocus, HDR"])
+def test_fits_the_width(page, width, tab):
     page.set_viewport_size({"width": width, "height": 844})
+    page.get_by_role("tab", name=tab).click()
     page.wait_for_timeout(200)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 

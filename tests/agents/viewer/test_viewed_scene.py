@@ -11,9 +11,18 @@ import torch
 from PIL import Image
 
 from ae_env.scenes import Scene
+from agents.viewer.from_one_raw import wider_f_numbers
 from agents.viewer.library import Entry, Library, Shown, find_scenes
 from agents.viewer.viewed_scene import WINDOW_SIZE, View, ViewedScene
-from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, get_camera
+from simulator import (
+    CameraSettings,
+    CameraSimulator,
+    NoiseLevelFunction,
+    RawImage,
+    get_camera,
+    write_dng,
+)
+from simulator.optics.blur import disc_blur
 
 CAMERA = get_camera("nikon_z6")
 SETTINGS = CameraSettings(100, 1 / 64, 4)
@@ -126,6 +135,45 @@ def test_a_library_reads_a_scene_when_it_is_opened_and_keeps_few():
 def test_what_is_no_scene_is_refused(what, why):
     with pytest.raises(ValueError, match=why):
         find_scenes(what)
+
+
+def test_a_folder_opens_at_its_first_readable_raw(tmp_path):
+    for i in range(2):
+        (tmp_path / f"IMG_{i}.dng").write_bytes(b"no raw")
+    with pytest.raises(ValueError, match=r"none can: IMG_0\.dng: .*; IMG_1\.dng: "):
+        find_scenes(str(tmp_path))
+    write_dng(tmp_path / "IMG_2.dng", RawImage(torch.full((4, 8, 8), 0.1), SETTINGS, CAMERA))
+    library = find_scenes(str(tmp_path))
+    assert library.first == "IMG_2.dng"
+    assert library.names == ["IMG_0.dng", "IMG_1.dng", "IMG_2.dng"]
+
+
+def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown():
+    tiles = torch.rand(1, 24, 36, generator=torch.Generator().manual_seed(0)) * 0.6 + 0.05
+    light = tiles.repeat_interleave(4, 1).repeat_interleave(4, 2).expand(4, 96, 144).clone()
+    light[..., 72:] = disc_blur(light, 6.0)[..., 72:]
+    narrow = CameraSettings(100, 1 / 64, 8)
+    raw = RawImage(light, narrow, CAMERA, nlf=CAMERA.nlf(100))
+    simulator = CameraSimulator.from_pretrained("nano", device="cpu", cache=None)
+    far, unknown = (
+        ViewedScene(Shown(Scene.from_raw(raw, scene_id="made")), simulator, depth=depth)
+        .picture(View(CameraSettings(100, 1 / 256, 4)))
+        .capture
+        for depth in ("far", "unknown")
+    )
+    sharp, soft = (1, slice(None), slice(60)), (1, slice(None), slice(84, None))
+    assert float(unknown[sharp].std()) == pytest.approx(float(far[sharp].std()), rel=0.01)
+    assert float(unknown[soft].std()) < 0.7 * float(far[soft].std())
+
+
+def test_only_wider_f_numbers_than_the_raw_s_are_offered():
+    def offered(f_number):
+        raw = RawImage(torch.zeros(4, 2, 2), CameraSettings(100, 1, f_number), CAMERA)
+        return wider_f_numbers(raw)
+
+    assert offered(2.8) == offered(8**0.5) == (2.5, 2.2, 2.0, 1.8, 1.6, 1.4)
+    assert offered(1.4) == offered(2**0.5) == ()
+    assert offered(16)[:2] == (14.0, 13.0)
 
 
 def test_a_scene_is_found_by_its_id():
