@@ -257,8 +257,9 @@ class EpisodeCore:
         """Sets `Episodes.light_index`: episodes at rest share the light of their scene."""
         episodes = self.episodes
         scenes = episodes.scene[env_indices]
-        blurs = (episodes.speed, episodes.subject_speed, episodes.defocus)
-        moves = np.any([blur[env_indices] > 0.0 for blur in blurs], axis=0)
+        moves = episodes.speed[env_indices] > 0.0
+        moves |= episodes.subject_speed[env_indices] > 0.0
+        moves |= episodes.defocus[env_indices] > 0.0
         shared, own = ~moves & self._shareable[scenes], len(self.scenes) + env_indices
         episodes.light_index[env_indices] = np.where(shared, scenes, own)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,14 @@ class _AtRest:
     times: np.ndarray
     aperture_blurs: np.ndarray
 
+    @cached_property
+    def blurs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of states that differ in blur, and (S,) which of these each state blurs as."""
+        own = self.captures.blur_px.numpy()
+        numbers = np.stack([self.times, self.aperture_blurs, own], axis=1)
+        _, first, alike = np.unique(numbers, axis=0, return_index=True, return_inverse=True)
+        return first, alike.reshape(-1)
+
 
 class SceneCaptures:
     """Describes captures of a scene, and caches what depends neither on blur nor on its light.
@@ -141,9 +150,13 @@ class SceneCaptures:
         known = self._known(scene, states)
         height, own = scene.light.shape[-2], known.captures.blur_px.numpy()
         discs = defocus * known.aperture_blurs * height / 64.0
-        pixel_blur = layout_blur(
-            scene, movement, speed=speed, times=known.times, discs=discs, own=own
-        )
+        pixel_blur = None
+        if scene.layout is not None:
+            first, alike = known.blurs
+            times, few = known.times[first], {"discs": discs[first], "own": own[first]}
+            pixel_blur = layout_blur(
+                scene, movement, speed=speed, times=times, **few, alike=alike
+            )
         if pixel_blur is None:
             blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
         else:

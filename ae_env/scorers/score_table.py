@@ -32,8 +32,8 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings
 
-#: Memory for cached descriptions of captures [byte]: some 500 scenes at 64 states.
-_MEMORY_BYTES = 2**25
+#: Memory for cached descriptions of captures [byte]: some 1000 scenes at 64 states.
+_MEMORY_BYTES = 2**26
 #: Memory for the blurred light of one table [byte].
 _LIGHT_BYTES = 2**25
 #: States whose pixels are looked at at once: more only spends time in memory paging.
@@ -108,14 +108,14 @@ def in_episode(
 
 
 def source_noises(
-    prepared: PreparedScene, states: Sequence[CameraSettings], gains: np.ndarray
+    prepared: PreparedScene, states: Sequence[CameraSettings], gain: float | np.ndarray
 ) -> list[NoiseLevelFunction] | None:
-    """`Captures.source_noise` of captures of `prepared`; `gains` (S,) are those of their light."""
+    """`Captures.source_noise` of captures of `prepared`; `gain`, one or (S,), is that of their light."""
     if prepared.nlf.is_zero:
         return None
     found = []
-    for state, gain in zip(states, gains.tolist(), strict=True):
-        exposure = prepared.exposure(state, gain=gain)
+    for state, own in zip(states, np.broadcast_to(gain, len(states)).tolist(), strict=True):
+        exposure = prepared.exposure(state, gain=own)
         left = exposure.remaining_variance
         share = prepared.box_factor**2 * (1.0 if left is None else float(left.mean()))
         found.append(exposure.source_noise.scaled(share))
@@ -278,16 +278,17 @@ class ScoreTables:
     ) -> Captures:
         """Facts of the captures of the states `part` of the grid."""
         states = self.grid.states[part]
-        gains = np.broadcast_to(gain, len(self.grid))[part]
+        if isinstance(gain, np.ndarray):
+            gain = gain[part]
         return self._captures.describe(
             scene,
             states,
             speed=prepared.image_speed,
             defocus=prepared.defocus * 64.0 / prepared.light.shape[-2],
             movement=prepared.movement,
-            gain=gains if isinstance(gain, np.ndarray) else gain,
+            gain=gain,
             row_gain=None if row_gain is None else row_gain[part],
-            source_noise=source_noises(prepared, states, gains),
+            source_noise=source_noises(prepared, states, gain),
             noisy=self.noise,
         )
 
