@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
@@ -17,6 +17,7 @@ from ae_env.scenes.loading import (
     SceneNetworks,
     check_weights,
     has_frames,
+    scenes_on_demand,
     without_noise,
 )
 from ae_env.scenes.photographed import photographed
@@ -49,7 +50,7 @@ _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
 #: Bundled scenes by all that decides them; the bound is on the memory of their light [byte].
-_LOADED: LruCache[list[Scene]] = LruCache(2**30)
+_LOADED: LruCache[Sequence[Scene]] = LruCache(2**30)
 
 
 @dataclass(frozen=True)
@@ -211,6 +212,10 @@ class EnvOptions:
 
         Those with a name stay in memory for the next environment with the same arguments.
         """
+        return list(self.scenes_on_demand())
+
+    def scenes_on_demand(self) -> Sequence[Scene]:
+        """Those of `load_scenes`; where they must be drawn first, each when it is needed."""
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
         needs_networks = finds_defocus or self.source == "raw"
@@ -222,7 +227,19 @@ class EnvOptions:
         cacheable &= not needs_networks or self.simulator in (None, *SIZES)
         known = _LOADED.get(key) if cacheable else None
         if known is not None:
-            return list(known)
+            return list(known) if isinstance(known, list) else known
+        scenes: Sequence[Scene] | None = None
+        if not needs_networks:  # those without noise, in known light, are taken as they are
+            scenes = scenes_on_demand(self.scenes, self.split, camera, *size)
+        if scenes is None:
+            scenes = self._made_ready(camera, finds_defocus)
+        if cacheable:
+            kept = list(scenes) if isinstance(scenes, list) else scenes
+            _LOADED.put(key, kept, len(scenes) * scenes[0].light.nbytes)
+        return scenes
+
+    def _made_ready(self, camera: CameraProfile, finds_defocus: bool) -> list[Scene]:
+        """Every scene, with what networks find in it."""
         networks = None if self.simulator is None else SceneNetworks(self.simulator)
         resize: Resize = Scene.resized
         if networks is not None and finds_defocus:
@@ -240,8 +257,6 @@ class EnvOptions:
             scenes = [photographed(scene) if scene.noise_free else scene for scene in scenes]
         scenes = [self._prepared(scene, networks) for scene in scenes]
         _check_light(scenes)
-        if cacheable:
-            _LOADED.put(key, list(scenes), sum(scene.light.nbytes for scene in scenes))
         return scenes
 
     def _prepared(self, scene: Scene, networks: SceneNetworks | None) -> Scene:

@@ -66,7 +66,7 @@ class BracketCore(EpisodeCore):
         num_envs: int,
         budget: float,
         max_frames: int,
-        scenes: list[Scene] | None = None,
+        scenes: Sequence[Scene] | None = None,
     ) -> None:
         self.shown, self.budget, self.max_frames = options.observation, budget, max_frames
         super().__init__(replace(options, observation="dn"), num_envs, scenes)

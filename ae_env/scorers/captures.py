@@ -154,9 +154,7 @@ class SceneCaptures:
         if scene.layout is not None:
             first, alike = known.blurs
             times, few = known.times[first], {"discs": discs[first], "own": own[first]}
-            pixel_blur = layout_blur(
-                scene, movement, speed=speed, times=times, **few, alike=alike
-            )
+            pixel_blur = layout_blur(scene, movement, speed=speed, times=times, **few, alike=alike)
         if pixel_blur is None:
             blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
         else:

@@ -110,7 +110,7 @@ def in_episode(
 def source_noises(
     prepared: PreparedScene, states: Sequence[CameraSettings], gain: float | np.ndarray
 ) -> list[NoiseLevelFunction] | None:
-    """`Captures.source_noise` of captures of `prepared`; `gain`, one or (S,), is that of their light."""
+    """`Captures.source_noise` of captures of `prepared` in the light `gain`, one or (S,)."""
     if prepared.nlf.is_zero:
         return None
     found = []
