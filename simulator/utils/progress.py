@@ -25,11 +25,10 @@ class Progress:
 
     def __init__(self, title: str, total: int) -> None:
         self._title, self._total, self._done = title, total, 0
-        self._shows = total > 0 and sys.stderr is not None and sys.stderr.isatty()
         self._shown, self._lock = -float("inf"), threading.Lock()
 
     def __enter__(self) -> Progress:
-        self._show()
+        self.show()
         return self
 
     def __exit__(
@@ -44,7 +43,12 @@ class Progress:
         """One step more is done."""
         with self._lock:
             self._done = min(self._done + 1, self._total)
-            self._show()
+            if time.monotonic() >= self._shown + _PAUSE:
+                self.show()
+
+    @property
+    def _shows(self) -> bool:
+        return self._total > 0 and sys.stderr is not None and sys.stderr.isatty()
 
     def close(self) -> None:
         """Wipes the bar out."""
@@ -52,8 +56,9 @@ class Progress:
             sys.stderr.write("\r\x1b[K")
             sys.stderr.flush()
 
-    def _show(self) -> None:
-        if not self._shows or time.monotonic() < self._shown + _PAUSE:
+    def show(self) -> None:
+        """Shows how far it is."""
+        if not self._shows:
             return
         self._shown = time.monotonic()
         full = _WIDTH * self._done // self._total
