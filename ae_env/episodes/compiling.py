@@ -43,10 +43,10 @@ def _run() -> None:
     subject = torch.zeros(size, size, dtype=torch.bool)
     subject[:, size // 2 :] = True
     scene = Scene.from_array(
-        torch.full((4, size, size), 0.2),
+        torch.rand(4, size, size, generator=torch.Generator().manual_seed(0)),
         CameraSettings(100, 1 / 125, 4.0),
         get_camera("nikon_z6"),
-        scene_id="grey",
+        scene_id="any",
         layout=Layout(torch.zeros(size, size), subject),
     )
     still = AutoExposureEnv(scenes=[scene], resolution=size, motion="none", depth="far")
