@@ -48,7 +48,10 @@ class Progress:
 
     @property
     def _shows(self) -> bool:
-        return self._total > 0 and sys.stderr is not None and sys.stderr.isatty()
+        stream = sys.stderr  # not another in its place, such as that of a bar of the program's own
+        return bool(self._total and stream is not None and stream is sys.__stderr__) and (
+            stream.isatty()
+        )
 
     def close(self) -> None:
         """Wipes the bar out."""
