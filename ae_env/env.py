@@ -68,7 +68,10 @@ class AutoExposureBase(SpecProperty):
 
     @property
     def scenes(self) -> Sequence[Scene]:
-        """Scenes that episodes draw from; of a sequence, its first frame."""
+        """Scenes that episodes draw from; of a sequence, its first frame.
+
+        Bundled ones that are not cached yet are drawn when they are looked at.
+        """
         return self.core.first_scenes
 
     @property
