@@ -100,12 +100,13 @@ class _AtRest:
     aperture_blurs: np.ndarray
 
     @cached_property
-    def blurs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of states that differ in blur, and (S,) which of these each state blurs as."""
+    def blurs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Times, aperture blurs and own blur where states differ in them, and which each has."""
         own = self.captures.blur_px.numpy()
         numbers = np.stack([self.times, self.aperture_blurs, own], axis=1)
-        _, first, alike = np.unique(numbers, axis=0, return_index=True, return_inverse=True)
-        return first, alike.reshape(-1)
+        few, alike = np.unique(numbers, axis=0, return_inverse=True)
+        times, aperture_blurs, own = few.T.copy()
+        return times, aperture_blurs, own, alike.reshape(-1)
 
 
 class SceneCaptures:
@@ -148,17 +149,13 @@ class SceneCaptures:
             noisy: See `Captures`.
         """
         known = self._known(scene, states)
-        height, own = scene.light.shape[-2], known.captures.blur_px.numpy()
-        discs = defocus * known.aperture_blurs * height / 64.0
-        pixel_blur = None
-        if scene.layout is not None:
-            first, alike = known.blurs
-            times, few = known.times[first], {"discs": discs[first], "own": own[first]}
-            pixel_blur = layout_blur(scene, movement, speed=speed, times=times, **few, alike=alike)
-        if pixel_blur is None:
-            blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
+        blur, alike = self.blur(scene, states, speed=speed, defocus=defocus, movement=movement)
+        pixel_blur: PixelBlur | None = None
+        if isinstance(blur, PixelBlur):
+            pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
+            blur_px = blur.rms_px[alike]
         else:
-            blur = pixel_blur.rms_px.numpy()
+            blur_px = blur[alike]
         light: dict[str, Any] = {}
         if isinstance(gain, np.ndarray) or gain != 1.0:
             light["ratio"] = torch.from_numpy(known.captures.ratio.numpy() * gain)
@@ -166,13 +163,38 @@ class SceneCaptures:
         return replace(
             known.captures,
             scene_light=self._light(scene, len(states)),
-            blur_px=torch.from_numpy(blur),
+            blur_px=blur_px,
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
             source_noise=source_noise,
             noisy=noisy,
             pixel_blur=pixel_blur,
             **light,
         )
+
+    def blur(
+        self,
+        scene: Scene,
+        states: Sequence[CameraSettings],
+        *,
+        speed: float = 0.0,
+        defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
+    ) -> tuple[torch.Tensor | PixelBlur, torch.Tensor]:
+        """The extents of blur that there are, of few states: the ISO blurs nothing.
+
+        Returns:
+            (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
+            of the K each of `states` has. The arguments are those of `describe`.
+        """
+        times, aperture_blurs, own, alike = self._known(scene, states).blurs
+        height = scene.light.shape[-2]
+        discs = defocus * aperture_blurs * height / 64.0
+        found: torch.Tensor | PixelBlur | None = layout_blur(
+            scene, movement, speed=speed, times=times, discs=discs, own=own
+        )
+        if found is None:
+            found = torch.from_numpy(np.hypot(np.hypot(speed * times * height, discs), own))
+        return found, torch.from_numpy(alike)
 
     def _known(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:
         key = (id(scene), states[0], len(states))

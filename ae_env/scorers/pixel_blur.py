@@ -38,7 +38,6 @@ def layout_blur(
     times: np.ndarray,
     discs: np.ndarray,
     own: np.ndarray,
-    alike: np.ndarray | None = None,
 ) -> PixelBlur | None:
     """Blur of S captures of a scene with a layout; None where all pixels have the same.
 
@@ -49,7 +48,6 @@ def layout_blur(
         times: (S,) exposure times [s].
         discs: (S,) diameters of the largest disc of defocus [pixel].
         own: (S,) blur that the scene brings itself [pixel].
-        alike: (T,) which of these S each of T captures is blurred as; None for S that differ.
     """
     layout, height = scene.layout, scene.light.shape[-2]
     if layout is None or not (discs.any() or movement.subject_speed):
@@ -64,9 +62,7 @@ def layout_blur(
     levels *= levels
     levels += rest
     np.sqrt(levels, out=levels)  # (S, K)
-    if alike is not None:
-        levels = levels[alike]
-    shares = torch.from_numpy(counted.share).expand(len(levels), -1)
+    shares = torch.from_numpy(counted.share).expand(len(times), -1)
     return PixelBlur(torch.from_numpy(levels), shares)
 
 

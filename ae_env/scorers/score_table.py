@@ -23,6 +23,7 @@ from ae_env.scorers.captures import SceneCaptures
 from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.composite import CompositeScorer, is_own
 from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
+from ae_env.scorers.terms import Sharpness
 from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
@@ -260,6 +261,8 @@ class ScoreTables:
         names = [] if others is None else others.names(*kinds)
         if others is None or not names:
             return {}
+        if all(type(others.parts[name]) is Sharpness for name in names):  # reads nothing else
+            return dict.fromkeys(names, self._sharpness(scene, prepared))
         looks = any(reads_pixels(others.parts[name]) for name in names)
         chunks = []
         for part in _slices(len(self.grid), _CHUNK if looks else len(self.grid)):
@@ -267,6 +270,11 @@ class ScoreTables:
             scores = others.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}
+
+    def _sharpness(self, scene: Scene, prepared: PreparedScene) -> np.ndarray:
+        """Scores (S,) of `Sharpness`, worked out for the few states that differ in blur."""
+        blur, alike = self._captures.blur(scene, self.grid.states, **_blurs(prepared))
+        return Sharpness.of(blur, scene.light.shape[-2])[alike].numpy()
 
     def _described(
         self,
@@ -283,9 +291,7 @@ class ScoreTables:
         return self._captures.describe(
             scene,
             states,
-            speed=prepared.image_speed,
-            defocus=prepared.defocus * 64.0 / prepared.light.shape[-2],
-            movement=prepared.movement,
+            **_blurs(prepared),
             gain=gain,
             row_gain=None if row_gain is None else row_gain[part],
             source_noise=source_noises(prepared, states, gain),
@@ -346,6 +352,15 @@ class ScoreTables:
             return
         for seed in range(self.noise_seeds):
             yield prepared.expose(states, seed=seed, **light).clamp_(0.0, 1.0)
+
+
+def _blurs(prepared: PreparedScene) -> dict[str, Any]:
+    """What the blur of captures depends on, as arguments of `SceneCaptures`."""
+    return {
+        "speed": prepared.image_speed,
+        "defocus": prepared.defocus * 64.0 / prepared.light.shape[-2],
+        "movement": prepared.movement,
+    }
 
 
 def _slices(count: int, size: int) -> list[slice]:
