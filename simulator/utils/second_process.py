@@ -51,7 +51,8 @@ def compile_beside(module: str, kernels: Collection[str]) -> None:
     """
     global _second
     is_child = multiprocessing.parent_process() is not None
-    if _second is not None or _is_second or is_child or thread_count() < 2 or not sys.executable:
+    python = Path(sys.executable or "").name.lower().startswith("python")  # no application with one
+    if _second is not None or _is_second or is_child or thread_count() < 2 or not python:
         return
     paths = [str(_ROOT), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     try:

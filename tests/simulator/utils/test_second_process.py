@@ -41,7 +41,6 @@ def test_one_that_fails_is_not_waited_for() -> None:
 @pytest.mark.usefixtures("alone")
 def test_one_that_does_not_end_is_waited_for_a_while_and_ended(monkeypatch) -> None:
     monkeypatch.setattr(second_process, "_PATIENCE", 1e9)
-    monkeypatch.setattr(sys, "executable", sys.executable)
     second_process.compile_beside("http.server", [NAME])  # serves until it is ended
     process, known = started(), second_process._second
     try:
@@ -63,14 +62,17 @@ def test_one_that_does_not_end_is_waited_for_a_while_and_ended(monkeypatch) -> N
 
 
 @pytest.mark.usefixtures("alone")
-@pytest.mark.parametrize("reason", ["one thread", "a child", "no Python", "itself", "not to start"])
+@pytest.mark.parametrize(
+    "reason", ["one thread", "a child", "no Python", "an application", "itself", "not to start"]
+)
 def test_none_is_started_where_it_would_not_help(reason: str, monkeypatch) -> None:
     patches: dict[str, tuple[Any, str, Any]] = {
         "one thread": (second_process, "thread_count", lambda: 1),
         "a child": (multiprocessing, "parent_process", lambda: object()),
         "no Python": (sys, "executable", ""),
+        "an application": (sys, "executable", "/usr/bin/editor"),
         "itself": (second_process, "_is_second", True),
-        "not to start": (sys, "executable", "/no/such/python"),
+        "not to start": (sys, "executable", "/no/such/python3"),
     }
     monkeypatch.setattr(*patches[reason])
     second_process.compile_beside("this", [NAME])
