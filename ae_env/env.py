@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -67,8 +67,11 @@ class AutoExposureBase(SpecProperty):
         return self.core.camera
 
     @property
-    def scenes(self) -> list[Scene]:
-        """Scenes that episodes draw from; of a sequence, its first frame."""
+    def scenes(self) -> Sequence[Scene]:
+        """Scenes that episodes draw from; of a sequence, its first frame.
+
+        Bundled ones that are not cached yet are drawn when they are looked at.
+        """
         return self.core.first_scenes
 
     @property

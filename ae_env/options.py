@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -18,6 +18,7 @@ from ae_env.scenes.loading import (
     SceneNetworks,
     check_weights,
     has_frames,
+    scenes_on_demand,
     without_noise,
 )
 from ae_env.scenes.photographed import photographed
@@ -50,7 +51,7 @@ _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
 #: Scenes by all that decides them; the bound is on the memory of their light [byte].
-_LOADED: LruCache[list[Scene]] = LruCache(2**30)
+_LOADED: LruCache[Sequence[Scene]] = LruCache(2**30)
 
 
 @dataclass(frozen=True)
@@ -213,6 +214,10 @@ class EnvOptions:
         Those with a name, and recorded ones whose files have not changed, stay in memory for the
         next environment with the same arguments.
         """
+        return list(self.scenes_on_demand())
+
+    def scenes_on_demand(self) -> Sequence[Scene]:
+        """Those of `load_scenes`; where they must be drawn first, each when it is needed."""
         camera = self.make_camera()
         finds_defocus = self.depth == "unknown"
         needs_networks = finds_defocus or self.source == "raw"
@@ -229,7 +234,20 @@ class EnvOptions:
         cacheable &= not needs_networks or self.simulator in (None, *SIZES)
         known = _LOADED.get(key) if cacheable else None
         if known is not None:
-            return list(known)
+            return list(known) if isinstance(known, list) else known
+        scenes: Sequence[Scene] | None = None
+        if not needs_networks:  # those without noise, in known light, are taken as they are
+            scenes = scenes_on_demand(self.scenes, self.split, camera, *size)
+        if scenes is None:
+            scenes = self._made_ready(camera, finds_defocus)
+        if cacheable:
+            kept = list(scenes) if isinstance(scenes, list) else scenes
+            tensors = [t for t in (scenes[0].light, scenes[0].recorded) if t is not None]
+            _LOADED.put(key, kept, len(scenes) * sum(tensor.nbytes for tensor in tensors))
+        return scenes
+
+    def _made_ready(self, camera: CameraProfile, finds_defocus: bool) -> list[Scene]:
+        """Every scene, with what networks find in it."""
         networks = None if self.simulator is None else SceneNetworks(self.simulator)
         resize: Resize = Scene.resized
         if networks is not None and finds_defocus:
@@ -252,9 +270,6 @@ class EnvOptions:
             scenes = [photographed(scene) if scene.noise_free else scene for scene in scenes]
         scenes = [self._prepared(scene, networks) for scene in scenes]
         _check_light(scenes)
-        if cacheable:
-            tensors = [t for s in scenes for t in (s.light, s.recorded) if t is not None]
-            _LOADED.put(key, list(scenes), sum(tensor.nbytes for tensor in tensors))
         return scenes
 
     def _prepared(self, scene: Scene, networks: SceneNetworks | None) -> Scene:

@@ -66,7 +66,7 @@ class BracketCore(EpisodeCore):
         num_envs: int,
         budget: float,
         max_frames: int,
-        scenes: list[Scene] | None = None,
+        scenes: Sequence[Scene] | None = None,
     ) -> None:
         if options.recorded is not None:
             raise ValueError(

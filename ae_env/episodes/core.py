@@ -15,9 +15,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ae_env.episodes.draws import Draws, allowed_states
+from ae_env.episodes.compiling import compile_beside
+from ae_env.episodes.draws import Draws
 from ae_env.episodes.light import FrameLight
 from ae_env.episodes.recorded import RecordedBatch, nearest_recorded
+from ae_env.episodes.scene_facts import SceneFacts
 from ae_env.episodes.scores import PartScores
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.lighting import Lighting
@@ -30,6 +32,7 @@ from ae_env.observation import (
     frame_statistics,
 )
 from ae_env.options import COSTS, EnvOptions
+from ae_env.scenes.drawn import DrawnScenes
 from ae_env.scenes.folder import sequence_bounds
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable, ScoreTables, in_episode, prepare_scene
@@ -90,14 +93,15 @@ class EpisodeCore:
     """
 
     def __init__(
-        self, options: EnvOptions, num_envs: int, scenes: list[Scene] | None = None
+        self, options: EnvOptions, num_envs: int, scenes: Sequence[Scene] | None = None
     ) -> None:
+        compile_beside()
         self.options = options
         self.grid = options.make_grid()
         self.camera = options.make_camera()
         self.scorer = options.make_scorer()
         self.lighting = options.make_lighting()
-        self.scenes = options.load_scenes() if scenes is None else scenes
+        self.scenes = options.scenes_on_demand() if scenes is None else scenes
         self.tables = ScoreTables(
             self.grid,
             self.camera,
@@ -108,17 +112,17 @@ class EpisodeCore:
         self.episodes = Episodes(num_envs, self.grid, options.delays)
         # First and last frame of the sequence that each scene is a frame of.
         self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
-        self._allowed = np.stack([allowed_states(scene, len(self.grid)) for scene in self.scenes])
-        self._draws = Draws(options, self.first_scenes, len(self.grid))
-        self.scene_ids = tuple(scene.scene_id for scene in self.scenes)
+        self._facts = first_facts = SceneFacts(self.scenes, len(self.grid))
+        if self._sequence is not None:
+            first_facts = SceneFacts(self.first_scenes, len(self.grid))
+        self._draws = Draws(options, self.first_scenes, first_facts)
+        self.scene_ids = self._facts.scene_ids
         states = self.grid.states
         apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
         self._settings = encode_settings(apex)
         # (4, S), see `_STATE_INFO`
         self._bounds = np.array([[getattr(s, name) for s in states] for name in _STATE_INFO])
         self._static = type(self.lighting) is Lighting
-        has_map = np.array([scene.defocus_map is not None for scene in self.scenes])
-        self._shareable = self._static & ~has_map
         self._light = FrameLight(
             self.lighting, self.episodes, self.scenes, self.camera, options.resolution
         )
@@ -149,6 +153,7 @@ class EpisodeCore:
         self._part_scores = PartScores(
             self.tables,
             self.scenes,
+            self._facts,
             self.episodes,
             self._captures,
             static=self._static,
@@ -173,16 +178,20 @@ class EpisodeCore:
     def _resume(self, progress: Mapping[str, Any]) -> None:
         for name, values in progress["episodes"].items():
             getattr(self.episodes, name)[:] = values
-        self._set_light_index(np.flatnonzero(self.episodes.begun))
+        begun = np.flatnonzero(self.episodes.begun)
+        self._facts.look_at(self.episodes.scene[begun])
+        self._set_light_index(begun)
 
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
         apertures = len(self.grid.f_numbers)
-        if any(scene.layout is not None for scene in self.scenes):  # what their discs make of it
+        # Drawn scenes are alike in what they have: the others need not be there yet.
+        scenes = self.scenes[:1] if isinstance(self.scenes, DrawnScenes) else self.scenes
+        if any(scene.layout is not None for scene in scenes):  # what their discs make of it
             apertures += len(DIAMETERS)
         if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results
             apertures += len(DIAMETERS) + apertures
-        as_recorded_and_denoised = 1 + any(s.denoised is not None for s in self.scenes)
+        as_recorded_and_denoised = 1 + any(s.denoised is not None for s in scenes)
         return as_recorded_and_denoised * apertures + 1
 
     # -- spaces -------------------------------------------------------------------------------
@@ -218,10 +227,10 @@ class EpisodeCore:
     def action_masks(self, env_indices: np.ndarray) -> np.ndarray:
         """(B, S) bool: states that the scenes shown allow; all of them before the first reset."""
         episodes = self.episodes
-        return self._allowed[episodes.scene[env_indices]] | ~episodes.begun[env_indices, None]
+        return self._facts.allowed[episodes.scene[env_indices]] | ~episodes.begun[env_indices, None]
 
     @property
-    def first_scenes(self) -> list[Scene]:
+    def first_scenes(self) -> Sequence[Scene]:
         """Scenes that episodes draw from: of a sequence, its first frame."""
         if self._sequence is None:
             return self.scenes
@@ -257,10 +266,14 @@ class EpisodeCore:
         """Sets `Episodes.light_index`: episodes at rest share the light of their scene."""
         episodes = self.episodes
         scenes = episodes.scene[env_indices]
-        blurs = (episodes.speed, episodes.subject_speed, episodes.defocus)
-        moves = np.any([blur[env_indices] > 0.0 for blur in blurs], axis=0)
-        shared, own = ~moves & self._shareable[scenes], len(self.scenes) + env_indices
-        episodes.light_index[env_indices] = np.where(shared, scenes, own)
+        moves = episodes.speed[env_indices] > 0.0
+        moves |= episodes.subject_speed[env_indices] > 0.0
+        moves |= episodes.defocus[env_indices] > 0.0
+        own = len(self.scenes) + env_indices
+        if self._static:
+            shared = ~(moves | self._facts.has_map[scenes])
+            own = np.where(shared, scenes, own)
+        episodes.light_index[env_indices] = own
 
     # -- step: the transition -----------------------------------------------------------------
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
+from ae_env.episodes.scene_facts import SceneFacts
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
 from ae_env.utils.checks import check_integer, did_you_mean
@@ -39,23 +40,18 @@ class Draws:
     Args:
         options: The environment's arguments.
         scenes: Scenes that episodes choose from; of sequences, the first frames.
-        num_states: Number of exposure states.
+        facts: What is known of them.
     """
 
-    def __init__(self, options: EnvOptions, scenes: Sequence[Scene], num_states: int) -> None:
-        self._options, self._num_states = options, num_states
-        self._index = {scene.scene_id: i for i, scene in enumerate(scenes)}
+    def __init__(self, options: EnvOptions, scenes: Sequence[Scene], facts: SceneFacts) -> None:
+        self._options, self._facts = options, facts
+        self._ids, self._num_states = facts.scene_ids, facts.allowed.shape[1]
+        self._index = {scene_id: i for i, scene_id in enumerate(self._ids)}
         if options.in_sequences:  # which have a name of their own
             self._index |= {s.sequence: i for i, s in enumerate(scenes) if s.sequence}
-        self._ids = [scene.scene_id for scene in scenes]
-        self._speeds = np.array([scene.median_speed for scene in scenes])
-        # States that a scene allows come first in its row, in order.
-        allowed = np.stack([allowed_states(scene, num_states) for scene in scenes])
-        self._starts = np.argsort(~allowed, axis=1, kind="stable")
-        self._num_starts = allowed.sum(axis=1)
-        subjects = [s.layout is not None and s.layout.subject is not None for s in scenes]
-        self._has_subject = np.array(subjects)
-        self._own_blur = np.array([s.own_blur(4.0) * 64.0 / options.resolution for s in scenes])
+        # Only recorded scenes forbid states. Those that one allows come first in its row, in order.
+        self._starts = np.argsort(~facts.allowed, axis=1, kind="stable")
+        self._num_starts = facts.allowed.sum(axis=1)
 
     def draw(
         self,
@@ -84,6 +80,7 @@ class Draws:
         for i, (wanted_scene, _, wanted_frame) in enumerate(given):
             scene[i] = scene[i] if wanted_scene is None else wanted_scene
             frame[i] = frame[i] if wanted_frame is None else wanted_frame
+        self._facts.look_at(scene)
         state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
         for i, (_, wanted_state, _) in enumerate(given):
             state[i] = state[i] if wanted_state is None else wanted_state
@@ -96,7 +93,7 @@ class Draws:
             "state": state,
             **self._motion(scene, moving, speed, *motion),
             "defocus": discs,
-            "focus_drive": np.hypot(discs, self._own_blur[scene]),
+            "focus_drive": np.hypot(discs, self._own_blur(scene)),
             "phase": phase,
             "noise_seed": (seed * _VALUES).astype(np.int64),
             "frame": frame,
@@ -114,20 +111,25 @@ class Draws:
         subject_direction: np.ndarray,
     ) -> dict[str, np.ndarray]:
         """Columns of the motion in `scene` (K,), from K uniform numbers each."""
+        speeds = self._facts.median_speed[scene]
         shake, own = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
         # Either may rest where both could move: a camera on a tripod, a subject that waits.
         moves = moving >= STATIC_SHARE
-        subject_moves = moves & self._has_subject[scene] & (apart < SUBJECT_SHARE)
+        subject_moves = moves & self._facts.has_subject[scene] & (apart < SUBJECT_SHARE)
         shakes = moves & ~(subject_moves & (apart < ALONE_SHARE))
         if self._options.motion != "random":  # one speed of the whole image
             subject_moves = np.zeros(len(scene), bool)
         return {
-            "speed": _fixed_or_drawn(self._options.motion, shakes * shake * self._speeds[scene]),
+            "speed": _fixed_or_drawn(self._options.motion, shakes * shake * speeds),
             "direction": 2.0 * math.pi * direction,
             "turn": TURN_SIGMA * ndtri(turn),
-            "subject_speed": subject_moves * own * self._speeds[scene],
+            "subject_speed": subject_moves * own * speeds,
             "subject_direction": 2.0 * math.pi * subject_direction,
         }
+
+    def _own_blur(self, scene: np.ndarray) -> np.ndarray:
+        """(K,) blur that scenes bring themselves, at f/4 [pixel of a 64-pixel frame]."""
+        return self._facts.own_blur[scene] * 64.0 / self._options.resolution
 
     def _chosen(self, options: Mapping[str, Any]) -> tuple[int | None, int | None, int | None]:
         """Scene, state and frame that the options of a reset ask for; None where they do not."""
@@ -144,22 +146,6 @@ class Draws:
         hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
         rule = f", or a scene id, such as {self._ids[0]!r}{hint}"
         return check_integer(_OPTION[0], wanted, 0, len(self._ids) - 1, more=rule)
-
-
-def allowed_states(scene: Scene, num_states: int) -> np.ndarray:
-    """(S,) bool: the states that `scene` allows.
-
-    Raises:
-        ValueError: If the scene was made for another number of states.
-    """
-    if scene.allowed is None:
-        return np.ones(num_states, bool)
-    if len(scene.allowed) != num_states:
-        raise ValueError(
-            f"`allowed` of scene {scene.scene_id!r} (length {len(scene.allowed)}) must have one "
-            f"entry for each of the {num_states} states of `grid`"
-        )
-    return scene.allowed
 
 
 def check_options(options: Any, *more: str) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ae_env.episodes.recorded import RecordedBatch
+from ae_env.episodes.scene_facts import SceneFacts
 from ae_env.episodes.state import Episodes
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import describe_captures
@@ -29,6 +30,7 @@ class PartScores:
     Args:
         tables: The scorer, and where expectations are worked out.
         scenes: Scenes that are photographed.
+        facts: What is known of them.
         episodes: The episodes that photograph them.
         batch: What photographs them.
         static: Whether the light never changes.
@@ -44,6 +46,7 @@ class PartScores:
         self,
         tables: ScoreTables,
         scenes: Sequence[Scene],
+        facts: SceneFacts,
         episodes: Episodes,
         batch: CaptureBatch | RecordedBatch,
         *,
@@ -61,7 +64,7 @@ class PartScores:
         self._scored = np.zeros((lights, len(self.grid)), bool)
         self._of_light: dict[int, dict[str, np.ndarray]] = {}  # by scene; see `_light_scores`
         self._means = np.full((lights, len(self.grid), 3), np.nan)
-        self._box_factors = np.array([scene.box_factor for scene in scenes])
+        self._box_factors = facts.box_factor
         self.reads_images = not tables.closed_form and not expected
         self._measures = bool(self._code_scores.parts)
         self._expected = expected

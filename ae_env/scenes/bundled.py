@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from ae_env.scenes.depth import drape
-from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes
+from ae_env.scenes.drawn import DrawnScenes, SceneSource
+from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes, scene_ids
 from ae_env.scenes.procedural import (
     GENERATOR_VERSION,
     HARD_KINDS,
@@ -19,12 +19,9 @@ from ae_env.scenes.procedural import (
     draw,
 )
 from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
-from ae_env.scenes.stored import cached_scenes
+from ae_env.scenes.stored import stored_scenes
 from simulator.camera import CameraProfile
 from simulator.utils.cache import cache_key
-from simulator.utils.threads import in_shares
-
-logger = logging.getLogger(__name__)
 
 Split = Literal["train", "test", "all"]
 
@@ -59,8 +56,10 @@ def bundled_scenes(
     *,
     size: Size = "normal",
     part: str | None = None,
-) -> list[Scene]:
+) -> Sequence[Scene]:
     """The bundled scenes of `split`, from the cache where they have been made before.
+
+    Else those of one split are drawn when they are needed (`DrawnScenes`).
 
     Args:
         split: ``"train"``, ``"test"`` or ``"all"`` (train, then test).
@@ -72,37 +71,40 @@ def bundled_scenes(
         part: Only those of one of `KINDS`, or the hard ones (`HARD`); None for all.
     """
     kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
-    scenes: list[Scene] = []
+    parts: list[Sequence[Scene]] = []
     for name in ["train", "test"] if split == "all" else [split]:
         key = _cache_key(name, camera, resolution, crop, size, part)
-        made = partial(_make, name, camera, resolution, crop, size, kinds)
-        scenes += cached_scenes(key, made, camera, resolution)
-    return scenes
+        found = stored_scenes(key, camera, resolution)
+        if found is None:
+            sources = list(_sources(name, camera, resolution, crop, size, kinds))
+            parts.append(DrawnScenes(f"the bundled scenes ({name})", sources, key))
+        else:
+            parts.append(found)
+    return parts[0] if len(parts) == 1 else [scene for own in parts for scene in own]
 
 
-def _make(
+def _sources(
     split: str,
     camera: CameraProfile,
     resolution: int | None,
     crop: Crop,
     size: Size,
     kinds: Sequence[str],
-) -> Iterator[Scene]:
-    logger.warning("drawing the bundled scenes (%s), once for this camera and resolution", split)
-    drawn = [(kind, index) for kind, index in _procedural(split, size) if kind in kinds]
-    made: list[Scene | None] = [None] * len(drawn)
+) -> Iterator[SceneSource]:
+    """Where the scenes of `split` come from, the photographs last."""
 
-    def draw_some(first: int, last: int) -> None:
-        for i in range(first, last):
-            scene = _procedural_scene(*drawn[i], camera)
-            made[i] = drape(scene).resized(resolution, crop)
+    def source(scene_ids: Sequence[str], draw: Callable[[], Iterable[Scene]]) -> SceneSource:
+        def make() -> list[Scene]:
+            return [drape(scene).resized(resolution, crop) for scene in draw()]
 
-    in_shares(draw_some, len(drawn))
-    yield from (scene for scene in made if scene is not None)
+        return SceneSource(tuple(scene_ids), make)
+
+    for kind, index in _procedural(split, size):
+        if kind in kinds:
+            yield source([_name(kind, index)], partial(_procedural_scenes, kind, index, camera))
     photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
-        for scene in photograph_scenes(photograph, camera):
-            yield drape(scene).resized(resolution, crop)
+        yield source(scene_ids(photograph), partial(photograph_scenes, photograph, camera))
 
 
 def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
@@ -117,11 +119,15 @@ def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
             yield kind, index
 
 
-def _procedural_scene(kind: str, index: int, camera: CameraProfile) -> Scene:
+def _name(kind: str, index: int) -> str:
+    return f"{kind}-{index:03d}"
+
+
+def _procedural_scenes(kind: str, index: int, camera: CameraProfile) -> Iterator[Scene]:
     rng = np.random.default_rng([zlib.crc32(kind.encode()), index])
     drawing = draw(kind, rng)
-    name = f"{kind}-{index:03d}"
-    return Scene.from_radiance(
+    name = _name(kind, index)
+    yield Scene.from_radiance(
         drawing.light,
         camera,
         scene_id=name,

@@ -102,6 +102,7 @@ def load_scenes(
         hint = "; `simulator.get_camera` gives one by name"
         raise ValueError(f"`camera` (={camera!r}) must be a CameraProfile{hint}")
     request = SceneRequest(split, camera, resolution, crop, resize)
+    scenes: Sequence[Scene]
     recorded = RecordedOptions.of(spec)
     if recorded is not None:
         scenes = recorded_scenes(recorded, request, grid or recorded.grid)
@@ -126,7 +127,19 @@ def load_scenes(
         if scene.scene_id in seen:
             raise ValueError(f"`scene_id` (={scene.scene_id!r}) must be unique, but occurs twice")
         seen.add(scene.scene_id)
-    return scenes
+    return list(scenes)
+
+
+def scenes_on_demand(
+    spec: object, split: Split, camera: CameraProfile, resolution: int | None, crop: Crop
+) -> Sequence[Scene] | None:
+    """As `load_scenes`, but scenes that must be drawn are when they are needed; None for others.
+
+    Those are the bundled ones, if not found in the cache.
+    """
+    if split == "all" or not isinstance(spec, str) or spec not in (*BUNDLED, *BUNDLED_PARTS):
+        return None
+    return _by_name(spec, split, SceneRequest(split, camera, resolution, crop))
 
 
 def is_sequence(spec: object) -> bool:
@@ -139,7 +152,7 @@ def has_frames(spec: object) -> bool:
     return is_sequence(spec) or RecordedOptions.of(spec) is not None
 
 
-def _by_name(spec: str, split: Split, request: SceneRequest) -> list[Scene]:
+def _by_name(spec: str, split: Split, request: SceneRequest) -> Sequence[Scene]:
     camera, resolution = request.camera, request.resolution
     if spec in BUNDLED or spec in BUNDLED_PARTS:
         size, part = BUNDLED.get(spec, "normal"), BUNDLED_PARTS.get(spec)

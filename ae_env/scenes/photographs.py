@@ -73,7 +73,7 @@ def photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator
     rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
     light = unprocess(read_photograph(photograph.file), rng)
     height, width = light.shape[1:]
-    for index in range(SCENES_PER_PHOTOGRAPH):
+    for index, scene_id in enumerate(scene_ids(photograph)):
         top, left = (height - NATIVE_SIZE) // 2, (width - NATIVE_SIZE) // 2
         if index:
             top = int(rng.integers(0, height - NATIVE_SIZE + 1))
@@ -85,13 +85,18 @@ def photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator
         yield Scene.from_radiance(
             np.ascontiguousarray(crop),
             camera,
-            scene_id=f"{photograph.name}-{index}",
+            scene_id=scene_id,
             group=photograph.name,
             illuminance=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
             illuminant=temperature_tint(rng.uniform(*photograph.tint)),
             kind="photograph",
             source=f"scikit-image {photograph.file}: {photograph.credit}",
         )
+
+
+def scene_ids(photograph: Photograph) -> list[str]:
+    """Names of its scenes."""
+    return [f"{photograph.name}-{index}" for index in range(SCENES_PER_PHOTOGRAPH)]
 
 
 def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -44,16 +44,25 @@ def cached_scenes(
         camera: In whose colours they are.
         resolution: Packed pixels a side; None for `NATIVE_SIZE`.
     """
-    cache = DiskCache()
-    loaded = _from_tensors(cache.get("scenes", key), camera, resolution)
+    loaded = stored_scenes(key, camera, resolution)
     if loaded is None:
-        loaded = [_rounded(scene) for scene in make()]
-        if loaded:
-            cache.put("scenes", key, _to_tensors(loaded))
+        loaded = [rounded(scene) for scene in make()]
+        store_scenes(key, loaded)
     return loaded
 
 
-def _rounded(scene: Scene) -> Scene:
+def stored_scenes(key: str, camera: CameraProfile, resolution: int | None) -> list[Scene] | None:
+    """Those in the cache, None if there are none; arguments as of `cached_scenes`."""
+    return _from_tensors(DiskCache().get("scenes", key), camera, resolution)
+
+
+def store_scenes(key: str, scenes: list[Scene]) -> None:
+    """Puts scenes, `rounded`, into the cache; see `cached_scenes`."""
+    if scenes:
+        DiskCache().put("scenes", key, _to_tensors(scenes))
+
+
+def rounded(scene: Scene) -> Scene:
     """The scene rounded as in the cache, so that a cached run equals a fresh one."""
     layout = None if scene.layout is None else _from_bytes(_to_bytes(scene.layout))
     light = scene.light.clamp(max=65504.0).half().float()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -98,6 +99,15 @@ class _AtRest:
     times: np.ndarray
     aperture_blurs: np.ndarray
 
+    @cached_property
+    def blurs(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Times, aperture blurs and own blur where states differ in them, and which each has."""
+        own = self.captures.blur_px.numpy()
+        numbers = np.stack([self.times, self.aperture_blurs, own], axis=1)
+        few, alike = np.unique(numbers, axis=0, return_inverse=True)
+        times, aperture_blurs, own = few.T.copy()
+        return times, aperture_blurs, own, alike.reshape(-1)
+
 
 class SceneCaptures:
     """Describes captures of a scene, and caches what depends neither on blur nor on its light.
@@ -139,15 +149,13 @@ class SceneCaptures:
             noisy: See `Captures`.
         """
         known = self._known(scene, states)
-        height, own = scene.light.shape[-2], known.captures.blur_px.numpy()
-        discs = defocus * known.aperture_blurs * height / 64.0
-        pixel_blur = layout_blur(
-            scene, movement, speed=speed, times=known.times, discs=discs, own=own
-        )
-        if pixel_blur is None:
-            blur = np.hypot(np.hypot(speed * known.times * height, discs), own)
+        blur, alike = self.blur(scene, states, speed=speed, defocus=defocus, movement=movement)
+        pixel_blur: PixelBlur | None = None
+        if isinstance(blur, PixelBlur):
+            pixel_blur = PixelBlur(blur.levels[alike], blur.shares[alike])
+            blur_px = blur.rms_px[alike]
         else:
-            blur = pixel_blur.rms_px.numpy()
+            blur_px = blur[alike]
         light: dict[str, Any] = {}
         if isinstance(gain, np.ndarray) or gain != 1.0:
             light["ratio"] = torch.from_numpy(known.captures.ratio.numpy() * gain)
@@ -155,13 +163,38 @@ class SceneCaptures:
         return replace(
             known.captures,
             scene_light=self._light(scene, len(states)),
-            blur_px=torch.from_numpy(blur),
+            blur_px=blur_px,
             row_gain=None if row_gain is None else torch.from_numpy(row_gain),
             source_noise=source_noise,
             noisy=noisy,
             pixel_blur=pixel_blur,
             **light,
         )
+
+    def blur(
+        self,
+        scene: Scene,
+        states: Sequence[CameraSettings],
+        *,
+        speed: float = 0.0,
+        defocus: float = 0.0,
+        movement: Movement = ALONG_ROWS,
+    ) -> tuple[torch.Tensor | PixelBlur, torch.Tensor]:
+        """The extents of blur that there are, of few states: the ISO blurs nothing.
+
+        Returns:
+            (K,) extents in pixels, or those of the pixels where they differ; and (S,) int64, which
+            of the K each of `states` has. The arguments are those of `describe`.
+        """
+        times, aperture_blurs, own, alike = self._known(scene, states).blurs
+        height = scene.light.shape[-2]
+        discs = defocus * aperture_blurs * height / 64.0
+        found: torch.Tensor | PixelBlur | None = layout_blur(
+            scene, movement, speed=speed, times=times, discs=discs, own=own
+        )
+        if found is None:
+            found = torch.from_numpy(np.hypot(np.hypot(speed * times * height, discs), own))
+        return found, torch.from_numpy(alike)
 
     def _known(self, scene: Scene, states: Sequence[CameraSettings]) -> _AtRest:
         key = (id(scene), states[0], len(states))

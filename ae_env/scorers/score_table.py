@@ -23,6 +23,7 @@ from ae_env.scorers.captures import SceneCaptures
 from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.composite import CompositeScorer, is_own
 from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
+from ae_env.scorers.terms import Sharpness
 from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
@@ -32,8 +33,8 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings
 
-#: Memory for cached descriptions of captures [byte]: some 500 scenes at 64 states.
-_MEMORY_BYTES = 2**25
+#: Memory for cached descriptions of captures [byte]: some 1000 scenes at 64 states.
+_MEMORY_BYTES = 2**26
 #: Memory for the blurred light of one table [byte].
 _LIGHT_BYTES = 2**25
 #: States whose pixels are looked at at once: more only spends time in memory paging.
@@ -108,14 +109,14 @@ def in_episode(
 
 
 def source_noises(
-    prepared: PreparedScene, states: Sequence[CameraSettings], gains: np.ndarray
+    prepared: PreparedScene, states: Sequence[CameraSettings], gain: float | np.ndarray
 ) -> list[NoiseLevelFunction] | None:
-    """`Captures.source_noise` of captures of `prepared`; `gains` (S,) are those of their light."""
+    """`Captures.source_noise` of captures of `prepared` in the light `gain`, one or (S,)."""
     if prepared.nlf.is_zero:
         return None
     found = []
-    for state, gain in zip(states, gains.tolist(), strict=True):
-        exposure = prepared.exposure(state, gain=gain)
+    for state, own in zip(states, np.broadcast_to(gain, len(states)).tolist(), strict=True):
+        exposure = prepared.exposure(state, gain=own)
         left = exposure.remaining_variance
         share = prepared.box_factor**2 * (1.0 if left is None else float(left.mean()))
         found.append(exposure.source_noise.scaled(share))
@@ -260,6 +261,8 @@ class ScoreTables:
         names = [] if others is None else others.names(*kinds)
         if others is None or not names:
             return {}
+        if all(type(others.parts[name]) is Sharpness for name in names):  # reads nothing else
+            return dict.fromkeys(names, self._sharpness(scene, prepared))
         looks = any(reads_pixels(others.parts[name]) for name in names)
         chunks = []
         for part in _slices(len(self.grid), _CHUNK if looks else len(self.grid)):
@@ -267,6 +270,11 @@ class ScoreTables:
             scores = others.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}
+
+    def _sharpness(self, scene: Scene, prepared: PreparedScene) -> np.ndarray:
+        """Scores (S,) of `Sharpness`, worked out for the few states that differ in blur."""
+        blur, alike = self._captures.blur(scene, self.grid.states, **_blurs(prepared))
+        return Sharpness.of(blur, scene.light.shape[-2])[alike].numpy()
 
     def _described(
         self,
@@ -278,16 +286,15 @@ class ScoreTables:
     ) -> Captures:
         """Facts of the captures of the states `part` of the grid."""
         states = self.grid.states[part]
-        gains = np.broadcast_to(gain, len(self.grid))[part]
+        if isinstance(gain, np.ndarray):
+            gain = gain[part]
         return self._captures.describe(
             scene,
             states,
-            speed=prepared.image_speed,
-            defocus=prepared.defocus * 64.0 / prepared.light.shape[-2],
-            movement=prepared.movement,
-            gain=gains if isinstance(gain, np.ndarray) else gain,
+            **_blurs(prepared),
+            gain=gain,
             row_gain=None if row_gain is None else row_gain[part],
-            source_noise=source_noises(prepared, states, gains),
+            source_noise=source_noises(prepared, states, gain),
             noisy=self.noise,
         )
 
@@ -345,6 +352,15 @@ class ScoreTables:
             return
         for seed in range(self.noise_seeds):
             yield prepared.expose(states, seed=seed, **light).clamp_(0.0, 1.0)
+
+
+def _blurs(prepared: PreparedScene) -> dict[str, Any]:
+    """What the blur of captures depends on, as arguments of `SceneCaptures`."""
+    return {
+        "speed": prepared.image_speed,
+        "defocus": prepared.defocus * 64.0 / prepared.light.shape[-2],
+        "movement": prepared.movement,
+    }
 
 
 def _slices(count: int, size: int) -> list[slice]:

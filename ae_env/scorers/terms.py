@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from ae_env.observation import decode_observation, encode_observation
+from ae_env.scorers.pixel_blur import PixelBlur
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
 
 
@@ -158,7 +159,13 @@ class Sharpness:
 
     def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
-        scale, blur = 64.0 / captures.frame_height, captures.pixel_blur
-        if blur is None:
-            return 1.0 / (1.0 + (captures.blur_px * scale) ** 2)
-        return (blur.shares / (1.0 + (blur.levels * scale) ** 2)).sum(dim=1)
+        blur = captures.blur_px if captures.pixel_blur is None else captures.pixel_blur
+        return self.of(blur, captures.frame_height)
+
+    @staticmethod
+    def of(blur: torch.Tensor | PixelBlur, frame_height: int) -> torch.Tensor:
+        """Scores (B,) of extents (B,), or of those of the pixels, in frames so high."""
+        scale = 64.0 / frame_height
+        if isinstance(blur, PixelBlur):
+            return (blur.shares / (1.0 + (blur.levels * scale) ** 2)).sum(dim=1)
+        return 1.0 / (1.0 + (blur * scale) ** 2)

@@ -33,6 +33,7 @@ def warm_up() -> None:
         for done, (name, arguments) in enumerate(_CASES):
             task(done, len(_CASES), ", ".join([name, *map(str, arguments.values())]))
             envs = gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)
+            list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
             envs.reset(seed=0)
             for _ in range(4):
                 envs.step(np.arange(16))

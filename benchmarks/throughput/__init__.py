@@ -4,9 +4,10 @@
     ae-env bench throughput --against PATH_OF_ANOTHER_CHECKOUT
 
 Parts: environment steps beside a fused kernel, copies of the environment and a lookup; resets
-beside steps; growth of time and memory with pixels and states; a 24-megapixel raw through the
-simulator beside LibRaw. With another checkout, both are timed in turns
-(`benchmarks.throughput.paired`). The real files that ``AE_ENV_DATA`` names are used where they are.
+beside steps; the first episode after installation; growth of time and memory with pixels and
+states; a 24-megapixel raw through the simulator beside LibRaw. With another checkout, both are
+timed in turns (`benchmarks.throughput.paired`). The real files that ``AE_ENV_DATA`` names are used
+where they are.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from benchmarks.harness import Benchmark, Part
 from benchmarks.isolated import CORES
-from benchmarks.throughput import full_frame, growth, resets
+from benchmarks.throughput import cold_start, full_frame, growth, resets
 from benchmarks.throughput.paired import measure_paired
 from benchmarks.throughput.report import report
 from benchmarks.throughput.steps import measure_steps
@@ -34,7 +35,7 @@ def parts(seed: int, quick: bool, against: Path | None = None) -> list[Part]:
     for threads, size in list(dict.fromkeys(STEPS))[: 1 if quick else None]:
         arguments = {"threads": threads, "size": size, "seed": seed, "quick": quick}
         found.append(Part(f"steps {threads} {size}", measure_steps, arguments, threads=threads))
-    found += resets.parts(seed, quick)
+    found += [*resets.parts(seed, quick), *cold_start.parts(quick)]
     return [*found, *growth.parts(quick), *full_frame.parts(quick)]
 
 

@@ -8,14 +8,14 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness import Report, Row, bullets, cell, pivot, sections, table
 from benchmarks.isolated import CORES
-from benchmarks.throughput import full_frame, growth
+from benchmarks.throughput import cold_start, full_frame, growth
 from benchmarks.throughput.paired import COLUMNS
 from benchmarks.throughput.steps import KERNEL, LOOKUP, SCENES
 
 #: Frame size and case that the targets for steps are about.
 SIZE, CASE, NUM_ENVS = 128, "vector env, cached scene", 64
 STEPS_PER_SECOND, TIMES_KERNEL, RATIO_TO_BEFORE = 5000.0, 1.5, 0.97
-RESET_IN_STEPS = 3.0
+RESET_IN_STEPS, COLD_START_SECONDS = 3.0, 10.0
 FULL_FRAME_MIB, TIMES_LIBRAW = 2048.0, 2.0
 #: An exponent counts as linear up to here, if two standard errors lead down to 1.
 _LINEAR = 1.1
@@ -27,12 +27,13 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by name of the part."""
     steps = [row for name, own in results.items() if name.startswith("steps ") for row in own]
     paired = [row for name, own in results.items() if name.startswith("paired ") for row in own]
-    resets = results.get("resets", [])
+    resets, cold = results.get("resets", []), results.get("cold start", [])
     curves, frames = growth.curves(results), full_frame.rows(results)
-    targets = list(_targets(steps, resets, paired, curves, frames))
+    targets = list(_targets(steps, resets, cold, paired, curves, frames))
     more = {
         "scenes": SCENES,
         "resets": resets,
+        "cold_start": cold,
         "growth": curves,
         "full_frame": frames,
         "targets": targets,
@@ -57,6 +58,13 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "Whole episodes of 8 steps with random actions, in motion and out of focus, 64 x 64, one "
         "thread, the default scenes, each seen before; medians.",
         table(resets, _RESET_COLUMNS),
+        "## The first episode",
+        f"`gymnasium.make` of the default environment, its first reset and its first step, in a "
+        f"process of its own with {CORES} threads, whose caches of compiled code and of scenes are "
+        f"empty, or hold what such a process has left; then {cold_start.EPISODES} more episodes. "
+        "Medians. Processor time is that of the process up to its first step, without the second "
+        "one that compiles beside it.",
+        table(cold, _COLD_COLUMNS),
         "## Growth of cost",
         "Each point in a process of its own. Memory is the peak above what the process held with "
         "all libraries loaded. Exponents: least squares on logarithms over the upper two decades, "
@@ -99,6 +107,14 @@ _RESET_COLUMNS: dict[str, Any] = {
     "step [ms]": "{step_ms:.2f}",
     "reset in steps": "{ratio:.2f}",
     "of the means": "{ratio_of_means:.2f}",
+    "spread": "{spread:.0%}",
+}
+_COLD_COLUMNS: dict[str, Any] = {
+    "case": "{case}",
+    "in all [s]": "{total_s:.2f}",
+    **{f"{name} [s]": f"{{{name}_s:.2f}}" for name in cold_start.TIMES[:-1]},
+    "processor time [s]": "{cpu_s:.2f}",
+    "more episodes [s]": "{episodes_s:.2f}",
     "spread": "{spread:.0%}",
 }
 _CURVE_COLUMNS: dict[str, Any] = {
@@ -172,6 +188,7 @@ def _step(rows: list[Row], case: str = CASE, num_envs: int = NUM_ENVS) -> Row | 
 def _targets(
     steps: list[Row],
     resets: list[Row],
+    cold: list[Row],
     paired: list[Row],
     curves: list[Row],
     frames: list[Row],
@@ -184,6 +201,9 @@ def _targets(
         yield _target(f"time over that of the fused kernel, {where}", times, TIMES_KERNEL)
     for row in resets:
         yield _target(f"reset in steps, {cell(row, '{case}')}", row["ratio"], RESET_IN_STEPS)
+    for row in cold[:1]:
+        what = f"first make, reset and step [s], {row['case']}"
+        yield _target(what, row["total_s"], COLD_START_SECONDS)
     for row in paired:
         what = f"speed over that of before: {row['case']}, threads: {row['threads']}"
         yield _target(what, row["ratio_to_before"], RATIO_TO_BEFORE, at_least=True)

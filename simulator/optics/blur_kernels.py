@@ -178,20 +178,31 @@ def _moved(first, last, rows, n, end, limit, out):  # type: ignore[no-untyped-de
         _streak(first, last, rows, n + 1, np.float32(end), np.float32(full), limit, out)
 
 
+# Two kernels for the two blurs: what compiles slowly and is not needed is not compiled.
 @_jit()
-def _blur_some(  # type: ignore[no-untyped-def]
-    first, last, planes, height, width, light, defocused, radius, moved, whole, end, limit
+def _defocus_some(  # type: ignore[no-untyped-def]
+    first, last, planes, height, width, light, defocused, radius, limit
 ):
-    """Images `first` to `last`; an address of 0 leaves the blur that would be written there out."""
+    """Images `first` to `last` behind discs; an address of 0 to write to leaves one out."""
     shape = (planes * height, width)
     for i in range(first, last):
-        rows = numba.carray(as_pointer(light[i]), shape)  # type: ignore[attr-defined, call-arg]
         if defocused[i]:
+            rows = numba.carray(as_pointer(light[i]), shape)  # type: ignore[attr-defined, call-arg]
             out = numba.carray(as_pointer(defocused[i]), shape)
             weights, reach = _quadrant(radius[i])
             _disc(0, len(rows), height, rows, weights, reach, limit, out)
-            rows = out
+
+
+@_jit()
+def _move_some(  # type: ignore[no-untyped-def]
+    first, last, planes, height, width, light, defocused, moved, whole, end, limit
+):
+    """Images `first` to `last` behind streaks, of what is `defocused` where there is that."""
+    shape = (planes * height, width)
+    for i in range(first, last):
         if moved[i]:
+            source = defocused[i] if defocused[i] else light[i]
+            rows = numba.carray(as_pointer(source), shape)  # type: ignore[attr-defined, call-arg]
             out = numba.carray(as_pointer(moved[i]), shape)
             _moved(0, len(rows), rows, whole[i], end[i], limit, out)
 
@@ -234,21 +245,23 @@ def blur_many(
     light = blurs[0].light
     height, width = light.shape[-2:]
     planes = light.numel() // (height * width)
-    whole, end = np.array([streak_share(blur.extent_px) for blur in blurs]).T.copy()
-    fixed = (
-        addresses([blur.light for blur in blurs]),
-        addresses([blur.defocused for blur in blurs]),
-        np.array([disc_radius(blur.diameter_px) for blur in blurs]),
-        addresses([blur.moved for blur in blurs]),
-        whole.astype(np.int64),
-        end,
-        np.float32(limit),
-    )
-    in_shares(
-        lambda first, last: _blur_some(first, last, planes, height, width, *fixed),
-        len(blurs),
-        threads=threads,
-    )
+    lights = addresses([blur.light for blur in blurs])
+    defocused = addresses([blur.defocused for blur in blurs])
+    moved = addresses([blur.moved for blur in blurs])
+    images, most = (planes, height, width, lights, defocused), np.float32(limit)
+    if defocused.any():
+        radius = np.array([disc_radius(blur.diameter_px) for blur in blurs])
+    if moved.any():
+        whole, end = np.array([streak_share(blur.extent_px) for blur in blurs]).T.copy()
+        streaks = (moved, whole.astype(np.int64), end)
+
+    def run(first: int, last: int) -> None:
+        if defocused.any():
+            _defocus_some(first, last, *images, radius, most)
+        if moved.any():
+            _move_some(first, last, *images, *streaks, most)
+
+    in_shares(run, len(blurs), threads=threads)
 
 
 def _without_wide_discs(blurs: Sequence[Blur], limit: float, threads: int | None) -> Sequence[Blur]:

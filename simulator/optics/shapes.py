@@ -37,8 +37,23 @@ def coverage(radius):  # type: ignore[no-untyped-def]
             area[i, 0] += 2.0 * min(chord, 0.5)
             for j in range(1, reach + 1):
                 area[i, j] += min(chord, j + 0.5) - min(chord, j - 0.5)
-    area = area + area.T  # the quadrature treats rows and columns alike
-    return area / (area[0, 0] + 2.0 * (area[0, 1:].sum() + area[1:].sum() + area[1:, 1:].sum()))
+    # Loops: numpy's operations on whole arrays compile three times as long.
+    out = np.empty_like(area)
+    first = lower = inner = 0.0
+    for i in range(reach + 1):
+        for j in range(reach + 1):
+            out[i, j] = area[i, j] + area[j, i]  # the quadrature treats rows and columns alike
+            if i:
+                lower += out[i, j]
+                if j:
+                    inner += out[i, j]
+            elif j:
+                first += out[i, j]
+    total = out[0, 0] + 2.0 * (first + lower + inner)
+    for i in range(reach + 1):
+        for j in range(reach + 1):
+            out[i, j] /= total
+    return out
 
 
 def _check_extent(name: str, value: float) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import logging
 import re
+import time
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,8 +21,15 @@ import torch
 from numba import types
 from numba.core import event
 
+from simulator.utils.progress import Progress
+from simulator.utils.second_process import is_compiling
+
 logger = logging.getLogger(__name__)
 _PACKAGES = ("simulator", "ae_env")
+#: How often it is looked whether a second process has compiled a kernel [s].
+_PAUSE = 0.02
+#: Kernels that a default environment needs for its first frame, about.
+_FIRST_KERNELS = 12
 #: Folder of the packages.
 _ROOT = Path(__file__).parents[2]
 #: The modules and names of imports from this project, one line or in parentheses.
@@ -50,15 +58,38 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     return compiled
 
 
+def is_cached(dispatcher: Any) -> bool:
+    """Whether a kernel was compiled before, or is compiled again in each process in any case."""
+    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    return file is None or bool(file._load_index())
+
+
 def _adapt_cache(dispatcher: Any, module: Path) -> None:
     """Make numba's cache of a kernel stale when any module changes that the kernel depends on.
 
     Numba itself looks at the kernel's own module alone, but the functions and constants that a
-    kernel names are compiled into it. Also, a full disk must not be an error.
+    kernel names are compiled into it. Also, a full disk must not be an error, and what a second
+    process compiles is waited for.
     """
     cache = dispatcher._cache
-    index, save = cache._cache_file, cache.save_overload
+    index, save, load = cache._cache_file, cache.save_overload, cache.load_overload
     index._source_stamp = (index._source_stamp, _checksum(module))
+    name = f"{dispatcher.py_func.__module__}.{dispatcher.py_func.__name__}"
+
+    def load_when_compiled(*arguments: Any) -> Any:
+        waits = False
+        while True:
+            may_come = is_compiling(name)
+            found = load(*arguments)
+            if found is not None or not may_come:
+                break
+            waits = True
+            _announcer.bar.show()
+            time.sleep(_PAUSE)
+        if waits:
+            _announcer.bar.advance()
+            _announcer.bar.close()
+        return found
 
     def save_if_possible(*arguments: Any) -> None:
         try:
@@ -66,7 +97,7 @@ def _adapt_cache(dispatcher: Any, module: Path) -> None:
         except OSError as error:
             logger.info("%s; it is compiled again in each process", error)
 
-    cache.save_overload = save_if_possible
+    cache.save_overload, cache.load_overload = save_if_possible, load_when_compiled
 
 
 @functools.cache
@@ -90,24 +121,34 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
     """Says that kernels are compiled, which takes seconds, and logs each one of this package."""
 
     said = False
+    depth = 0  # kernels compile the kernels that they call
+    bar = Progress("compiling the simulator", _FIRST_KERNELS)
 
     def on_start(self, event: Any) -> None:
         """Numba is about to compile a function, not to load one from its cache."""
+        self.depth += 1
         function = event.data["dispatcher"].py_func
         if function.__module__.partition(".")[0] in _PACKAGES:
             if not self.said:
                 logger.warning(
-                    "compiling the simulator, once on this machine (10 to 20 s; `ae-env warm-up` "
+                    "compiling the simulator, once on this machine (10 s or so; `ae-env warm-up` "
                     "does it beforehand)"
                 )
                 self.said = True
             logger.info("compiling %s.%s", function.__module__, function.__name__)
+            if self.depth == 1:
+                self.bar.show()
 
     def on_end(self, event: Any) -> None:
-        """Nothing to log; numba's base class requires the method."""
+        """It is compiled."""
+        self.depth -= 1
+        if not self.depth:
+            self.bar.advance()
+            self.bar.close()
 
 
-event.register("numba:compile", _Announcer())  # type: ignore[no-untyped-call]
+_announcer = _Announcer()
+event.register("numba:compile", _announcer)  # type: ignore[no-untyped-call]
 
 
 # Images are given to kernels by their addresses: a batch need not lie in one piece of memory.

@@ -45,7 +45,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(self: EnvOptions) -> None:
         raise Work
 
-    monkeypatch.setattr(EnvOptions, "load_scenes", load)
+    monkeypatch.setattr(EnvOptions, "scenes_on_demand", load)
 
 
 def test_the_tables_have_every_argument() -> None:

@@ -1,6 +1,7 @@
 """Blur that differs from pixel to pixel: sharpness is the mean over the pixels."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
-from ae_env.scorers.score_table import ScoreTables
+from ae_env.scorers.score_table import ScoreTables, prepare_scene
 from ae_env.scorers.terms import Sharpness
 from simulator.capture.layout import Layout
 from simulator.optics.motion_path import Movement
@@ -96,3 +97,19 @@ def test_sharpness_knows_that_discs_end_where_the_frame_has_them_end() -> None:
     tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
     sharp = tables.table(scene, defocus=16.0).parts["sharpness"]
     np.testing.assert_allclose(sharp, 1.0 / (1.0 + (32.0 / 256.0 * 64.0) ** 2), rtol=1e-2)
+
+
+@pytest.mark.parametrize("layout", [True, False])
+@pytest.mark.parametrize("movement", [MOVEMENT, Movement(1.0, -3.0)])
+def test_sharpness_of_all_states_at_once_is_that_of_each_capture(
+    layout: bool, movement: Movement
+) -> None:
+    """To the bit: rewards must not depend on how many states were scored together."""
+    scene = _scene() if layout else replace(_scene(), layout=None)
+    tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
+    moves: Any = {"speed": 0.2, "defocus": 6.0, "movement": movement}
+    found = tables.known_parts(scene, prepare_scene(scene, CAMERA, **moves), kinds=("blur",))
+    for index, state in enumerate(GRID):
+        numbers = {"speed": np.array([0.2]), "defocus": np.array([6.0]), "gain": np.ones(1)}
+        capture = describe_captures([scene], [state], CAMERA, movements=[movement], **numbers)
+        assert Sharpness()(None, capture).item() == found["sharpness"][index]
