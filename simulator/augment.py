@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -220,7 +220,7 @@ def _in_pieces(
 ) -> torch.Tensor:
     """A function of single pixels of (C, H, W), some rows at a time."""
     rows = max(1, _PIECE // (4 * image.shape[-1]))
-    pieces = image.split(rows, dim=1)
+    pieces = torch.split(image, rows, dim=1)
     return torch.cat([function(piece.contiguous()) for piece in pieces], dim=1)
 
 
@@ -265,7 +265,7 @@ class AugmentedDataset(Dataset[Any]):
         self.dataset, self.augmentation = dataset, augmentation
         self.seed = _check_integer("seed", seed)
         # Shared memory: workers that persist see it change.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     @property
     def epoch(self) -> int:
@@ -309,7 +309,7 @@ def _check_range(name: str, given: Any, low: float, high: float) -> tuple[float,
 
 
 def _check_integer(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= value < 2**63:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value < 2**63:
         raise ValueError(f"`{name}` (={value!r}) must be an integer >= 0, below 2**63")
     return int(value)
 
