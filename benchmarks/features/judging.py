@@ -14,7 +14,16 @@ from torch import Tensor
 
 from ae_env.scenes.pictures import Split
 from benchmarks.features.detector import Features, mutual_matches
-from benchmarks.features.pairs import Source, finer, inside, mapped, sources, two_crops, warped
+from benchmarks.features.pairs import (
+    Source,
+    finer,
+    inside,
+    mapped,
+    sources,
+    training_view,
+    two_crops,
+    warped,
+)
 from benchmarks.features.training import CAMERA
 from simulator import CameraSettings, develop, get_camera
 from simulator.noise.generator import noise_generator
@@ -32,6 +41,8 @@ REPEATED, CORNER_ERRORS = 2.0, (3, 5, 10)
 #: Shake of the hand: motion at the metered exposure [pixel].
 _SHAKE = 0.5
 _RANSAC_PX = 2.0
+#: Places of a picture that are looked at for corners.
+_PLACES = 6
 
 #: From pictures and how many keypoints to find to the features of each picture.
 Detect = Callable[[Tensor, int], list[Features]]
@@ -110,20 +121,27 @@ def held_out_pairs(
 
 
 def _views(source: Source, rng: np.random.Generator) -> tuple[list[ReferenceScene], np.ndarray]:
-    """Light of both views, and the homography between them."""
+    """Light of both views, and the homography between them.
+
+    Of a few places, that with the most corners is taken: there is nothing to match on a flat wall.
+    """
     pitch = 2 if source.light.shape[0] == 3 else 1
     height, width = (n // pitch for n in source.light.shape[1:])
-    homographies = two_crops(rng, height, width, SIZE)
     image = source.light.permute(1, 2, 0).numpy()
-    scenes = []
-    for homography in homographies:
+
+    def light(homography: np.ndarray) -> Tensor:
         scaled = finer(homography) if pitch == 2 else homography
-        light = torch.from_numpy(warped(image, scaled, pitch * SIZE)).permute(2, 0, 1).contiguous()
-        scenes.append(
-            ReferenceScene(
-                source.name, source.group, "planar", light, CameraSettings(100.0, 1.0 / 64.0, 5.6)
-            )
-        )
+        crop = torch.from_numpy(warped(image, scaled, pitch * SIZE))
+        return crop.permute(2, 0, 1).contiguous()
+
+    places = [two_crops(rng, height, width, SIZE) for _ in range(_PLACES)]
+    counts = [len(training_view(source._replace(light=light(h))).corners) for h, _ in places]
+    homographies = places[int(np.argmax(counts))]
+    metered = CameraSettings(100.0, 1.0 / 64.0, 5.6)
+    scenes = [
+        ReferenceScene(source.name, source.group, "planar", light(homography), metered)
+        for homography in homographies
+    ]
     return scenes, homographies[1] @ np.linalg.inv(homographies[0])
 
 

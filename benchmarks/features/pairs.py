@@ -82,7 +82,9 @@ def _metered(light: Tensor) -> Tensor:
 
 def training_view(source: Source) -> View:
     """The picture of a source as files hold them, and the corners of it."""
-    packed = F.avg_pool2d(source.light[None], 2)[:, [0, 1, 1, 2]]
+    packed = source.light[None]
+    if packed.shape[1] == 3:
+        packed = F.avg_pool2d(packed, 2)[:, [0, 1, 1, 2]]
     picture = develop(packed)[0].permute(1, 2, 0).numpy()
     return View(np.round(picture * 255.0).astype(np.uint8), corners(picture))
 
