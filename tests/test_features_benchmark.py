@@ -203,6 +203,13 @@ def test_aliked_wants_its_weights(ae_env, here: Path) -> None:
     code, _, error = ae_env("bench", "features", "--weights", "none.pth", "--out", "results")
     assert code == 2
     assert "`weights` (='none.pth') must be an existing file" in error
+    # A file of the right layout is read; its features are of its network.
+    from kornia.feature import ALIKED
+
+    torch.save(ALIKED("aliked-n16").state_dict(), here / "random.pth")
+    found = judging.aliked(here / "random.pth")(torch.rand(2, 3, 64, 64), 20)
+    assert [f.points.shape for f in found] == [(20, 2)] * 2
+    assert [f.descriptors.shape[0] for f in found] == [20] * 2
     torch.save({"other": torch.zeros(1)}, here / "other.pth")
     with pytest.raises(ValueError, match="must hold aliked-n16: no "):
         judging.aliked(here / "other.pth")

@@ -63,11 +63,15 @@ class Numbered(Dataset):
         return pictures(6)[index], index
 
 
-@pytest.mark.parametrize("context", ["fork", "spawn"])
-def test_workers_give_the_pictures_of_this_process(context: str) -> None:
+@pytest.mark.parametrize(("context", "workers"), [("fork", 2), ("spawn", 1)])
+def test_workers_give_the_pictures_of_this_process(context: str, workers: int) -> None:
     """And persistent workers see that an epoch has begun."""
     dataset = AugmentedDataset(Numbered(), ExposureAugmentation(), seed=2)
-    options = {"num_workers": 2, "multiprocessing_context": context, "persistent_workers": True}
+    options = {
+        "num_workers": workers,
+        "multiprocessing_context": context,
+        "persistent_workers": True,
+    }
     loader = DataLoader(dataset, batch_size=3, **options)
     epochs = []
     for epoch in (0, 1):
