@@ -81,8 +81,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         _words(runs, groups),
         "## What the augmentations cost",
         table(costs, _cost_columns()),
-        "Milliseconds for one picture on one thread; training on one thread, crops and "
-        "augmentation included, on a machine that others used meanwhile.",
+        "Milliseconds for one picture on one thread, and seconds of the second stage of the "
+        "training on one thread, on a machine that others used meanwhile.",
         "## Across the exposure gap",
         "![accuracy against the gap, and matches of one pair](features.png)",
         *_by_gap(means),
@@ -105,15 +105,19 @@ def _words(runs: list[dict[str, Any]], groups: int) -> str:
     seeds = len({run["seed"] for run in runs if run["arm"] == "none"})
     count = sum(p.numel() for p in training.Detector().parameters())
     low, high = training.STOPS
+    steps = next(run["steps"] for run in runs if run["steps"])
     return (
         f"A detector and descriptor with {count:,} parameters (after SuperPoint, cells of 4 "
         f"pixels), trained from random weights on homographic pairs of {training.SIZE}-pixel crops "
         "of photographs and radiance maps: corners of the unchanged picture are the labels of the "
-        "scores, InfoNCE trains the descriptors. Only what is done to the crops differs between "
-        f"the rows: nothing; gamma in [1/3, 3] and contrast in [0.5, 1.5]; linear light times 2 to "
+        "scores, InfoNCE trains the descriptors. Each seed is trained without augmentation first; "
+        "these weights go on under each of the augmentations, for as many steps again. Every "
+        f"picture is brought to the same mean and contrast, and {training.AUGMENTED:.0%} of the "
+        "crops are augmented, the same ones in every row. Only what is done to them differs: "
+        f"nothing; gamma in [1/3, 3] and contrast in [0.5, 1.5]; linear light times 2 to "
         f"the power of {low:g} to {high:g}, clipped; `simulator.augment` with the same range of "
-        f"exposures alone, and in full (ISO 100 to 12800, defocus, motion). Same crops, "
-        f"{runs[0]['steps'] or training.STEPS} steps of {training.BATCH} pairs, {seeds} seeds.\n\n"
+        f"exposures alone, and in full (ISO 100 to 12800, a little defocus and "
+        f"motion). Same crops, twice {steps} steps of {training.BATCH} pairs, {seeds} seeds.\n\n"
         f"Judged on {groups} source groups that no training saw (photographs, maps, raws), each "
         f"photographed twice by the reference camera ({training.CAMERA}, Poisson noise, a mosaic, "
         "a body with hidden errors, a hand that shakes by half a pixel at the metered exposure), "

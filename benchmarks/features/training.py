@@ -36,6 +36,10 @@ CAMERA = "canon_70d"
 #: Side of a crop [pixel], pairs of a batch, points of a pair that are described.
 SIZE, BATCH, POINTS = 80, 8, 48
 STEPS, QUICK_STEPS = 800, 20
+#: Share of the crops that are augmented; the others stay as they are.
+AUGMENTED = 0.5
+#: Name of the weights that all augmentations start from.
+START = "start"
 _RATE, _TEMPERATURE, _SAME = 2e-3, 0.1, 6.0
 #: Weight of the loss of the descriptors against that of the scores.
 _DESCRIBED = 1.0
@@ -108,37 +112,59 @@ def weights_file(arm: str, seed: int, steps: int) -> Path:
 def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[Detector, float]:
     """The detector trained under an augmentation, or that of an earlier run; and its seconds.
 
-    All arms see the same crops in the same order; only what is done to them differs.
+    Random weights are trained without augmentation first, once for each seed, and go on under the
+    augmentation for as many steps. All arms see the same crops in the same order, and of the same
+    half of them what they make of them.
 
     Args:
         arm: Of `AUGMENTATIONS`.
         seed: Of the first weights, the crops and the augmentation.
-        steps: Of the optimiser.
+        steps: Of each of the two stages.
         limit: Photographs, and maps; None for all.
     """
-    path, model = weights_file(arm, seed, steps), Detector()
-    if path.is_file():
-        stored = load_file(path)
-        seconds = float(stored.pop("seconds"))
-        model.load_state_dict(stored)
-        return model.to(memory_format=torch.channels_last).eval(), seconds
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = Detector()
+    begin, end = weights_file(START, seed, steps), weights_file(arm, seed, steps)
+    if not begin.is_file():
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            model = Detector()
+        _fit(model, "none", seed, range(steps), _RATE, limit, begin)
+    if not end.is_file():
+        model = _stored(begin)[0]
+        _fit(model, arm, seed, range(steps, 2 * steps), 0.5 * _RATE, limit, end)
+    model, seconds = _stored(end)
+    return model.eval(), seconds
+
+
+def _stored(path: Path) -> tuple[Detector, float]:
+    model, stored = Detector().to(memory_format=torch.channels_last), load_file(path)
+    seconds = float(stored.pop("seconds"))
+    model.load_state_dict(stored)
+    return model, seconds
+
+
+def _fit(
+    model: Detector, arm: str, seed: int, steps: range, rate: float, limit: int | None, path: Path
+) -> None:
+    """Trains a detector, in place, and stores it in a file."""
     views = _views(limit)
     begun = time.perf_counter()
-    model.to(memory_format=torch.channels_last)
-    optimiser = torch.optim.AdamW(model.parameters(), lr=_RATE, weight_decay=1e-4)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=max(steps, 2))
-    for step, chosen in zip(range(steps), batches(len(views), BATCH, seed), strict=False):
+    model.to(memory_format=torch.channels_last).train()
+    optimiser = torch.optim.AdamW(model.parameters(), lr=rate, weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=max(len(steps), 2))
+    for step, chosen in zip(range(steps.stop), batches(len(views), BATCH, seed), strict=False):
+        if step not in steps:
+            continue
         batch = [
             _pair(views[i], np.random.default_rng([seed, step, j])) for j, i in enumerate(chosen)
         ]
         pictures = torch.from_numpy(np.stack([p for pair in batch for p in pair[0]]))
         pictures = pictures.permute(0, 3, 1, 2).float() / 255.0
-        seeds = sample_seeds(seed, step, range(len(pictures)))
-        pictures = as_codes(AUGMENTATIONS[arm](pictures, seeds))
-        loss = _loss(model, pictures, batch)
+        some = np.random.default_rng([seed, step]).random(len(pictures)) < AUGMENTED
+        indices = np.flatnonzero(some)
+        pictures[indices] = AUGMENTATIONS[arm](
+            pictures[indices], sample_seeds(seed, step, indices.tolist())
+        )
+        loss = _loss(model, as_codes(pictures), batch)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -150,7 +176,6 @@ def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[De
     state = {name: value.contiguous() for name, value in model.state_dict().items()}
     save_file({**state, "seconds": torch.tensor(seconds)}, partial)
     partial.replace(path)
-    return model.eval(), seconds
 
 
 @functools.cache
