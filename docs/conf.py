@@ -54,7 +54,7 @@ CONTENTS = {
     ],
     "The simulator": [
         *("simulator", "networks", "dataset", "colour", "performance", "stability"),
-        *("refocus", "hdr"),
+        *("refocus", "hdr", "augmentation"),
     ],
     "More": [
         "gallery",

@@ -85,7 +85,10 @@ def test_given_weights_are_measured_and_nothing_is_trained(ae_env, here: Path) -
         (("paper", "runs"), "`folder` (='runs') must hold a camera_params.csv"),
         (("paper", "data", "--weights", "none.safetensors"), "there is no none.json"),
         (("convergence", "data"), "`folder` (='data') is an argument of paper and recorded only"),
-        (("convergence", "--weights", "a"), "`weights` (='a') is an option of paper only"),
+        (
+            ("convergence", "--weights", "a"),
+            "`weights` (='a') is an option of paper and features only",
+        ),
     ],
 )
 def test_errors_before_any_work(ae_env, here: Path, arguments, message: str) -> None:

@@ -23,9 +23,10 @@ BENCHMARKS = (
         "convergence",
         "defects",
         "denoising",
-        "hdr",
+        "features",
     ),
     *(
+        "hdr",
         "libcamera",
         "onboard",
         "paper",
@@ -63,7 +64,11 @@ def bench(
         Path | None, typer.Option(help="Of throughput: another checkout, timed in turns with this.")
     ] = None,
     weights: Annotated[
-        Path | None, typer.Option(help="Of paper: measure these weights, and train nothing.")
+        Path | None,
+        typer.Option(
+            help="Of paper: measure these weights, and train nothing; of features: ALIKED's "
+            "(aliked-n16.pth), judged beside."
+        ),
     ] = None,
     part: Annotated[
         str | None, typer.Option(help="Of transfer: agents or tables; by default both.")
@@ -85,8 +90,8 @@ def bench(
         check_word("part", part, ("agents", "tables"))
     if name == "paper" and folder is None:
         raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
-    if weights is not None and name != "paper":
-        raise ValueError(f"`weights` (={str(weights)!r}) is an option of paper only")
+    if weights is not None and name not in ("paper", "features"):
+        raise ValueError(f"`weights` (={str(weights)!r}) is an option of paper and features only")
     if folder is not None and name not in ("paper", "recorded"):
         raise ValueError(f"`folder` (={str(folder)!r}) is an argument of paper and recorded only")
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():

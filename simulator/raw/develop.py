@@ -87,7 +87,7 @@ def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
     What a camera's own processing did besides (its tone curve, sharpening, compression) stays in.
 
     Args:
-        pictures: (B, 3, H, W) uint8, sRGB.
+        pictures: (B, 3, H, W) sRGB, uint8 or floating point in [0, 1].
 
     Returns:
         (B, 4, H, W) float32 in [0, 1]: each pixel becomes a packed one, its planes at one place.
@@ -96,12 +96,18 @@ def develop_inverse(pictures: torch.Tensor) -> torch.Tensor:
     >>> develop(develop_inverse(picture)).mul(255.0).round()[0, 0, 0]
     tensor([  0.,  17., 118., 255.])
     """
-    encoded = torch.arange(256, dtype=torch.float64) / 255.0
+    if pictures.is_floating_point():
+        return _decoded(pictures.float())[:, [0, 1, 1, 2]]
+    light = _decoded(torch.arange(256, dtype=torch.float64) / 255.0).float()
+    return light.to(pictures.device)[pictures.long()][:, [0, 1, 1, 2]]
+
+
+def _decoded(encoded: torch.Tensor) -> torch.Tensor:
+    """Light that `_finish` shows as `encoded`, sRGB in [0, 1]."""
     curved = ((encoded + 0.055) / 1.055) ** 2.4
     shown = torch.where(encoded <= 0.04045, encoded / 12.92, curved)
     # The inverse of Schlick's curve, see `apply_tone`.
-    light = shown / (PHOTOGRAPHIC_SLOPE - (PHOTOGRAPHIC_SLOPE - 1.0) * shown)
-    return light.float()[pictures.long()][:, [0, 1, 1, 2]]
+    return shown / (PHOTOGRAPHIC_SLOPE - (PHOTOGRAPHIC_SLOPE - 1.0) * shown)
 
 
 def render_srgb(

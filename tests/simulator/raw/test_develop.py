@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from simulator import CameraSettings, RawImage, develop, get_camera, read_raw, render_srgb
 from simulator.camera import CameraProfile
-from simulator.raw.develop import apply_tone, srgb_encode
+from simulator.raw.develop import apply_tone, develop_inverse, srgb_encode
 from tests.strategies import lights, log_uniform
 
 Z6 = get_camera("nikon_z6")
@@ -161,3 +161,15 @@ def test_a_real_raw_looks_as_libraw_shows_it(data_dir, exposure_ev):
     difference = ours - theirs / 257.0
     assert np.abs(difference.mean(axis=(0, 1))).max() < 0.25
     assert np.quantile(np.abs(difference), 0.999) < 1.5
+
+
+def test_the_inverse_takes_codes_and_floating_point() -> None:
+    """Above the sRGB curve's toe by hand: its inverse, then Schlick's curve solved for light."""
+    codes = torch.arange(256, dtype=torch.uint8).reshape(1, 1, 16, 16).expand(1, 3, 16, 16)
+    light, same = develop_inverse(codes), develop_inverse(codes.float() / 255.0)
+    assert torch.allclose(light, same, rtol=1e-5, atol=1e-8)
+    shown, p = ((200 / 255 + 0.055) / 1.055) ** 2.4, 1.618
+    assert light[0, 3].flatten()[200].item() == pytest.approx(
+        shown / (p - (p - 1) * shown), rel=1e-3
+    )
+    assert develop(same).sub(codes / 255.0).abs().max() < 1e-5

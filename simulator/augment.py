@@ -1,0 +1,345 @@
+"""Augmentation for training: the same picture under another exposure, with its noise and blur.
+
+A picture is taken back to scene-linear light, photographed by the simulator (exposure, defocus,
+motion, the noise of the target's ISO, clip, whole digital numbers) and developed again. What is
+drawn for a picture is a function of its seed alone, whatever the batch or the worker.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset
+
+from simulator.camera import CameraProfile, get_camera
+from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.sensor import clip_and_quantise
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.motion_path import Movement
+from simulator.raw.develop import develop, develop_inverse
+from simulator.raw.image import check_packed
+from simulator.settings import CameraSettings
+
+#: Parts of the augmentation, in the order in which they act.
+MODULES = ("exposure", "blur", "noise")
+#: Displayed level from which a pixel counts as clipped by the camera that took the picture.
+_CLIPPED = 0.97
+#: Widest blur [pixel].
+_WIDEST = 64.0
+#: Elements of a piece that is developed at a time. PyTorch splits larger arrays among its threads,
+#: and the last bits then depend on their number.
+_PIECE = 2**15
+#: f-number of every capture: the defocus of a `PreparedScene` is stated at f/4.
+_F_NUMBER, _TIME = 4.0, 1.0
+
+
+class DrawnSettings(NamedTuple):
+    """What an `ExposureAugmentation` draws for one picture.
+
+    Args:
+        stops: Exposure relative to the picture's [EV].
+        iso: ISO speed, whose noise the new picture has.
+        defocus: Diameter of the defocus disc [pixel].
+        motion: Length of the motion blur [pixel].
+        direction: Of the motion [rad]; 0 is along the rows.
+        highlights: By how much light that was clipped is raised above white [EV].
+    """
+
+    stops: float
+    iso: float
+    defocus: float
+    motion: float
+    direction: float
+    highlights: float
+
+
+@dataclass(frozen=True)
+class ExposureAugmentation:
+    """Photographs pictures again at settings drawn at random.
+
+    Seeds decide everything: the same seed gives the same picture, bit for bit on one device, alone
+    or in a batch, in any process and on any number of threads. It can be pickled.
+
+    Args:
+        camera: The body whose noise, black level and digital numbers the pictures get: a
+            `CameraProfile` with a noise calibration, or the name of a built-in one.
+        stops: Range of the exposure relative to the picture's [EV], drawn uniformly.
+        isos: Range of the ISO speed, drawn uniformly in its logarithm.
+        defocus: Range of the diameter of the defocus disc [pixel], in [0, 64], drawn uniformly.
+        motion: Range of the length of the motion blur [pixel], in [0, 64], drawn uniformly; its
+            direction is random.
+        highlights: Range by which clipped light of an RGB picture is raised above white [EV],
+            drawn uniformly, so that it is not grey in a darker picture; raws hold what is known.
+        modules: Which of ``"exposure"``, ``"blur"`` and ``"noise"`` act. What is drawn does not
+            depend on it. With none, pictures are returned as they are.
+
+    Raises:
+        ValueError: If an argument is out of its range.
+
+    >>> augment = ExposureAugmentation(stops=(-2.0, -2.0), modules=("exposure",))
+    >>> grey = torch.full((1, 4, 2, 2), 0.4)
+    >>> augment(grey, [0])[0, 0, 0, 0]
+    tensor(0.1000)
+    """
+
+    camera: CameraProfile | str = "nikon_z6"
+    stops: tuple[float, float] = (-4.0, 4.0)
+    isos: tuple[float, float] = (100.0, 12800.0)
+    defocus: tuple[float, float] = (0.0, 2.0)
+    motion: tuple[float, float] = (0.0, 3.0)
+    highlights: tuple[float, float] = (0.0, 2.5)
+    modules: tuple[str, ...] = MODULES
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.camera, CameraProfile):
+            object.__setattr__(self, "camera", get_camera(self.camera))
+        if not self.profile.nlf_by_iso:
+            raise ValueError(f"`camera` (={self.profile.name!r}) must have a noise calibration")
+        for name, low, high in (
+            ("stops", -20.0, 20.0),
+            ("isos", 1.0, 1e7),
+            ("defocus", 0.0, _WIDEST),
+            ("motion", 0.0, _WIDEST),
+            ("highlights", 0.0, 20.0),
+        ):
+            object.__setattr__(self, name, _check_range(name, getattr(self, name), low, high))
+        if isinstance(self.modules, str) or any(name not in MODULES for name in self.modules):
+            raise ValueError(f"`modules` (={self.modules!r}) must be some of {list(MODULES)}")
+        object.__setattr__(self, "modules", tuple(self.modules))
+
+    @property
+    def profile(self) -> CameraProfile:
+        """The camera."""
+        assert isinstance(self.camera, CameraProfile)
+        return self.camera
+
+    def draw(self, seed: int) -> DrawnSettings:
+        """What a picture with this seed is given; what `modules` leaves out is drawn, too."""
+        rng = np.random.default_rng([int(seed), 0xA06])
+        low, high = (math.log2(iso) for iso in self.isos)
+        return DrawnSettings(
+            stops=rng.uniform(*self.stops),
+            iso=2.0 ** rng.uniform(low, high),
+            defocus=rng.uniform(*self.defocus),
+            motion=rng.uniform(*self.motion),
+            direction=rng.uniform(0.0, math.pi),
+            highlights=rng.uniform(*self.highlights),
+        )
+
+    def __call__(
+        self,
+        images: torch.Tensor,
+        seeds: Sequence[int] | np.ndarray | torch.Tensor | torch.Generator,
+        *,
+        nlf: NoiseLevelFunction | None = None,
+    ) -> torch.Tensor:
+        """The same pictures, photographed again.
+
+        Args:
+            images: (B, 3, H, W) sRGB pictures, floating point in [0, 1] or uint8, taken for
+                `develop`'s; or (B, 4, H, W) floating point, packed raws, 1.0 at sensor white. On
+                any device; the steps run there, the noise is drawn on the CPU.
+            seeds: (B,) integers >= 0, one for each picture (`sample_seeds`), or a generator on the
+                CPU that draws them.
+            nlf: Noise that raws have already: only what is missing is added. None takes pictures
+                as free of noise.
+
+        Returns:
+            Tensor of the shape and on the device of `images`, float32: pictures in [0, 1], raws
+            in whole digital numbers from minus the pedestal to 1. Without modules, `images`.
+
+        Raises:
+            ValueError: If an argument has the wrong shape, dtype or range.
+        """
+        images = _check_images(images)
+        words = _check_seeds(seeds, len(images))
+        if nlf is not None and not isinstance(nlf, NoiseLevelFunction):
+            raise ValueError(f"`nlf` (={nlf!r}) must be a NoiseLevelFunction or None")
+        if not self.modules:
+            return images
+        source = NoiseLevelFunction.zero() if nlf is None else nlf
+        out = torch.empty(images.shape, device=images.device)
+        for image, seed, frame in zip(images, words, out, strict=True):
+            frame.copy_(self._photographed(image, seed, source))
+        return out
+
+    def _photographed(
+        self, image: torch.Tensor, seed: int, source: NoiseLevelFunction
+    ) -> torch.Tensor:
+        """One picture."""
+        drawn = self.draw(seed)
+        if image.shape[0] == 4:
+            return self._raw(image.float(), seed, drawn, source)
+        light = _in_pieces(lambda piece: develop_inverse(piece[None])[0], image)
+        if "exposure" in self.modules:
+            light = light * _raised(image, drawn.highlights)
+        raw = self._raw(light, seed, drawn, source)
+        return _in_pieces(lambda piece: develop(piece[None])[0], raw)
+
+    def _raw(
+        self, light: torch.Tensor, seed: int, drawn: DrawnSettings, source: NoiseLevelFunction
+    ) -> torch.Tensor:
+        """(4, H, W) as the camera records `light`.
+
+        The capture takes 1 s at f/4 and at the drawn ISO; the exposure of the picture that it is
+        made of is as much less or more as the drawn stops say.
+        """
+        stops = drawn.stops if "exposure" in self.modules else 0.0
+        blurs = "blur" in self.modules
+        settings = CameraSettings(drawn.iso, _TIME, _F_NUMBER)
+        prepared = PreparedScene(
+            light=light,
+            reference=CameraSettings(drawn.iso, _TIME * 2.0**-stops, _F_NUMBER),
+            camera=self.profile,
+            nlf=source,
+            image_speed=drawn.motion / (_TIME * light.shape[-2]) if blurs else 0.0,
+            defocus=drawn.defocus if blurs else 0.0,
+            movement=Movement(drawn.direction),
+            tolerance=0.0,
+        )
+        if "noise" in self.modules:
+            return prepared.expose([settings], seed=seed)[0]
+        return clip_and_quantise(prepared.expected(settings), self.profile)
+
+
+def _raised(image: torch.Tensor, stops: float) -> torch.Tensor:
+    """(1, H, W) factor of the light: 2**`stops` at white, fading in from just below it."""
+    peak = image.amax(dim=0, keepdim=True).float() / (1.0 if image.is_floating_point() else 255.0)
+    blown = ((peak - _CLIPPED) / (1.0 - _CLIPPED)).clamp_(0.0, 1.0)
+    return 1.0 + blown.square_() * (2.0**stops - 1.0)
+
+
+def _in_pieces(
+    function: Callable[[torch.Tensor], torch.Tensor], image: torch.Tensor
+) -> torch.Tensor:
+    """A function of single pixels of (C, H, W), some rows at a time."""
+    rows = max(1, _PIECE // (4 * image.shape[-1]))
+    pieces = torch.split(image, rows, dim=1)
+    return torch.cat([function(piece.contiguous()) for piece in pieces], dim=1)
+
+
+def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -> list[int]:
+    """Seeds of the samples of an epoch, for a batch that is augmented after it was collated.
+
+    Args:
+        seed: Of the training, >= 0.
+        epoch: Number of the epoch, >= 0: each has pictures of its own.
+        indices: Of the samples in the data set, >= 0.
+
+    Returns:
+        An integer for each index, a function of it, of `seed` and of `epoch`.
+
+    >>> sample_seeds(0, 1, [5, 7]) == sample_seeds(0, 1, [5]) + sample_seeds(0, 1, [7])
+    True
+    """
+    found = []
+    for index in indices.tolist() if isinstance(indices, torch.Tensor) else indices:
+        words = [_check_integer("seed", seed), _check_integer("epoch", epoch)]
+        sequence = np.random.SeedSequence([*words, _check_integer("indices", index)])
+        found.append(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
+    return found
+
+
+class AugmentedDataset(Dataset[Any]):
+    """A data set whose pictures are augmented where they are loaded, in the workers.
+
+    The seed of a sample comes from `seed`, the epoch and its index: the order of the samples and
+    the number of workers do not matter.
+
+    Args:
+        dataset: Map-style data set of pictures (C, H, W), or of tuples and lists that begin with
+            one. All that `ExposureAugmentation` takes.
+        augmentation: What photographs them.
+        seed: Of the training, >= 0.
+    """
+
+    def __init__(
+        self, dataset: Dataset[Any], augmentation: ExposureAugmentation, *, seed: int = 0
+    ) -> None:
+        self.dataset, self.augmentation = dataset, augmentation
+        self.seed = _check_integer("seed", seed)
+        # Shared memory: workers that persist see it change.
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+
+    @property
+    def epoch(self) -> int:
+        """Number of the epoch."""
+        return int(self._epoch)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Begins an epoch; call it before the loader is iterated, as that of a sampler."""
+        self._epoch.fill_(_check_integer("epoch", epoch))
+
+    def __len__(self) -> int:
+        return len(self.dataset)  # type: ignore[arg-type]
+
+    def __getitem__(self, index: int) -> Any:
+        """Sample `index`, its picture augmented."""
+        index = index + len(self) if index < 0 else index
+        sample = self.dataset[index]
+        alone = isinstance(sample, torch.Tensor)
+        image, rest = (sample, []) if alone else (sample[0], list(sample[1:]))
+        if not isinstance(image, torch.Tensor) or image.ndim != 3:
+            shape = tuple(image.shape) if isinstance(image, torch.Tensor) else type(image).__name__
+            raise ValueError(f"`dataset` ({shape} at {index}) must hold tensors (C, H, W)")
+        seeds = sample_seeds(self.seed, self.epoch, [index])
+        (augmented,) = self.augmentation(image[None], seeds)
+        return augmented if alone else type(sample)([augmented, *rest])
+
+
+# -- checks ---------------------------------------------------------------------------------------
+
+
+def _check_range(name: str, given: Any, low: float, high: float) -> tuple[float, float]:
+    try:
+        first, last = (math.nan if isinstance(v, bool) else float(v) for v in given)
+    except (TypeError, ValueError):
+        first = last = math.nan
+    if not low <= first <= last <= high:
+        raise ValueError(
+            f"`{name}` (={given!r}) must be two numbers in [{low:g}, {high:g}], the lower one first"
+        )
+    return first, last
+
+
+def _check_integer(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value < 2**63:
+        raise ValueError(f"`{name}` (={value!r}) must be an integer >= 0, below 2**63")
+    return int(value)
+
+
+def _check_images(images: Any) -> torch.Tensor:
+    if not isinstance(images, torch.Tensor) or images.ndim != 4 or images.shape[1] not in (3, 4):
+        kind = tuple(images.shape) if isinstance(images, torch.Tensor) else type(images).__name__
+        raise ValueError(
+            f"`images` (={kind}) must be a tensor (B, 3, H, W) of pictures or (B, 4, H, W) of "
+            "packed raws"
+        )
+    if images.shape[1] == 4:
+        return check_packed("images", images, ndim=4) if len(images) else images
+    if min(images.shape[2:]) < 1:
+        raise ValueError(f"`images` (shape {tuple(images.shape)}) must not be empty")
+    if images.dtype == torch.uint8 or not len(images):
+        return images
+    low, high = torch.aminmax(images)
+    if not images.is_floating_point() or not (low >= 0.0 and high <= 1.0):  # also refuses NaN
+        raise ValueError(
+            f"`images` ({images.dtype}, {low.item():g} to {high.item():g}) must be floating point "
+            "in [0, 1], or uint8"
+        )
+    return images
+
+
+def _check_seeds(seeds: Any, count: int) -> list[int]:
+    if isinstance(seeds, torch.Generator):
+        return torch.randint(2**62, (count,), generator=seeds).tolist()
+    given = seeds.tolist() if isinstance(seeds, torch.Tensor | np.ndarray) else seeds
+    if isinstance(given, str | Real) or not isinstance(given, Sequence) or len(given) != count:
+        raise ValueError(f"`seeds` (={seeds!r}) must be {count} integers, one for each picture")
+    return [_check_integer("seeds", value) for value in given]

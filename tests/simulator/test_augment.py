@@ -1,0 +1,268 @@
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, Dataset, TensorDataset
+
+from simulator import NoiseLevelFunction, get_camera
+from simulator.augment import AugmentedDataset, DrawnSettings, ExposureAugmentation, sample_seeds
+from simulator.raw.develop import GREY_CARD_SIGNAL
+
+CAMERA = get_camera("nikon_z6")
+NOTHING = {"stops": (0.0, 0.0), "defocus": (0.0, 0.0), "motion": (0.0, 0.0)}
+
+
+def pictures(count: int = 4, size: int = 24, planes: int = 3) -> torch.Tensor:
+    return torch.rand(count, planes, size, size, generator=torch.Generator().manual_seed(0))
+
+
+# -- determinism ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("planes", [3, 4])
+def test_a_seed_gives_the_same_picture_alone_in_a_batch_and_in_another_order(planes: int) -> None:
+    augment, given = ExposureAugmentation(), pictures(planes=planes)
+    together = augment(given, [3, 1, 4, 15])
+    for index, seed in enumerate((3, 1, 4, 15)):
+        alone = augment(given[index : index + 1], torch.tensor([seed]))
+        assert torch.equal(alone[0], together[index])
+    assert torch.equal(augment(given.flip(0), np.array([15, 4, 1, 3])).flip(0), together)
+    assert not torch.equal(augment(given, [3, 1, 4, 16])[3], together[3])
+
+
+def test_the_number_of_threads_does_not_matter() -> None:
+    """PyTorch splits larger arrays among threads, and the last bits depend on where."""
+    augment, given, threads = ExposureAugmentation(), pictures(1, 200), torch.get_num_threads()
+    found = []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            found.append(augment(given, [7]))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
+
+
+def test_a_generator_draws_the_seeds() -> None:
+    augment, given = ExposureAugmentation(), pictures()
+    first = augment(given, torch.Generator().manual_seed(5))
+    assert torch.equal(first, augment(given, torch.Generator().manual_seed(5)))
+    assert not torch.equal(first, augment(given, torch.Generator().manual_seed(6)))
+
+
+class Numbered(Dataset):
+    """Pictures with their numbers; at the top of the module, for workers that are spawned."""
+
+    def __len__(self) -> int:
+        return 6
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
+        return pictures(6)[index], index
+
+
+@pytest.mark.parametrize(("context", "workers"), [("fork", 2), ("spawn", 1)])
+def test_workers_give_the_pictures_of_this_process(context: str, workers: int) -> None:
+    """And persistent workers see that an epoch has begun."""
+    dataset = AugmentedDataset(Numbered(), ExposureAugmentation(), seed=2)
+    options = {
+        "num_workers": workers,
+        "multiprocessing_context": context,
+        "persistent_workers": True,
+    }
+    loader = DataLoader(dataset, batch_size=3, **options)
+    epochs = []
+    for epoch in (0, 1):
+        dataset.set_epoch(epoch)
+        images, numbers = (torch.cat(parts) for parts in zip(*loader, strict=True))
+        assert numbers.tolist() == list(range(6))
+        here = ExposureAugmentation()(pictures(6), sample_seeds(2, epoch, numbers))
+        assert torch.equal(images, here)
+        epochs.append(images)
+    assert not torch.equal(*epochs)
+    del loader
+
+
+def test_samples_keep_what_they_hold_besides() -> None:
+    labels = torch.arange(4)
+    dataset = AugmentedDataset(TensorDataset(pictures(), labels), ExposureAugmentation())
+    image, label = dataset[-1]
+    assert label == 3
+    assert image.shape == (3, 24, 24)
+    assert len(dataset) == 4
+    alone = AugmentedDataset(pictures(), ExposureAugmentation())  # a tensor is a data set, too
+    assert torch.equal(alone[3], image)
+
+
+def test_seeds_differ_by_seed_epoch_and_index() -> None:
+    seeds = {sample_seeds(s, e, [i])[0] for s in range(3) for e in range(3) for i in range(3)}
+    assert len(seeds) == 27
+
+
+def test_it_can_be_pickled() -> None:
+    augment = ExposureAugmentation(stops=(-1, 1), modules=["exposure"])
+    assert pickle.loads(pickle.dumps(augment)) == augment
+
+
+# -- what it does ---------------------------------------------------------------------------------
+
+
+def test_nothing_asked_changes_nothing() -> None:
+    given = pictures()
+    assert torch.equal(ExposureAugmentation(modules=())(given, range(4)), given)
+    # Only the sensor's digital numbers are left, 1 / 15520 of white: at black, where the curves
+    # are steepest, 12.92 * 1.618 of one.
+    still = ExposureAugmentation(**NOTHING, highlights=(0.0, 0.0), modules=("exposure", "blur"))
+    step = 0.5 / min(CAMERA.span)
+    assert (still(given, range(4)) - given).abs().max() <= 12.92 * 1.618 * step + 1e-5
+
+
+@pytest.mark.parametrize("stops", [-3.0, -1.0, 1.5])
+def test_raws_are_exposed_by_the_ratio_and_clipped(stops: float) -> None:
+    augment = ExposureAugmentation(stops=(stops, stops), modules=("exposure",))
+    given = torch.linspace(0.0, 1.0, 64).reshape(1, 1, 8, 8).expand(1, 4, 8, 8)
+    wanted = (given.double() * 2.0**stops).clamp(max=1.0)
+    assert (augment(given, [0]) - wanted).abs().max() <= 0.51 / min(CAMERA.span)
+
+
+def test_a_grey_card_two_stops_under() -> None:
+    """By hand: light of a card, Schlick's curve p x / ((p - 1) x + 1), the sRGB curve."""
+    p = 0.18 * (1 - GREY_CARD_SIGNAL) / (GREY_CARD_SIGNAL * (1 - 0.18))
+
+    def shown(light: float) -> float:
+        return 1.055 * (p * light / ((p - 1) * light + 1)) ** (1 / 2.4) - 0.055
+
+    augment = ExposureAugmentation(stops=(-2.0, -2.0), modules=("exposure",))
+    card = torch.full((1, 3, 4, 4), shown(GREY_CARD_SIGNAL))
+    wanted = shown(GREY_CARD_SIGNAL / 4)
+    assert augment(card, [0]).mean().item() == pytest.approx(wanted, abs=4e-4)
+
+
+def test_clipped_highlights_stay_white_where_their_light_is_above() -> None:
+    white = torch.ones(1, 3, 4, 4)
+    raised = ExposureAugmentation(stops=(-2.0, -2.0), highlights=(2.0, 2.0), modules=("exposure",))
+    assert raised(white, [0]).min().item() == pytest.approx(1.0, abs=1e-6)
+    grey = ExposureAugmentation(stops=(-2.0, -2.0), highlights=(0.0, 0.0), modules=("exposure",))
+    assert grey(white, [0]).max() < 0.8
+    codes = torch.full((1, 3, 4, 4), 255, dtype=torch.uint8)
+    assert torch.allclose(raised(codes, [0]), raised(white, [0]))
+
+
+@pytest.mark.parametrize("source", [None, NoiseLevelFunction((2e-5,) * 4, (1e-7,) * 4)])
+def test_noise_has_the_variance_of_the_nlf(source: NoiseLevelFunction | None) -> None:
+    """Of the target's ISO; a source's own noise, exposed, is taken away from it."""
+    iso, stops, level = 3200.0, -1.0, 0.4
+    augment = ExposureAugmentation(**NOTHING | {"stops": (stops, stops)}, isos=(iso, iso))
+    flat = torch.full((1, 4, 256, 256), level)
+    noisy = augment(flat, [1], nlf=source)[0]
+    nlf, signal, ratio = CAMERA.nlf(iso), level * 2.0**stops, 2.0**stops
+    for plane in range(4):
+        wanted = nlf.read[plane] + nlf.shot[plane] * signal
+        if source is not None:
+            wanted -= ratio**2 * source.read[plane] + ratio * source.shot[plane] * signal
+        found = noisy[plane].double()
+        assert found.mean().item() == pytest.approx(signal, abs=5 * math.sqrt(wanted) / 256)
+        # Standard error of a variance of 65536 normals: 0.55 %.
+        assert found.var().item() == pytest.approx(wanted, rel=0.03)
+
+
+def test_blur_keeps_light_and_has_the_moments_of_disc_and_streak() -> None:
+    diameter, length = 6.0, 8.0
+    augment = ExposureAugmentation(
+        defocus=(diameter, diameter), motion=(length, length), modules=("blur",)
+    )
+    point = torch.zeros(1, 4, 33, 33)
+    point[:, :, 16, 16] = 0.9
+    spread = augment(point, [3])[0, 0].double()
+    assert spread.sum().item() == pytest.approx(0.9, rel=0.02)
+    y, x = (torch.arange(33.0).double() - 16.0 for _ in range(2))
+    weights = spread / spread.sum()
+    across = (weights.sum(0) * x**2).sum() + (weights.sum(1) * y**2).sum()
+    # A disc of diameter d has d^2 / 16 along each axis, a streak of length l has l^2 / 12.
+    assert across.item() == pytest.approx(2 * diameter**2 / 16 + length**2 / 12, rel=0.1)
+    directions = {augment.draw(seed).direction for seed in range(20)}
+    assert min(directions) < 1.0 < 2.0 < max(directions) <= math.pi
+
+
+def test_settings_are_drawn_within_their_ranges_whatever_acts() -> None:
+    full = ExposureAugmentation()
+    exposure = ExposureAugmentation(modules=("exposure",))
+    drawn = [full.draw(seed) for seed in range(200)]
+    assert drawn == [exposure.draw(seed) for seed in range(200)]
+    columns = DrawnSettings(*np.array(drawn).T)
+    ranges = {"stops": (-4, 4), "iso": (100, 12800), "defocus": (0, 2), "motion": (0, 3)}
+    for name, (low, high) in ranges.items():
+        values = getattr(columns, name)
+        values, ends = (np.log2(v) if name == "iso" else v for v in (values, np.array([low, high])))
+        width = ends[1] - ends[0]
+        assert ends[0] <= values.min() < ends[0] + 0.05 * width
+        assert ends[1] - 0.05 * width < values.max() <= ends[1]
+
+
+def test_an_empty_batch_passes() -> None:
+    assert ExposureAugmentation()(torch.zeros(0, 3, 4, 4), []).shape == (0, 3, 4, 4)
+
+
+@pytest.mark.gpu
+def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    given = pictures()
+    here, there = (ExposureAugmentation()(x, range(4)) for x in (given, given.cuda()))
+    assert there.is_cuda
+    assert (here - there.cpu()).abs().max() <= 12.92 * 1.618 / min(CAMERA.span) + 1e-4
+
+
+# -- bad input ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stops": (1.0, -1.0)}, r"`stops` \(=\(1.0, -1.0\)\) must be two numbers"),
+        ({"stops": (-1.0, math.nan)}, "`stops`"),
+        ({"stops": 2.0}, "`stops`"),
+        ({"isos": (0.0, 100.0)}, "`isos`"),
+        ({"defocus": (0.0, 65.0)}, r"`defocus` .* must be two numbers in \[0, 64\]"),
+        ({"motion": (-1.0, 1.0)}, "`motion`"),
+        ({"highlights": ("a", "b")}, "`highlights`"),
+        ({"modules": ("exposure", "colour")}, "`modules`"),
+        ({"modules": "noise"}, "`modules`"),
+        ({"camera": "nikon_z7"}, "did you mean 'nikon_z6'"),
+    ],
+)
+def test_bad_settings(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ExposureAugmentation(**options)
+
+
+@pytest.mark.parametrize(
+    ("images", "seeds", "message"),
+    [
+        (torch.zeros(3, 4, 4), [0], "`images`"),
+        (torch.zeros(1, 2, 4, 4), [0], r"`images` \(=\(1, 2, 4, 4\)\)"),
+        (torch.full((1, 3, 4, 4), 1.5), [0], r"`images` .* in \[0, 1\]"),
+        (torch.full((1, 3, 4, 4), math.nan), [0], "`images`"),
+        (torch.full((1, 4, 4, 4), math.inf), [0], "`images` .* finite"),
+        (torch.zeros(1, 3, 4, 4, dtype=torch.int64), [0], "`images`"),
+        (torch.zeros(1, 4, 4, 4, dtype=torch.uint8), [0], "`images` .* floating point"),
+        (torch.zeros(1, 3, 4, 4), [0, 1], "`seeds` .* must be 1 integers"),
+        (torch.zeros(1, 3, 4, 4), [-1], "`seeds`"),
+        (torch.zeros(1, 3, 4, 4), [0.5], "`seeds`"),
+        (torch.zeros(1, 3, 4, 4), 3, "`seeds`"),
+    ],
+)
+def test_bad_input(images: torch.Tensor, seeds: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ExposureAugmentation()(images, seeds)
+
+
+def test_bad_samples_and_seeds() -> None:
+    with pytest.raises(ValueError, match="must hold tensors"):
+        AugmentedDataset([np.zeros((3, 4, 4))], ExposureAugmentation())[0]
+    with pytest.raises(ValueError, match="`seed`"):
+        AugmentedDataset([], ExposureAugmentation(), seed=-1)
+    with pytest.raises(ValueError, match="`epoch`"):
+        sample_seeds(0, -1, [0])
