@@ -207,10 +207,11 @@ class Page:
         if viewed is None:
             return
         self._viewed = viewed
-        self._title.text = name
         self._episode.show_scene(viewed)
         self._one_raw.take_scene(viewed)
         await self._exposure.show_scene(viewed)
+        if viewed is self._viewed:  # no other was opened meanwhile
+            self._title.text = name
         await self._show_raw()
 
     async def _show_raw(self) -> None:

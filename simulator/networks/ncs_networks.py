@@ -42,8 +42,9 @@ def light_of_aperture(f_number: Tensor) -> Tensor:
     Args:
         f_number: (B,) effective f-numbers, such as sqrt(2) ** 9 for f/22.
 
-    >>> light_of_aperture(torch.tensor([2.0 ** (9 / 2), 2.0 ** (26 / 6), 4.0])).tolist()
-    [1.0, 1.3333333730697632, 32.0]
+    >>> light = light_of_aperture(torch.tensor([2.0 ** (9 / 2), 2.0 ** (26 / 6), 4.0]))
+    >>> [round(value, 5) for value in light.tolist()]
+    [1.0, 1.33333, 32.0]
     """
     stops = _STOPS_OF_F22 - 2.0 * f_number.double().log2()
     whole = (stops + 1e-9).floor()  # rounding must not take a whole stop for the one below
