@@ -59,6 +59,19 @@ def encode_observation(signal: torch.Tensor, out: torch.Tensor | None = None) ->
     return codes.byte() if out is None else out.copy_(codes)
 
 
+def encode_array(signal: np.ndarray) -> np.ndarray:
+    """`encode_observation` of an array, without torch: its threads do not survive a fork.
+
+    Args:
+        signal: Of any shape.
+
+    Returns:
+        uint8 of this shape.
+    """
+    light = np.clip(signal, -PEDESTAL, 1.0) + PEDESTAL
+    return np.rint(255.0 * np.sqrt(light / (1.0 + PEDESTAL))).astype(np.uint8)
+
+
 def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     """What an image processor hands to its auto exposure, from the 8-bit codes of frames.
 
@@ -77,7 +90,7 @@ def frame_statistics(codes: np.ndarray) -> dict[str, np.ndarray]:
     sums = np.add.reduceat(sums, columns, axis=-1)
     area = np.diff(rows, append=height)[:, None] * np.diff(columns, append=width)
     means = np.clip(sums / area, 0.0, 1.0)
-    zones = np.rint(255.0 * np.sqrt((means + PEDESTAL) / (1.0 + PEDESTAL))).astype(np.uint8)
+    zones = encode_array(means)
     flat = codes.reshape(len(codes), -1)
     counts = np.stack([np.bincount(frame, minlength=256) for frame in flat])
     shares = (counts / flat.shape[1]).astype(np.float32)

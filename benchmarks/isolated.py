@@ -41,7 +41,8 @@ def isolated(
         arguments: Of `task`.
 
     Raises:
-        RuntimeError: If it fails; with its last words.
+        ValueError: If it refuses its arguments; in its own words.
+        RuntimeError: If it fails otherwise; with its last words.
     """
     command = [sys.executable, "-m", __name__, f"{task.__module__}:{task.__qualname__}"]
     variables = {name: str(num_threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")}
@@ -59,6 +60,9 @@ def isolated(
         )
     if done.returncode:
         words = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        kind, _, message = words[-1].partition(": ")
+        if kind == "ValueError":
+            raise ValueError(message)
         raise RuntimeError(f"{task.__qualname__}({arguments}): {words[-1]}")
     return json.loads(done.stdout.splitlines()[-1])
 

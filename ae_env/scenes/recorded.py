@@ -161,8 +161,9 @@ def _places(
         places[state] = file
     if len(places) < 2:
         raise ValueError(
-            f"recorded scene {scene!r} ({len(places)} of {len(files)} captures in the grid) must "
-            "have two states or more: settings that its files share are one state"
+            f"recorded scene {scene!r} ({len(places)} of {len(files)} captures in the grid, such "
+            f"as {str(files[0].path)!r}) must have two states or more: settings that its files "
+            "share are one state, and what is left of a name without them is the scene's name"
         )
     return places
 
@@ -281,6 +282,8 @@ def _read(file: RecordedFile, camera: CameraProfile | None = None) -> RawImage:
         if not file.is_picture:
             return read_raw(file.path, settings=file.settings)
         with Image.open(file.path) as picture:
+            if picture.mode.startswith(("I", "F")):
+                raise ValueError(f"must have 8 bits a sample, not mode {picture.mode!r}")
             rgb = np.asarray(ImageOps.exif_transpose(picture).convert("RGB"))
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError) as error:
         raise ValueError(f"recorded file {str(file.path)!r} cannot be read: {error}") from error

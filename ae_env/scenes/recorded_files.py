@@ -43,11 +43,15 @@ _COLUMNS = {
 _SETTINGS = ("iso", "exposure_time", "f_number")
 _NUMBER = r"(\d+(?:\.\d+)?)"
 #: Settings in a name, in the order in which they are looked for.
+# A fraction is one over something. An underscore parts words as well, so that it is a fraction's
+# bar only where nothing else stands before: "1_125s", but not "frame_0001_8s".
 _IN_NAMES = (
+    ("iso", re.compile(rf"(?<![a-z\d.]){_NUMBER} ?iso(?![a-z\d])", re.I)),
     ("iso", re.compile(rf"(?<![a-z])iso[_-]?{_NUMBER}", re.I)),
-    ("exposure_time", re.compile(rf"(?<![\d.]){_NUMBER}[-_]{_NUMBER} ?s(?![a-z])", re.I)),
-    ("exposure_time", re.compile(rf"(?<![\d.]){_NUMBER} ?(s|ms|us)(?![a-z])", re.I)),
     ("f_number", re.compile(rf"(?<![a-z\d])f-?{_NUMBER}(?![a-z\d])", re.I)),
+    ("exposure_time", re.compile(rf"(?<![\d.])(?<!frame[_-])(1)-{_NUMBER} ?s(?![a-z])", re.I)),
+    ("exposure_time", re.compile(rf"^[_\-. ]*(1)_{_NUMBER} ?s(?![a-z])", re.I)),
+    ("exposure_time", re.compile(rf"(?<![\d.]){_NUMBER} ?(s|ms|us)(?![a-z])", re.I)),
 )
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 _FRAME = re.compile(r"frame[_-]?(\d+)", re.I)
@@ -90,7 +94,7 @@ def index_recorded(folder: Path, known: Mapping[str, float]) -> list[RecordedFil
         ValueError: If there is no capture, one does not state its settings, or a table is wrong.
     """
     if not folder.is_dir():
-        raise ValueError(f"`scenes` (='recorded:{folder}') must name a folder: there is none")
+        raise ValueError(f"`scenes` (='recorded:{folder}') must name an existing folder")
     tables = _Tables(folder)
     found = [
         _recorded(folder, path, tables, known)

@@ -78,6 +78,8 @@ class Classifier:
             raise ValueError(f"`std` (={std!r}) must be > 0")
         self.batch: int | None = None  # of a network that takes no other number of pictures
         if callable(model):
+            if getattr(model, "training", False):
+                raise ValueError("`model` must be in evaluation mode: call its eval() first")
             self._model: Network | tuple[str, str] = model
             self.size = size or INPUT_SIZE
             return
@@ -121,10 +123,11 @@ class Classifier:
 
 
 def _triple(name: str, values: Sequence[float]) -> tuple[float, float, float]:
-    numbers = tuple(float(value) for value in values)
-    if len(numbers) != 3:
-        raise ValueError(f"`{name}` (={values!r}) must be three numbers, for R, G and B")
-    return numbers
+    try:
+        red, green, blue = (float(value) for value in values)
+    except (TypeError, ValueError):
+        raise ValueError(f"`{name}` (={values!r}) must be three numbers, for R, G and B") from None
+    return red, green, blue
 
 
 def _confidence(outputs: Any, count: int) -> Tensor:

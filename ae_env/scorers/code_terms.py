@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ae_env.observation import PEDESTAL, encode_observation
+from ae_env.observation import PEDESTAL, encode_array
 from ae_env.scorers.code_kernels import FAR, FINE, expect_codes, expect_means, measure_codes
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures
@@ -206,8 +206,7 @@ def _code_edges(camera: CameraProfile) -> np.ndarray:
     numbers = np.arange(camera.white_level + 1.0)
     edges = np.empty((4, 256))
     for plane, (black, span) in enumerate(zip(camera.black_level, camera.span, strict=True)):
-        signals = torch.from_numpy((numbers - black) / span)
-        first = np.searchsorted(encode_observation(signals).numpy(), np.arange(256))
+        first = np.searchsorted(encode_array((numbers - black) / span), np.arange(256))
         edges[plane] = (first - 0.5 - black) / span
     return edges
 

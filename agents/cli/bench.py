@@ -56,7 +56,10 @@ def bench(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for the results; by default the checkout's docs/results."),
+        typer.Option(
+            help="Folder for the results; by default the checkout's docs/results, of a FOLDER "
+            "of your own ./results."
+        ),
     ] = None,
     seed: Seed = 0,
     quick: Annotated[bool, typer.Option(help="A short version, to try it out.")] = False,
@@ -99,7 +102,8 @@ def bench(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
             "run this in a clone of the repository, installed with `pip install -e .`"
         )
-    out = CHECKOUT / "docs" / "results" if out is None else out
+    if out is None:  # results of a folder of one's own are not those of the docs
+        out = CHECKOUT / "docs" / "results" if folder is None else Path("results")
     make_folder(out)
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name)

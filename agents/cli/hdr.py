@@ -64,7 +64,7 @@ def hdr(
         f"fused {count} simulated pictures, {picture.exposures[0]:+g} to "
         f"{picture.exposures[-1]:+g} EV"
     )
-    if saturated:
+    if saturated >= 5e-5:
         print_line(f"highlights: {saturated:.2%} of the raw is saturated: its light is estimated")
     files = {"EXR": write_exr(out, linear_rgb(source, picture.radiance))}
     if png is not None:

@@ -75,7 +75,7 @@ def fused(raw: RawImage, simulator: CameraSimulator) -> Made:
     darkest, brightest = hdr.exposures[0], hdr.exposures[-1]
     told = f"{len(hdr.exposures)} simulated pictures, {darkest:+g} to {brightest:+g} EV, fused"
     saturated = float(raw.saturated.float().mean())
-    if saturated:
+    if saturated >= 5e-5:
         told += f"; {saturated:.2%} of the raw is saturated: its light is estimated"
     files = {
         ".png": lambda path: write_atomically(path, _encoded(image, "PNG")),

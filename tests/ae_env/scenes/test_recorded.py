@@ -144,6 +144,12 @@ def _other_size(folder: Path) -> None:
         picture.resize((44, 40)).save(path)
 
 
+def _sixteen_bits(folder: Path) -> None:
+    path = folder / "l1" / "param_3" / "n00000001" / "val_1.JPEG"
+    path.unlink()
+    Image.fromarray(np.full((32, 40), 30000, np.uint16)).save(path.with_suffix(".png"))
+
+
 def _no_table(folder: Path) -> None:
     (folder / "grid-options-2x2x2.csv").unlink()
 
@@ -162,7 +168,8 @@ def _one_state(folder: Path) -> None:
         (_twice, r"'l1/n00000001/val_1' must have one file for each state, but .* are both ISO"),
         (_other_size, r"val_1.JPEG' \(\(40, 44\) packed pixels\) must be of the size of .*, \(40,"),
         (_no_table, r"val_0.JPEG' does not state its iso and exposure_time and f_number: name it"),
-        (_one_state, r"\(1 of 1 captures in the grid\) must have two states or more"),
+        (_sixteen_bits, r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
+        (_one_state, r"\(1 of 1 captures in the grid, .*param_3.*\) must have two states or more"),
     ],
 )
 def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: str) -> None:
@@ -180,7 +187,7 @@ def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: 
         ({"recorded": 3}, r"`scenes\['recorded'\]` \(=3\) must be the path"),
         ({"recorded": "a", "isos": 3}, r"field 'isos' must be one of .*did you mean 'iso'"),
         ({"recorded": "a", "iso": -3}, r"`iso` \(=-3\) must be"),
-        ("recorded:/no/such", r"`scenes` \(='recorded:/no/such'\) must name a folder"),
+        ("recorded:/no/such", r"`scenes` \(='recorded:/no/such'\) must name an existing folder"),
     ],
 )
 def test_bad_options(spec: object, message: str) -> None:

@@ -27,6 +27,15 @@ def touch(folder: Path, *names: str) -> Path:
         ("f2.8 iso50 8ms", (50, 0.008, 2.8), ""),
         ("250us", (None, 0.00025, None), ""),
         ("15s", (None, 15, None), ""),
+        # An underscore parts words: it is no fraction's bar after one.
+        ("frame_0007_0.5s_iso100_f4", (100, 0.5, 4), "frame_0007"),
+        ("frame_0007_8s", (None, 8, None), "frame_0007"),
+        ("frame_1_8s", (None, 8, None), "frame_1"),
+        ("frame-1-8s", (None, 8, None), "frame-1"),
+        ("IMG_0001_2s_f4", (None, 2, 4), "IMG_0001"),
+        ("f4_0.5s_iso100", (100, 0.5, 4), ""),
+        ("f4_1s_iso100", (100, 1, 4), ""),
+        ("100iso_1-125s", (100, 1 / 125, None), ""),
         # Not settings: a class of ImageNet, a picture of it, words that begin with f or iso.
         ("n01443537", (None, None, None), "n01443537"),
         ("ILSVRC2012_val_00000293", (None, None, None), "ILSVRC2012_val_00000293"),
@@ -112,7 +121,7 @@ def test_wrong_tables(tmp_path: Path, table: str, message: str) -> None:
 
 
 def test_files_that_are_no_state(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'recorded:.*none'\) must name a folder"):
+    with pytest.raises(ValueError, match=r"'recorded:.*none'\) must name an existing folder"):
         index_recorded(tmp_path / "none", {})
     with pytest.raises(ValueError, match=r"must hold captures: raws \(.*pictures \("):
         index_recorded(touch(tmp_path / "a", "read_me.txt", ".hidden/iso1_1s_f1.png"), {})

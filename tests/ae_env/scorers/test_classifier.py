@@ -79,10 +79,17 @@ def test_a_callable_sees_normalised_squares() -> None:
     expected = (images.mean(dim=(2, 3)).numpy() - MEAN) / STD
     np.testing.assert_allclose(torch.cat(seen)[:, :, 0, 0].numpy(), expected, rtol=1e-4)
     assert seen[0].dtype == torch.float32
-    own = Classifier(torch.nn.Flatten(), size=1, mean=(0, 0, 0), std=(0.5, 0.5, 0.5))
+    own = Classifier(torch.nn.Flatten().eval(), size=1, mean=(0, 0, 0), std=(0.5, 0.5, 0.5))
     powers = np.exp(images.mean(dim=(2, 3)).numpy() / 0.5)
     expected = powers.max(axis=1) / powers.sum(axis=1)
     np.testing.assert_allclose(own(images, None).numpy(), expected, rtol=1e-4)  # type: ignore[arg-type]
+
+
+def test_a_network_in_training_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="`model` must be in evaluation mode"):
+        Classifier(torch.nn.Dropout())
+    with pytest.raises(ValueError, match=r"`mean` \(='abc'\) must be three numbers"):
+        Classifier(torch.nn.Flatten().eval(), mean="abc")  # type: ignore[arg-type]
 
 
 def test_it_rates_the_captures_of_a_recorded_grid(
