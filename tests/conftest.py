@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import json
 import logging
 import multiprocessing
 import multiprocessing.forkserver
@@ -86,6 +87,21 @@ def compiled_and_loaded(tmp_path: Path) -> Callable[[str], list[list[str]]]:
         return [output.decode().split() for output in outputs]
 
     return run
+
+
+@pytest.fixture
+def benchmarks_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder; parts of benchmarks run in this process, and keep their results there."""
+    from benchmarks import harness
+
+    def isolated(task: Callable[..., Any], *, num_threads: int, **options: Any) -> Any:
+        for name in ("fresh_cache", "timeout"):
+            options.pop(name)
+        return json.loads(json.dumps(task(**options)))
+
+    monkeypatch.setattr(harness, "isolated", isolated)
+    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
+    return tmp_path
 
 
 @pytest.fixture

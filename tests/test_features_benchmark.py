@@ -1,9 +1,7 @@
 """Local features: measures against closed forms, and a whole run on drawn pictures."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ import torch
 from PIL import Image
 
 from ae_env.scenes.pictures import detail_split
-from benchmarks import harness
 from benchmarks.features import judging, pairs, training
 from benchmarks.features.detector import CELL, Detector, Features, mutual_matches, sample
 from benchmarks.features.judging import SIZE, area_under, measures
@@ -149,16 +146,8 @@ def test_plain_scaling_and_ours_have_the_same_range() -> None:
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(benchmarks_here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Parts run in this process on drawn photographs, and nothing is written elsewhere."""
-
-    def isolated(task: Callable[..., Any], *, num_threads: int, **options: Any) -> Any:
-        for name in ("fresh_cache", "timeout"):
-            options.pop(name)
-        return json.loads(json.dumps(task(**options)))
-
-    monkeypatch.setattr(harness, "isolated", isolated)
-    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
     monkeypatch.setattr(training, "RUNS", tmp_path / "runs" / "bench")
     monkeypatch.setattr(training, "QUICK_STEPS", 2)
     monkeypatch.setenv("AE_ENV_DATA", str(tmp_path))

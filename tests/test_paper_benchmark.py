@@ -1,16 +1,14 @@
 """The paper's table on a small dataset in the paper's layout, from training to table."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from benchmarks import harness, paper
+from benchmarks import paper
 from simulator import CameraSimulator
 from simulator.networks.weights import build_modules, save_modules
 from simulator.training.captured import split_dataset
@@ -18,16 +16,8 @@ from tests.simulator.training.captures import write_dataset
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def here(benchmarks_here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Parts run in this process, and nothing is written elsewhere."""
-
-    def isolated(task: Callable[..., Any], *, num_threads: int, **options: Any) -> Any:
-        for name in ("fresh_cache", "timeout"):
-            options.pop(name)
-        return json.loads(json.dumps(task(**options)))
-
-    monkeypatch.setattr(harness, "isolated", isolated)
-    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
     monkeypatch.setattr(paper, "WEIGHTS", tmp_path / "runs" / "paper")
     write_dataset(tmp_path / "data")
     return tmp_path

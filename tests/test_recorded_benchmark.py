@@ -1,40 +1,24 @@
 """Simulated states against the captures of a small recorded grid, in one command."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from benchmarks import harness, recorded
+from benchmarks import recorded
 from simulator import exposure_ratio
 from tests.ae_env.recorded_files import GRID, capture, write_raws
 from tests.simulator.training.scenes import scene as photographed
 
 
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Parts run in this process, and nothing is written elsewhere."""
-
-    def isolated(task: Callable[..., Any], *, num_threads: int, **options: Any) -> Any:
-        for name in ("fresh_cache", "timeout"):
-            options.pop(name)
-        return json.loads(json.dumps(task(**options)))
-
-    monkeypatch.setattr(harness, "isolated", isolated)
-    monkeypatch.setattr(harness, "RUNS", tmp_path / "runs" / "bench")
-    return tmp_path
-
-
-def test_a_grid_of_ones_own(ae_env, here: Path) -> None:
-    write_raws(here / "grid" / "a")
-    write_raws(here / "grid" / "b", tuple(GRID)[:-1], seed=1)
-    code, _, error = ae_env("bench", "recorded", "grid", "--quick", "--out", "results")
+def test_a_grid_of_ones_own(ae_env, benchmarks_here: Path) -> None:
+    write_raws(benchmarks_here / "grid" / "a")
+    write_raws(benchmarks_here / "grid" / "b", tuple(GRID)[:-1], seed=1)
+    code, _, error = ae_env("bench", "recorded", "grid", "--quick")  # into ./results
     assert (code, error.partition("WARNING")[0]) == (0, "")
-    result = json.loads((here / "results" / "recorded.json").read_text())
+    result = json.loads((benchmarks_here / "results" / "recorded.json").read_text())
     assert result["meta"]["command"] == "ae-env bench recorded grid --quick"
     rows = {(row["scene"], row["method"]): row for row in result["rows"]}
     assert set(rows) == {(s, m) for s in "ab" for m in ("simulated", "scaled")}
@@ -59,7 +43,7 @@ def test_a_grid_of_ones_own(ae_env, here: Path) -> None:
     assert simulated["psnr_expected_db"] > simulated["psnr_db"]
     for own in rows.values():
         assert 0.0 <= own["oracle_regret"] < 0.2
-    page = (here / "results" / "recorded.md").read_text()
+    page = (benchmarks_here / "results" / "recorded.md").read_text()
     assert "| grid | two real captures |" in page
     assert "boreal" not in page
 
@@ -86,15 +70,15 @@ def test_the_noise_of_two_real_captures_is_told(tmp_path: Path) -> None:
     [
         (("none",), "`scenes` (='recorded:"),
         (("empty",), "must hold captures"),
-        (("empty", "--weights", "a"), "`weights` (='a') is an option of paper only"),
+        (("empty", "--weights", "a"), "`weights` (='a') is an option of paper and features only"),
     ],
 )
 def test_errors_are_one_line_and_nothing_is_written(
-    ae_env, here: Path, arguments: tuple[str, ...], message: str
+    ae_env, benchmarks_here: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    (here / "empty").mkdir()
+    (benchmarks_here / "empty").mkdir()
     code, _, error = ae_env("bench", "recorded", *arguments, "--out", "results")
     assert code == 2
     assert message in error
     assert error.strip().count("\n") == 0
-    assert not list(here.glob("results/*"))
+    assert not list(benchmarks_here.glob("results/*"))
