@@ -183,6 +183,7 @@ def settings_in_name(name: str) -> tuple[dict[str, float], str]:
             )
         found[setting] = value
         rest = rest[: match.start()] + rest[match.end() :]
+    found = {setting: found[setting] for setting in _SETTINGS if setting in found}
     return (found, re.sub(r"[_\-. ]+$|^[_\-. ]+", "", rest)) if found else ({}, name)
 
 

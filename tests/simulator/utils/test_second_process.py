@@ -7,6 +7,7 @@ import sys
 import time
 from typing import Any
 
+import numba
 import pytest
 import torch
 
@@ -79,8 +80,11 @@ def test_none_is_started_where_it_would_not_help(reason: str, monkeypatch) -> No
     assert second_process._second is None
 
 
-def test_a_kernel_is_loaded_as_soon_as_the_other_process_has_compiled_it(monkeypatch) -> None:
+def test_a_kernel_is_loaded_as_soon_as_the_other_process_has_compiled_it(
+    monkeypatch, tmp_path
+) -> None:
     """Else both would compile it, and the second process save nothing."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # not what an earlier run left
 
     def twice(a: int) -> int:
         return 2 * a
