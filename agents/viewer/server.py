@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import secrets
 import socket
@@ -10,7 +11,7 @@ from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from nicegui import app, ui
+from nicegui import app, background_tasks, ui
 
 from agents.viewer.page import Options, show_page
 
@@ -106,11 +107,25 @@ def serve(options: Options, port: int, open_browser: bool, tell: Any) -> None:
     token = secrets.token_urlsafe(16)
     path = f"/?token={token}"
     app.add_middleware(TokenGuard, token=token, port=port)
-    app.on_startup(lambda: tell(f"http://{HOST}:{port}{path}"))
+    address = f"http://{HOST}:{port}{path}"
+    app.on_startup(lambda: background_tasks.create(_tell_when_served(tell, address, port)))
     ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
     # Uploads and downloads are gone with the program, however its pages were left.
     with tempfile.TemporaryDirectory(prefix="ae-env-view-") as options.folder:
         _run(port, path if open_browser else False)
+
+
+async def _tell_when_served(tell: Any, address: str, port: int) -> None:
+    """Calls `tell` as soon as the port answers: the program starts before it listens."""
+    while True:
+        try:
+            _, writer = await asyncio.open_connection(HOST, port)
+        except OSError:
+            await asyncio.sleep(0.05)
+            continue
+        writer.close()
+        tell(address)
+        return
 
 
 def _run(port: int, show: str | bool) -> None:
