@@ -176,8 +176,13 @@ class ExposurePage:
             centre=self._centre,
         )
 
-    async def show_scene(self, viewed: ViewedScene) -> None:
-        """Shows another scene, at its best state."""
+    async def show_scene(self, viewed: ViewedScene, before: CameraSettings) -> None:
+        """Shows another scene, at its best state or at what was chosen since it was asked for.
+
+        Args:
+            viewed: The scene.
+            before: Settings on the page when it was asked for.
+        """
         self._viewed, self._marks, self._centre = viewed, {}, None
         self._silent = True
         try:
@@ -190,8 +195,12 @@ class ExposurePage:
         self._show_compared(None)
         self._show_window()
         best = await run.io_bound(viewed.best)
-        if best is not None and viewed is self._viewed:
+        if best is None or viewed is not self._viewed:
+            return
+        if self.view.settings == before:
             await self._set(best)
+        else:
+            await self._refresh()
 
     async def _set(self, settings: CameraSettings) -> None:
         self._silent = True

@@ -198,6 +198,7 @@ class Page:
 
     async def _open(self, name: str) -> None:
         self._title.text = f"{name} ..."
+        before = self._exposure.view.settings
         try:
             viewed = await run.io_bound(self._options.viewed, self._library, name)
         except (ValueError, OSError) as error:
@@ -209,7 +210,7 @@ class Page:
         self._viewed = viewed
         self._episode.show_scene(viewed)
         self._one_raw.take_scene(viewed)
-        await self._exposure.show_scene(viewed)
+        await self._exposure.show_scene(viewed, before)
         if viewed is self._viewed:  # no other was opened meanwhile
             self._title.text = name
         await self._show_raw()

@@ -21,6 +21,8 @@ from PIL import Image
 from simulator import CameraSettings, RawImage, get_camera, read_raw, write_dng
 from simulator.optics.blur import disc_blur
 
+playwright = pytest.importorskip("playwright.sync_api")
+expect = playwright.expect
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 #: Time within which a page does what it is asked, on a busy machine [ms].
@@ -77,7 +79,7 @@ def address_of_soft_raw(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api")
+    expect.set_options(timeout=PATIENCE)
     with playwright.sync_playwright() as driver:
         options = ["--no-sandbox"] if os.geteuid() == 0 else []
         found = driver.chromium.launch(executable_path=CHROMIUM, args=options)
@@ -153,13 +155,13 @@ def test_shows_the_state_that_is_clicked(page):
 
 
 def test_starts_at_the_best_state(page):
+    expect(page.locator(".state", has_text=re.compile(r"\d"))).to_have_count(64)
     scores = {
         button.get_attribute("aria-label"): float(button.inner_text().split()[-1])
         for button in page.locator(".state").all()
     }
-    assert len(scores) == 64
     shown = page.locator(".state.shown")
-    assert "★" in shown.inner_text()
+    expect(shown).to_contain_text("★")
     assert float(shown.inner_text().split()[-1]) == max(scores.values())
 
 
@@ -180,7 +182,7 @@ def test_zooms_to_the_pixels_and_back(page):
 
 def test_compares_two_states_with_a_divider(page):
     page.get_by_text("Compare with this (P)").click()
-    over = page.locator(".stage .over")
+    over = page.locator(".stage .over[src]")
     over.wait_for()
     pinned = over.get_attribute("src")
     before = picture(page)
@@ -190,14 +192,14 @@ def test_compares_two_states_with_a_divider(page):
     assert over.get_attribute("src") == pinned
     page.locator("input.divider").focus()
     page.keyboard.press("Home")
-    assert over.evaluate("e => getComputedStyle(e).clipPath") == "inset(0px 0px 0px 0%)"
+    expect(over).to_have_css("clip-path", "inset(0px 0px 0px 0%)")
 
 
 def test_marks_where_a_policy_stands(page):
     page.get_by_label(re.compile("Mark where policies")).click()
     page.get_by_role("option", name="average", exact=True).click()
     page.get_by_text(re.compile(r"^A average: ISO")).wait_for()
-    assert page.locator(".state", has_text="A").count() == 1
+    expect(page.locator(".state", has_text="A")).to_have_count(1)
 
 
 def test_plays_an_episode_of_two_policies(page):
@@ -207,9 +209,9 @@ def test_plays_an_episode_of_two_policies(page):
     page.get_by_label("frames").fill("6")
     page.get_by_role("button", name="Run").click()
     page.get_by_text("frame 6 of 6").wait_for()
-    assert page.get_by_text(re.compile(r"^A average: .* regret")).count() == 1
-    assert page.get_by_text(re.compile(r"^B rpi_agc: .* regret")).count() == 1
-    assert page.locator(".chart polyline").count() == 3 + 2 + 2
+    expect(page.get_by_text(re.compile(r"^A average: .* regret"))).to_have_count(1)
+    expect(page.get_by_text(re.compile(r"^B rpi_agc: .* regret"))).to_have_count(1)
+    expect(page.locator(".chart polyline")).to_have_count(3 + 2 + 2)
     page.get_by_label("policy A").fill("averagee")
     page.get_by_role("button", name="Run").click()
     page.get_by_text(re.compile("did you mean")).wait_for()
@@ -254,7 +256,7 @@ def saved(page, ending, folder):
 
 def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
     page = soft_page
-    assert page.get_by_role("button", name="save DNG").is_disabled()
+    expect(page.get_by_role("button", name="save DNG")).to_be_disabled()
     slider(page, "Wider aperture").focus()
     thirds = (1.4, 1.6, 1.8, 2.0, 2.2, 2.5, 2.8, 3.2, 3.5)
     for f_number in thirds:
@@ -268,7 +270,7 @@ def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
     over = page.locator(".stage .over[src]")
     over.wait_for()
     page.get_by_text(re.compile(r"^right: f/3.5, blur estimated: the widest disc has")).wait_for()
-    assert over.get_attribute("src") != picture(page)
+    expect(over).not_to_have_attribute("src", picture(page))
     back = read_raw(saved(page, "dng", tmp_path))
     assert back.settings.f_number == 3.5
     assert back.data.shape == (4, 96, 144)
@@ -280,7 +282,7 @@ def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
         page.get_by_text(f"f/{f_number:g}", exact=True).wait_for()
     page.get_by_role("button", name="Open the aperture").click()
     page.get_by_text(re.compile(r"^right: f/1.4, blur")).wait_for()
-    assert over.get_attribute("src") != first
+    expect(over).not_to_have_attribute("src", first)
     wider = read_raw(saved(page, "dng", tmp_path))
     assert wider.settings.f_number == 1.4
     assert wider.data[:, 8:-8, :60].equal(back.data[:, 8:-8, :60])
@@ -311,7 +313,7 @@ def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
     page.get_by_role("tab", name="Refocus, HDR").click()
     page.get_by_text("Only a raw can be opened or fused").wait_for()
     for name in ("Open the aperture", "Fuse a bracket"):
-        assert page.get_by_role("button", name=name).is_disabled()
+        expect(page.get_by_role("button", name=name)).to_be_disabled()
     write_dng(tmp_path / "flat.dng", raw)
     page.locator("input[type=file]").set_input_files(tmp_path / "flat.dng")
     page.wait_for_selector(".stage img[src]")
@@ -330,7 +332,7 @@ def test_two_tabs_show_different_scenes(page, address):
     name = thumb.inner_text()
     thumb.click()
     other.locator(".title", has_text=name).first.wait_for()
-    assert page.locator(".title").first.inner_text() != name
+    expect(page.locator(".title").first).not_to_have_text(name)
 
 
 @pytest.mark.parametrize("width", [390, 1280])
@@ -339,7 +341,7 @@ def test_fits_the_width(page, width, tab):
     page.set_viewport_size({"width": width, "height": 844})
     page.get_by_role("tab", name=tab).click()
     page.wait_for_timeout(200)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
 
 
 @pytest.mark.parametrize(
