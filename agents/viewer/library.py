@@ -13,6 +13,7 @@ from typing import Any
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES
+from ae_env.scenes.recorded import PREFIX
 from ae_env.utils.checks import did_you_mean
 from simulator import RawImage, get_camera, read_raw
 from simulator.raw.develop import quarter_turns
@@ -114,14 +115,16 @@ def find_scenes(what: str) -> Library:
     """The library of what ``ae-env view`` was asked to show.
 
     Args:
-        what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them,
-            or the id of a bundled scene.
+        what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
+            (of a recorded grid the light that its captures tell together), or the id of a bundled
+            scene.
 
     Raises:
         ValueError: If it is none of these.
     """
     known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
-    if Path(what).exists() or Path(what).suffix.lower() in known or any(s in what for s in "/*?"):
+    looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
+    if Path(what).exists() or (looks_like_files and not what.startswith(PREFIX)):
         base, files = find_files(what)
         entries: list[Entry] = []
         for path in files:
@@ -135,6 +138,8 @@ def find_scenes(what: str) -> Library:
     try:
         scenes = _load(what)
     except ValueError:
+        if what.startswith(PREFIX):
+            raise
         bundled = _load("bundled")
         ids = [scene.scene_id for scene in bundled]
         if what in ids:

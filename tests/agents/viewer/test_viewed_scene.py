@@ -130,6 +130,7 @@ def test_a_library_reads_a_scene_when_it_is_opened_and_keeps_few():
         ("snow-9999", "must be a raw, a radiance map"),
         ("IMG_0001.dng", "must name an existing file"),
         ("no/such/folder", "must name an existing file"),
+        ("recorded:no/such", "must name an existing folder"),
     ],
 )
 def test_what_is_no_scene_is_refused(what, why):
@@ -146,6 +147,16 @@ def test_a_folder_opens_at_its_first_readable_raw(tmp_path):
     library = find_scenes(str(tmp_path))
     assert library.first == "IMG_2.dng"
     assert library.names == ["IMG_0.dng", "IMG_1.dng", "IMG_2.dng"]
+
+
+def test_a_recorded_grid_is_the_light_of_its_captures(tmp_path):
+    for shutter, time in (("1-64s", 1 / 64), ("1-16s", 1 / 16)):
+        light = torch.full((4, 8, 8), 6.4 * time)  # 0.1 at 1/64 s
+        raw = RawImage(light, CameraSettings(100, time, 4), CAMERA, nlf=CAMERA.nlf(100))
+        write_dng(tmp_path / f"iso100_{shutter}_f4.dng", raw)
+    library = find_scenes(f"recorded:{tmp_path}")
+    scene = library.open(library.first).scene
+    assert float(scene.light.mean()) == pytest.approx(6.4 * scene.reference.exposure_time, rel=1e-3)
 
 
 def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown():
