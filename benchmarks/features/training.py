@@ -35,9 +35,9 @@ STOPS = (-6.0, 4.0)
 CAMERA = "canon_70d"
 #: Side of a crop [pixel], pairs of a batch, points of a pair that are described.
 SIZE, BATCH, POINTS = 80, 8, 48
-STEPS, QUICK_STEPS = 800, 20
+STEPS, QUICK_STEPS = 3200, 20
 #: Share of the crops that are augmented; the others stay as they are.
-AUGMENTED = 0.5
+AUGMENTED = 0.15
 #: Name of the weights that all augmentations start from.
 START = "start"
 _RATE, _TEMPERATURE, _SAME = 2e-3, 0.1, 6.0
@@ -113,8 +113,8 @@ def train(arm: str, seed: int, steps: int, limit: int | None = None) -> tuple[De
     """The detector trained under an augmentation, or that of an earlier run; and its seconds.
 
     Random weights are trained without augmentation first, once for each seed, and go on under the
-    augmentation for as many steps. All arms see the same crops in the same order, and of the same
-    half of them what they make of them.
+    augmentation for as many steps. All arms see the same crops in the same order, and what they
+    make of the same few of them.
 
     Args:
         arm: Of `AUGMENTATIONS`.
@@ -161,9 +161,9 @@ def _fit(
         pictures = pictures.permute(0, 3, 1, 2).float() / 255.0
         some = np.random.default_rng([seed, step]).random(len(pictures)) < AUGMENTED
         indices = np.flatnonzero(some)
-        pictures[indices] = AUGMENTATIONS[arm](
-            pictures[indices], sample_seeds(seed, step, indices.tolist())
-        )
+        if len(indices):
+            seeds = sample_seeds(seed, step, indices.tolist())
+            pictures[indices] = AUGMENTATIONS[arm](pictures[indices], seeds)
         loss = _loss(model, as_codes(pictures), batch)
         optimiser.zero_grad()
         loss.backward()
