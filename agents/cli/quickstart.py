@@ -120,7 +120,6 @@ def run_quickstart(
         device: Torch device of the agents' networks.
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
-    from ae_env.options import EnvOptions
     from ae_env.utils.checks import check_integer
     from agents.episodes import make_envs, training_arguments
     from agents.evaluation.engine import evaluate
@@ -134,10 +133,11 @@ def run_quickstart(
     environment = {**learnt, "split": "train", "resolution": 64}
     # Scenes and compiled code into their caches, before processes share the trainings.
     with progress("scenes") as task:
-        task(1, 1, f"{len(EnvOptions.from_kwargs(environment).load_scenes())} to learn from")
-    envs = make_envs(environment, num_envs=1, frames=1)
-    envs.reset(seed=seed)
-    envs.close()
+        envs = make_envs(environment, num_envs=1, frames=1)
+        found = list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
+        envs.reset(seed=seed)
+        envs.close()
+        task(1, 1, f"{len(found)} to learn from")
     agents = _train(environment, out, seed, progress, device)
     unseen = {"scenes": files, "split": "test", "resolution": 64}
     policies = _policies(unseen, agents, device)
