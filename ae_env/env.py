@@ -215,7 +215,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
     |---|---|---|
     | `scenes` | `"bundled"` | name (`"bundled:snow"`: of one kind), path, glob, mapping (`{"sequence": folder}`: raws as the frames of one scene over time), `"recorded:FOLDER"` (every state is a real capture), `"package.module:name"` or list of `Scene`; `"polyhaven"`: views of real places, `"mixed"`: as many real as procedural ones |
     | `split` | `"train"` | `"train"`, `"test"` or `"all"`, by source group |
-    | `grid` | `"default"` | `"default"`, `"third_stop"`, `"video"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
+    | `grid` | `None`: `"default"`, or of recorded scenes that of their captures | `"default"`, `"third_stop"`, `"video"`, or a mapping of `isos`, `exposure_times`, `f_numbers` |
     | `scorer` | `"balanced"` | name, mapping of names to weights, `"my_file.py:name"`, `"package.module:name"`, or a callable |
     | `costs` | `None` | mapping to the weights of `flicker` (change of the image mean) and `switch` (share of the controls that changed) |
     | `observation` | `"uint8"` | `"uint8"`, `"linear"` (float32 in [-p, 1]), `"dn"` (the camera's uint16), or `"statistics"`: what an image processor hands to its auto exposure, 18 times fewer numbers |
@@ -248,7 +248,7 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
         *,
         scenes: SceneSpec = "bundled",
         split: Split = "train",
-        grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default",
+        grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None = None,
         scorer: str | Mapping[str, float] | Scorer = "balanced",
         costs: Mapping[str, float] | None = None,
         observation: ObservationKind = "uint8",

@@ -60,7 +60,7 @@ class EnvOptions:
 
     scenes: SceneSpec = "bundled"
     split: Split = "train"
-    grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default"
+    grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None = None
     scorer: str | Mapping[str, float] | Scorer = "balanced"
     costs: Mapping[str, float] = field(default_factory=dict)
     observation: ObservationKind = "uint8"
@@ -136,8 +136,9 @@ class EnvOptions:
             value = getattr(self, name)
             if not any(value is word or value == word for word in allowed):
                 raise ValueError(
-                    f"`{name}` (={value!r}) must be left at its default for recorded scenes: their "
-                    "captures are real, nothing of them is simulated"
+                    f"`{name}` (={value!r}) must be {allowed[0]!r} for recorded scenes: their "
+                    "captures are real, nothing of them is simulated (AutoExposure-v0 shows "
+                    "recorded videos, too)"
                 )
         object.__setattr__(self, "motion", "none")
         object.__setattr__(self, "depth", "far")
@@ -175,10 +176,10 @@ class EnvOptions:
         Raises:
             ValueError: If a value of it cannot be shown by an observation's ``settings``.
         """
-        if self.recorded is not None and self.grid == "default":
+        if self.recorded is not None and self.grid is None:
             grid = self.recorded.grid
         else:
-            grid = ExposureGrid.from_spec(self.grid)
+            grid = ExposureGrid.from_spec("default" if self.grid is None else self.grid)
         _check_shown(grid)
         return grid
 

@@ -68,7 +68,7 @@ class AutoExposureVectorEnv(
         max_episode_steps: int | None = 8,
         scenes: SceneSpec = "bundled",
         split: Split = "train",
-        grid: ExposureGrid | str | Mapping[str, Iterable[float]] = "default",
+        grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None = None,
         scorer: str | Mapping[str, float] | Scorer = "balanced",
         costs: Mapping[str, float] | None = None,
         observation: ObservationKind = "uint8",

@@ -25,6 +25,7 @@ from ae_env.grid import ExposureGrid
 from ae_env.scenes import load_scenes
 from ae_env.scenes.loading import DEFAULT_SIMULATOR, SceneNetworks
 from ae_env.scenes.recorded import RecordedOptions, merged_scene
+from ae_env.scenes.recorded_files import PREFIX
 from ae_env.scenes.reference_scenes import reference_scenes
 from ae_env.scenes.scene import MEAN_SIGNAL, Crop, Scene
 from ae_env.scorers import make_scorer
@@ -92,12 +93,18 @@ def _reference_grids(quick: bool, seed: int) -> list[Scene]:
         return _of_folder(folder)
 
 
+def _options(folder: str) -> RecordedOptions:
+    found = RecordedOptions.of(f"{PREFIX}{folder}")
+    assert found is not None
+    return found
+
+
 def _of_folder(folder: str) -> list[Scene]:
     def smaller(scene: Scene, resolution: int | None, crop: Crop) -> Scene:
         return scene.resized(min(RESOLUTION, *scene.light.shape[1:]), crop)
 
     options: Any = {"camera": get_camera(CAMERA), "resolution": RESOLUTION, "resize": smaller}
-    return load_scenes(f"recorded:{folder}", "all", **options)
+    return load_scenes(_options(folder), "all", **options)
 
 
 def _boreal() -> list[Scene]:
@@ -120,7 +127,7 @@ def measure(source: str, seed: int, quick: bool, folder: str | None = None) -> l
     """Rows of one set of scenes, one for each scene and method."""
     linear_below = np.inf
     if folder is not None:
-        scenes, grid = _of_folder(folder), RecordedOptions(Path(folder)).grid
+        scenes, grid = _of_folder(folder), _options(folder).grid
     elif source == REFERENCE:
         scenes, grid = _reference_grids(quick, seed), ExposureGrid.default()
     else:
@@ -270,8 +277,8 @@ def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
     shared: dict[str, Any] = {"seed": seed, "quick": quick}
     depends = checksums(DEFAULT_SIMULATOR)
     if folder is not None:
-        assert RecordedOptions(folder).grid  # raises before any work
-        name = folder.resolve().name
+        assert _options(str(folder)).grid  # raises before any work
+        name = folder.resolve().name.partition("?")[0]
         arguments = {"source": name, "folder": str(folder.resolve()), **shared}
         return [Part(name, measure, arguments, depends=depends)]
     return [

@@ -8,7 +8,8 @@ drawn for a picture is a function of its seed alone, whatever the batch or the w
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, NamedTuple
@@ -109,9 +110,11 @@ class ExposureAugmentation:
             ("highlights", 0.0, 20.0),
         ):
             object.__setattr__(self, name, _check_range(name, getattr(self, name), low, high))
-        if isinstance(self.modules, str) or any(name not in MODULES for name in self.modules):
+        modules = () if isinstance(self.modules, str) else self.modules
+        modules = tuple(modules) if isinstance(modules, Iterable) else (modules,)
+        if isinstance(self.modules, str) or any(name not in MODULES for name in modules):
             raise ValueError(f"`modules` (={self.modules!r}) must be some of {list(MODULES)}")
-        object.__setattr__(self, "modules", tuple(self.modules))
+        object.__setattr__(self, "modules", modules)
 
     @property
     def profile(self) -> CameraProfile:
@@ -139,7 +142,7 @@ class ExposureAugmentation:
         *,
         nlf: NoiseLevelFunction | None = None,
     ) -> torch.Tensor:
-        """The same pictures, photographed again.
+        """The same pictures, photographed again. No gradient flows through it.
 
         Args:
             images: (B, 3, H, W) sRGB pictures, floating point in [0, 1] or uint8, taken for
@@ -165,7 +168,7 @@ class ExposureAugmentation:
             return images
         source = NoiseLevelFunction.zero() if nlf is None else nlf
         out = torch.empty(images.shape, device=images.device)
-        for image, seed, frame in zip(images, words, out, strict=True):
+        for image, seed, frame in zip(images.detach(), words, out, strict=True):
             frame.copy_(self._photographed(image, seed, source))
         return out
 
@@ -238,8 +241,11 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
     >>> sample_seeds(0, 1, [5, 7]) == sample_seeds(0, 1, [5]) + sample_seeds(0, 1, [7])
     True
     """
+    given = indices.tolist() if isinstance(indices, torch.Tensor) else indices
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ValueError(f"`indices` (={indices!r}) must be integers, one for each sample")
     found = []
-    for index in indices.tolist() if isinstance(indices, torch.Tensor) else indices:
+    for index in given:
         words = [_check_integer("seed", seed), _check_integer("epoch", epoch)]
         sequence = np.random.SeedSequence([*words, _check_integer("indices", index)])
         found.append(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
@@ -257,11 +263,16 @@ class AugmentedDataset(Dataset[Any]):
             one. All that `ExposureAugmentation` takes.
         augmentation: What photographs them.
         seed: Of the training, >= 0.
+
+    Raises:
+        ValueError: If an argument, or a sample that is asked for, is none of these.
     """
 
     def __init__(
         self, dataset: Dataset[Any], augmentation: ExposureAugmentation, *, seed: int = 0
     ) -> None:
+        if not isinstance(augmentation, ExposureAugmentation):
+            raise ValueError(f"`augmentation` (={augmentation!r}) must be an ExposureAugmentation")
         self.dataset, self.augmentation = dataset, augmentation
         self.seed = _check_integer("seed", seed)
         # Shared memory: workers that persist see it change.
@@ -280,17 +291,25 @@ class AugmentedDataset(Dataset[Any]):
         return len(self.dataset)  # type: ignore[arg-type]
 
     def __getitem__(self, index: int) -> Any:
-        """Sample `index`, its picture augmented."""
-        index = index + len(self) if index < 0 else index
-        sample = self.dataset[index]
-        alone = isinstance(sample, torch.Tensor)
-        image, rest = (sample, []) if alone else (sample[0], list(sample[1:]))
+        """Sample `index`, its picture augmented; a negative one counts from the end."""
+        number = operator.index(index)  # also of a tensor
+        number += len(self) if number < 0 else 0
+        if number < 0:
+            raise IndexError(f"`index` (={index}) must be in [-{len(self)}, {len(self) - 1}]")
+        sample = self.dataset[number]
+        image, *rest = sample if isinstance(sample, tuple | list) and sample else [sample]
         if not isinstance(image, torch.Tensor) or image.ndim != 3:
             shape = tuple(image.shape) if isinstance(image, torch.Tensor) else type(image).__name__
-            raise ValueError(f"`dataset` ({shape} at {index}) must hold tensors (C, H, W)")
-        seeds = sample_seeds(self.seed, self.epoch, [index])
+            raise ValueError(
+                f"`dataset` ({shape} at {number}) must hold tensors (C, H, W), or tuples that "
+                "begin with one"
+            )
+        seeds = sample_seeds(self.seed, self.epoch, [number])
         (augmented,) = self.augmentation(image[None], seeds)
-        return augmented if alone else type(sample)([augmented, *rest])
+        if sample is image:
+            return augmented
+        named = hasattr(sample, "_fields")  # a named tuple
+        return type(sample)(*(augmented, *rest)) if named else type(sample)((augmented, *rest))
 
 
 # -- checks ---------------------------------------------------------------------------------------
@@ -320,6 +339,10 @@ def _check_images(images: Any) -> torch.Tensor:
         raise ValueError(
             f"`images` (={kind}) must be a tensor (B, 3, H, W) of pictures or (B, 4, H, W) of "
             "packed raws"
+        )
+    if images.layout != torch.strided or images.is_complex():
+        raise ValueError(
+            f"`images` ({images.layout}, {images.dtype}) must be dense and hold real numbers"
         )
     if images.shape[1] == 4:
         return check_packed("images", images, ndim=4) if len(images) else images

@@ -18,6 +18,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
+from ae_env.scenes.recorded_files import PICTURE_SUFFIXES
+from ae_env.scenes.recorded_files import PREFIX as RECORDED
 from ae_env.scenes.scene import Scene, SceneRequest
 from ae_env.scenes.split import (
     FEWEST_GROUPS_TO_SPLIT,
@@ -211,6 +213,10 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
     """
+    if str(spec).startswith(RECORDED):
+        raise ValueError(
+            f"`scenes` (={str(spec)!r}) must be raws or radiance maps here, not a recorded grid"
+        )
     try:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
@@ -224,6 +230,8 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     ]
     if not files:
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
+        if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):
+            endings += f"; developed pictures of every state are '{RECORDED}FOLDER'"
         raise ValueError(
             f"`scenes` (={str(spec)!r}) must hold raws ({_RAW_ENDINGS}) or radiance maps "
             f"({', '.join(RADIANCE_SUFFIXES)}); "

@@ -8,13 +8,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ae_env.grid import ExposureGrid
-from ae_env.scenes.recorded_files import RecordedFile, index_recorded, recorded_grid, state_of
+from ae_env.scenes.recorded_files import (
+    PREFIX,
+    RecordedFile,
+    index_recorded,
+    parse_number,
+    recorded_grid,
+    state_of,
+)
 from ae_env.scenes.scene import MEAN_SIGNAL, Scene, SceneRequest
 from ae_env.scenes.split import log_groups, scenes_of_split
 from ae_env.utils.checks import check_number, did_you_mean
@@ -28,8 +36,8 @@ from simulator.settings import CameraSettings, exposure_ratio
 
 logger = logging.getLogger(__name__)
 
-#: How a text names a recorded grid, and the entry of a mapping that does.
-PREFIX, KEY = "recorded:", "recorded"
+#: The entry of a mapping that names a recorded grid.
+KEY = "recorded"
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,7 @@ class RecordedOptions:
         if isinstance(spec, RecordedOptions):
             return spec
         if isinstance(spec, str) and spec.startswith(PREFIX):
-            spec = {KEY: spec.removeprefix(PREFIX)}
+            spec = _of_text(spec)
         if not isinstance(spec, Mapping) or KEY not in spec:
             return None
         names = (KEY, "iso", "exposure_time", "f_number")
@@ -110,6 +118,22 @@ class RecordedOptions:
             default: Whose noise developed pictures are assumed to have.
         """
         return self._body or replace(default, colour_matrix=None, colour_matrix_source="")
+
+
+def _of_text(spec: str) -> dict[str, Any]:
+    """The mapping that ``recorded:FOLDER?iso=100&f_number=4`` stands for."""
+    folder, mark, given = spec.removeprefix(PREFIX).partition("?")
+    found: dict[str, Any] = {KEY: folder}
+    for part in given.split("&") if mark else ():
+        name, _, text = part.partition("=")
+        try:
+            found[name] = parse_number(text)
+        except ValueError:
+            raise ValueError(
+                f"`scenes` (={spec!r}) must be written {PREFIX}FOLDER?iso=100&f_number=4: "
+                f"{part!r} is no setting"
+            ) from None
+    return found
 
 
 # -- scenes ---------------------------------------------------------------------------------------

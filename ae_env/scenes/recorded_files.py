@@ -27,6 +27,8 @@ from simulator.raw.read import read_settings
 from simulator.settings import CameraSettings
 from simulator.utils.files import RAW_SUFFIXES
 
+#: How a text names a recorded grid.
+PREFIX = "recorded:"
 #: Endings of developed pictures.
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 #: Two values of a setting are the same within this share: recorded ones are rounded.
@@ -140,8 +142,8 @@ def _recorded(
         raise ValueError(
             f"recorded file {str(path)!r} does not state its {' and '.join(missing)}: name it in a "
             "settings.csv (columns file, iso, exposure_time, f_number), put it into its name "
-            "(iso100_1-125s_f4) or, where it is the same in all files, give "
-            "{'recorded': folder, 'iso': 100, 'f_number': 4}"
+            "(iso100_1-125s_f4) or, where it is the same in all files, give it with the folder: "
+            f"{PREFIX}FOLDER?iso=100&f_number=4"
         ) from None
     except ValueError as error:
         raise ValueError(f"recorded file {str(path)!r}: {error}") from error
@@ -199,7 +201,12 @@ class _Tables:
         for pattern in _TABLES:
             for table in sorted(folder.rglob(pattern)):
                 for name, settings in _rows(table):
-                    self._by_place[table.parent / name] = settings
+                    place = table.parent / name
+                    if self._by_place.setdefault(place, settings) != settings:
+                        raise ValueError(
+                            f"{str(table)!r} must have one row for {name!r}: two say "
+                            f"{self._by_place[place]} and {settings}"
+                        )
                     self._by_name[name] = settings
 
     def row(self, place: Path) -> dict[str, float]:
@@ -227,15 +234,15 @@ def _rows(table: Path) -> Iterator[tuple[str, dict[str, float]]]:
     for number, row in enumerate(rows, start=2):
         values = {what: (row[column] or "").strip() for what, column in names.items() if column}
         try:
-            settings = {name: _number(values[name]) for name in _SETTINGS if values.get(name)}
+            settings = {name: parse_number(values[name]) for name in _SETTINGS if values.get(name)}
             # The states of ImageNet-ES are numbered.
             name = values["file"]
-            yield f"param_{_number(name):g}" if names["file"] == "idx" else name, settings
+            yield f"param_{parse_number(name):g}" if names["file"] == "idx" else name, settings
         except ValueError as error:
             raise ValueError(f"{str(table)!r}, line {number}: {error}") from error
 
 
-def _number(text: str) -> float:
+def parse_number(text: str) -> float:
     """The number of ``"1/20"``, ``'0"4'`` (0.4 s), ``"f5.6"``, ``"200"`` or ``"8ms"``."""
     plain = text.lower().removeprefix("f").removeprefix("/").replace('"', ".")
     unit = next((u for u in ("ms", "us", "s") if plain.endswith(u)), "")

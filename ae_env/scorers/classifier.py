@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.checks import check_integer
+from ae_env.utils.checks import UserCodeError, check_integer
 from ae_env.utils.model_files import find_model_file
 
 #: Environment variable that names the ONNX file.
@@ -83,6 +83,8 @@ class Classifier:
             self._model: Network | tuple[str, str] = model
             self.size = size or INPUT_SIZE
             return
+        if not isinstance(model, str | os.PathLike | None):
+            raise ValueError(f"`model` (={model!r}) must be an ONNX file, a callable or None")
         found = find_model_file(
             "classifier",
             model,
@@ -98,7 +100,11 @@ class Classifier:
         self.size = own_size or size or INPUT_SIZE
 
     def __call__(self, images: Tensor | None, captures: Captures) -> Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        """Scores (B,) of sRGB `images` (B, 3, H, W).
+
+        Raises:
+            UserCodeError: If the network raises, or returns anything but numbers (B, classes).
+        """
         assert images is not None
         mean, std = (torch.tensor(v)[:, None, None] for v in (self.mean, self.std))
         shape = (self.size, self.size)
@@ -112,9 +118,15 @@ class Classifier:
         return torch.cat(scores)
 
     def _outputs(self, pictures: Tensor) -> Any:
-        if callable(self._model):
-            return self._model(pictures)
-        session = _session(*self._model)
+        model = self._model
+        run = model if callable(model) else partial(self._run, _session(*model))
+        try:
+            return run(pictures)
+        except Exception as error:  # whatever a user's network raises
+            text = f"the classifier raised {type(error).__name__}: {error}"
+            raise UserCodeError(text) from error
+
+    def _run(self, session: Any, pictures: Tensor) -> Any:
         missing = 0 if self.batch is None else self.batch - len(pictures)
         if missing:
             pictures = torch.cat([pictures, pictures[-1:].expand(missing, -1, -1, -1)])
@@ -132,12 +144,17 @@ def _triple(name: str, values: Sequence[float]) -> tuple[float, float, float]:
 
 def _confidence(outputs: Any, count: int) -> Tensor:
     """Largest probability (B,) float64 of logits or probabilities (B, classes)."""
-    values = torch.as_tensor(outputs).double()
-    if values.ndim != 2 or len(values) != count or values.shape[1] < 2:
-        raise ValueError(
-            f"the classifier returned {tuple(values.shape)}: it must return (B, classes), two "
-            f"classes or more, of {count} pictures"
+    try:
+        values = torch.as_tensor(outputs)
+        found = "complex numbers" if values.is_complex() else str(tuple(values.shape))
+    except (TypeError, ValueError, RuntimeError):
+        values, found = torch.empty(0), type(outputs).__name__
+    if values.is_complex() or values.ndim != 2 or len(values) != count or values.shape[1] < 2:
+        raise UserCodeError(
+            f"the classifier returned {found}: it must return (B, classes), two classes or more, "
+            f"of {count} pictures"
         )
+    values = values.double()
     sums = values.sum(dim=1)
     if bool((values >= 0.0).all()) and bool(((sums - 1.0).abs() < _SUM_ERROR).all()):
         return values.amax(dim=1).clamp(max=1.0)

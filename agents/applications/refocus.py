@@ -122,6 +122,6 @@ def _known_blur(raw: RawImage, depth: np.ndarray, lens: Lens) -> torch.Tensor:
     """Signed circle of confusion (H, W) at the raw's own aperture [packed pixel]."""
     assert raw.camera.pixel_pitch_um is not None
     pitch = 2e-6 * raw.camera.pixel_pitch_um * raw.box_factor
-    metres = torch.from_numpy(np.asarray(depth, np.float64))
+    metres = torch.from_numpy(np.ascontiguousarray(depth, np.float64))
     blur = lens.circle_of_confusion(metres, raw.settings.effective_f_number) / pitch
     return F.avg_pool2d(blur[None], len(blur) // raw.data.shape[-2])[0]

@@ -51,7 +51,8 @@ def bench(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            help="Of paper: sequences of captures (docs/dataset.md); of recorded: recorded grids."
+            help="Of paper, required: sequences of captures (docs/dataset.md). Of recorded, "
+            "optional: recorded grids; by default those of the page."
         ),
     ] = None,
     out: Annotated[
@@ -104,7 +105,7 @@ def bench(
         )
     if out is None:  # results of a folder of one's own are not those of the docs
         out = CHECKOUT / "docs" / "results" if folder is None else Path("results")
-    make_folder(out)
+    make_folder(out, make=False)  # a benchmark makes it for its results
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name)
     given: dict[str, Any] = {

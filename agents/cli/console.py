@@ -99,10 +99,29 @@ def parse_f_number(text: str, name: str = "aperture") -> float:
         raise ValueError(f"`{name}` (={text!r}) must be an f-number, such as 4 or f/4") from None
 
 
+@contextmanager
+def option_names(**options: str) -> Iterator[None]:
+    """Errors within name the option that the user typed, by the argument that it became."""
+    try:
+        yield
+    except ValueError as error:
+        text = str(error)
+        for argument, option in options.items():
+            text = text.replace(f"`{argument}`", f"`{option}`")
+        raise ValueError(text) from error
+
+
 def scene_files(scenes: Any, on_error: str) -> Any:
     """The environment's `scenes` for the options `--scenes` and `--on-error`."""
     if on_error == "stop":
         return scenes
+    from ae_env.scenes.recorded import RecordedOptions
+
+    if RecordedOptions.of(scenes) is not None:
+        raise ValueError(
+            f"`on-error` (={on_error!r}) must be 'stop' for recorded grids: take captures that "
+            "cannot be read out of the folder, and their states are forbidden"
+        )
     given = scenes if isinstance(scenes, Mapping) else {"path": scenes}
     return {**given, "on_error": on_error}
 
@@ -137,13 +156,13 @@ def make_folder(
         raise ValueError(f"{given} cannot be written: {error.strerror}") from error
 
 
-def check_outputs(raw: Path, **files: tuple[Path | None, str]) -> None:
-    """Checks that each file has its ending, is not `raw` itself and can be written; makes nothing.
+def check_outputs(*read: Path | None, **files: tuple[Path | None, str]) -> None:
+    """Checks that each file has its ending, is none that is read and can be written; makes nothing.
 
     Whoever writes a file makes its folder: an error before leaves none.
 
     Args:
-        raw: The file that is read.
+        read: Files that are read, the raw first.
         files: By the name of the option, the file or None, and its ending.
 
     Raises:
@@ -152,8 +171,10 @@ def check_outputs(raw: Path, **files: tuple[Path | None, str]) -> None:
     for name, (path, suffix) in files.items():
         if path is not None and path.suffix.lower() != suffix:
             raise ValueError(f"`{name}` (={str(path)!r}) must end in {suffix}")
-        if path is not None and path.resolve() == raw.resolve():
-            raise ValueError(f"`{name}` (={str(path)!r}) must not be the raw itself")
+        for i, own in enumerate(read):
+            if path is not None and own is not None and path.resolve() == own.resolve():
+                what = "the raw itself" if i == 0 else "a file that is read"
+                raise ValueError(f"`{name}` (={str(path)!r}) must not be {what}")
         if path is not None:
             make_folder(path.parent, name=name, file=path, make=False)
 

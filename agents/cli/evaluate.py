@@ -58,7 +58,7 @@ Scenes = Annotated[
     str | None,
     typer.Option(
         help="'bundled', 'polyhaven', 'mixed', a folder or file of raws or radiance maps, or "
-        "'recorded:FOLDER'."
+        "'recorded:FOLDER' (with what its files do not say: 'recorded:FOLDER?iso=100')."
     ),
 ]
 Split = Annotated[str | None, typer.Option(help="train, test (default) or all.")]

@@ -120,9 +120,8 @@ def run_quickstart(
         device: Torch device of the agents' networks.
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
-    from ae_env.options import EnvOptions
     from ae_env.utils.checks import check_integer
-    from agents.episodes import training_arguments
+    from agents.episodes import make_envs, training_arguments
     from agents.evaluation.engine import evaluate
     from agents.evaluation.evaluation_plan import MAX_SEED
     from agents.evaluation.running import fit_policies
@@ -132,8 +131,13 @@ def run_quickstart(
     files = scene_files(scenes, on_error)
     learnt, zero_shot = training_arguments(files)
     environment = {**learnt, "split": "train", "resolution": 64}
-    with progress("scenes") as task:  # into the cache, before processes share the trainings
-        task(1, 1, f"{len(EnvOptions.from_kwargs(environment).load_scenes())} to learn from")
+    # Scenes and compiled code into their caches, before processes share the trainings.
+    with progress("scenes") as task:
+        envs = make_envs(environment, num_envs=1, frames=1)
+        found = list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
+        envs.reset(seed=seed)
+        envs.close()
+        task(1, 1, f"{len(found)} to learn from")
     agents = _train(environment, out, seed, progress, device)
     unseen = {"scenes": files, "split": "test", "resolution": 64}
     policies = _policies(unseen, agents, device)

@@ -20,7 +20,7 @@ def record(
         str | None, typer.Option(help="Preset of the environment, or a YAML file.")
     ] = None,
     scenes: Annotated[str | None, typer.Option(help="Scenes to draw from.")] = None,
-    split: Annotated[str, typer.Option(help="train, test or all.")] = "train",
+    split: Annotated[str | None, typer.Option(help="train (default), test or all.")] = None,
     episodes: Annotated[int, typer.Option(help="How many.", min=1, max=1_000_000)] = 200,
     seed: Seed = 0,
 ) -> None:
@@ -34,20 +34,27 @@ def record(
 
     from ae_env.utils.checks import check_word
     from ae_env.utils.presets import load_preset
+    from agents.episodes import training_arguments
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext, make_policy
     from agents.recording import check_dataset_id, record_dataset
 
     check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))
     check_dataset_id(out)
-    options: dict[str, Any] = {"split": split, **({} if env is None else load_preset(env))}
-    if scenes is not None:
-        options["scenes"] = scenes
+    given = {"split": split, "scenes": scenes}
+    options: dict[str, Any] = {
+        "split": "train",
+        **({} if env is None else load_preset(env)),
+        **{name: value for name, value in given.items() if value is not None},
+    }
     task = f"ae_env/{task}"
     with closing(gym.make_vec(f"ae_env:{task}", num_envs=1, **options)) as envs:
         acting = make_policy(policy, PolicyContext.from_envs(envs))
         arguments = {k: v for k, v in options.items() if k != "max_episode_steps"}
         arguments |= {"grid": "video"} if "Video" in task and "grid" not in arguments else {}
+        if "scenes" in options:
+            learnt_on, _ = training_arguments(options["scenes"], options.get("resolution", 64))
+            arguments = {**arguments, **learnt_on}
     with progress_bars() as progress:
         with progress("fitting") as bar:
             fit_policies({policy: acting}, arguments, seed=seed, progress=bar)

@@ -12,6 +12,7 @@ from agents.cli.console import (
     Device,
     Seed,
     check_outputs,
+    option_names,
     parse_f_number,
     print_files,
     print_line,
@@ -33,13 +34,14 @@ def refocus(
     depth: Annotated[
         Path | None,
         typer.Option(
-            help="Depth map of the raw's size or half of it: PNG, EXR or .npy; by default the "
-            "blur is estimated."
+            help="Depth map of the developed picture, upright, or half its size: PNG, EXR or .npy; "
+            "by default the blur is estimated."
         ),
     ] = None,
     depth_kind: Annotated[
-        str, typer.Option(help="distance, or disparity: larger numbers are nearer.")
-    ] = "distance",
+        str | None,
+        typer.Option(help="distance (default), or disparity: larger numbers are nearer."),
+    ] = None,
     depth_scale: Annotated[
         float | None,
         typer.Option(
@@ -72,14 +74,18 @@ def refocus(
 
     Example: `ae-env refocus IMG_0001.CRW --aperture 1.4 -o out.dng --png out.png`
     """
+    import numpy as np
+
     from agents.applications.depth_map import read_depth
     from agents.applications.refocus import refocus as refocused
     from agents.cli.simulate import make_simulator, source_settings, write_png
     from simulator import read_raw, write_dng
+    from simulator.raw.develop import quarter_turns
 
     f_number = parse_f_number(aperture)
     if depth is None:
         for name, value in (
+            ("depth-kind", depth_kind),
             ("depth-scale", depth_scale),
             ("focus", focus),
             ("focal-length", focal_length),
@@ -89,24 +95,28 @@ def refocus(
                 raise ValueError(f"`{name}` (={value}) is an option of a known `--depth`")
     if pixel_pitch is not None and not 0.1 <= pixel_pitch <= 100.0:
         raise ValueError(f"`pixel-pitch` (={pixel_pitch:g}) must be in [0.1, 100] micrometres")
-    check_outputs(raw, out=(out, ".dng"), png=(png, ".png"))
+    check_outputs(raw, depth, out=(out, ".dng"), png=(png, ".png"))
     source = read_raw(raw, settings=source_settings(source_iso, source_shutter, source_aperture))
     metres, lens = None, None
     if depth is not None:
-        metres = read_depth(depth, kind=depth_kind, scale=depth_scale)  # type: ignore[arg-type]
+        with option_names(kind="depth-kind", scale="depth-scale"):
+            kind: Any = depth_kind or "distance"
+            metres = read_depth(depth, kind=kind, scale=depth_scale)
         if pixel_pitch is not None:
             source = replace(source, camera=replace(source.camera, pixel_pitch_um=pixel_pitch))
         lens = _lens(source, metres, focus, focal_length)
-    result = refocused(
-        source,
-        f_number,
-        depth=metres,
-        lens=lens,
-        simulator=make_simulator(weights, torch_device(device), cache),
-        seed=seed,
-    )
+        metres = np.rot90(metres, -quarter_turns(source))  # as the sensor lies
+    with option_names(f_number="aperture"):
+        result = refocused(
+            source,
+            f_number,
+            depth=metres,
+            lens=lens,
+            simulator=make_simulator(weights, torch_device(device), cache),
+            seed=seed,
+        )
     print_line(f"source {source.settings} ({source.camera.name})")
-    for line in _remarks(result):
+    for line in _remarks(source, result):
         print_line(line)
     write_dng(out, result)
     files = {"DNG": out}
@@ -124,7 +134,10 @@ def _lens(
     millimetres = source.metadata.get("focal_length") if focal_length is None else focal_length
     if millimetres is None:
         raise ValueError("`focal-length` (=None) must be given: the file does not say it")
-    return Lens(float(millimetres) / 1000.0, _focus_distance(focus, metres))
+    if not float(millimetres) > 0.0:
+        raise ValueError(f"`focal-length` (={millimetres:g}) must be above 0 mm")
+    with option_names(focus_distance="focus", focal_length="focal-length"):
+        return Lens(float(millimetres) / 1000.0, _focus_distance(focus, metres))
 
 
 def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
@@ -152,11 +165,13 @@ def _focus_distance(focus: str | None, metres: np.ndarray) -> float:
     )
 
 
-def _remarks(result: RawImage) -> list[str]:
+def _remarks(source: RawImage, result: RawImage) -> list[str]:
     """Lines about what was done."""
     how, largest = result.metadata["depth"], result.metadata["largest_disc_px"]
     lines = [f"depth {how}; at {result.settings} the widest disc has {largest:.1f} packed pixels"]
-    if how == "estimated" and largest == 0.0:
+    if result.settings.effective_f_number == source.settings.effective_f_number:
+        lines.append("this is the aperture of the raw: nothing changed")
+    elif how == "estimated" and largest == 0.0:
         lines.append(
             "nothing was found out of focus, so nothing changed: blur below 1.5 pixels cannot be "
             "told from sharpness; a depth map (`--depth`) says what is far"

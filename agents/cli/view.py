@@ -10,6 +10,9 @@ from agents.cli.console import Device, console, print_line, progress_bars, torch
 from agents.cli.simulate import Cache, Depth, Tolerance, Weights, check_depth, make_simulator
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 
+#: What is shown where nothing is named; `ae-env warm-up` draws it.
+DEFAULT_SCENES = "bundled:small"
+
 
 def view(
     what: Annotated[
@@ -19,7 +22,7 @@ def view(
             help="A raw or radiance map, a folder of them, scenes such as bundled or polyhaven, or "
             "the id of a bundled scene.",
         ),
-    ] = "bundled:small",
+    ] = DEFAULT_SCENES,
     port: Annotated[int, typer.Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
     open_browser: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")

@@ -9,6 +9,7 @@ told by the names of the tensors in it.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from simulator.networks.torch_files import may_be_pickle, read_state
+from simulator.networks.torch_files import is_torch_file, read_state
 from simulator.networks.weights import build_modules
 
 #: Python modules of the authors' code, whose classes stand in their files.
@@ -31,6 +32,8 @@ PACKAGES = (
 )
 #: Our modules, and what the demo calls their files.
 FILES = {"exposure": "exp_model", "noise": "unet_model", "aperture": "ap_model"}
+#: Names of the files of the demo and of a training: these are never passed over.
+_NAMED = re.compile(r"(exp|unet|unet_att|ap)_(model|\d+)(\.pth?)?")
 #: Planes R, G1, B, G2 of the authors' pictures in the order of ours, R, G1, G2, B.
 _PLANES = [0, 1, 3, 2]
 #: Tensors by our name: along which dimension they have planes, and in which order these come.
@@ -58,19 +61,24 @@ def read_authors_weights(folder: Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     """Modules of preset `ncs` with the weights in `folder`, and what their card says of the files.
 
     Args:
-        folder: Holds one file for each of the exposure, the noise and the aperture module; files
-            that are no pickles are passed over.
+        folder: Holds one file for each of the exposure, the noise and the aperture module. Files
+            that neither are torch's nor are named as those of the authors are passed over.
 
     Raises:
         ValueError: If a file is missing, there twice, damaged or harmful, or its tensors are not
             those of the released networks. Nothing of a file is executed.
     """
     if not folder.is_dir():
-        raise ValueError(f"`folder` (={str(folder)!r}) must be a folder of the authors' files")
+        fault = "is a file" if folder.exists() else "does not exist"
+        raise ValueError(
+            f"`folder` (={str(folder)!r}) must be a folder of the authors' files, but {fault}"
+        )
     names = author_names()
     files: dict[str, Path] = {}
     tensors: dict[str, Tensor] = {}
-    for path in sorted(p for p in folder.iterdir() if p.is_file() and may_be_pickle(p)):
+    for path in sorted(p for p in folder.iterdir() if p.is_file()):
+        if not (_NAMED.fullmatch(path.name) or is_torch_file(path)):
+            continue
         state = read_state(path, packages=PACKAGES)
         kind = _kind(path, state, names)
         if kind in files:
@@ -187,6 +195,8 @@ def _ours(
         tensor = state.get(theirs, torch.zeros_like(wanted))
         if ours == "exposure.w" and tensor.shape == (1, 1):
             tensor = tensor.reshape(())
+        if wanted.is_floating_point() and not tensor.is_floating_point():
+            raise ValueError(f"`{path}`: {theirs} (of {tensor.dtype}) must be floating point")
         if tensor.shape != wanted.shape:
             shapes = tuple(tensor.shape), tuple(wanted.shape)
             raise ValueError(f"`{path}`: {theirs} (of shape {shapes[0]}) must be of {shapes[1]}")

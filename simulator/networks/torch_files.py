@@ -142,11 +142,12 @@ def _is_size(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**40
 
 
-def may_be_pickle(path: Path) -> bool:
-    """Whether a file begins as those that ``torch.save`` writes, or any other pickle."""
+def is_torch_file(path: Path) -> bool:
+    """Whether a file begins as those that ``torch.save`` writes."""
     with path.open("rb") as stream:
-        start = stream.read(len(_ZIP_START))
-    return start == _ZIP_START or start[:1] == pickle.PROTO
+        start = stream.read(4096)
+    in_zip = start.startswith(_ZIP_START) and b"/data.pkl" in start  # its first entry
+    return in_zip or start.startswith(_LEGACY_START)
 
 
 def read_state(path: Path, *, packages: tuple[str, ...] = ()) -> dict[str, Tensor]:
@@ -192,6 +193,12 @@ def _parsed(
         return _parsed_zip(content, packages)
     if content.startswith(_LEGACY_START):
         return _parsed_legacy(content, packages)
+    try:
+        _Reader(io.BytesIO(content), packages).load()  # refuses by name what may be harmful
+    except _Refused:
+        raise
+    except Exception:  # no pickle at all
+        pass
     raise _Refused("must be a file that torch.save wrote")
 
 

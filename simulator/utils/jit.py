@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import multiprocessing
 import re
 import time
 import zlib
@@ -30,6 +31,15 @@ _PACKAGES = ("simulator", "ae_env")
 _PAUSE = 0.02
 #: Kernels that a default environment needs for its first frame, about.
 _FIRST_KERNELS = 12
+#: What is said where something is compiled that was not kept from an earlier run.
+_KEPT = (
+    "compiling parts of the simulator that were not used on this machine before, for this and "
+    "later runs (all take 10 s or so; `ae-env warm-up` compiles them beforehand)"
+)
+_NOT_KEPT = (
+    "compiling parts of the simulator, as in every run (10 s or so for all): no folder can be "
+    "written to keep them; NUMBA_CACHE_DIR names one"
+)
 #: Folder of the packages.
 _ROOT = Path(__file__).parents[2]
 #: The modules and names of imports from this project, one line or in parentheses.
@@ -60,8 +70,12 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
 def is_cached(dispatcher: Any) -> bool:
     """Whether a kernel was compiled before, or is compiled again in each process in any case."""
-    file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    return file is None or bool(file._load_index())
+    return not _is_kept(dispatcher) or bool(dispatcher._cache._cache_file._load_index())
+
+
+def _is_kept(dispatcher: Any) -> bool:
+    """Whether what is compiled of a kernel is kept for other processes."""
+    return hasattr(getattr(dispatcher, "_cache", None), "_cache_file")
 
 
 def _adapt_cache(dispatcher: Any, module: Path) -> None:
@@ -129,12 +143,9 @@ class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
         self.depth += 1
         function = event.data["dispatcher"].py_func
         if function.__module__.partition(".")[0] in _PACKAGES:
-            if not self.said:
-                logger.warning(
-                    "compiling the simulator, once on this machine (10 s or so; `ae-env warm-up` "
-                    "does it beforehand)"
-                )
+            if not self.said and multiprocessing.parent_process() is None:  # children are many
                 self.said = True
+                logger.warning(_KEPT if _is_kept(event.data["dispatcher"]) else _NOT_KEPT)
             logger.info("compiling %s.%s", function.__module__, function.__name__)
             if self.depth == 1:
                 self.bar.show()

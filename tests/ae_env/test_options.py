@@ -16,11 +16,11 @@ NAN, INF, HUGE, ARRAY = math.nan, math.inf, 10**30, np.array([1, 2])
 ODD = [None, True, "x", 1.5, -1, NAN, INF, [], {}, object(), HUGE, b"x", ["x"], [0.5], ARRAY]
 #: Values of `ODD` that an argument takes.
 TAKES: dict[str, list[Any]] = {
-    **{key: [] for key in ("split", "grid", "scorer", "observation", "resolution", "crop")},
+    **{key: [] for key in ("split", "scorer", "observation", "resolution", "crop")},
     **{key: [] for key in ("lighting", "delay", "camera", "reward", "source")},
     **{key: [True] for key in ("sensors", "noise", "with_oracle")},
     **{key: [1.5] for key in ("motion", "depth")},
-    **{key: [None] for key in ("simulator", "render_mode")},
+    **{key: [None] for key in ("grid", "simulator", "render_mode")},
     "costs": [None, {}],
     "tolerance": [1.5, HUGE],
 }

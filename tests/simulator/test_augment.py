@@ -1,5 +1,6 @@
 import math
 import pickle
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -92,6 +93,8 @@ def test_samples_keep_what_they_hold_besides() -> None:
     assert label == 3
     assert image.shape == (3, 24, 24)
     assert len(dataset) == 4
+    named = namedtuple("named", "image label")(pictures()[0], 7)
+    assert AugmentedDataset([named], ExposureAugmentation())[0].label == 7
     alone = AugmentedDataset(pictures(), ExposureAugmentation())  # a tensor is a data set, too
     assert torch.equal(alone[3], image)
 
@@ -230,6 +233,7 @@ def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
         ({"highlights": ("a", "b")}, "`highlights`"),
         ({"modules": ("exposure", "colour")}, "`modules`"),
         ({"modules": "noise"}, "`modules`"),
+        ({"modules": None}, "`modules`"),
         ({"camera": "nikon_z7"}, "did you mean 'nikon_z6'"),
     ],
 )
@@ -247,6 +251,8 @@ def test_bad_settings(options: dict, message: str) -> None:
         (torch.full((1, 3, 4, 4), math.nan), [0], "`images`"),
         (torch.full((1, 4, 4, 4), math.inf), [0], "`images` .* finite"),
         (torch.zeros(1, 3, 4, 4, dtype=torch.int64), [0], "`images`"),
+        (torch.zeros(1, 3, 4, 4, dtype=torch.complex64), [0], "`images` .* real"),
+        (torch.zeros(1, 3, 4, 4).to_sparse(), [0], "`images` .* dense"),
         (torch.zeros(1, 4, 4, 4, dtype=torch.uint8), [0], "`images` .* floating point"),
         (torch.zeros(1, 3, 4, 4), [0, 1], "`seeds` .* must be 1 integers"),
         (torch.zeros(1, 3, 4, 4), [-1], "`seeds`"),
@@ -260,9 +266,33 @@ def test_bad_input(images: torch.Tensor, seeds: object, message: str) -> None:
 
 
 def test_bad_samples_and_seeds() -> None:
-    with pytest.raises(ValueError, match="must hold tensors"):
-        AugmentedDataset([np.zeros((3, 4, 4))], ExposureAugmentation())[0]
+    for sample in (np.zeros((3, 4, 4)), {"image": torch.zeros(3, 4, 4)}, ()):
+        with pytest.raises(ValueError, match="must hold tensors"):
+            AugmentedDataset([sample], ExposureAugmentation())[0]
     with pytest.raises(ValueError, match="`seed`"):
         AugmentedDataset([], ExposureAugmentation(), seed=-1)
     with pytest.raises(ValueError, match="`epoch`"):
         sample_seeds(0, -1, [0])
+    with pytest.raises(ValueError, match=r"`indices` \(=5\)"):
+        sample_seeds(0, 0, 5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"`augmentation` \(='x'\)"):
+        AugmentedDataset([], "x")  # type: ignore[arg-type]
+
+
+def test_indices_are_those_of_a_list() -> None:
+    dataset = AugmentedDataset(pictures(), ExposureAugmentation())
+    assert torch.equal(dataset[torch.tensor(3)], dataset[3])
+    assert torch.equal(dataset[-4], dataset[0])
+    with pytest.raises(IndexError, match=r"`index` \(=-5\) must be in \[-4, 3\]"):
+        dataset[-5]
+    with pytest.raises(TypeError):
+        dataset[1.5]  # type: ignore[index]
+
+
+def test_pictures_that_require_gradients_get_none() -> None:
+    augment = ExposureAugmentation()
+    for images in (pictures(), torch.rand(1, 4, 8, 8)):
+        seeds = range(len(images))
+        augmented = augment(images.clone().requires_grad_(), seeds)
+        assert torch.equal(augmented, augment(images, seeds))
+        assert not augmented.requires_grad

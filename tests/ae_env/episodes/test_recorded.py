@@ -93,6 +93,15 @@ def test_states_without_a_capture_are_masked_and_never_shown(raws: Path) -> None
     assert info["state"] == 3
 
 
+def test_the_grid_is_that_of_the_captures_unless_one_is_named(raws: Path) -> None:
+    assert make_env(**arguments(raws)).action_space.n == len(GRID)
+    named: Any = make_env(**arguments(raws, grid="default"))
+    assert named.action_space.n == 64
+    # Of the 64 states those at f/4 and f/8 with ISO 100 or 1600 and 1/1000 or 1/125 s were taken.
+    (whole,) = (scene for scene in named.unwrapped.scenes if scene.scene_id == "a")
+    assert whole.allowed.sum() == 8
+
+
 def test_the_nearest_capture_is_nearest_in_exposure_first() -> None:
     grid = ExposureGrid((100, 200, 400), (1 / 64, 1 / 32), (4,))
     light = torch.full((4, 4, 4), 0.1)
@@ -216,7 +225,7 @@ def test_a_masked_agent_learns_and_chooses_what_there_is(raws: Path) -> None:
 )
 def test_nothing_of_real_captures_can_be_simulated(raws: Path, changed: dict[str, Any]) -> None:
     (name,) = changed
-    with pytest.raises(ValueError, match=rf"`{name}` .* must be left at its default for recorded"):
+    with pytest.raises(ValueError, match=rf"`{name}` .* must be .* for recorded"):
         make_env(**arguments(raws, **changed))
 
 

@@ -233,6 +233,7 @@ def test_many_at_once_are_as_single_ones(recorded: Path, extra: dict[str, Any]) 
         ({"sequence": "{}", "path": "{}"}, "test", "field 'path' must be one of"),
         ({"sequence": "{}", "on_error": "skip"}, "test", r"`on_error` \(='skip'\) must be 'stop'"),
         ({"sequence": "{}", "hrad": True}, "test", "did you mean 'hard'"),
+        ({"path": "recorded:{}"}, "test", "must be raws or radiance maps here, not a recorded"),
         ({"sequence": "bundled:snow"}, "test", "give the name 'bundled:snow' itself"),
     ],
 )

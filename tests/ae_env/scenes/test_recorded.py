@@ -180,6 +180,11 @@ def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: 
     assert "\n" not in str(error.value)
 
 
+def test_settings_can_stand_behind_the_folder() -> None:
+    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
@@ -187,6 +192,9 @@ def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: 
         ({"recorded": 3}, r"`scenes\['recorded'\]` \(=3\) must be the path"),
         ({"recorded": "a", "isos": 3}, r"field 'isos' must be one of .*did you mean 'iso'"),
         ({"recorded": "a", "iso": -3}, r"`iso` \(=-3\) must be"),
+        ("recorded:a?iso=-3", r"`iso` \(=-3.0\) must be"),
+        ("recorded:a?iso=fast", r"f_number=4: 'iso=fast' is no setting"),
+        ("recorded:a?isos=3", r"field 'isos' must be one of .*did you mean 'iso'"),
         ("recorded:/no/such", r"`scenes` \(='recorded:/no/such'\) must name an existing folder"),
     ],
 )

@@ -111,6 +111,7 @@ def test_nominal_and_exact_values_are_one_state() -> None:
         ("file,iso\nx,many", r"settings.csv', line 2: 'many' must be a number"),
         ("file,iso\nx,1\ny,1/0", r"settings.csv', line 3: '1/0' must be a number"),
         ("idx,iso\nfirst,100", r"settings.csv', line 2: 'first' must be a number"),
+        ("file,iso\nx,100\nx,200", r"settings.csv' must have one row for 'x': two say"),
         ("file,iso\n\udcff,100", r"settings.csv' must be a CSV file in UTF-8"),
     ],
 )

@@ -11,6 +11,7 @@ import torch
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.classifier import Classifier
+from ae_env.utils.checks import UserCodeError
 from tests.ae_env.recorded_files import GRID, write_raws
 
 onnx = pytest.importorskip("onnx")
@@ -90,6 +91,30 @@ def test_a_network_in_training_mode_is_refused() -> None:
         Classifier(torch.nn.Dropout())
     with pytest.raises(ValueError, match=r"`mean` \(='abc'\) must be three numbers"):
         Classifier(torch.nn.Flatten().eval(), mean="abc")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        (lambda x: "a cat", r"returned str: it must return \(B, classes\)"),
+        (lambda x: None, "returned NoneType: it must"),
+        (lambda x: {"logits": x}, "returned dict: it must"),
+        (lambda x: [[1.0, 2.0], [3.0]], "returned list: it must"),
+        (lambda x: torch.zeros(len(x), 3, dtype=torch.complex64), "returned complex numbers"),
+        (lambda x: 1 / 0, "the classifier raised ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_a_callable_does_wrong_is_one_kind_of_error(network, message: str) -> None:
+    with pytest.raises(UserCodeError, match=message):
+        Classifier(network)(pictures(2), None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("model", [3, b"file.onnx", ["file.onnx"]])
+def test_a_model_is_a_file_or_a_callable(model) -> None:
+    with pytest.raises(
+        ValueError, match=r"`model` \(=.*\) must be an ONNX file, a callable or None"
+    ):
+        Classifier(model)
 
 
 def test_it_rates_the_captures_of_a_recorded_grid(

@@ -30,6 +30,26 @@ def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path, tmp_path: Pa
     assert out.read_bytes() == before  # the pixel lies at 2 m
 
 
+def test_a_depth_map_is_upright_as_the_picture(ae_env, raw: RawImage, tmp_path: Path) -> None:
+    depth = np.full(raw.data.shape[-2:], 9.0, np.float32)
+    depth[:40, :60] = 2.0
+    backs = []
+    for name, held, shown in (
+        ("level", raw, depth),
+        ("held", replace(raw, metadata={"flip": 6}), np.rot90(depth, -1)),  # a quarter, clockwise
+    ):
+        write_dng(tmp_path / f"{name}.dng", held)
+        np.save(tmp_path / f"{name}.npy", shown)
+        row, column = np.argwhere(shown == 2.0)[-1]
+        given = ("--depth", tmp_path / f"{name}.npy", "--focus", f"{column},{row}")
+        given = (*given, "--focal-length", 50, "--aperture", 1.4, "--weights", "none")
+        out = tmp_path / f"{name}-out.dng"
+        code, _, error = ae_env("refocus", tmp_path / f"{name}.dng", *given, "-o", out)
+        assert code == 0, error
+        backs.append(read_raw(out).to_mosaic())
+    assert np.array_equal(*backs)
+
+
 def test_hdr(ae_env, dng: Path, tmp_path: Path) -> None:
     openexr = pytest.importorskip("OpenEXR")
     out, png = tmp_path / "out.exr", tmp_path / "out.png"
@@ -47,12 +67,19 @@ def test_bad_input_writes_nothing(ae_env, raw: RawImage, dng: Path, tmp_path: Pa
     Image.new("RGB", (8, 8)).save(tmp_path / "photo.jpg")
     nameless = replace(raw, camera=replace(raw.camera, make="X", model="Y", pixel_pitch_um=None))
     write_dng(tmp_path / "nameless.dng", nameless)
+    Image.new("L", (120, 100), 9).save(tmp_path / "depth.png")
+    over = ("--depth", tmp_path / "depth.png", "--png", tmp_path / "depth.png")
     np.save(tmp_path / "fits.npy", np.ones((100, 120)))
     fits = ("--depth", tmp_path / "fits.npy", "--focal-length", 3)
     out = tmp_path / "nowhere" / "out.dng"
     depth = ("--depth", tmp_path / "small.png", "--focal-length", 3)
     for arguments, message in (
-        ((dng, "--aperture", 8), "must be at most that of the raw, 5.6"),
+        ((dng, "--aperture", 8), "`aperture` (=8) must be at most that of the raw, 5.6"),
+        ((dng, "--aperture", 1.4, *over), "`png` (="),
+        ((dng, "--aperture", 1.4, "--depth-kind", "disparity"), "`depth-kind` (=disparity) is an"),
+        ((dng, "--aperture", 1.4, *depth[:2], "--depth-kind", "far"), "`depth-kind` (='far')"),
+        ((dng, "--aperture", 1.4, *depth[:2], "--focal-length", -3), "`focal-length` (=-3) must"),
+        ((dng, "--aperture", 1.4, *fits, "--focus", "0.001"), "`focus` (=0.001) must be above"),
         ((tmp_path / "nameless.dng", "--aperture", 1.4, *fits), "with `--pixel-pitch`"),
         ((dng, "--aperture", 1.4, *depth), "must be (100, 120) or (200, 240)"),
         ((dng, "--aperture", 1.4, *depth[:2]), "`focal-length` (=None) must be given"),

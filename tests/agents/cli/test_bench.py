@@ -5,8 +5,13 @@ from pathlib import Path
 import pytest
 
 from agents.cli import bench
+from tests.simulator.training.captures import write_dataset
 
-OURS = "def run(out, *, seed, quick): (out / 'ours').write_text(f'{seed} {quick}')\n"
+OURS = """
+def run(out, *, seed, quick):
+    out.mkdir()
+    (out / 'ours').write_text(f'{seed} {quick}')
+"""
 
 
 @pytest.fixture
@@ -46,3 +51,17 @@ def test_parts_are_those_of_transfer(ae_env, name, part, words):
     code, _, error = ae_env("bench", name, "--part", part)
     assert code == 2
     assert words in error
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("recorded", "nope"), ("paper", "nope"), ("paper", "data", "--weights", "nope")],
+    ids=" ".join,
+)
+def test_what_is_refused_leaves_no_folder(ae_env, arguments, tmp_path):
+    write_dataset(tmp_path / "data")
+    for out in ((), ("--out", "here")):
+        code, _, error = ae_env("bench", *arguments, *out)
+        assert code == 2, error
+        assert "nope" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]

@@ -1,5 +1,6 @@
 import json
 import os
+import pickle
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,7 @@ class Harmful:
         (("ncs", "none"), "`folder` (='none') must be a folder"),
         (("ncs", "demo", "-o", "ncs.pth"), "must end in .safetensors"),
         (("ncs", "bad"), "bad/unet_model` names posix.system"),
+        (("ncs", "old"), "old/exp_model` names posix.system"),
         (("ncs", "empty"), "must also hold exp_model (exposure)"),
     ],
 )
@@ -53,6 +55,8 @@ def test_errors_write_nothing(ae_env, tmp_path: Path, arguments, message: str) -
     (tmp_path / "demo").mkdir()
     (tmp_path / "empty").mkdir()
     (tmp_path / "bad").mkdir()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "exp_model").write_bytes(pickle.dumps(Harmful(), protocol=0))
     torch.save({"model": Harmful()}, tmp_path / "bad" / "unet_model")
     before = sorted(tmp_path.rglob("*"))
     code, _, error = ae_env("import-weights", *arguments)

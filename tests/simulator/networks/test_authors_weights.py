@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import pickle
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -156,6 +158,7 @@ def test_a_plain_state_dict_is_taken(released, folder: Path, tmp_path: Path) -> 
         ({"bias": None}, "names that are missing for the exposure module: 'bias'"),
         ({"bias": torch.zeros(3)}, r"bias \(of shape \(3,\)\) must be of \(4,\)"),
         ({"bias": torch.full((4,), torch.nan)}, "must be finite, not so in 'bias'"),
+        ({"bias": torch.zeros(4, dtype=torch.int64)}, r"bias \(of torch.int64\) must be floating"),
         ({"bias": None, "linear.weight": None, "w": torch.ones(1)}, "none of its names is known"),
     ],
 )
@@ -167,8 +170,11 @@ def test_tensors_that_do_not_fit(released, tmp_path: Path, change, message: str)
 
 
 def test_files_that_are_missing_or_there_twice(released, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="must be a folder"):
+    with pytest.raises(ValueError, match=r"must be a folder of .* but does not exist"):
         read_authors_weights(tmp_path / "none")
+    with zipfile.ZipFile(tmp_path / "pictures.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.txt", "no network")
+    (tmp_path / "notes.pkl").write_bytes(pickle.dumps("nor is this"))
     torch.save(released["exp_model"].state_dict(), tmp_path / "exp_2")
     with pytest.raises(
         ValueError, match=r"must also hold unet_model \(noise\), ap_model .*found: exp_2"

@@ -93,6 +93,14 @@ def test_harmful_pickles_are_refused_by_name(
     assert [p.name for p in tmp_path.iterdir()] == ["exp_model"]
 
 
+def test_pickles_of_any_protocol_are_refused_by_name(tmp_path: Path) -> None:
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        content = pickle.dumps({"model": Calls(os.system, "touch harmed")}, protocol)
+        (tmp_path / "exp_model").write_bytes(content)
+        with pytest.raises(ValueError, match=r"exp_model` names (posix|nt)\.system"):
+            read_state(tmp_path / "exp_model")
+
+
 def test_layers_of_torch_are_stand_ins_that_call_nothing(tmp_path: Path) -> None:
     """A call where the file must only name a class, and a class that is not known."""
     torch.save({"model": Calls(nn.Linear, 2, 3)}, tmp_path / "call")

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import numba
@@ -105,3 +106,26 @@ def test_a_kernel_is_loaded_as_soon_as_the_other_process_has_compiled_it(
     assert again(4) == 8
     assert len(asked) == 1  # found at once
     assert is_cached(torch.nn.Identity())  # what has no cache is not compiled beforehand
+
+
+@pytest.mark.parametrize(
+    ("cache", "words"),
+    [(SimpleNamespace(_cache_file=None), "for this and later runs"), (None, "as in every run")],
+)
+def test_it_says_once_that_it_compiles_and_whether_that_is_kept(
+    caplog, monkeypatch, cache, words
+) -> None:
+    def function() -> None: ...
+
+    function.__module__ = "simulator.any"
+    event = SimpleNamespace(data={"dispatcher": SimpleNamespace(py_func=function, _cache=cache)})
+    announcer = jit._Announcer()
+    for _ in range(2):
+        announcer.on_start(event)
+        announcer.on_end(event)
+    (record,) = caplog.records
+    assert words in record.getMessage()
+    caplog.clear()
+    monkeypatch.setattr(multiprocessing, "parent_process", lambda: object())  # one of many
+    jit._Announcer().on_start(event)
+    assert not caplog.records
