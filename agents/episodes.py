@@ -67,6 +67,15 @@ def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[st
     return found, True
 
 
+def fitting_arguments(environment: Mapping[str, Any], resolution: int) -> dict[str, Any]:
+    """`environment`, arguments of one that a policy is judged in, with scenes to fit it on."""
+    scenes = environment.get("scenes", "bundled")
+    if not isinstance(scenes, str | Mapping):
+        return dict(environment)
+    own = {name: value for name, value in environment.items() if name != "scenes"}
+    return training_arguments(scenes, resolution)[0] | own
+
+
 def scenes_of(envs: gym.vector.VectorEnv[Any, Any, Any]) -> list[Scene]:
     """The scenes that the episodes of `envs` draw from."""
     base: Any = envs.unwrapped

@@ -34,7 +34,7 @@ def record(
 
     from ae_env.utils.checks import check_word
     from ae_env.utils.presets import load_preset
-    from agents.episodes import training_arguments
+    from agents.episodes import fitting_arguments
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext, make_policy
     from agents.recording import check_dataset_id, record_dataset
@@ -52,9 +52,7 @@ def record(
         acting = make_policy(policy, PolicyContext.from_envs(envs))
         arguments = {k: v for k, v in options.items() if k != "max_episode_steps"}
         arguments |= {"grid": "video"} if "Video" in task and "grid" not in arguments else {}
-        if "scenes" in options:
-            learnt_on, _ = training_arguments(options["scenes"], options.get("resolution", 64))
-            arguments = {**arguments, **learnt_on}
+        arguments = fitting_arguments(arguments, options.get("resolution", 64))
     with progress_bars() as progress:
         with progress("fitting") as bar:
             fit_policies({policy: acting}, arguments, seed=seed, progress=bar)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE
 from ae_env.utils.checks import check_integer
-from agents.episodes import Episodes, action_masks, expected_scores, make_envs, training_arguments
+from agents.episodes import Episodes, action_masks, expected_scores, fitting_arguments, make_envs
 from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
@@ -283,11 +283,7 @@ class EvaluationRun:
         if getattr(type(policy), "fit", Policy.fit) is Policy.fit:
             return policy
         base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-        source = base.get("scenes", "bundled")
-        if isinstance(source, str | Mapping):
-            base = training_arguments(source, self.plan.options().resolution)[0] | {
-                k: v for k, v in base.items() if k != "scenes"
-            }
+        base = fitting_arguments(base, self.plan.options().resolution)
         if self._training is None:
             self._training = training_envs(base)
         fit_policies({member.name: policy}, base, seed=self.plan.seeds[0], training=self._training)

@@ -70,8 +70,10 @@ class StandIn:
     """In the place of an object of a network's class: what the file says of it, and no code."""
 
 
-class _Reader(pickle.Unpickler):
+class _Reader(pickle._Unpickler):
     """Unpickles the few things that a saved network is made of.
+
+    In Python: C's keeps a list as long as the largest number in the file, whatever that takes.
 
     Args:
         stream: The pickle.

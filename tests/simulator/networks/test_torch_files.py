@@ -7,6 +7,7 @@ import os
 import pickle
 import re
 import subprocess
+import tracemalloc
 import warnings
 import zipfile
 from collections.abc import Callable
@@ -99,6 +100,18 @@ def test_pickles_of_any_protocol_are_refused_by_name(tmp_path: Path) -> None:
         (tmp_path / "exp_model").write_bytes(content)
         with pytest.raises(ValueError, match=r"exp_model` names (posix|nt)\.system"):
             read_state(tmp_path / "exp_model")
+
+
+def test_a_large_number_in_a_pickle_takes_no_memory(tmp_path: Path) -> None:
+    """1 is to be remembered as object 16,777,215."""
+    (tmp_path / "exp_model").write_bytes(b"\x80\x02K\x01r\xff\xff\xff\x00.")
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"must be a file that torch\.save wrote"):
+            read_state(tmp_path / "exp_model")
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_layers_of_torch_are_stand_ins_that_call_nothing(tmp_path: Path) -> None:
