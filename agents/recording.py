@@ -20,8 +20,8 @@ from agents.policy import Policy
 
 #: The variable that names Minari's folder.
 _ROOT = "MINARI_DATASETS_PATH"
-#: Minari's form of a name: namespaces, the dataset and its version.
-_ID = re.compile(r"([\w-]+/)*[\w-]+-v\d+")
+#: Minari's form of a name: namespaces (two letters or more), the dataset and its version.
+_ID = re.compile(r"([\w-][\w/-]*[\w-]/)?[\w-]+-v\d+")
 
 
 def check_dataset_id(dataset_id: str) -> None:
