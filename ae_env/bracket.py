@@ -12,8 +12,8 @@ from ae_env.episodes.bracket_core import BracketCore
 from ae_env.episodes.core import EpisodeCore
 from ae_env.options import EnvOptions
 from ae_env.registration import names_nearest
-from ae_env.utils.checks import check_integer, check_number
 from ae_env.vector_env import AutoExposureVectorEnv
+from simulator.utils.checks import check_integer, check_number
 
 #: Arguments that differ from those of `AutoExposureEnv`, and those that there are not.
 DEFAULTS: dict[str, Any] = {"grid": "bracket", "depth": "far"}

@@ -32,9 +32,9 @@ from ae_env.registration import SpecProperty, names_nearest
 from ae_env.scenes import Scene, SceneSpec
 from ae_env.scorers import Scorer
 from ae_env.scorers.score_table import ScoreTable
-from ae_env.utils.checks import check_actions, check_seed, check_word
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES
+from simulator.utils.checks import check_actions, check_seed, check_word
 
 logger = logging.getLogger(__name__)
 

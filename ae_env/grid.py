@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ae_env.utils.checks import did_you_mean
 from simulator.settings import CameraSettings
+from simulator.utils.checks import did_you_mean
 
 
 def plain(value: Any) -> Any:

@@ -26,13 +26,13 @@ from ae_env.scenes.recorded import RecordedOptions
 from ae_env.scenes.scene import Crop as Crop
 from ae_env.scenes.scene import Resize
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
-from ae_env.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 from simulator.camera import CameraProfile, get_camera
 from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.plan import check_tolerance
 from simulator.capture.prepared_scene import MAX_DISC_PX, MAX_IMAGE_SPEED
 from simulator.networks.denoiser import SIZES
 from simulator.utils.cache import LruCache
+from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 
 #: Smallest frame that the default networks of the common libraries take.
 MIN_RESOLUTION = 36

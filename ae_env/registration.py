@@ -12,7 +12,7 @@ from typing import Any, ParamSpec
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from ae_env.utils.checks import did_you_mean
+from simulator.utils.checks import did_you_mean
 
 P = ParamSpec("P")
 #: The tasks: module and class, for one episode and for many, and the actions after which an episode

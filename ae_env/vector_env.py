@@ -33,8 +33,8 @@ from ae_env.options import (
 from ae_env.registration import names_nearest
 from ae_env.scenes import SceneSpec
 from ae_env.scorers import Scorer
-from ae_env.utils.checks import check_actions, check_integer, check_seed, check_word
 from simulator.camera import CameraProfile
+from simulator.utils.checks import check_actions, check_integer, check_seed, check_word
 
 #: Most environments in one process: at 64 pixels, they observe 1 GiB.
 MAX_ENVS = 2**16

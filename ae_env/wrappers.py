@@ -24,7 +24,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector.utils import batch_space
 
 from ae_env.grid import ExposureGrid
-from ae_env.utils.checks import check_actions
+from simulator.utils.checks import check_actions
 
 __all__ = [
     "ContinuousActions",

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.scenes.folder import find_files
-from ae_env.utils.checks import check_word
 from agents.episodes import Episodes, expected_scores, scenes_of
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_word
 from simulator.utils.files import RAW_SUFFIXES
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 from ae_env.episodes.scene_facts import SceneFacts
 from ae_env.options import EnvOptions
 from ae_env.scenes.scene import Scene
-from ae_env.utils.checks import check_integer, did_you_mean
+from simulator.utils.checks import check_integer, did_you_mean
 
 #: Share of the episodes in which nothing moves.
 STATIC_SHARE = 1.0 / 3.0

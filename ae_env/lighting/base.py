@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from ae_env.utils.checks import check_integer, check_number, did_you_mean
+from simulator.utils.checks import check_integer, check_number, did_you_mean
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64

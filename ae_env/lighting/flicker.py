@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from ae_env.lighting.base import MAX_STOPS, Lighting, RollingShutter
-from ae_env.utils.checks import check_number
 from simulator.optics.flicker_integral import Lamp, MainsLamp, PulsedLamp
+from simulator.utils.checks import check_number
 
 #: Depth of a lamp on the mains, where none is given.
 MAINS_DEPTH = 0.8

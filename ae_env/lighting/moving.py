@@ -13,7 +13,7 @@ import numpy as np
 
 from ae_env.lighting.base import Lighting, RollingShutter
 from ae_env.lighting.flicker import FlickerLighting
-from ae_env.utils.checks import check_word
+from simulator.utils.checks import check_word
 
 #: Mean light that a camera sees as it turns, in 72 directions [EV], 5 degrees apart: a line for
 #: each public panorama (CC0) of the test split of `ae_env.scenes.polyhaven`, from `light_around`.

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ae_env.lighting.base import MAX_STOPS, Lighting
-from ae_env.utils.checks import check_number
+from simulator.utils.checks import check_number
 
 #: Most frames of a schedule.
 MAX_FRAMES = 2**20

@@ -24,8 +24,8 @@ from ae_env.scenes.colour import temperature_tint
 from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise, paint_leaves
 from ae_env.scenes.procedural import Drawing
 from ae_env.scenes.scene import Scene
-from ae_env.utils.checks import check_integer, check_word
 from simulator.capture.layout import Layout
+from simulator.utils.checks import check_integer, check_word
 
 #: The lens that procedural scenes are drawn for [m], and the f-number of the stated blur.
 FOCAL_LENGTH = 0.05

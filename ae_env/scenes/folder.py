@@ -31,8 +31,8 @@ from ae_env.scenes.split import (
     scenes_of_split,
     too_few_groups,
 )
-from ae_env.utils.checks import check_flag, check_number, check_word
 from simulator.raw.read import read_raw
+from simulator.utils.checks import check_flag, check_number, check_word
 from simulator.utils.files import RAW_SUFFIXES
 
 logger = logging.getLogger(__name__)

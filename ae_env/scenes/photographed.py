@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from ae_env.scenes.scene import Scene, mean_anchor
-from ae_env.utils.checks import check_number
 from simulator.noise.generator import noise_generator
 from simulator.raw.image import RawImage
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_number
 
 #: Range of the ISO of the photograph, drawn log-uniformly, and its f-number.
 ISO_RANGE, F_NUMBER = (100.0, 6400.0), 8.0

@@ -24,10 +24,10 @@ from PIL import Image, ImageDraw, ImageFont
 from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
 from ae_env.scenes.photographs import unprocess
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES, read_radiance
-from ae_env.utils.checks import check_word
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.read import read_raw
 from simulator.training.crops import DetailPicture
+from simulator.utils.checks import check_word
 
 logger = logging.getLogger(__name__)
 

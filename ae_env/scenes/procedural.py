@@ -15,7 +15,7 @@ import numpy as np
 
 from ae_env.scenes.colour import temperature_tint
 from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
-from ae_env.utils.checks import did_you_mean
+from simulator.utils.checks import did_you_mean
 
 #: Part of every cache key: raise it with any change of the drawings.
 GENERATOR_VERSION = 1

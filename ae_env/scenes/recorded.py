@@ -25,7 +25,6 @@ from ae_env.scenes.recorded_files import (
 )
 from ae_env.scenes.scene import MEAN_SIGNAL, Scene, SceneRequest
 from ae_env.scenes.split import log_groups, scenes_of_split
-from ae_env.utils.checks import check_number, did_you_mean
 from ae_env.utils.merging import SATURATED, merge
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
@@ -33,6 +32,7 @@ from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.utils.checks import check_number, did_you_mean
 
 logger = logging.getLogger(__name__)
 

@@ -38,11 +38,11 @@ from ae_env.scenes.pictures import (
 from ae_env.scenes.procedural import draw, list_kinds
 from ae_env.scenes.radiance import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
 from ae_env.scenes.scene import Scene, mean_anchor, reference_settings
-from ae_env.utils.checks import check_integer, check_word
 from simulator.camera import CameraProfile
 from simulator.optics.thin_lens import Lens
 from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.settings import incident_ev100
+from simulator.utils.checks import check_integer, check_word
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from ae_env.scenes.colour import camera_from_srgb, check_rgb
-from ae_env.utils.checks import check_number
 from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import BlurredLight
@@ -27,6 +26,7 @@ from simulator.raw.image import RawImage, check_packed
 from simulator.reference.sampling import lens_blur, sample_mosaic
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
+from simulator.utils.checks import check_number
 
 # -- the scale of a scene's light -----------------------------------------------------------------
 

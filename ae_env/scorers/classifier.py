@@ -14,8 +14,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.checks import UserCodeError, check_integer
 from ae_env.utils.model_files import find_model_file
+from ae_env.utils.user_code import UserCodeError
+from simulator.utils.checks import check_integer
 
 #: Environment variable that names the ONNX file.
 VARIABLE = "AE_ENV_CLASSIFIER"

@@ -24,7 +24,6 @@ from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.composite import CompositeScorer, is_own
 from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
 from ae_env.scorers.terms import Sharpness
-from ae_env.utils.checks import check_integer
 from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
@@ -32,6 +31,7 @@ from simulator.capture.sensor import Transitions, clip_and_quantise
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_integer
 
 #: Memory for cached descriptions of captures [byte]: some 1000 scenes at 64 states.
 _MEMORY_BYTES = 2**26

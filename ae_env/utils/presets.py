@@ -6,7 +6,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from ae_env.utils.checks import did_you_mean
+from simulator.utils.checks import did_you_mean
 
 #: In an installed package a folder of this one, in a clone the one beside the packages.
 _FOLDERS = (Path(__file__).parents[1] / "configs", Path(__file__).parents[2] / "configs")

@@ -12,10 +12,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ae_env.utils.checks import did_you_mean
+from simulator.utils.checks import did_you_mean
 
 #: Modules beside the file that was run last, which another folder may have under the same name.
 _helpers: set[str] = set()
+
+
+class UserCodeError(ValueError):
+    """A user's scorer or policy raised an error, or returned an invalid value."""
 
 
 def split_file_name(name: str) -> tuple[str, str] | None:

@@ -14,12 +14,12 @@ from pydantic import Field
 from torch import nn
 
 from ae_env.observation import decode_sensors
-from ae_env.utils.checks import check_flag
 from agents.bracketing.policies import Bracketing, Planner, describe
 from agents.bracketing.schedules import BINS, Floats, light_histogram
 from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
 from agents.learning.optimisation import Optimisation
 from agents.policy import PolicyContext
+from simulator.utils.checks import check_flag
 from simulator.utils.config_file import Configuration
 
 #: log2 of the blurs [64ths of the frame] at which their error is learnt; less has none.

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from ae_env.utils.checks import check_word
 from agents.cli.console import Seed, make_folder
+from simulator.utils.checks import check_word
 
 BENCHMARKS = (
     *(

@@ -35,10 +35,10 @@ def film(
 
     import ae_env  # noqa: F401  (registers the environment)
     from ae_env.lighting.moving import KIND_SETS, MOVES
-    from ae_env.utils.checks import check_word
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext, make_policy
     from agents.report.film import film as write
+    from simulator.utils.checks import check_word
 
     if out.suffix.lower() != ".gif":
         raise ValueError(f"`out` (={str(out)!r}) must end in .gif: the film is an animated GIF")
@@ -68,7 +68,7 @@ def film(
 
 def _check_scene(scene: str, envs: Any) -> None:
     """Raises a `ValueError` unless `envs` have `scene`."""
-    from ae_env.utils.checks import did_you_mean
+    from simulator.utils.checks import did_you_mean
 
     known = [one.scene_id for one in envs.unwrapped.scenes]
     if scene not in known:

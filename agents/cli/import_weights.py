@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from ae_env.utils.checks import check_word
 from agents.cli.console import command_line, make_folder, print_files, print_line
+from simulator.utils.checks import check_word
 
 #: Whose weights can be read.
 KINDS = ("ncs",)

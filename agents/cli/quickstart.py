@@ -120,12 +120,12 @@ def run_quickstart(
         device: Torch device of the agents' networks.
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
-    from ae_env.utils.checks import check_integer
     from agents.episodes import make_envs, training_arguments
     from agents.evaluation.engine import evaluate
     from agents.evaluation.evaluation_plan import MAX_SEED
     from agents.evaluation.running import fit_policies
     from agents.report.evaluation_report import write_report
+    from simulator.utils.checks import check_integer
 
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
     files = scene_files(scenes, on_error)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE
-from ae_env.utils.checks import check_integer
 from agents.episodes import Episodes, action_masks, expected_scores, fitting_arguments, make_envs
 from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
@@ -40,6 +39,7 @@ from agents.evaluation.running import (
     training_envs,
 )
 from agents.policy import Policy, PolicyContext, make_policy, training_seeds
+from simulator.utils.checks import check_integer
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene

@@ -14,8 +14,8 @@ from pydantic import Field, field_validator, model_validator
 
 from ae_env.options import checked_delay
 from ae_env.scenes.folder import sequence_bounds
-from ae_env.utils.checks import did_you_mean
 from agents.episodes import Episodes
+from simulator.utils.checks import did_you_mean
 from simulator.utils.config_file import Configuration, load_yaml
 
 if TYPE_CHECKING:

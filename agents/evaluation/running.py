@@ -10,7 +10,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.utils.checks import check_number
 from agents.episodes import (
     EpisodeBatch,
     Episodes,
@@ -21,6 +20,7 @@ from agents.episodes import (
 )
 from agents.metering.reading import linear_signal, signal_codes
 from agents.policy import Policy
+from simulator.utils.checks import check_number
 
 Ints = NDArray[np.int64]
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]

@@ -20,7 +20,6 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
-from ae_env.utils.checks import check_flag
 from agents.foresight import Floats, Foresight, LightTracker
 from agents.learning.agent_weights import NetworkPolicy, trained_grid
 from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
@@ -36,6 +35,7 @@ from agents.policy import (
     masked_argmax,
     weight_files,
 )
+from simulator.utils.checks import check_flag
 
 #: Dropout of the CNN's channels, relative to that of the features.
 _OF_CHANNELS = 0.4

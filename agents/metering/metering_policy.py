@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
-from ae_env.utils.checks import check_word
 from agents.episodes import Episodes, expected_scores, scenes_of
 from agents.foresight import Foresight
 from agents.metering.meters import make_meter
@@ -32,6 +31,7 @@ from agents.metering.reading import (
 from agents.metering.trend import TrendTracker
 from agents.metering.tuned import ScoreRegression
 from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
+from simulator.utils.checks import check_word
 
 if TYPE_CHECKING:
     import gymnasium as gym

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.utils.checks import did_you_mean
 from agents.metering.reading import (
     BLACK_SIGNAL,
     GREEN,
@@ -27,6 +26,7 @@ from agents.metering.reading import (
 )
 from agents.policy import METERS, Observations
 from simulator.camera import CameraProfile
+from simulator.utils.checks import did_you_mean
 
 #: Share of a centre-weighted meter's reading that comes from the central circle, and the circle's
 #: diameter in frame heights (12 mm of 24 mm).

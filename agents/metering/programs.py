@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.grid import ExposureGrid
-from ae_env.utils.checks import check_number, check_word
 from agents.policy import MANUAL_PROGRAMS
+from simulator.utils.checks import check_number, check_word
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.utils.checks import check_integer, check_number, check_word
 from agents.metering.libcamera_agc import (
     CONSTRAINTS,
     LADDERS,
@@ -29,6 +28,7 @@ from agents.metering.programs import (
 )
 from agents.metering.reading import GREEN, TARGET_SIGNAL, frame_ev100, linear_signal
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from simulator.utils.checks import check_integer, check_number, check_word
 
 #: Least signal from which the light is estimated.
 _LEAST_SIGNAL = 1e-3

@@ -14,9 +14,9 @@ from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES
 from ae_env.scenes.recorded_files import PREFIX
-from ae_env.utils.checks import did_you_mean
 from simulator import RawImage, get_camera, read_raw
 from simulator.raw.develop import quarter_turns
+from simulator.utils.checks import did_you_mean
 from simulator.utils.files import RAW_SUFFIXES
 
 #: Camera in whose colours named scenes and radiance maps are made, as the environment's default.

@@ -11,10 +11,6 @@ from typing import Any
 import numpy as np
 
 
-class UserCodeError(ValueError):
-    """A user's scorer or policy raised an error, or returned an invalid value."""
-
-
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
     """End of a message that proposes the nearest of `known` to a misspelt `name`; empty if none is.
 
