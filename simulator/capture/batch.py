@@ -67,7 +67,7 @@ class FrameStatistics:
 
 
 class FrameSource(Protocol):
-    """Frames of n scenes, each at any of S states: simulated, or looked up where they were recorded.
+    """Frames of n scenes, each at any of S states: simulated, or looked up if they were recorded.
 
     For each batch of frames, call `prepare`, then `record`. When another scene is to be shown under
     an index, call `forget` first.
