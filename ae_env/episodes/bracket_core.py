@@ -296,7 +296,7 @@ class BracketCore(EpisodeCore):
         rows, columns = self._offsets(np.array([env_index]))[0].tolist()
         scene = displaced(self.scenes[episode.scene], rows, columns)
         prepared = prepare_scene(scene, self.camera, **episode.moves)
-        return replace(prepared, tolerance=self.options.tolerance)
+        return prepared.changed(tolerance=self.options.tolerance)
 
     def score_table(self, env_index: int) -> ScoreTable:
         """Raises: what a frame is worth depends on those before and after it.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 
-from simulator.capture.kernels import _record
+from simulator.capture.sensor import _record
 from simulator.utils import second_process
 from simulator.utils.jit import is_cached
 
@@ -15,7 +15,7 @@ from simulator.utils.jit import is_cached
 #: of the capture, which come last in the first frame, then those of motion.
 KERNELS = (
     *(f"simulator.noise.generator.{name}" for name in ("_fold", "_singles")),
-    *("simulator.capture.kernels._record", "ae_env.scorers.code_kernels.measure_codes"),
+    *("simulator.capture.sensor._record", "ae_env.scorers.code_kernels.measure_codes"),
     "ae_env.observation._read_sensors",
     *(f"simulator.optics.motion_path.{name}" for name in ("_length", "_lengths", "_rasterised")),
     *(f"simulator.optics.motion_path.{name}" for name in ("_blur_apart", "_blur_rows")),

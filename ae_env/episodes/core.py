@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -422,7 +422,7 @@ class EpisodeCore:
         prepared = self._at_rest.get(scene)
         if prepared is None:
             prepared = prepare_scene(self.scenes[scene], self.camera)
-            prepared = replace(prepared, tolerance=self.options.tolerance)
+            prepared = prepared.changed(tolerance=self.options.tolerance)
             if prepared.aperture_blur is None:  # which caches too much light to stay for long
                 self._at_rest[scene] = prepared
         return prepared

@@ -10,7 +10,7 @@ from typing import Any, overload
 from ae_env.scenes.scene import Scene
 from ae_env.scenes.stored import rounded, store_scenes
 from simulator.utils.progress import Progress
-from simulator.utils.threads import in_shares
+from simulator.utils.threads import parallel_ranges
 
 logger = logging.getLogger(__name__)
 #: So many at once are said to be drawn; fewer take no time to speak of.
@@ -101,7 +101,7 @@ class DrawnScenes(Sequence[Scene]):
                     self._drawn.setdefault(number, scenes)
                     progress.advance()
 
-            in_shares(draw_some, len(missing))
+            parallel_ranges(draw_some, len(missing))
         if len(self._drawn) == len(self._sources) and not self._stored:
             self._stored = True
             store_scenes(self._key, list(self))

@@ -13,13 +13,10 @@ import torch
 
 from ae_env.scenes.colour import camera_from_srgb, check_rgb
 from simulator.camera import CameraProfile
-from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.denoised import Denoised
+from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
 from simulator.capture.layout import Layout
-from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.residual import Residual
+from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
@@ -243,9 +240,9 @@ class Scene:
     @property
     def prepared(self) -> PreparedScene:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        denoised: tuple[Denoised, ...] = ()
+        denoised: tuple[DenoisedLight, ...] = ()
         if self.denoised is not None:
-            denoised = (Denoised(self.denoised, residual=self.residual),)
+            denoised = (DenoisedLight(self.denoised, residual=self.residual),)
         aperture_blur = None
         if self.defocus_map is not None:
             f_number = self.reference.effective_f_number
@@ -258,7 +255,7 @@ class Scene:
             saturated=self.saturated,
             white_balance=self.white_balance,
             box_factor=self.box_factor,
-            denoised=denoised,
+            denoised_lights=denoised,
             aperture_blur=aperture_blur,
             layout=self.layout,
             blurred_light=BlurredLight(

@@ -64,8 +64,7 @@ def _use_rest() -> None:
     from agents.viewer.library import find_scenes
     from agents.viewer.viewed_scene import View, ViewedScene
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.optics.blur import disc_blur, motion_blur
-    from simulator.optics.blur_kernels import Blur, blur_many
+    from simulator.optics.blur import Blur, blur_many, disc_blur, motion_blur
 
     library = find_scenes(DEFAULT_SCENES)
     viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))

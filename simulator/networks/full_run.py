@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from simulator.capture.blurred_light import blur
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.scene_blur import scene_light
-from simulator.capture.sensor import Transitions, record
+from simulator.capture.sensor import Transitions, exposed_light, record
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, smoothed, variance_map
@@ -67,7 +67,7 @@ class FullRun:
             seed: Seed of the output's noise.
         """
         keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
-        bare = replace(prepared, denoised=(), aperture_blur=None, tolerance=0.0)
+        bare = replace(prepared, denoised_lights=(), aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = self.exposure(prepared.light[None], exposure.ratio)
         if not self.noise.commutes:
@@ -85,7 +85,7 @@ class FullRun:
                 )
                 opened = self.aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        light = scene_light(opened[0], at_target)
+        light = exposed_light(blur(opened[0], at_target), at_target)
         capture = torch.empty_like(light)[None]
         transition = Transitions.of([light], [at_target])
         record(transition, prepared.camera, keys=keys, signals=capture)

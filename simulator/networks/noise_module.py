@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from simulator.capture.residual import Residual
+from simulator.capture.statistics import Residual
 from simulator.networks.denoiser import SIZES, Denoiser
 from simulator.networks.ncs_networks import NcsUNet
 from simulator.networks.unet import UNet

@@ -22,10 +22,10 @@ from scipy.special import ndtri
 
 from simulator.settings import CameraSettings
 from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.threads import parallel_ranges
 
 #: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
-#: and tails of the camera's read noise (`simulator.noise.read_noise`).
+#: and tails of the camera's read noise (`simulator.noise.noise_level_function`).
 Noise = Literal["exact", "bank", "sensor"]
 
 
@@ -38,7 +38,7 @@ def check_noise(noise: str) -> None:
 def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
     """Standard normals of a frame of `shape` (P, H, W), float32.
 
-    They are what `simulator.capture.kernels` adds, as an array: for other devices and for tests.
+    They are what `simulator.capture.sensor` adds, as an array: for other devices and for tests.
 
     Args:
         key: 64 bits, from `noise_keys`.
@@ -310,7 +310,7 @@ def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     out = np.empty((planes, samples), np.float32)
-    in_shares(
+    parallel_ranges(
         lambda first, last: _draw(first, last, np.uint64(key), blocks, out),
         planes * blocks,
         least=1024,

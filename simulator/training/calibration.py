@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, wiener_error
+from simulator.capture.statistics import BLOCK, Residual, ResidualStatistics, wiener_error
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.training.crops import DetailCrops

@@ -23,13 +23,13 @@ def thread_count() -> int:
     return torch.get_num_threads()
 
 
-def in_shares(
+def parallel_ranges(
     task: Callable[[int, int], object], count: int, *, least: int = 1, threads: int | None = None
 ) -> None:
     """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
 
-    The caller's thread takes the first share. A task that calls `in_shares` itself gets one share.
-    Returns when all shares are done.
+    The caller's thread takes the first share. A task that calls `parallel_ranges` itself gets one
+    share. Returns when all shares are done.
 
     Args:
         task: Safe to run on several threads at once; an error in any share is raised here.
