@@ -13,7 +13,6 @@ from ae_env.scenes.bundled import _procedural
 from simulator.camera import get_camera
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
-from simulator.utils.cache import DiskCache
 from simulator.utils.cache import disk_cache
 
 CAMERA = get_camera("nikon_z6")
