@@ -15,9 +15,8 @@ from ae_env.utils.merging import LOG_FLOOR, merge
 from agents.bracketing.schedules import BINS, Floats, Ints, Schedules, bin_of
 from agents.policy import Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
-from simulator.utils.checks import check_flag, check_number
 from simulator.radiance.light import WHITE_SIGNAL
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_flag, check_number
 
 if TYPE_CHECKING:
     import gymnasium as gym
