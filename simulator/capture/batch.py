@@ -273,14 +273,11 @@ class CaptureBatch:
         exposures = self._table.exposure
         try:
             opened = [pair for pair in planned if exposures[pair[1]].opened_to is not None]
-            parallel_ranges(lambda a, b: [self._open(*pair) for pair in opened[a:b]], len(opened))
+            _each(self._open, opened)
             begun = [self._begin_blur(index, row) for index, row in planned]
             blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
-            tasks = [task for task in begun if callable(task)]
-            parallel_ranges(lambda a, b: [task() for task in tasks[a:b]], len(tasks))
-            parallel_ranges(
-                lambda a, b: [self._balance(*pair) for pair in planned[a:b]], len(planned)
-            )
+            _each(lambda task: task(), [(task,) for task in begun if callable(task)])
+            _each(self._balance, planned)
         except BaseException:  # some of the light is not made
             self.forget(indices)
             raise
@@ -307,6 +304,11 @@ class CaptureBatch:
             columns.excess_variance[row] = balance.relative_excess_variance
         if columns.exposure[row].opened_to is not None and not self._cache_light:
             self._scenes[index].blurred_light.forget_opened()
+
+
+def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
+    """Calls `task` with each of `arguments`, on as many threads as torch may use."""
+    parallel_ranges(lambda a, b: [task(*each) for each in arguments[a:b]], len(arguments))
 
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:

@@ -303,9 +303,15 @@ class BlurredLight:
         return light
 
     def _defocus(self, source: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
-        """`defocused`; on small frames the discs are cached."""
-        cache = self._banks if source.shape[-2] * source.shape[-1] <= TILE**2 else {}
-        return defocused(source, exposure, out, cache)
+        """`source` (4, H, W) behind the lens of `exposure`; written to `out` on the CPU."""
+        if exposure.layout is None or not exposure.defocus_px:
+            light = disc_blur(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure.defocus_px)
+            return light if out is None else out.copy_(light)
+        # Exposures share most of their discs; on large frames they take too much memory.
+        banks = self._banks if source.shape[-2] * source.shape[-1] <= TILE**2 else {}
+        diameter = exposure.layout.defocus.to(source.device) * exposure.defocus_px
+        key = exposure.denoised, exposure.opened_to
+        return _bank(banks, key, source).blurred(diameter, out)
 
     # -- batches ------------------------------------------------------------------------------
 
@@ -402,35 +408,13 @@ class BlurredLight:
         return left
 
 
-def defocused(
-    source: Tensor,
-    exposure: Exposure,
-    out: Tensor | None = None,
-    banks: dict[object, DiscBank] | None = None,
-) -> Tensor:
-    """`source` (4, H, W) behind the lens of `exposure`, still at the source's exposure.
-
-    Args:
-        source: Light that the exposure starts from; limited to `LIGHT_LIMIT`.
-        exposure: The exposure.
-        out: Contiguous tensor to write to, instead of a new one, where `source` is on the CPU.
-        banks: Discs of earlier exposures of the same scene.
-    """
-    if exposure.layout is None or not exposure.defocus_px:
-        light = disc_blur(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure.defocus_px)
-        return light if out is None else out.copy_(light)
-    key = exposure.denoised, exposure.opened_to
-    diameter = exposure.layout.defocus.to(source.device) * exposure.defocus_px
-    return _bank({} if banks is None else banks, key, source).blurred(diameter, out)
-
-
 def motion_blurred(light: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
     """`light` (4, H, W), behind the lens already, as it moves in `exposure`.
 
     Args:
         light: Light; limited to `LIGHT_LIMIT`.
         exposure: The exposure; without a path, the motion is along the rows.
-        out: See `defocused`.
+        out: Contiguous tensor to write to, instead of a new one, where `light` is on the CPU.
     """
     if exposure.path is None:
         return motion_blur(light, exposure.motion_px, out, limit=LIGHT_LIMIT)
@@ -440,13 +424,6 @@ def motion_blurred(light: Tensor, exposure: Exposure, out: Tensor | None = None)
         return path_blur(light, taps, out, limit=LIGHT_LIMIT)
     own, layout = path_taps(exposure.subject_path, height, width), exposure.layout
     return path_blur_apart(light, layout.mask, layout.behind, taps, own, out, limit=LIGHT_LIMIT)
-
-
-def blur(source: Tensor, exposure: Exposure) -> Tensor:
-    """`source` (4, H, W) with every blur of `exposure`; the brightest light of none stays exact."""
-    if not exposure.defocus_px and not exposure.motion_px:
-        return source
-    return motion_blurred(defocused(source, exposure), exposure)
 
 
 def _bank(banks: dict[Any, DiscBank], key: object, light: Tensor) -> DiscBank:

@@ -201,7 +201,8 @@ def exposure_table(exposures: Sequence[Exposure]) -> np.ndarray:
 
 def decide(inputs: TransitionInputs) -> Exposure:
     """The exposure of a capture, without what `BlurredLight.with_remaining_noise` knows of it."""
-    steps = noise_reduction, aperture, defocus, motion_blur = _decide_steps(inputs)
+    steps = _decide_steps(inputs)
+    noise_reduction, aperture, defocus, motion_blur = steps
     defocus_px = defocus.extent if defocus.runs else 0.0
     moves, denoised = motion_blur.runs, noise_reduction.network
     subject_path = inputs.subject_path if moves else None
@@ -221,7 +222,7 @@ def decide(inputs: TransitionInputs) -> Exposure:
     )
 
 
-def _decide_steps(inputs: TransitionInputs) -> tuple[Step, Step, Step, Step]:
+def _decide_steps(inputs: TransitionInputs) -> tuple[Step, ...]:
     """`Exposure.steps`.
 
     Noise that stays widens a pixel's distribution, blur that is missing shifts it: squares add.
@@ -229,35 +230,37 @@ def _decide_steps(inputs: TransitionInputs) -> tuple[Step, Step, Step, Step]:
     square, so that the root of the sum of squares of all errors is right for any set of steps.
     """
     noise_reduction = _decide_noise_reduction(inputs)
-    if not (inputs.aperture_px or inputs.defocus_px or inputs.motion_px):
-        return noise_reduction, _no_aperture(inputs), _no_defocus(inputs), _NO_MOTION
-    missing_blur = 0.0
     missing_noise = noise_reduction.residual if noise_reduction.runs else noise_reduction.error
-    # Beyond anybody's reach: blur has the tolerance to itself.
+    # No network can mend it: blur has the tolerance to itself.
     if missing_noise > inputs.tolerance or not inputs.networks:
         missing_noise = 0.0
-    disc, row = _curvature(inputs, noise_reduction.network)
-
-    def blur(name: str, extent: float, curvature: float) -> Step:
-        nonlocal missing_blur
+    extents = {
+        "aperture": inputs.aperture_px or 0.0,
+        "defocus": inputs.defocus_px,
+        "motion_blur": inputs.motion_px,
+    }
+    disc = row = 0.0
+    if any(extents.values()):
+        disc, row = _curvature(inputs, noise_reduction.network)
+    blurs, missing_blur = [], 0.0
+    for name, extent in extents.items():
+        if not extent:
+            blurs.append(Step(name, False, _without_blur(name, inputs)))
+            continue
+        curvature = row if name == "motion_blur" else disc
         error = math.inf if extent == math.inf else curvature * extent * extent
         together = missing_blur + error
         left_out = math.hypot(missing_noise, together) <= inputs.tolerance
         added = math.sqrt(error * (together + missing_blur)) if error else 0.0
         if left_out:
             missing_blur = together
-        reason = (_LEFT_OUT if left_out else _NEEDED)[name, extent == math.inf]
+        reason = "the aperture opens and adds blur"
+        if extent < math.inf:
+            reason = _BLUR_REASONS[name][left_out]
         if not left_out and added < math.inf:
             reason += _WITHOUT
-        return Step(name, not left_out, reason, added, extent)
-
-    aperture_px, defocus_px, motion_px = inputs.aperture_px, inputs.defocus_px, inputs.motion_px
-    return (
-        noise_reduction,
-        blur("aperture", aperture_px, disc) if aperture_px else _no_aperture(inputs),
-        blur("defocus", defocus_px, disc) if defocus_px else _no_defocus(inputs),
-        blur("motion_blur", motion_px, row) if motion_px else _NO_MOTION,
-    )
+        blurs.append(Step(name, not left_out, reason, added, extent))
+    return noise_reduction, *blurs
 
 
 def _curvature(inputs: TransitionInputs, network: DenoisedLight | None) -> tuple[float, float]:
@@ -265,7 +268,7 @@ def _curvature(inputs: TransitionInputs, network: DenoisedLight | None) -> tuple
     if inputs.tolerance == 0.0:  # no blur is left out, however small
         return math.inf, math.inf
     if not (inputs.defocus_px or inputs.motion_px or inputs.aperture_px != math.inf):
-        return math.inf, math.inf  # nobody asks: the network need not run for it
+        return math.inf, math.inf  # not needed: the network need not run for it
     light = inputs.statistics if network is None else network.statistics
     disc, row = light.curvature(inputs.ratio, inputs.target)
     # No second difference exceeds the Laplacian, in the root mean square: (k u)^4 <= |k|^4.
@@ -274,9 +277,10 @@ def _curvature(inputs: TransitionInputs, network: DenoisedLight | None) -> tuple
 
 def _decide_noise_reduction(inputs: TransitionInputs) -> Step:
     """The cheapest of all ways within the tolerance, or else the one with the least error."""
+    name = "noise_reduction"
     if inputs.source.is_zero:
-        return _CLEAN_SOURCE
-    name, error = "noise_reduction", _noise_error(inputs)
+        return Step(name, False, "the source carries no noise")
+    error = _noise_error(inputs)
     if not inputs.networks:
         return Step(name, False, "the simulator has no noise module", error)
     if inputs.opens_denoised and inputs.aperture_px:  # blur averages noise, too: not counted on
@@ -321,43 +325,36 @@ def _small_noise(inputs: TransitionInputs, error: float) -> str:
     return "the source's noise beyond the target's is within the tolerance"
 
 
-def _no_aperture(inputs: TransitionInputs) -> Step:
-    if inputs.aperture_px is None:
-        return _NO_APERTURE_MODULE
-    return _IN_FOCUS if inputs.opens else _CLOSES
+def _without_blur(name: str, inputs: TransitionInputs) -> str:
+    """Reason why a blur would do nothing."""
+    if name == "motion_blur":
+        return "the image does not move"
+    estimated = inputs.aperture_px is not None
+    if name == "defocus":
+        if estimated:
+            return "none is given for the whole frame: each pixel's was estimated"
+        return "the scene is taken as far or in focus throughout"
+    if not estimated:
+        return "the scene is taken as in focus: `depth` is not 'unknown'"
+    if inputs.opens:
+        return "the picture was found to be in focus throughout"
+    return "the aperture does not open; what is blurred in the source stays so"
 
 
-def _no_defocus(inputs: TransitionInputs) -> Step:
-    return _FAR if inputs.aperture_px is None else _DEFOCUS_ESTIMATED
-
-
-#: Steps that would do nothing.
-_CLEAN_SOURCE = Step("noise_reduction", False, "the source carries no noise")
-_NO_APERTURE_MODULE = Step(
-    "aperture", False, "the scene is taken as in focus: `depth` is not 'unknown'"
-)
-_CLOSES = Step(
-    "aperture", False, "the aperture does not open; what is blurred in the source stays so"
-)
-_IN_FOCUS = Step("aperture", False, "the picture was found to be in focus throughout")
-_FAR = Step("defocus", False, "the scene is taken as far or in focus throughout")
-_DEFOCUS_ESTIMATED = Step(
-    "defocus", False, "none is given for the whole frame: each pixel's was estimated"
-)
-_NO_MOTION = Step("motion_blur", False, "the image does not move")
 _WITHOUT = "; leaving it out would be an error of {error:.2g}"
-#: Reasons by step, and whether the extent is unknown; filled in when a plan is shown.
-_NEEDED = {
-    ("aperture", False): "the aperture opens and adds blur (up to {extent:.2g} pixel)",
-    ("aperture", True): "the aperture opens and adds blur",
-    ("defocus", False): "the defocus disc is {extent:.3g} pixel wide",
-    ("motion_blur", False): "the image moves by {extent:.3g} pixel during the exposure",
-}
-_LEFT_OUT = {
-    ("aperture", False): "the blur that opening adds (up to {extent:.2g} pixel) would hardly show",
-    ("defocus", False): "the defocus disc is {extent:.2g} pixel wide, which would hardly show",
-    ("motion_blur", False): (
-        "the image moves by {extent:.2g} pixel during the exposure, which would hardly show"
+#: Reasons why a blur runs, and why it is left out; filled in when a plan is shown.
+_BLUR_REASONS = {
+    "aperture": (
+        "the aperture opens and adds blur (up to {extent:.2g} pixel)",
+        "the blur that opening adds (up to {extent:.2g} pixel) would hardly show",
+    ),
+    "defocus": (
+        "the defocus disc is {extent:.3g} pixel wide",
+        "the defocus disc is {extent:.2g} pixel wide, which would hardly show",
+    ),
+    "motion_blur": (
+        "the image moves by {extent:.3g} pixel during the exposure",
+        "the image moves by {extent:.2g} pixel during the exposure, which would hardly show",
     ),
 }
 

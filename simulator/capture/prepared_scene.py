@@ -250,7 +250,7 @@ class PreparedScene:
         """
         exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
-        light = self.light if exposure.source.is_zero else self.source_light(exposure)
+        light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
         return SimulationPlan(
             settings=settings,
             exposure=exposure,
@@ -286,14 +286,10 @@ class PreparedScene:
         if exposure.opened_to is None:
             return 0.0
         light = self.light if exposure.denoised is None else exposure.denoised.light
-        lights, white = (light, self.source_light(exposure)), 1.0 if noise else float("inf")
+        lights, white = (light, self.blurred_light.source(exposure)), 1.0 if noise else float("inf")
         sharp, opened = ((part * exposure.ratio).clamp_(max=white) for part in lights)
         wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
         return float(((opened - sharp).square_() / wanted).double().mean().sqrt())
-
-    def source_light(self, exposure: Exposure) -> torch.Tensor:
-        """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
-        return self.blurred_light.source(exposure)
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.

@@ -287,12 +287,10 @@ class NoiseBalance:
     Args:
         relative_excess_variance: Mean over the pixels of the variance beyond the target's,
             relative to it.
-        excess_variance: Mean of that variance, 1 is sensor white squared.
         lacks_noise: Whether any pixel has less noise than the target.
     """
 
     relative_excess_variance: float
-    excess_variance: float
     lacks_noise: bool
 
 
@@ -305,12 +303,12 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
     """
     source, target = exposure.source_noise, exposure.target
     if source.is_zero:
-        return NoiseBalance(0.0, 0.0, not target.is_zero)
+        return NoiseBalance(0.0, not target.is_zero)
     (table,), remaining = top_up_table([source], [target]), exposure.remaining_variance
     height, width = light.shape[-2:]
     rows = max(1, _BALANCED // width)
     parts = [slice(top, top + rows) for top in range(0, height, rows)]
-    relative, excess, lacks = np.zeros(4), np.zeros(4), np.zeros(4, bool)
+    relative, lacks = np.zeros(4), np.zeros(4, bool)
 
     def balance(first: int, last: int) -> None:
         for plane in range(first, last):
@@ -324,13 +322,11 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
                 lacks[plane] |= bool((missing > 0).any())
                 wanted = signal.mul_(target.shot[plane]).add_(target.read[plane])
                 missing.clamp_(max=0.0)
-                excess[plane] -= float(missing.sum())
                 relative[plane] -= float((missing / wanted.clamp_(min=_TINY)).sum())
 
     parallel_ranges(balance, 4, threads=None if len(parts) > 4 else 1)
-    count = light.numel()
-    share = min(abs(float(relative.sum())) / count, VARIANCE_LIMIT)  # finite over no noise, too
-    return NoiseBalance(share, abs(float(excess.sum())) / count, bool(lacks.any()))
+    share = abs(float(relative.sum())) / light.numel()
+    return NoiseBalance(min(share, VARIANCE_LIMIT), bool(lacks.any()))  # finite over no noise, too
 
 
 # -- the fused kernel -------------------------------------------------------------------------

@@ -18,7 +18,7 @@ import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from simulator.utils.threads import parallel_ranges
 #: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
 BINS = 64
 SAMPLES = 65_536
-#: Pixels of a plane that are sorted for bins and median, at most about this many.
+#: Pixels of a plane that are sorted to find the bins, at most about this many.
 _SORTED = 4096
 #: Pixels from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
@@ -162,27 +162,18 @@ def _curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[n
 # -- the statistics ---------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Bins:
-    """Pixels of each plane (rows) in bins of similar light (columns), each (4, B) float64.
+class _Bins(NamedTuple):
+    """Pixels of each plane in bins of similar light, (4, B) float64 each."""
 
-    Args:
-        share: Share of all pixels.
-        light: Mean of the light, at least 0.
-        edges: Least and most light in the bin, at least 0: (2, 4, B).
-        disc: Mean square of the Laplacian.
-        row: Mean square of the second difference along the rows.
-    """
-
-    share: np.ndarray
-    light: np.ndarray
-    edges: np.ndarray
-    disc: np.ndarray
-    row: np.ndarray
+    share: np.ndarray  # of all pixels
+    light: np.ndarray  # mean, at least 0
+    edges: np.ndarray  # (2, 4, B) least and most light, at least 0
+    disc: np.ndarray  # mean square of the Laplacian
+    row: np.ndarray  # mean square of the second difference along the rows
 
 
 class LightStatistics:
-    """Levels and curvature of a light; each value is computed when it is first needed.
+    """Noise and curvature of a light, by its levels; each value is computed when first needed.
 
     The first answer takes a pass over the pixels, the others a few microseconds each.
 
@@ -195,12 +186,6 @@ class LightStatistics:
 
     def __reduce__(self) -> tuple[type[LightStatistics], tuple[torch.Tensor]]:
         return LightStatistics, (self.light,)
-
-    @functools.cached_property
-    def median(self) -> np.ndarray:
-        """(4,) median light of each plane, at least 0; of a sample where there are many pixels."""
-        middle = self._sorted.shape[1] // 2
-        return np.maximum(self._sorted[:, [middle, -middle - 1]].mean(axis=1), 0.0)
 
     def excess_error(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
@@ -255,7 +240,7 @@ class LightStatistics:
         """
         bins = self._bins
         own = _variance(bins.light, source)
-        wanted = np.maximum(_variance(bins.light * ratio, target), _FLOOR)
+        wanted = self._signal(ratio, target)[1]
         detail = np.maximum(bins.disc - _LAPLACIAN * own, 0.0)
         if noise:
             detail = np.where(ratio * (bins.light - SURE * np.sqrt(own)) > 1.0, 0.0, detail)
@@ -263,16 +248,14 @@ class LightStatistics:
 
     def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
         """Root mean square of the signal in units of the target's noise."""
-        signal = self._bins.light * ratio
-        wanted = np.maximum(_variance(signal, target), _FLOOR)
+        signal, wanted = self._signal(ratio, target)
         return _root_mean(self._bins.share, signal**2 / wanted)
 
     def relative_noise(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
         """Root mean square of the exposed source's noise in units of the target's."""
-        signal = self._bins.light * ratio
-        wanted = np.maximum(_variance(signal, target), _FLOOR)
+        signal, wanted = self._signal(ratio, target)
         return _root_mean(self._bins.share, _variance(signal, source.exposed(ratio)) / wanted)
 
     def relative_excess_variance(
@@ -283,10 +266,14 @@ class LightStatistics:
         Relative to the target's. Other than in `excess_error`, `source` is on the target's scale,
         averaged by what blur there is.
         """
-        signal = self._bins.light * ratio
-        wanted = np.maximum(_variance(signal, target), _FLOOR)
+        signal, wanted = self._signal(ratio, target)
         beyond = np.maximum(_variance(signal, source) / wanted - 1.0, 0.0)
         return float(np.vdot(self._bins.share, beyond))
+
+    def _signal(self, ratio: float, target: NoiseLevelFunction) -> tuple[np.ndarray, np.ndarray]:
+        """Signal of each bin in the capture, and the variance that it should have."""
+        signal = self._bins.light * ratio
+        return signal, np.maximum(_variance(signal, target), _FLOOR)
 
     @property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from simulator.capture.blurred_light import blur
+from simulator.capture.blurred_light import BlurredLight
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, exposed_light, record
 from simulator.networks.aperture_module import ApertureModule
@@ -85,7 +85,8 @@ class FullRun:
                 )
                 opened = self.aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        light = exposed_light(blur(opened[0], at_target), at_target)
+        lights = BlurredLight(opened[0], (), at_target.source, None)
+        light = exposed_light(lights.blurred(at_target), at_target)
         capture = torch.empty_like(light)[None]
         transition = Transitions.of([light], [at_target])
         record(transition, prepared.camera, keys=keys, signals=capture)

@@ -16,12 +16,7 @@ from torch import Tensor
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
 from simulator.capture import blurred_light as module
 from simulator.capture.batch import CaptureBatch
-from simulator.capture.blurred_light import (
-    BlurredLight,
-    MapApertureBlur,
-    NetworkApertureBlur,
-    blur,
-)
+from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
 from simulator.capture.exposure import Exposure
 from simulator.capture.layout import Layout
 from simulator.capture.statistics import DenoisedLight
@@ -322,13 +317,6 @@ def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement
         ratio = ratio[:, :4]
     assert float(ratio.median()) == pytest.approx(1.0, abs=0.06)  # of the draws
     assert float(ratio.quantile(0.95)) < 1.2
-
-
-@pytest.mark.parametrize("movement", [MOVEMENT, Movement(0.6), Movement()])
-def test_light_without_a_cache_is_the_same(movement: Movement) -> None:
-    scene = _prepared(defocus=3.0, image_speed=0.2, movement=movement)
-    exposure = scene.exposure(SLOW)
-    assert torch.equal(blur(SCENE, exposure) * exposure.ratio, scene.expected(SLOW))
 
 
 @pytest.mark.parametrize("cache_light", [True, False])

@@ -82,7 +82,7 @@ def test_denoised_light_is_used_where_the_source_is_noisier(
     source = prepared(reference=reference)
     exposure = source.exposure(target)
     assert (exposure.denoised is not None) is exposure.source.is_zero is denoised
-    assert torch.equal(source.source_light(exposure), flat(0.2)) is denoised
+    assert torch.equal(source.blurred_light.source(exposure), flat(0.2)) is denoised
     frame, excess = source.capture(target, 3)
     assert excess == source.plan(target).excess_noise == 0.0
     wanted = expected_variance(0.2, Z6.nlf(target.iso)) + ROUNDING

@@ -146,17 +146,6 @@ def test_excess_variance_over_all_pixels(ratio: float) -> None:
     assert stated == pytest.approx(expected.mean(), rel=0.01)
 
 
-def test_median_of_each_plane() -> None:
-    """Of a sample; also where every fourth column is bright, whatever pixels are sampled."""
-    light = LIGHTS["natural"] * np.array([1.0, 2.0, 3.0, -1.0])[:, None, None]
-    median = LightStatistics(tensor(light)).median
-    np.testing.assert_allclose(median[:3], np.median(light[:3], axis=(1, 2)), rtol=0.03)
-    assert median[3] == 0.0
-    columns = torch.full((4, 128, 128), 0.002)
-    columns[..., ::4] = 0.5
-    np.testing.assert_allclose(LightStatistics(columns).median, 0.002, rtol=1e-6)
-
-
 @pytest.mark.parametrize("name", list(LIGHTS))
 @pytest.mark.parametrize("iso", [100, 6400])
 def test_no_blur_moves_the_light_by_more_than_its_bound(name: str, iso: float) -> None:
