@@ -27,9 +27,8 @@ from benchmarks.isolated import timed
 from simulator import CameraProfile, get_camera
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.reference_camera import ReferenceCamera
-from simulator.reference.sampling import lens_blur, sample_mosaic
-from simulator.training.crops import DetailPicture
+from simulator.reference.camera import ReferenceCamera, lens_blur, sample_mosaic
+from simulator.training.data import DetailPicture
 
 #: Sources are photographed by both cameras in turn.
 CAMERAS = ("nikon_z6", "canon_70d")

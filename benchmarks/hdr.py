@@ -21,7 +21,7 @@ from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
 from simulator import CameraSimulator, RawImage, get_camera
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 CAMERA, F_NUMBER = "nikon_z6", 8.0
 ISOS = (100, 1600, 6400)

@@ -22,7 +22,7 @@ from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.disc_bank import DiscBank, added_blur
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 CAMERA, F_SOURCE = "nikon_z6", 11.0
 ISOS, F_NUMBERS = (100, 1600), (4.0, 2.8, 2.0, 1.4)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simulator.utils.jit import kernel
+from simulator.utils.compute import kernel
 
 #: Number of times that the leaves cover the frame; gaps show the ground.
 _COVERAGE = 3.0

@@ -15,7 +15,7 @@ import numpy as np
 from ae_env.scenes.scene import Scene, mean_anchor
 from simulator.noise.generator import noise_generator
 from simulator.raw.image import RawImage
-from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.camera import ReferenceCamera
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
 

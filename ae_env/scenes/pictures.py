@@ -26,7 +26,7 @@ from ae_env.scenes.photographs import unprocess
 from ae_env.scenes.radiance import RADIANCE_SUFFIXES, read_radiance
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.read import read_raw
-from simulator.training.crops import DetailPicture
+from simulator.training.data import DetailPicture
 from simulator.utils.checks import check_word
 
 logger = logging.getLogger(__name__)

@@ -40,7 +40,7 @@ from ae_env.scenes.radiance import AZIMUTHS, EV100_RANGE, assumed_ev100, read_ra
 from ae_env.scenes.scene import Scene, mean_anchor, reference_settings
 from simulator.camera import CameraProfile
 from simulator.optics.thin_lens import Lens
-from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.settings import incident_ev100
 from simulator.utils.checks import check_integer, check_word
 

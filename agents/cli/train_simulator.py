@@ -25,9 +25,9 @@ from agents.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from simulator.reference.reference_camera import ReferenceScene
-    from simulator.training.config import SimulatorConfig
-    from simulator.training.crops import DetailPicture
+    from simulator.reference.camera import ReferenceScene
+    from simulator.training.data import DetailPicture
+    from simulator.training.train import SimulatorConfig
 
 #: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
@@ -49,8 +49,7 @@ def train_simulator(
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
     from simulator.networks.weights import build_modules
-    from simulator.training.config import load_config
-    from simulator.training.train import load_start, train_and_save
+    from simulator.training.train import load_config, load_start, train_and_save
 
     training = load_config(find_config(config))
     if seed is not None:

@@ -30,7 +30,7 @@ def warm_up() -> None:
 
     Example: `ae-env warm-up`
     """
-    logging.getLogger("simulator.utils.jit").setLevel(logging.ERROR)  # it proposes this command
+    logging.getLogger("simulator.utils.compute").setLevel(logging.ERROR)  # it proposes this command
     with progress_bars() as progress, progress("warming up") as task:
         for done, (name, arguments) in enumerate(_CASES):
             task(done, len(_CASES) + 1, ", ".join([name, *map(str, arguments.values())]))

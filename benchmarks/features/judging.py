@@ -27,7 +27,7 @@ from benchmarks.features.pairs import (
 from benchmarks.features.training import CAMERA
 from simulator import CameraSettings, develop, get_camera
 from simulator.noise.generator import noise_generator
-from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
 
 #: Gaps [EV] and ISOs at which every pair is taken.
 GAPS, ISOS = (0.0, 2.0, 4.0, 6.0), (100.0, 1600.0, 12800.0)

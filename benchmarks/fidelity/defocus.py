@@ -24,7 +24,7 @@ from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
 from simulator.optics.disc_bank import DiscBank, added_blur
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 CAMERA = "nikon_z6"
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].

@@ -16,7 +16,7 @@ from benchmarks.fidelity.defocus import CAMERA, equal_exposure
 from benchmarks.harness import Row, data_root, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 ISO, F_SOURCE, F_TARGET = 100, 8.0, 4.0
 #: Height and width [packed pixel], at most.

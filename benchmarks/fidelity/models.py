@@ -18,7 +18,7 @@ from simulator import CameraSimulator, get_camera
 from simulator.networks.denoiser import SIZES
 from simulator.networks.noise_module import NoiseModule
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.camera import ReferenceScene
 
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
 FOLDER, CONFIGS = ROOT / "runs" / "simulator", ROOT / "configs" / "simulator"

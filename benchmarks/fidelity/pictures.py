@@ -20,7 +20,7 @@ from benchmarks.fidelity.models import load_models
 from benchmarks.harness import RUNS, Row, data_root, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 CAMERA = "nikon_z6"
 #: The published picture; a quick run leaves it alone.

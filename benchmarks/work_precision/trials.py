@@ -21,7 +21,7 @@ from benchmarks.captures import cropped
 from benchmarks.harness import data_root
 from simulator import CameraSettings, RawImage, get_camera, incident_ev100
 from simulator.camera_simulator import Depth
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 #: Height and width [packed pixel].
 Size = tuple[int, int]

@@ -23,13 +23,17 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.dataset import PARAMETERS, PackedCapture, read_table
 from simulator.reference.sequences import Pair, any_pairs, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.config import SimulatorConfig
 from simulator.training.data import Batch, settings_parameters
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, expose
-from simulator.training.train import TrainingProgress, load_start, make_accelerator, train_stage
+from simulator.training.train import (
+    SimulatorConfig,
+    TrainingProgress,
+    load_start,
+    make_accelerator,
+    train_stage,
+)
 from simulator.utils.cache import LruCache
-from simulator.utils.files import sibling
-from simulator.utils.results import result_meta
+from simulator.utils.files import result_meta, sibling
 
 #: Stages in the order of the paper.
 STAGES = ("exposure", "noise", "aperture", "baseline")

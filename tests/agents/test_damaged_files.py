@@ -8,7 +8,7 @@ import pytest
 
 from ae_env.scenes.radiance import read_radiance
 from agents.learning.training import AgentConfig
-from simulator.training.config import SimulatorConfig
+from simulator.training.train import SimulatorConfig
 from simulator.utils.config_file import load_yaml
 
 INPUTS = 120

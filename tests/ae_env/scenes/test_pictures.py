@@ -12,7 +12,7 @@ from PIL import Image
 
 from ae_env.scenes import pictures
 from ae_env.scenes.pictures import detail_pictures, detail_split
-from simulator.training.crops import DetailPicture
+from simulator.training.data import DetailPicture
 from tests.ae_env.scene_files import write_hdr
 
 SPLITS = ("train", "validation", "test")

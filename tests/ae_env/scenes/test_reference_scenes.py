@@ -16,7 +16,7 @@ from ae_env.scenes.reference_scenes import (
     reference_scenes,
 )
 from simulator import CameraSettings, get_camera
-from simulator.reference.reference_camera import DRAPED, ReferenceScene
+from simulator.reference.camera import DRAPED, ReferenceScene
 from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")

@@ -10,10 +10,9 @@ from agents.cli import train_simulator
 from agents.cli.train_simulator import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
-from simulator.training import calibration
-from simulator.training.config import SimulatorConfig
-from simulator.training.crops import DetailCrops
-from simulator.training.data import ReferencePairs
+from simulator.training import train as calibration
+from simulator.training.data import DetailCrops, ReferencePairs
+from simulator.training.train import SimulatorConfig
 
 TINY = """\
 preset: compact

@@ -19,7 +19,7 @@ from simulator.raw.dataset import (
     write_packed_sequence,
     write_raw_sequence,
 )
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 SETTINGS = (
     CameraSettings(100, 1 / 64, 8),

@@ -8,7 +8,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from simulator.camera import BayerPattern
-from simulator.reference.sampling import average_planes, lens_blur, sample_mosaic
+from simulator.reference.camera import average_planes, lens_blur, sample_mosaic
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.3, 0.5, 1.2])

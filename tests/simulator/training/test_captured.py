@@ -16,8 +16,8 @@ from simulator.training.captured import (
     split_dataset,
     train_on_captures,
 )
-from simulator.training.config import SimulatorConfig
 from simulator.training.losses import BaselineLoss
+from simulator.training.train import SimulatorConfig
 from tests.simulator.training.captures import SETTINGS, write_dataset
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}

@@ -8,7 +8,7 @@ import torch
 
 from simulator import get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.training.crops import DetailCrops, DetailPicture
+from simulator.training.data import DetailCrops, DetailPicture
 
 Z6, CANON = get_camera("nikon_z6"), get_camera("canon_70d")
 

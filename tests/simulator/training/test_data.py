@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from simulator import CameraSettings, get_camera
-from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.camera import ReferenceCamera
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training.data import Batch, ReferencePairs, draw_sequences

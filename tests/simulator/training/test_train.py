@@ -14,7 +14,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from simulator import CameraSettings, get_camera
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import (
+from simulator.reference.camera import (
     DRAPED,
     MOSAIC,
     ReferenceCamera,
@@ -23,10 +23,16 @@ from simulator.reference.reference_camera import (
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import train
-from simulator.training.config import SimulatorConfig, StageConfig
-from simulator.training.crops import DetailPicture
-from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.train import Clock, make_accelerator, train_and_save, train_stage, validate
+from simulator.training.data import DetailPicture, ReferencePairs, draw_sequences
+from simulator.training.train import (
+    Clock,
+    SimulatorConfig,
+    StageConfig,
+    make_accelerator,
+    train_and_save,
+    train_stage,
+    validate,
+)
 from tests.simulator.training.scenes import REFERENCE, scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
@@ -52,8 +58,8 @@ def pictures(config: SimulatorConfig, split: str) -> list[DetailPicture]:
 @pytest.fixture(autouse=True, scope="module")
 def quick_calibration():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("simulator.training.calibration._CROPS", 8)
-        patch.setattr("simulator.training.calibration._SIDE", 16)
+        patch.setattr("simulator.training.train._CROPS", 8)
+        patch.setattr("simulator.training.train._SIDE", 16)
         yield
 
 

@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from simulator import CameraSimulator
-from simulator.utils.processor import computes_bfloat16
+from simulator.utils.compute import computes_bfloat16
 
 
 def test_emulated_bfloat16_is_said(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    known = "simulator.utils.processor.computes_bfloat16"
+    known = "simulator.utils.compute.computes_bfloat16"
     for computed in (True, False):
         monkeypatch.setattr(known, lambda device, computed=computed: computed)
         with caplog.at_level(logging.WARNING):

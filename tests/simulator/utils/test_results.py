@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_results
 
 
 def test_meta_says_where_a_number_comes_from():

@@ -4,7 +4,7 @@ import threading
 import numpy as np
 import pytest
 
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import parallel_ranges
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 8])
@@ -18,9 +18,9 @@ def test_every_item_is_done_once(count, threads):
             def inner(a: int, b: int, row: np.ndarray = row) -> None:
                 row[a:b] += 1
 
-            in_shares(inner, 10, threads=2)
+            parallel_ranges(inner, 10, threads=2)
 
-    in_shares(task, count, threads=threads)
+    parallel_ranges(task, count, threads=threads)
     assert (done == 1).all()
 
 
@@ -31,10 +31,10 @@ def test_shares_are_contiguous_and_run_at_the_same_time():
         barrier.wait()  # passes only if all three are under way
         shares.append((first, last))
 
-    in_shares(task, 9, threads=3)
+    parallel_ranges(task, 9, threads=3)
     assert sorted(shares) == [(0, 3), (3, 6), (6, 9)]
     names = []  # little work stays on the caller's thread
-    in_shares(lambda *_: names.append(threading.current_thread()), 5, least=3, threads=4)
+    parallel_ranges(lambda *_: names.append(threading.current_thread()), 5, least=3, threads=4)
     assert names == [threading.current_thread()]
 
 
@@ -48,7 +48,7 @@ def test_errors_of_any_share_are_raised_once_all_are_done(bad):
         done.append(first)
 
     with pytest.raises(ValueError, match=f"share {bad}"):
-        in_shares(task, 6, threads=2)
+        parallel_ranges(task, 6, threads=2)
     assert done == [3 - bad]
 
 
@@ -58,13 +58,13 @@ def _sum_in_child(queue: multiprocessing.Queue) -> None:
     def task(first: int, last: int) -> None:
         totals[first:last] = last
 
-    in_shares(task, 2, threads=2)
+    parallel_ranges(task, 2, threads=2)
     queue.put(totals.tolist())
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # forking a process that has threads
 def test_child_processes_make_threads_of_their_own():
-    in_shares(lambda *_: None, 2, threads=2)  # this process has some already
+    parallel_ranges(lambda *_: None, 2, threads=2)  # this process has some already
     context = multiprocessing.get_context("fork")
     queue = context.Queue()
     child = context.Process(target=_sum_in_child, args=(queue,))

@@ -13,8 +13,12 @@ from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.flicker_integral import PulsedLamp
 from simulator.optics.thin_lens import Lens
-from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
-from simulator.reference.sampling import sample_mosaic
+from simulator.reference.camera import (
+    BodyError,
+    ReferenceCamera,
+    ReferenceScene,
+    sample_mosaic,
+)
 from simulator.settings import CameraSettings
 
 BASE = CameraSettings(100, 1 / 64, 4)

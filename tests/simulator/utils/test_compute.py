@@ -5,8 +5,8 @@ from pathlib import Path
 import numba
 from numba.core import caching
 
-from simulator.utils import jit
-from simulator.utils.jit import kernel
+from simulator.utils import compute as jit
+from simulator.utils.compute import kernel
 
 
 def add(a: int, b: int) -> int:
@@ -23,7 +23,7 @@ def test_kernels_run_without_the_lock_and_are_cached():
 
 def test_they_run_where_nothing_can_be_cached(monkeypatch, caplog):
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
-    with caplog.at_level(logging.INFO, "simulator.utils.jit"):
+    with caplog.at_level(logging.INFO, "simulator.utils.compute"):
         assert kernel()(add)(1, 2) == 3
     assert "compiled again in each process" in caplog.text
 
