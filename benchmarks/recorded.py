@@ -44,9 +44,8 @@ from benchmarks.harness import (
     table,
 )
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.radiance.light import MEAN_SIGNAL
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 
 CAMERA = "nikon_z6"
 #: Side of a frame [packed pixel].

@@ -35,13 +35,12 @@ from ae_env.scenes.pictures import (
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.optics.thin_lens import Lens
-from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
 from simulator.radiance.light import mean_anchor, reference_settings, temperature_tint
 from simulator.radiance.maps import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
 from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
 from simulator.radiance.procedural import draw, list_kinds
-from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.settings import incident_ev100
 from simulator.utils.checks import check_integer, check_word
 

@@ -23,8 +23,6 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
-from simulator.reference.camera import lens_blur, sample_mosaic
-from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 from simulator.settings import CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_number
