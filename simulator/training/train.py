@@ -7,7 +7,9 @@ a noise module leaves is measured (`calibrate`), for the plan's predictions.
 from __future__ import annotations
 
 import functools
+import logging
 import math
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -45,14 +47,26 @@ from simulator.training.data import (
     draw_sequences,
 )
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
+from simulator.training.scenes import (
+    Split,
+    detail_pictures,
+    draped_scenes,
+    mosaic_scenes,
+    reference_scenes,
+)
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.compute import check_bfloat16
 from simulator.utils.config_file import Configuration, load_yaml
-from simulator.utils.files import result_meta, sibling
+from simulator.utils.files import DATA_VARIABLE, data_folder, result_meta, sibling
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
+logger = logging.getLogger(__name__)
+
+#: Splits that a training uses, and the procedural scenes that it validates on.
+_SPLITS: tuple[Split, ...] = ("train", "validation")
+_VALIDATION_SCENES = 24
 #: Fixed batches that a trained stage is validated on.
 _VALIDATION_STEPS, _VALIDATION_BATCH = 8, 8
 #: Pairs that each stage is trained on, see `simulator.reference.sequences.select_pairs`.
@@ -191,11 +205,10 @@ def load_config(path: str | Path) -> SimulatorConfig:
 
 
 # -- training -------------------------------------------------------------------------------------
-#: Makes the scenes of a split, ``"train"`` or ``"validation"``, such as
-#: `ae_env.scenes.reference_scenes` does.
-SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
-#: Gives the pictures of a split for the noise stage, such as `ae_env.scenes.pictures` does.
-PictureMaker = Callable[[SimulatorConfig, str], Sequence[DetailPicture]]
+#: Makes the scenes of a split, ``"train"`` or ``"validation"``, of a training.
+SceneMaker = Callable[[SimulatorConfig, Split], Sequence[ReferenceScene]]
+#: Makes the pictures of a split for its noise stage.
+PictureMaker = Callable[[SimulatorConfig, Split], Sequence[DetailPicture]]
 #: Called with the task, the share of it that is done, and the latest values.
 TrainingProgress = Callable[[str, float, dict[str, float]], None]
 
@@ -209,13 +222,13 @@ class Batches(Protocol):
 
 def train_and_save(
     config: SimulatorConfig,
-    make_scenes: SceneMaker,
-    make_pictures: PictureMaker,
     path: Path,
     *,
     command: str,
     device: str = "cpu",
     tensorboard: bool = False,
+    make_scenes: SceneMaker | None = None,
+    make_pictures: PictureMaker | None = None,
     progress: TrainingProgress | None = None,
 ) -> Path:
     """Trains the stages of `config` and writes the weights with their model card.
@@ -224,12 +237,13 @@ def train_and_save(
 
     Args:
         config: The training.
-        make_scenes: Gives the scenes of a split; not called for a noise module alone.
-        make_pictures: Gives the pictures of a split for the noise stage.
         path: File name of the weights; checkpoints and logs go into its folder.
         command: The command line that does it again, for the card.
         device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
         tensorboard: Whether to log to ``tensorboard`` in that folder.
+        make_scenes: Gives the scenes of a split, `scenes_of` by default; not called for a noise
+            module alone.
+        make_pictures: Gives the pictures of a split for the noise stage, `pictures_of` by default.
         progress: Called while scenes are rendered and every few steps.
 
     Returns:
@@ -245,8 +259,8 @@ def train_and_save(
         modules = build_modules(config.preset)
     start = None if config.start is None else load_start(config, modules)
     sources = {
-        split: _Source(config, make_scenes, make_pictures, split)
-        for split in ("train", "validation")
+        split: _Source(config, make_scenes or scenes_of, make_pictures or pictures_of, split)
+        for split in _SPLITS
     }
     if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
         progress = None
@@ -286,6 +300,29 @@ def train_and_save(
         card = {"training": config.card(), **done, "residual": residual, **origin}
         save_modules(path, modules, config.preset, card)
     return sibling(path, ".safetensors")
+
+
+def scenes_of(config: SimulatorConfig, split: Split) -> list[ReferenceScene]:
+    """The scenes of a split that a training's configuration names."""
+    radiance, folder = config.scenes.radiance or "", data_folder()
+    if folder is not None:
+        radiance = radiance.replace(f"${DATA_VARIABLE}", str(folder))
+    radiance = os.path.expandvars(radiance)
+    if config.scenes.radiance and ("$" in radiance or not radiance):  # unset, or empty
+        logger.warning("%s is not set: training without radiance maps", config.scenes.radiance)
+        radiance = ""
+    data, size = Path(radiance) if radiance else None, config.scenes.size
+    camera = get_camera(config.camera)
+    number = config.scenes.procedural if split == "train" else _VALIDATION_SCENES
+    scenes = reference_scenes(split, camera, number=number, size=size, data=data, seed=config.seed)
+    if data is not None:
+        scenes += mosaic_scenes(split, camera, data, size=size)
+    return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
+
+
+def pictures_of(config: SimulatorConfig, split: Split) -> list[DetailPicture]:
+    """The pictures of a split that the noise stage is trained on."""
+    return detail_pictures(split, data=data_folder(), seed=config.seed)
 
 
 def load_start(config: SimulatorConfig, modules: nn.ModuleDict) -> dict[str, Any]:
@@ -347,7 +384,7 @@ class _Source:
         config: SimulatorConfig,
         make_scenes: SceneMaker,
         make_pictures: PictureMaker,
-        split: str,
+        split: Split,
     ) -> None:
         self.config, self.split = config, split
         self._make_scenes, self._make_pictures = make_scenes, make_pictures

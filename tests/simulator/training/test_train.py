@@ -2,6 +2,7 @@ import itertools
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Sequence as SequenceOf
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,9 @@ def save(
 ) -> Path:
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
-    return train_and_save(made, scenes, pictures, file, tensorboard=True, **options)
+    return train_and_save(
+        made, file, make_scenes=scenes, make_pictures=pictures, tensorboard=True, **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -307,3 +310,17 @@ def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch.cpu = 1e6
     clocks[0].tick()
     assert (clocks[0].step, clocks[0].share) == (2, 1.0)
+
+
+def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
+    made = config(scenes={"procedural": 4, "size": 32})
+    splits = {split: train.scenes_of(made, split) for split in ("train", "validation")}
+    groups = {split: {one.group for one in found} for split, found in splits.items()}
+    assert not groups["train"] & groups["validation"]
+    # Three of four procedural scenes have depth; the fourth is draped over two depths.
+    deep = [Counter(one.kind for one in own if one.depth is not None) for own in splits.values()]
+    assert deep == [{"depth": 3, "draped": 2}, {"depth": 2}]
+    for one in itertools.chain(*splits.values()):
+        assert (one.size, one.sampled) == ((32, 32), True)
+        assert one.illuminance is not None

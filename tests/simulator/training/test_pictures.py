@@ -10,9 +10,9 @@ import pytest
 import torch
 from PIL import Image
 
-from ae_env.scenes import pictures
-from ae_env.scenes.pictures import detail_pictures, detail_split
+from simulator.training import scenes as pictures
 from simulator.training.data import DetailPicture
+from simulator.training.scenes import detail_pictures, detail_split
 from tests.ae_env.scene_files import write_hdr
 
 SPLITS = ("train", "validation", "test")

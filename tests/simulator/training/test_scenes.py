@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes.reference_scenes import (
+from simulator import CameraSettings, get_camera
+from simulator.reference.camera import DRAPED, ReferenceScene
+from simulator.training.scenes import (
     _edge_ratio,
     depth_photographs,
     draped_scenes,
     mosaic_scenes,
     reference_scenes,
 )
-from simulator import CameraSettings, get_camera
-from simulator.reference.camera import DRAPED, ReferenceScene
 from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")
