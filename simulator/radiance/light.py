@@ -156,7 +156,8 @@ def camera_light(
     else:
         reference = reference_settings(ev100)
         light *= mean_anchor(light[1:3] if sampled else light[1])
-    return CameraLight(light, reference, (white[1] / white[0], 1.0, white[1] / white[2]))
+    red, green, blue = white.tolist()
+    return CameraLight(light, reference, (green / red, 1.0, green / blue))
 
 
 def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:
