@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from agents.cli.console import command_line, make_folder, print_files, print_line
-from simulator.utils.checks import check_word
 
 #: Whose weights can be read.
 KINDS = ("ncs",)
@@ -30,6 +29,7 @@ def import_weights(
     """
     from simulator.networks.authors_weights import read_authors_weights
     from simulator.networks.weights import save_modules
+    from simulator.utils.checks import check_word
 
     check_word("kind", kind, KINDS)
     if out.suffix != ".safetensors":

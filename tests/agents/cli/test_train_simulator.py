@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from ae_env.scenes import pictures
-from agents.cli import train_simulator
-from agents.cli.train_simulator import reference_scenes_of
+from agents.cli import train
+from agents.cli.train import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
 from simulator.training import calibration
@@ -30,7 +30,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     Without a folder of real files, on a few drawn pictures."""
     monkeypatch.delenv("AE_ENV_DATA", raising=False)
     monkeypatch.setattr(pictures, "_DRAWN", {"train": 2, "validation": 1})
-    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
     monkeypatch.setattr(calibration, "_CROPS", 8)
     (tmp_path / "tiny.yaml").write_text(TINY)
     steps = []
@@ -68,7 +68,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train_simulator, "_VALIDATION_SCENES", 2)
+    monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
     config = SimulatorConfig.model_validate(yaml.safe_load(TINY))
     splits = {s: reference_scenes_of(config, s) for s in ("train", "validation")}
     groups = {split: {scene.group for scene in scenes} for split, scenes in splits.items()}
