@@ -29,7 +29,7 @@ import importlib, pkgutil
 import gymnasium as gym, numba
 from agents.cli.data import warm_up
 from simulator.utils.jit import is_cached
-from agents.cli.warm_up import warm_up
+from agents.cli.data import warm_up
 import ae_env, simulator
 
 make_vec = gym.make_vec
