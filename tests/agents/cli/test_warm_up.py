@@ -28,8 +28,6 @@ _WARM_UP = """
 import importlib, pkgutil
 import gymnasium as gym, numba
 from agents.cli.data import warm_up
-from simulator.utils.jit import is_cached
-from agents.cli.data import warm_up
 import ae_env, simulator
 
 make_vec = gym.make_vec
