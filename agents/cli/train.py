@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,9 +24,6 @@ from agents.cli.console import (
 
 if TYPE_CHECKING:
     from agents.learning.training import AgentConfig
-    from simulator.reference.reference_camera import ReferenceScene
-    from simulator.training.config import SimulatorConfig
-    from simulator.training.crops import DetailPicture
 
 #: Evaluations of the tasks; that of still light is the command's own default.
 _PRESETS = {"ae_env/AutoExposureVideo-v0": "video", "ae_env/ExposureBracket-v0": "bracket"}
@@ -107,8 +102,7 @@ def train_simulator(
     """
     from ae_env.utils.presets import find_config
     from simulator.networks.weights import build_modules
-    from simulator.training.config import load_config
-    from simulator.training.train import load_start, train_and_save
+    from simulator.training.train import load_config, load_start, train_and_save
 
     training = load_config(find_config(config))
     if seed is not None:
@@ -155,7 +149,7 @@ def export(
     """
     import gymnasium as gym
 
-    from agents.learning.agent_weights import load_agent, trained_grid
+    from agents.learning.weights import load_agent, trained_grid
     from agents.onboard.controller import Controller
     from agents.onboard.export import export_agent
     from agents.policy import PolicyContext, make_policy, training_seeds
