@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.metering.histogram_meters import encoded
+from agents.metering.meters import encoded
 from agents.metering.reading import (
     BLACK_SIGNAL,
     CODE_SIGNALS,
@@ -22,14 +22,13 @@ from agents.metering.reading import (
     GREEN,
     TARGET_SIGNAL,
     WHITE_SIGNAL,
+    Floats,
     Reading,
     frame_ev100,
     signal_codes,
 )
 from agents.policy import Observations
 from simulator.camera import CameraProfile
-
-Floats = NDArray[np.float64]
 
 #: Gammas that Shim's search tries; below 1 brightens.
 GAMMAS = (0.1, 0.5, 0.8, 1.0, 1.2, 1.5, 1.9)

@@ -1,6 +1,6 @@
 import numpy as np
 
-from agents.learning.augmentation import moved
+from agents.learning.networks import moved
 
 
 def _shifted(raw: np.ndarray, rows: int, columns: int) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ae_env.observation import encode_settings
-from agents.learning.history import NUMBERS, MeterHistory, WithHistory, with_history
+from agents.learning.networks import NUMBERS, MeterHistory, WithHistory, with_history
 from agents.learning.sb3_adapter import SB3VectorAdapter
 from agents.policy import PolicyContext
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.learning.learning_curve import LearningCurve, load_curve
+from agents.learning.training import LearningCurve, load_curve
 
 
 def test_rows_are_means_over_parts_of_the_training(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learning.regression_training import RegressionTraining, Replay, train_regression
+from agents.learning.regression import RegressionTraining, Replay, train_regression
 
 TRAINING = RegressionTraining(frames=160, width=16, seed=5)
 

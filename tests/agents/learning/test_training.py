@@ -13,7 +13,7 @@ import yaml
 
 from agents.learning import training, workers
 from agents.learning.ppo import PPOTraining
-from agents.learning.regression_training import RegressionTraining
+from agents.learning.regression import RegressionTraining
 from simulator.utils import checkpoint
 from simulator.utils.files import sibling
 

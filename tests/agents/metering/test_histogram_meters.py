@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from agents.metering import histogram_meters
+from agents.metering import meters as histogram_meters
 from agents.metering.meters import make_meter
 
 GREY = np.ones((64, 64))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.metering.libcamera_agc import inter_quantile_mean, signal_histogram
+from agents.metering.rpi_agc import inter_quantile_mean, signal_histogram
 from benchmarks.libcamera import compare, play
 
 #: Six of the 36 recordings, so that nothing else is needed.

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from agents.metering.matching import MatchedReadings, light_change
 from agents.metering.meters import make_meter
+from agents.metering.reading import MatchedReadings, light_change
 
 #: Stripes from 5 stops below to 2 stops above a grey card, and a flat one.
 STRIPES = np.repeat(2.0 ** np.linspace(-5.0, 2.0, 16), 4)[None, :] * np.ones((64, 1))
