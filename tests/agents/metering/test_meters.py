@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ae_env.observation import decode_observation
-from agents.metering import meters
+from agents.metering import search_meters
 from agents.metering.meters import make_meter, weight_map
 from agents.policy_names import METERS, make_policy
 
@@ -178,7 +178,7 @@ def test_simulated_histogram_is_that_of_the_exposed_frame():
     codes = np.arange(256)
     edges = (np.clip(codes[:, None] + [-0.5, 0.5], 0, 255) / 255.0) ** 2 * (1 + 1 / 1024) - 1 / 1024
     shares = np.diff(np.clip(edges, 0.0, 1.0), axis=1)[:, 0]
-    exposed = meters._exposed(shares[None], np.array([-1.0, 0.0, 1.0]))[0]
+    exposed = search_meters._exposed(shares[None], np.array([-1.0, 0.0, 1.0]))[0]
     assert exposed.shape == (3, 256)
     assert exposed.sum(axis=1) == pytest.approx(1.0)
     share = exposed[:, 128:].sum(axis=1)  # above half of the code: signal above 0.214
@@ -192,7 +192,7 @@ def test_saturated_pixels_add_to_what_a_search_finds():
     shares = np.zeros((2, 256))
     shares[0, [100, 255]] = 0.75, 0.25
     shares[1, 0] = 1.0
-    found = meters._search_reading(shares, np.array([8.0, 8.0]), np.array([-1.0, 2.0]))
+    found = search_meters._search_reading(shares, np.array([8.0, 8.0]), np.array([-1.0, 2.0]))
     assert found.ev100.tolist() == [9.0 + 0.25 * 3.0, 6.0]
     assert found.saturated.tolist() == [0.25, 0.0]
     assert found.black.tolist() == [False, True]
@@ -202,7 +202,7 @@ def test_peak_is_the_top_of_a_parabola():
     x = np.arange(-3.0, 3.01, 0.5)
     tops = (0.7, -1.2, -3.2, 3.2)  # the last two lie beyond the ends
     values = np.stack([*(-((x - top) ** 2) for top in tops), x, np.zeros_like(x)])
-    np.testing.assert_allclose(meters.peak(values, x), [0.7, -1.2, -3, 3, 3, 0])
+    np.testing.assert_allclose(search_meters.peak(values, x), [0.7, -1.2, -3, 3, 3, 0])
 
 
 @pytest.mark.parametrize("name", ["shim", "zhang"])
