@@ -34,8 +34,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.sensor import Transitions, record
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.jit import addresses
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import addresses, parallel_ranges
 
 #: Memory for tabulated expectations [byte].
 _BYTES = 2**25

@@ -21,7 +21,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ae_env.scenes.pictures import Split
 from benchmarks.harness import Row
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
@@ -36,6 +35,7 @@ from benchmarks.work_precision.trials import (
 from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, PreparedScene, RawImage
 from simulator.capture.sensor import exposed_light
 from simulator.noise.noise_level_function import missing_variance, noise_variance, top_up_table
+from simulator.training.scenes import Split
 
 #: Photographs of each scene, and fair states of it; a third as many are any others of the grid.
 DRAWS, FAIR = 8, 12

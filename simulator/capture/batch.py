@@ -25,7 +25,7 @@ from simulator.capture.statistics import LightStatistics
 from simulator.noise.generator import Noise, noise_keys, single_normals
 from simulator.optics.blur import Blur, blur_many
 from simulator.settings import CameraSettings
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import parallel_ranges
 
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")

@@ -7,7 +7,7 @@ then serves many exposures.)
 
 `record` is the one way from light to frames: sweeps, the full run and the environment all take it.
 On the CPU it is one fused kernel, which works in blocks of 256 samples that stay in the first-level
-cache, vectorised by the compiler, on as many threads as `simulator.utils.threads` allows.
+cache, vectorised by the compiler, on as many threads as `simulator.utils.compute` allows.
 Elsewhere, and where the read noise has rows and tails, the steps run one by one.
 """
 
@@ -42,8 +42,7 @@ from simulator.noise.noise_level_function import (
     plane_tensor,
     top_up_table,
 )
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: A sample at or below this signal counts as clipped low: ten stops below white.
 LOW_CLIP = 2.0**-10

@@ -26,8 +26,7 @@ import torch.nn.functional as F
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
-from simulator.utils.jit import kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
 BINS = 64

@@ -21,8 +21,7 @@ from scipy.special import ndtri
 
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer, check_word
-from simulator.utils.jit import kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
 #: and tails of the camera's read noise (`simulator.noise.noise_level_function`).

@@ -29,8 +29,7 @@ import torch
 import torch.nn.functional as F
 
 from simulator.utils.checks import check_number
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import parallel_ranges, thread_count
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges, thread_count
 
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32

@@ -21,8 +21,7 @@ from torch import Tensor
 from simulator.optics.blur import Blur, blur_many, disc_blur, disc_kernel
 from simulator.optics.motion_path import Taps
 from simulator.raw.image import new_frame
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
 #: discs is within 2 % of the disc between them.

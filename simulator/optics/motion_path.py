@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from simulator.optics.blur import streak_share
-from simulator.utils.jit import kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: Points of a path, per pixel of its length and at most: longer ones are sampled more coarsely.
 _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024

@@ -14,8 +14,7 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.jit import kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 PLANES = ("R", "G1", "G2", "B")
 #: Packed rows from which a second thread helps, and that are packed at a time.

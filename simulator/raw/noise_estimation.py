@@ -16,8 +16,7 @@ import torch
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
-from simulator.utils.jit import kernel
-from simulator.utils.threads import parallel_ranges
+from simulator.utils.compute import kernel, parallel_ranges
 
 
 @kernel()

@@ -25,7 +25,7 @@ from simulator.noise.noise_level_function import (
     top_up_table,
     tukey_lambda,
 )
-from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))

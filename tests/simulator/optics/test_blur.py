@@ -121,7 +121,7 @@ def test_threads_and_views_change_nothing(blur, monkeypatch):
     view = torch.stack([light, light], dim=-1)[..., 0]  # not contiguous
     assert torch.equal(blur(view, 4.0), alone)
     for threads in (2, 3):
-        monkeypatch.setattr("simulator.utils.threads.thread_count", lambda n=threads: n)
+        monkeypatch.setattr("simulator.utils.compute.thread_count", lambda n=threads: n)
         assert torch.equal(blur(light, 4.0), alone)
 
 
