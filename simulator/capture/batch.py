@@ -49,7 +49,7 @@ class FrameStatistics:
         predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
             light without noise only what is left out.
         modules: (B,) int64 index into `MODULES`: the steps that ran.
-        source_noise: (B, 2, 4) shot and read noise that the source brings to the frame.
+        source_noise: (B, 2, 4) shot and read noise of the source in the frame.
         keys: Keys of the noise, uint64.
     """
 
@@ -317,7 +317,7 @@ def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
         return 0.0
     source, target = exposure.source_noise, exposure.target
     pairs = zip((*source.shot, *source.read), (*target.shot, *target.read), strict=True)
-    if all(brought <= wanted for brought, wanted in pairs):
+    if all(present <= wanted for present, wanted in pairs):
         return 0.0
     if exposure.remaining_variance is not None:
         return math.nan

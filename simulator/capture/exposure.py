@@ -155,7 +155,7 @@ class Exposure:
 
     @cached_property
     def source_noise(self) -> NoiseLevelFunction:
-        """Noise that the source brings to the sensor: exposed, and averaged by the blur."""
+        """Noise of the source on the sensor: exposed, and averaged by the blur."""
         if self.source.is_zero:
             return self.source
         energy = self.energy
@@ -300,7 +300,7 @@ def _decide_noise_reduction(inputs: TransitionInputs) -> Step:
         return Step(name, False, "no network would make a smaller error than the noise", error)
     reason = "the source is noisier than the target"
     if not inputs.noise:
-        reason = "the light is asked for without noise"
+        reason = "the light is wanted without noise"
     return Step(name, True, reason + _WITHOUT, error, 0.0, least, best)
 
 

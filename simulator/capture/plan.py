@@ -44,7 +44,7 @@ _OPERATIONS = {
     "clip_and_quantise": 6,
 }
 #: Reasons why no noise is added.
-_ONLY_LIGHT = "only the light is asked for"
+_ONLY_LIGHT = "only the light is wanted"
 _ENOUGH_NOISE = "no pixel lacks noise: the source has the target's already, or more"
 
 
@@ -124,7 +124,7 @@ class SimulationPlan:
 
     @property
     def tolerance(self) -> float:
-        """Error that was asked for."""
+        """Error that the capture may have."""
         return self._inputs.tolerance
 
     @property

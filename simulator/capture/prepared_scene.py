@@ -434,7 +434,7 @@ class PreparedScene:
     ) -> Iterator[torch.Tensor]:
         """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once.
 
-        A state is asked for when its frame is: the next one may depend on the last frame.
+        Each state is taken when its frame is: the next one may depend on the last frame.
 
         Args:
             states: Settings to simulate.

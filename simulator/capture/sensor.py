@@ -102,7 +102,7 @@ class Transitions:
 
         The light of each row multiplies the blurred light before there is noise, so that the noise
         is that of the banded signal: exact for motion along the rows; other motion blurs across
-        rows that do not share their light. Noise that the source itself brings is multiplied with
+        rows that do not share their light. The source's own noise is multiplied with
         its light: its variance by the square of the row's gain, r^2. What the top-up takes away for
         it has the variance times r: exact for shot noise, whose variance is worked out from the
         banded signal, and off by r (1 - r) of the source's read noise.
@@ -135,9 +135,9 @@ class Transitions:
         if self.remaining_variance is None:
             return self.table
         left = [1.0 if share is None else float(share.mean()) for share in self.shares()]
-        kept, table = np.array(left, np.float32)[:, None, None], self.table.copy()
-        table[:, 1:3] += (1.0 - kept) * table[:, 3:]
-        table[:, 3:] *= kept
+        remaining, table = np.array(left, np.float32)[:, None, None], self.table.copy()
+        table[:, 1:3] += (1.0 - remaining) * table[:, 3:]
+        table[:, 3:] *= remaining
         return table
 
     def shares(self) -> list[torch.Tensor | None]:
@@ -281,7 +281,7 @@ def clip_and_quantise(signal: torch.Tensor, camera: CameraProfile) -> torch.Tens
 
 @dataclass(frozen=True)
 class NoiseBalance:
-    """The noise that a source brings against the noise that a capture should have.
+    """The source's noise in a capture against the noise that the capture should have.
 
     Args:
         relative_excess_variance: Mean over the pixels of the variance beyond the target's,
@@ -294,7 +294,7 @@ class NoiseBalance:
 
 
 def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
-    """Compares the noise that one image brings with the target's.
+    """Compares the source's noise in one image with the target's.
 
     Args:
         light: (4, H, W) at the exposure of the prepared scene.

@@ -28,7 +28,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
 from simulator.utils.compute import kernel, parallel_ranges
 
-#: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
+#: Bins of about equal population per plane, and pixels of a plane that are sampled, at most.
 BINS = 64
 SAMPLES = 65_536
 #: Pixels of a plane that are sorted to find the bins, at most about this many.
@@ -41,7 +41,7 @@ _LAPLACIAN = 20.0
 SURE = 4.0
 _FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
 #: Side of a block, over which light is averaged, and of a window, over which detail is [packed
-#: pixel]; blocks that are looked at, at most about this many.
+#: pixel]; blocks that are sampled, at most about this many.
 BLOCK, _WINDOW, _BLOCKS = 8, 32, 16384
 #: Relative variance of its square: twice the squared autocorrelation, over as many samples.
 _CHANCE = 2.0 * (20.0**2 + 4 * 8.0**2 + 4 * 2.0**2 + 4 * 1.0**2) / 20.0**2
@@ -260,7 +260,7 @@ class LightStatistics:
     def relative_excess_variance(
         self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
     ) -> float:
-        """Mean over the pixels of the variance that `source` brings beyond the target's.
+        """Mean over the pixels of the variance of `source` beyond the target's.
 
         Relative to the target's. Other than in `excess_error`, `source` is on the target's scale,
         averaged by what blur there is.
@@ -276,7 +276,7 @@ class LightStatistics:
 
     @property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Light (4, R, W): rows that are looked at and their neighbours; and which they are.
+        """Light (4, R, W): sampled rows and their neighbours; and the indices of the sampled ones.
 
         Whole rows: every column counts alike whatever the width, and a row is read at once.
         """
@@ -340,8 +340,8 @@ def _root_mean(weight: np.ndarray, square: np.ndarray) -> float:
 def wiener_error(light: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
     """Mean square error of the best linear filter, in units of the noise's variance.
 
-    Where detail has S times the energy of the noise, the Wiener filter errs by S / (1 + S) of the
-    noise. S is estimated for each octave from the energy of the Laplacian of the light averaged
+    Where detail has S times the energy of the noise, the Wiener filter's error is S / (1 + S) of
+    the noise. S is estimated for each octave from the energy of the Laplacian of the light averaged
     over 1, 2, 4 and 8 pixels, all planes together, in windows of 32 x 32 pixels.
 
     Args:
@@ -526,7 +526,7 @@ class ResidualStatistics:
 
 
 def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
-    """First row, and row after the last, of the bands that are looked at."""
+    """First row, and row after the last, of the bands that are sampled."""
     height, width = light.shape[-2:]
     blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
     if blocks <= _BLOCKS or height < 2 * _WINDOW:
