@@ -161,7 +161,7 @@ def test_coverage_is_that_of_many_rows_and_columns(radius):
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_many_images_are_scipys_correlation(threads, monkeypatch):
-    for module in ("utils.threads", "optics.blur"):
+    for module in ("utils.compute", "optics.blur"):
         monkeypatch.setattr(f"simulator.{module}.thread_count", lambda: threads)
     extents = [(0.0, 5.0), (3.3, 0.0), (8.0, 17.0), (1e-4, 1e-7), (2.0, 90.0), (0.7, 0.4)]
     blurs = []
