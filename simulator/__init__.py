@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from simulator.noise.noise_level_function import NoiseLevelFunction as NoiseLevelFunction
     from simulator.optics.thin_lens import Lens as Lens
     from simulator.optics.thin_lens import defocus as defocus
-    from simulator.raw.decoding import RawFileError as RawFileError
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
     from simulator.raw.dng import write_dng as write_dng
     from simulator.raw.image import RawImage as RawImage
     from simulator.raw.noise_estimation import estimate_nlf as estimate_nlf
+    from simulator.raw.read import RawFileError as RawFileError
     from simulator.raw.read import read_raw as read_raw
     from simulator.settings import CameraSettings as CameraSettings
     from simulator.settings import exposure_ratio as exposure_ratio
@@ -60,12 +60,11 @@ _MODULES = {
     "capture.prepared_scene": ["PreparedScene"],
     "noise.noise_level_function": ["NoiseLevelFunction"],
     "optics.thin_lens": ["Lens", "defocus"],
-    "raw.decoding": ["RawFileError"],
     "raw.develop": ["develop", "render_srgb"],
     "raw.dng": ["write_dng"],
     "raw.image": ["RawImage"],
     "raw.noise_estimation": ["estimate_nlf"],
-    "raw.read": ["read_raw"],
+    "raw.read": ["RawFileError", "read_raw"],
     "settings": ["CameraSettings", "exposure_ratio", "incident_ev100", "sensor_signal"],
 }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -22,16 +22,25 @@ from simulator.capture.blurred_light import ApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
+from simulator.capture.scene_blur import scene_light
+from simulator.capture.sensor import Transitions, record
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
-from simulator.networks.denoiser import SIZES, Denoiser
 from simulator.networks.exposure_module import ExposureModule
-from simulator.networks.full_run import FullRun, Stages
 from simulator.networks.network_cache import NetworkCache, Where
-from simulator.networks.noise_module import NoiseModule, Preset, smoothed, variance_map
-from simulator.noise.generator import Noise, check_noise
-from simulator.raw.highlights import neutral_highlights
+from simulator.networks.noise_module import (
+    SIZES,
+    Denoiser,
+    NoiseModule,
+    Preset,
+    smoothed,
+    variance_map,
+)
+from simulator.noise.generator import Noise, check_noise, sweep_keys
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_word
 from simulator.utils.processor import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 
@@ -47,10 +56,23 @@ _TIMED = 128
 _DISC_REACH = 16
 
 
-def check_depth(depth: str) -> None:
-    """Raises a `ValueError` unless `depth` says what is known of the scene's."""
-    if depth not in get_args(Depth):
-        raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """Every intermediate result of the full pipeline (paper, figure 2), each (4, H, W).
+
+    Args:
+        exposed: After the exposure module (EXP).
+        denoised: After the noise module (NS).
+        opened: After the aperture module (Full).
+        light: With the blur of a known disc and of motion, before the output's noise.
+        capture: With the output settings' noise, clipped and quantised.
+    """
+
+    exposed: torch.Tensor
+    denoised: torch.Tensor
+    opened: torch.Tensor
+    light: torch.Tensor
+    capture: torch.Tensor
 
 
 def prepared_of(source: Source, device: torch.device) -> PreparedScene:
@@ -138,8 +160,7 @@ class CameraSimulator:
             raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
-        if precision not in ("float32", "bfloat16"):
-            raise ValueError(f"`precision` (={precision!r}) must be 'float32' or 'bfloat16'")
+        check_word("precision", precision, ("float32", "bfloat16"))
         if precision == "bfloat16":
             check_bfloat16(self.device)
         self.precision = precision
@@ -238,7 +259,7 @@ class CameraSimulator:
                 "`tolerance` (=None) must be a number here: what is prepared is shared between "
                 "transitions; ask `simulate` for the full run of one"
             )
-        check_depth(depth)
+        check_word("depth", depth, get_args(Depth))
         if depth == "unknown" and self.aperture is None:
             raise ValueError(
                 "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
@@ -464,15 +485,50 @@ class CameraSimulator:
         """
         if self.noise is None or self.aperture is None:
             raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
-        check_depth(depth)
+        check_word("depth", depth, get_args(Depth))
         prepared = self._seen(source, image_speed, defocus)
         opens = depth == "unknown" or prepared.aperture_blur is not None
         # A prepared scene may be corrected already; a scene is no recording of this body.
         exposure = self.exposure
         if not isinstance(source, RawImage):
             exposure = ExposureModule().requires_grad_(False).to(self.device)
-        aperture, half = self.aperture if opens else None, self.precision == "bfloat16"
-        return FullRun(exposure, self.noise, aperture, half).run(prepared, settings, seed=seed)
+        return self._full_run(prepared, settings, exposure, opens, seed)
+
+    @torch.no_grad()
+    def _full_run(
+        self,
+        prepared: PreparedScene,
+        settings: CameraSettings,
+        module: ExposureModule,
+        opens: bool,
+        seed: int,
+    ) -> Stages:
+        """The paper's pipeline; `opens` says whether the aperture module runs."""
+        assert self.noise is not None
+        assert self.aperture is not None
+        keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
+        # What networks found out about the scene is not used.
+        bare = replace(prepared, denoised=(), aperture_blur=None, tolerance=0.0)
+        exposure = bare.exposure(settings)
+        exposed = module(prepared.light[None], exposure.ratio)
+        if not self.noise.commutes:
+            exposed = exposed.clamp(0.0, 1.0)
+        nlf = prepared.nlf.exposed(float(module.w) * exposure.ratio)
+        shot, read = (torch.tensor([v]).to(exposed) for v in (nlf.shot, nlf.read))
+        with self._autocast():
+            denoised = opened = self.noise(exposed, shot, read)
+            if opens:
+                deviation = variance_map(smoothed(exposed), shot, read).sqrt()
+                f_numbers = (
+                    torch.tensor([s.effective_f_number], device=exposed.device)
+                    for s in (prepared.reference, settings)
+                )
+                opened = self.aperture(denoised, deviation, *f_numbers)
+        at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
+        light = scene_light(opened[0], at_target)
+        capture = torch.empty_like(light)[None]
+        record(Transitions.of([light], [at_target]), prepared.camera, keys=keys, signals=capture)
+        return Stages(exposed[0], denoised[0], opened[0], light, capture[0])
 
     def simulate(
         self,
