@@ -28,30 +28,6 @@ if TYPE_CHECKING:
     from simulator.settings import incident_ev100 as incident_ev100
     from simulator.settings import sensor_signal as sensor_signal
 
-__all__ = [
-    "BayerPattern",
-    "CameraProfile",
-    "CameraSettings",
-    "CameraSimulator",
-    "Lens",
-    "NoiseLevelFunction",
-    "PreparedScene",
-    "RawFileError",
-    "RawImage",
-    "SimulationPlan",
-    "defocus",
-    "develop",
-    "estimate_nlf",
-    "exposure_ratio",
-    "get_camera",
-    "incident_ev100",
-    "list_cameras",
-    "read_raw",
-    "render_srgb",
-    "sensor_signal",
-    "write_dng",
-]
-
 #: Module of each public name; loaded when the name is first used, so that importing is fast.
 _MODULES = {
     "camera": ["BayerPattern", "CameraProfile", "get_camera", "list_cameras"],
@@ -67,6 +43,8 @@ _MODULES = {
     "raw.read": ["RawFileError", "read_raw"],
     "settings": ["CameraSettings", "exposure_ratio", "incident_ev100", "sensor_signal"],
 }
+
+__all__ = sorted(name for names in _MODULES.values() for name in names)
 
 
 def __getattr__(name: str) -> Any:

@@ -125,7 +125,7 @@ class ExposureAugmentation:
         return self.camera
 
     def draw(self, seed: int) -> DrawnSettings:
-        """What a picture with this seed is given; what `modules` leaves out is drawn, too."""
+        """The settings of a picture with this seed, those that `modules` leaves out included."""
         rng = np.random.default_rng([int(seed), 0xA06])
         low, high = (math.log2(iso) for iso in self.isos)
         return DrawnSettings(

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, TypedDict, Unpack, cast, get_args
 
 import torch
 from torch import nn
@@ -54,6 +54,14 @@ _NOISE_HALO, _MAP_HALO = 80, 56
 _TIMED = 128
 #: How far the largest disc of `simulator.optics.disc_bank` reaches [pixel].
 _DISC_REACH = 16
+
+
+class SceneArguments(TypedDict, total=False):
+    """What may be said of the scene of a source; see `CameraSimulator.prepare`."""
+
+    image_speed: float | None
+    defocus: float | None
+    depth: Depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +124,8 @@ def _recorded(raw: RawImage, device: torch.device) -> PreparedScene:
 def _for_the_map(prepared: PreparedScene) -> torch.Tensor | None:
     """The light with little noise that defocus is estimated on; None if there is none.
 
-    The smallest network will do, whatever the tolerance: with it, the blur of 24 validation scenes
-    at ISO 6400 erred by 2 % more than with the largest, at ISO 100 by nothing.
+    The smallest network is enough, whatever the tolerance: with it, the error of the blur of 24
+    validation scenes was 2 % larger than with the largest at ISO 6400, and the same at ISO 100.
     """
     return prepared.denoised[0].light if prepared.denoised else None
 
@@ -288,7 +296,7 @@ class CameraSimulator:
     def _seen(
         self, source: Source, image_speed: float | None, defocus: float | None
     ) -> PreparedScene:
-        """The source's light, with its motion and blur where they are given."""
+        """The source's light, with its motion and blur unless they are None."""
         prepared = prepared_of(source, self.device)
         if image_speed is not None:
             prepared = replace(prepared, image_speed=image_speed)
@@ -435,10 +443,8 @@ class CameraSimulator:
         settings: CameraSettings,
         *,
         noise: bool = True,
-        image_speed: float | None = None,
-        defocus: float | None = None,
-        depth: Depth = "far",
         tolerance: float | Literal["source"] = "source",
+        **scene: Unpack[SceneArguments],
     ) -> SimulationPlan:
         """Which steps the change to `settings` takes, why others are left out, error and cost.
 
@@ -446,15 +452,10 @@ class CameraSimulator:
             source: A raw, a prepared scene, or a scene.
             settings: Target settings.
             noise: False plans the light on the sensor alone (`PreparedScene.expected`).
-            image_speed: See `prepare`.
-            defocus: See `prepare`.
-            depth: See `prepare`.
             tolerance: See `prepare`.
+            scene: `image_speed`, `defocus` and `depth`, see `prepare`.
         """
-        prepared = self.prepare(
-            source, image_speed=image_speed, defocus=defocus, depth=depth, tolerance=tolerance
-        )
-        return prepared.plan(settings, noise=noise)
+        return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 
     def stages(
         self,
@@ -462,9 +463,7 @@ class CameraSimulator:
         settings: CameraSettings,
         *,
         seed: int = 0,
-        image_speed: float | None = None,
-        defocus: float | None = None,
-        depth: Depth = "unknown",
+        **scene: Unpack[SceneArguments],
     ) -> Stages:
         """Runs the whole pipeline on one source, every module for this very transition.
 
@@ -476,17 +475,17 @@ class CameraSimulator:
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-            image_speed: See `prepare`.
-            defocus: See `prepare`.
-            depth: See `prepare`; unknown to a prepared scene that was prepared as such.
+            scene: `image_speed`, `defocus` and `depth`, see `prepare`; by default the depth is
+                unknown.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.
         """
         if self.noise is None or self.aperture is None:
             raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
+        depth = scene.get("depth", "unknown")
         check_word("depth", depth, get_args(Depth))
-        prepared = self._seen(source, image_speed, defocus)
+        prepared = self._seen(source, scene.get("image_speed"), scene.get("defocus"))
         opens = depth == "unknown" or prepared.aperture_blur is not None
         # A prepared scene may be corrected already; a scene is no recording of this body.
         exposure = self.exposure
@@ -537,10 +536,8 @@ class CameraSimulator:
         *,
         seed: int = 0,
         noise: Noise = "exact",
-        image_speed: float | None = None,
-        defocus: float | None = None,
-        depth: Depth = "far",
         tolerance: float | Literal["source"] | None = "source",
+        **scene: Unpack[SceneArguments],
     ) -> RawImage:
         """The raw that the camera would have recorded at `settings`.
 
@@ -550,11 +547,9 @@ class CameraSimulator:
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
             noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster, ``"sensor"`` draws it with
                 row noise and tails (see `PreparedScene.capture`); the full run knows ``"exact"``.
-            image_speed: See `prepare`.
-            defocus: See `prepare`.
-            depth: See `prepare`.
             tolerance: See `prepare`; None runs every module for this very transition (`stages`),
                 and shares and leaves out nothing.
+            scene: `image_speed`, `defocus` and `depth`, see `prepare`.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
@@ -564,21 +559,14 @@ class CameraSimulator:
         if tolerance is None and self.noise is not None:
             if noise == "sensor":
                 raise ValueError("`noise` (='sensor') needs a `tolerance`: not in the full run")
-            stages = self.stages(
-                source, settings, seed=seed, image_speed=image_speed, defocus=defocus, depth=depth
-            )
+            stages = self.stages(source, settings, seed=seed, **{"depth": "far", **scene})
             data, excess_noise = stages.capture, 0.0
             prepared = prepared_of(source, self.device)
             clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=(), aperture_blur=None)
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
-            prepared = self.prepare(
-                source,
-                image_speed=image_speed,
-                defocus=defocus,
-                depth=depth,
-                tolerance=0.0 if tolerance is None else tolerance,
-            )
+            exact = 0.0 if tolerance is None else tolerance
+            prepared = self.prepare(source, tolerance=exact, **scene)
             data, excess_noise = prepared.capture(settings, seed, noise=noise)
             output_noise = prepared.output_noise(settings)
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}

@@ -21,7 +21,7 @@ from simulator.utils.checks import check_word
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]
 #: Side of the window that smooths the signal which the noise level is read from.
 _SMOOTHING = 5
-#: Seed of the sample of noise that the authors' network is shown.
+#: Seed of the sample of noise that is an input of the authors' network.
 _SAMPLE_SEED = 1234
 #: Windows of the local means [packed pixel]: the near one divides detail from surroundings, the far
 #: one shows the network the noise that the near mean still has.
@@ -32,8 +32,7 @@ _CELL = 8
 _MEAN_CELLS = 17
 #: Largest change of a pixel, in standard deviations of its noise.
 _LARGEST = 5.0
-#: What the network is shown of detail and of level is compressed beyond this many standard
-#: deviations.
+#: The network's inputs, detail and level, are compressed beyond this many standard deviations.
 _LEVEL = 8.0
 
 
@@ -259,8 +258,8 @@ class NoiseModule(nn.Module):
         preset: ``"nano"``, ``"compact"`` or ``"large"``: a `Denoiser` of that size, which commutes
             with exposure; ``"paper"``: the U-Net of Brooks et al. 2019 with a noise-level map, as
             the paper uses it (section 3.2); ``"ncs"``: the U-Net of the authors' released code,
-            which is shown a sample of the noise in place of its level. The sample is the same
-            whenever it is asked for.
+            whose second input is a sample of the noise in place of its level. The sample is
+            always the same, so that results can be shared between captures.
     """
 
     def __init__(self, preset: Preset = "compact") -> None:
@@ -303,8 +302,8 @@ class NoiseModule(nn.Module):
             result = self.network(exposed, shot, read)
         else:
             level = variance_map(exposed, shot, read).sqrt()
-            shown = level if self.preset == "paper" else exposed + level * _sample(exposed)
-            result = exposed + self.network(torch.cat([exposed, shown], dim=1)).float()
+            second = level if self.preset == "paper" else exposed + level * _sample(exposed)
+            result = exposed + self.network(torch.cat([exposed, second], dim=1)).float()
         noisy = ((shot > 0) | (read > 0)).any(dim=1)
         return torch.where(noisy[:, None, None, None], result, exposed.float())
 
