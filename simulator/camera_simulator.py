@@ -559,7 +559,8 @@ class CameraSimulator:
         if tolerance is None and self.noise is not None:
             if noise == "sensor":
                 raise ValueError("`noise` (='sensor') needs a `tolerance`: not in the full run")
-            stages = self.stages(source, settings, seed=seed, **{"depth": "far", **scene})
+            scene.setdefault("depth", "far")
+            stages = self.stages(source, settings, seed=seed, **scene)
             data, excess_noise = stages.capture, 0.0
             prepared = prepared_of(source, self.device)
             clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=(), aperture_blur=None)
