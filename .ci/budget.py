@@ -38,7 +38,9 @@ def imported(tree: ast.AST, modules: dict[str, Path]) -> set[str]:
 
 def lines_of(folder: str) -> int:
     """Lines of the Python files below a folder."""
-    return sum(len(p.read_text(encoding="utf-8").splitlines()) for p in (ROOT / folder).rglob("*.py"))
+    return sum(
+        len(p.read_text(encoding="utf-8").splitlines()) for p in (ROOT / folder).rglob("*.py")
+    )
 
 
 def main() -> None:
