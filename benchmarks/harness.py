@@ -223,7 +223,7 @@ def rounded(value: Any) -> Any:
 
 
 def write_picture(path: Path, figure: Figure) -> Path:
-    """Writes a figure: a photograph as WebP, a plot as a PNG with a palette, a third of the bytes."""
+    """Writes a figure: photographs as WebP, plots as PNG with a palette, a third of the bytes."""
     from PIL import Image
 
     stream = io.BytesIO()

@@ -8,9 +8,9 @@
 | `detail.py` | `shim`, `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
 | `fidelity.py` | `fidelity` |
-| `nima.py`, `niqe.py` | `nima_aesthetic`, `nima_technical`; `niqe` |
+| `nima.py` | `nima_aesthetic`, `nima_technical` |
 | `classifier.py` | `classifier` |
-| `opencv.py` | `brisque`, `keypoints`, `matches` |
+| `opencv.py` | `keypoints`, `matches` |
 | `registry.py` | ``pyiqa:METRIC`` |
 """
 
@@ -49,8 +49,7 @@ from ae_env.scorers.exposure_measures import (
 )
 from ae_env.scorers.fidelity import Fidelity
 from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
-from ae_env.scorers.niqe import Niqe
-from ae_env.scorers.opencv import Brisque, Keypoints, Matches
+from ae_env.scorers.opencv import Keypoints, Matches
 from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
 from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
 from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
@@ -69,13 +68,11 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "noise": Noise,
     "sharpness": Sharpness,
     "banding": Banding,
-    "brisque": Brisque,
     "classifier": Classifier,
     "keypoints": Keypoints,
     "matches": Matches,
     "nima_aesthetic": NimaAesthetic,
     "nima_technical": NimaTechnical,
-    "niqe": Niqe,
     "mid_grey": MidGrey,
     "clipping": Clipping,
     "dynamic_range": DynamicRange,

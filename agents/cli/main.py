@@ -28,7 +28,7 @@ from agents.cli.record import record
 from agents.cli.refocus import refocus
 from agents.cli.scenes import scenes
 from agents.cli.score_tables import score_tables
-from agents.cli.scorers import convert_nima, scorers
+from agents.cli.scorers import scorers
 from agents.cli.simulate import simulate
 from agents.cli.sweep import sweep
 from agents.cli.train_agent import train
@@ -44,7 +44,7 @@ app = typer.Typer(
     epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
 )
 for command in (
-    *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
+    *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
     *(import_weights, view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
