@@ -12,9 +12,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+import examples.convert_nima as convert_nima
 from ae_env.scorers import make_scorer
 from ae_env.scorers.nima import PUBLISHED, NimaMobileNet, read_network
-import examples.convert_nima as convert_nima
 
 KERAS = """
     import os, sys
