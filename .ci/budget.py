@@ -1,4 +1,4 @@
-"""The house's budget: fails where the packages outgrow it, a function is too long, or imports run upward or in a circle."""
+"""The budget of the packages: lines, modules, length of functions, direction of imports."""
 
 from __future__ import annotations
 

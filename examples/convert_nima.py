@@ -16,7 +16,7 @@ import h5py
 import torch
 from safetensors.torch import save_file
 
-from ae_env.scorers.nima import PUBLISHED, NimaMobileNet, read_network
+from ae_env.scorers.learnt import PUBLISHED, NimaMobileNet, read_network
 from simulator.utils.cache import cache_dir
 
 #: The layers of Keras' MobileNet in the order of `NimaMobileNet.features`.

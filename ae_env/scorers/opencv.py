@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ae_env.scorers.fidelity import distinct_references, reference_pictures
-from ae_env.scorers.luma import luma_of
+from ae_env.scorers.measures import luma_of
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
 
 

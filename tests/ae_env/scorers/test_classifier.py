@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.classifier import Classifier
+from ae_env.scorers.learnt import Classifier
 from ae_env.utils.user_code import UserCodeError
 from tests.ae_env.recorded_files import GRID, write_raws
 

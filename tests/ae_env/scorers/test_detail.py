@@ -10,7 +10,7 @@ import torch
 from skimage.measure import shannon_entropy
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.detail import immerkaer_sigma, shim_gradient, shin_metric, zhang_gradient
+from ae_env.scorers.measures import immerkaer_sigma, shim_gradient, shin_metric, zhang_gradient
 from simulator import CameraSettings
 from tests.ae_env.scorer_images import CAMERA, captures_of, random_pictures
 

@@ -10,7 +10,7 @@ from skimage.color import rgb2gray
 from skimage.measure import shannon_entropy
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.detail import histogram_entropy
+from ae_env.scorers.measures import histogram_entropy
 from simulator import CameraSettings, NoiseLevelFunction
 from tests.ae_env.scorer_images import captures_of, random_pictures
 

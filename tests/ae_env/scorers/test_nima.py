@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 import examples.convert_nima as convert_nima
 from ae_env.scorers import make_scorer
-from ae_env.scorers.nima import PUBLISHED, NimaMobileNet, read_network
+from ae_env.scorers.learnt import PUBLISHED, NimaMobileNet, read_network
 
 KERAS = """
     import os, sys

@@ -1,20 +1,107 @@
-"""Detail and noise of a picture: entropy, the gradient metrics of auto-exposure papers, noise.
+"""Measures of one developed picture: exposure, detail and noise, and the scorers that they make.
 
-The functions take luma (B, H, W) in [0, 1], gamma-encoded as in an 8-bit picture, and return (B,)
-float64 in the units of the papers, which are those of 8-bit grey levels. They read noise as detail:
-at fixed brightness all but `shin_metric` rise with the gain. Pair them with a measure of noise.
+The functions take luma (B, H, W) in [0, 1], gamma-encoded as in an 8-bit picture. None of the
+exposure scorers knows the incident light: they want every scene middle grey.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch.nn.functional import adaptive_avg_pool2d, pad
 
-from ae_env.scorers.luma import SCHARR, SOBEL, check_luma, luma_of, squared_gradient
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
+
+#: R, G, B shares of luma (ITU-R BT.601), of gamma-encoded values: an 8-bit camera's grey.
+LUMA_SHARES = (0.299, 0.587, 0.114)
+#: R, G, B shares of CIE Y (IEC 61966-2-1), of linear sRGB.
+LUMINANCE_SHARES = (0.2126, 0.7152, 0.0722)
+#: Weight of the middle and of each side in one direction of a gradient filter, and of all together.
+SOBEL = (2.0, 1.0)
+SCHARR = (10.0, 3.0)
+#: Samples that `by_parts` gives to a function at a time.
+_PART = 2**18
+
+
+def luma_of(images: torch.Tensor) -> torch.Tensor:
+    """Luma (B, H, W) in [0, 1] of gamma-encoded sRGB `images` (B, 3, H, W) in [0, 1].
+
+    >>> luma_of(torch.ones(1, 3, 1, 1)).item()
+    1.0
+    """
+    red, green, blue = images.unbind(dim=1)
+    r, g, b = LUMA_SHARES
+    return (red * r).add_(green, alpha=g).add_(blue, alpha=b).clamp_(0.0, 1.0)
+
+
+def srgb_decode(encoded: torch.Tensor) -> torch.Tensor:
+    """sRGB values in [0, 1] to linear light in [0, 1] (IEC 61966-2-1).
+
+    >>> round(srgb_decode(torch.tensor([0.4614])).item(), 3)
+    0.18
+    """
+    toe = encoded.mul(1.0 / 12.92).sub_(0.04045 / 12.92).clamp_(max=0.0)  # 0 above it
+    curved = encoded.clamp(min=0.04045).add_(0.055).mul_(1.0 / 1.055).log2_().mul_(2.4).exp2_()
+    return curved.add_(toe).clamp_(min=0.0)
+
+
+def luminance_of(images: torch.Tensor) -> torch.Tensor:
+    """Linear CIE Y (B, H, W) in [0, 1], 1 is white, of sRGB `images` (B, 3, H, W) in [0, 1]."""
+    return by_parts(_luminance, images)
+
+
+def _luminance(images: torch.Tensor) -> torch.Tensor:
+    red, green, blue = srgb_decode(images).unbind(dim=1)
+    r, g, b = LUMINANCE_SHARES
+    return (red * r).add_(green, alpha=g).add_(blue, alpha=b)
+
+
+def by_parts(
+    function: Callable[[torch.Tensor], torch.Tensor], images: torch.Tensor
+) -> torch.Tensor:
+    """`function` of a few `images` (B, ...) at a time, as one batch.
+
+    They stay in the CPU's cache: several times as fast where a function takes many steps.
+    """
+    step = len(images)
+    if images.device.type == "cpu":
+        step = max(1, _PART // max(1, images[0].numel()))
+    return torch.cat([function(part) for part in images.split(step)])  # type: ignore[no-untyped-call]
+
+
+def squared_gradient(luma: torch.Tensor, weights: tuple[float, float]) -> torch.Tensor:
+    """gx^2 + gy^2 (B, H, W) of 3 x 3 difference filters, borders repeated.
+
+    Args:
+        luma: (B, H, W), any range.
+        weights: Weight of the middle row (column) and of the two beside it, such as `SOBEL`. The
+            filters are not normalised: a step of 1 gives ``middle + 2 * side``.
+    """
+    middle, side = weights
+    padded = pad(luma[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    across = padded[:, :, 2:] - padded[:, :, :-2]  # (B, H + 2, W)
+    gx = (across[:, :-2] + across[:, 2:]).mul_(side).add_(across[:, 1:-1], alpha=middle)
+    down = padded[:, 2:] - padded[:, :-2]  # (B, H, W + 2)
+    gy = (down[:, :, :-2] + down[:, :, 2:]).mul_(side).add_(down[:, :, 1:-1], alpha=middle)
+    return gx.square_().add_(gy.square_())
+
+
+def check_luma(luma: torch.Tensor) -> torch.Tensor:
+    """`luma` as it is.
+
+    Raises:
+        ValueError: Unless it is a floating point tensor (B, H, W) with pixels.
+    """
+    if not torch.is_tensor(luma) or luma.ndim != 3 or not luma.is_floating_point():
+        what = f"{tuple(luma.shape)} {luma.dtype}" if torch.is_tensor(luma) else repr(luma)
+        raise ValueError(f"`luma` (={what}) must be a floating point tensor (B, H, W)")
+    if min(luma.shape[1:]) < 1:
+        raise ValueError(f"`luma` (shape {tuple(luma.shape)}) must have pixels")
+    return luma
+
 
 # -- detail ---------------------------------------------------------------------------------------
 
@@ -212,7 +299,7 @@ def shin_noise(luma: torch.Tensor) -> torch.Tensor:
     return torch.where(number < 1e-4 * samples, immerkaer_sigma(luma), masked)
 
 
-# -- scorers --------------------------------------------------------------------------------------
+# -- scorers of detail and noise ------------------------------------------------------------------
 
 
 class Shim:
@@ -295,3 +382,111 @@ class BlindNoise:
     def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
         """Scores (B,)."""
         return 1.0 / (1.0 + immerkaer_sigma(luma_of(images)) / self.half)
+
+
+# -- scorers of exposure --------------------------------------------------------------------------
+
+
+class MidGrey:
+    """Mean luminance against 18 % grey: ``2^-|log2(mean Y / 0.18)|``.
+
+    Y is the linear luminance (CIE, white is 1) of the developed picture, whose tone curve shows an
+    18 % card in incident-light exposure at 0.18. A stop off scores 0.5, two stops 0.25, black 0.
+
+    Source: the photographers' convention of the 18 % card as the mean of a scene.
+    """
+
+    domain: Domain = "srgb"
+    target = 0.18
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        ratio = luminance_of(images).mean(dim=(1, 2), dtype=torch.float64) / self.target
+        return torch.minimum(ratio, 1.0 / ratio.clamp(min=1e-30))
+
+
+class Clipping:
+    """Share of raw samples that are neither blown nor black: ``1 - (w_h f_h + w_l f_l)``.
+
+    f_h is the share of the samples of all four planes at sensor white, f_l that at or below
+    2^-9 of white, where `shadows` has its middle. Both weights are 1. Alone it prefers dark
+    pictures: nothing clips there.
+    """
+
+    domain: Domain = "raw"
+    high_weight = 1.0
+    low_weight = 1.0
+    white = 1.0 - 1e-6  # rounding
+    black = 2.0**-9
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return by_parts(self._kept, images)
+
+    def _kept(self, images: torch.Tensor) -> torch.Tensor:
+        samples = images.flatten(1)
+        high = (samples >= self.white).sum(dim=1).double()
+        low = (samples <= self.black).sum(dim=1).double()
+        lost = self.high_weight * high + self.low_weight * low
+        return (1.0 - lost / samples.shape[1]).clamp_(min=0.0)
+
+
+class DynamicRange:
+    """Share of a sensor's range that the light fills: stops from its 1st to 99th percentile / 14.
+
+    Of the noise-free mean green x, held to [x_1, 1]: from the signal at which the signal-to-noise
+    ratio of a native pixel is 1, ``x_1 = (shot + sqrt(shot^2 + 4 read)) / 2``, to white (the range
+    as in EMVA 1288). ``min(log2(P99 / P1) / 14, 1)``; 14 stops is what a full-frame sensor has at
+    ISO 100 (Nikon Z6: 13.6). Percentiles are of the nearest rank.
+    """
+
+    domain: Domain = "raw"
+    depends_on: DependsOn = "light"
+    stops = 14.0
+    percentiles = (0.01, 0.99)
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        shot = torch.tensor([0.5 * (n.shot[1] + n.shot[2]) for n in captures.nlf]).double()
+        read = torch.tensor([0.5 * (n.read[1] + n.read[2]) for n in captures.nlf]).double()
+        floor = (0.5 * (shot + (shot**2 + 4.0 * read).sqrt())).clamp_(2.0**-40, 1.0)
+        green = captures.light[:, 1:3].mean(dim=1).flatten(1)
+        last = green.shape[1] - 1
+        ranks = [1 + round(share * last) for share in self.percentiles]
+        low, high = (green.kthvalue(rank, dim=1).values.double() for rank in ranks)
+        low, high = (end.clamp(max=1.0).maximum(floor) for end in (low, high))
+        return ((high / low).log2() / self.stops).clamp_(0.0, 1.0)
+
+
+class WellExposedness:
+    """Mertens' well-exposedness: how near each channel of each pixel is to 0.5.
+
+    Mean over the pixels of the product over R, G, B of ``exp(-(c - 0.5)^2 / (2 * 0.2^2))``, c the
+    gamma-encoded value.
+
+    Source: T. Mertens, J. Kautz, F. Van Reeth, "Exposure fusion", Pacific Graphics 2007, section 3.
+    """
+
+    domain: Domain = "srgb"
+    centre = 0.5
+    sigma = 0.2
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        squares = (images - self.centre).square_().sum(dim=1)  # of the product: a sum of exponents
+        weights = squares.mul_(-0.5 / self.sigma**2).exp_()
+        return weights.mean(dim=(1, 2), dtype=torch.float64)
+
+
+class Entropy:
+    """Entropy of the luma histogram in bits, over the 8 bits of 256 grey levels.
+
+    See `histogram_entropy`. Noise raises it.
+    """
+
+    domain: Domain = "srgb"
+    bits = 8.0
+
+    def __call__(self, images: torch.Tensor, captures: Captures) -> torch.Tensor:
+        """Scores (B,)."""
+        return histogram_entropy(luma_of(images)) / self.bits
