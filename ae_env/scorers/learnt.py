@@ -416,8 +416,6 @@ def _confidence(outputs: Any, count: int) -> Tensor:
     return values.softmax(dim=1).amax(dim=1)
 
 
-
-
 @lru_cache(maxsize=4)
 def _session(file: str, digest: str) -> Any:
     """The network of a file, read once per content."""
