@@ -42,6 +42,7 @@ from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
 from simulator.utils.processor import check_bfloat16
+from simulator.utils.compute import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 
 #: Depth of a scene: it is far or in focus throughout, or it is not known.
