@@ -41,7 +41,6 @@ from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
-from simulator.utils.processor import check_bfloat16
 from simulator.utils.compute import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 

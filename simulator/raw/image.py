@@ -14,8 +14,6 @@ from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_integer
-from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
 from simulator.utils.compute import kernel, parallel_ranges
 
 PLANES = ("R", "G1", "G2", "B")
