@@ -79,7 +79,7 @@ class BestFixed(Policy):
 
 
 class Oracle(Policy):
-    """Knows the expected score of every state, in the light that it is told of.
+    """Knows the expected score of every state, in the light that it knows.
 
     Args:
         context: The camera, the grid and the observation.

@@ -50,7 +50,7 @@ WHITE_SHARE = 0.5
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
-#: What a state must promise beyond the one asked for last, to be asked for with foresight [score].
+#: What a state must promise beyond that of the last decision to replace it, with foresight [score].
 #: Chosen among 0, 0.01, 0.03 and 0.06 on training scenes and kinds of light.
 HYSTERESIS = 0.01
 #: Past frames come in so many parts, each from another step.
@@ -160,7 +160,7 @@ class RegressionPolicy(NetworkPolicy):
 
     @cached_property
     def _meter(self) -> Meter:
-        """Meter whose reading tells that the light has changed."""
+        """Meter whose reading shows that the light has changed."""
         return make_meter("average", self.context.camera)
 
     @staticmethod
