@@ -24,9 +24,8 @@ from agents.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from agents.evaluation.bracket_plan import BracketPlan
-    from agents.evaluation.evaluation_plan import EvaluationPlan
     from agents.evaluation.intervals import Rank
+    from agents.evaluation.plan import BracketPlan, EvaluationPlan
     from agents.evaluation.result import EvaluationResult
 
 logger = logging.getLogger(__name__)
@@ -136,7 +135,7 @@ def evaluate(
         raise ValueError(
             f"`on-error` (={on_error!r}) is about the files of --scenes: give that, too"
         )
-    from agents.evaluation.bracket_plan import BracketPlan
+    from agents.evaluation.plan import BracketPlan
 
     device = torch_device(device)
     plan = _plan(preset, env, list(policy or ()), given)
@@ -165,11 +164,11 @@ def _run(
     workers: int | None,
     device: str,
 ) -> None:
-    from agents.evaluation.evaluation_plan import plan_scenes
-    from agents.evaluation.plan_run import StoredRun
+    from agents.evaluation.jobs import StoredRun
+    from agents.evaluation.plan import plan_scenes
+    from agents.evaluation.result import overall_ranking
     from agents.report.ae_bench import append_rows, check_append, check_hash, result_rows
-    from agents.report.evaluation_report import write_report
-    from agents.report.result_table import overall_ranking
+    from agents.report.evaluation import write_report
 
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
@@ -194,10 +193,9 @@ def _run(
 
 
 def _run_brackets(plan: BracketPlan, out: Path, append: Path | None, author: str) -> None:
-    from agents.evaluation.bracket_plan import check_bracket_policies, run_bracket_plan
-    from agents.evaluation.evaluation_plan import plan_scenes
+    from agents.evaluation.plan import check_bracket_policies, plan_scenes, run_bracket_plan
     from agents.report.ae_bench import append_rows, bracket_rows, check_append, check_hash
-    from agents.report.bracket_report import rows_by_budget, write_bracket_report
+    from agents.report.evaluation import rows_by_budget, write_bracket_report
 
     scenes = plan_scenes(plan.of_conditions())
     check_hash(plan, scenes)
@@ -220,8 +218,7 @@ def _plan(
     preset: str | None, env: str | None, policies: list[str], given: Mapping[str, Any]
 ) -> EvaluationPlan | BracketPlan:
     """The plan that the options describe."""
-    from agents.evaluation.bracket_plan import BracketPlan, load_bench_plan
-    from agents.evaluation.evaluation_plan import EvaluationPlan
+    from agents.evaluation.plan import BracketPlan, EvaluationPlan, load_bench_plan
 
     base = None if preset is None else load_bench_plan(preset)
     changed = [*given, *(["env"] if env is not None else [])]
@@ -314,7 +311,7 @@ def _plain(
 
 def _one_condition(entries: Mapping[str, Any]) -> dict[str, Any]:
     """A condition by the kind of its light."""
-    from agents.evaluation.evaluation_plan import light_name
+    from agents.evaluation.plan import light_name
 
     return {light_name(entries.get("lighting", "static")): entries}
 
@@ -338,7 +335,7 @@ def _changed(plan: Plan, entries: Mapping[str, Any]) -> Plan:
 
 def print_scores(result: EvaluationResult) -> None:
     """Prints the scores of one condition, and every source group's where there are few."""
-    from agents.report.result_table import result_rows
+    from agents.evaluation.result import result_rows
 
     rows = result_rows(result, resamples=2000)
     parts = result.conditions
@@ -373,7 +370,7 @@ def _print_ranking(
 
 def _print_groups(result: EvaluationResult, groups: int) -> None:
     from agents.evaluation.intervals import MIN_GROUPS
-    from agents.report.result_table import group_values
+    from agents.evaluation.result import group_values
 
     if groups >= MIN_GROUPS:
         return

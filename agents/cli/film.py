@@ -35,9 +35,9 @@ def film(
 
     import ae_env  # noqa: F401  (registers the environment)
     from ae_env.lighting.moving import KIND_SETS, MOVES
-    from agents.evaluation.running import fit_policies
+    from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext, make_policy
-    from agents.report.film import film as write
+    from agents.report.plots import film as write
     from simulator.utils.checks import check_word
 
     if out.suffix.lower() != ".gif":

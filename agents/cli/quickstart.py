@@ -121,10 +121,9 @@ def run_quickstart(
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
     from agents.episodes import make_envs, training_arguments
-    from agents.evaluation.engine import evaluate
-    from agents.evaluation.evaluation_plan import MAX_SEED
-    from agents.evaluation.running import fit_policies
-    from agents.report.evaluation_report import write_report
+    from agents.evaluation.engine import evaluate, fit_policies
+    from agents.evaluation.plan import MAX_SEED
+    from agents.report.evaluation import write_report
     from simulator.utils.checks import check_integer
 
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)

@@ -34,7 +34,7 @@ def record(
 
     from ae_env.utils.presets import load_preset
     from agents.episodes import fitting_arguments
-    from agents.evaluation.running import fit_policies
+    from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext, make_policy
     from agents.recording import check_dataset_id, record_dataset
     from simulator.utils.checks import check_word

@@ -182,7 +182,7 @@ def write_png(path: Path, raw: RawImage) -> Path:
 
 def write_upright(path: Path, raw: RawImage, srgb: torch.Tensor) -> Path:
     """Writes `srgb` (3, 2H, 2W) uint8, a picture of `raw`, upright and with square pixels."""
-    from agents.report.upright import upright_picture
+    from agents.report.plots import upright_picture
 
     aspect = raw.metadata.get("pixel_aspect", 1.0)
     if aspect != 1.0:

@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation import metrics
-from agents.evaluation.bracket_plan import BracketPlan, BracketResult, load_bench_plan
-from agents.evaluation.evaluation_plan import EvaluationPlan, digest
 from agents.evaluation.intervals import Rank
+from agents.evaluation.plan import (
+    BracketPlan,
+    BracketResult,
+    EvaluationPlan,
+    digest,
+    load_bench_plan,
+)
+from agents.evaluation.result import Results
 from agents.policy import split_class, split_options
-from agents.report.markdown import escape, markdown_table
-from agents.report.result_table import Results
+from agents.report.evaluation import escape, markdown_table
 from simulator.utils.files import write_atomically
 from simulator.utils.results import machine, versions
 

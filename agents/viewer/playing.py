@@ -11,9 +11,9 @@ import gymnasium as gym
 import ae_env  # noqa: F401  (registers the environments)
 from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.scenes import Scene
-from agents.evaluation.running import fit_policies
+from agents.evaluation.engine import fit_policies
 from agents.policy import Policy, PolicyContext, make_policy
-from agents.report.film import Recording, record
+from agents.report.plots import Recording, record
 
 #: Kinds of moving light, and light that stays.
 STILL = "still"

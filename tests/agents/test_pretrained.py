@@ -5,7 +5,7 @@ import pytest
 
 from agents import PolicyContext, evaluate, make_policy
 from agents.episodes import make_envs
-from agents.evaluation.store import policy_content
+from agents.evaluation.jobs import policy_content
 from agents.policy import training_seeds
 
 SCENES = {"scenes": "bundled:small", "split": "test", "resolution": 64}

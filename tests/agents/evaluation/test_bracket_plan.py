@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from agents.cli.evaluate import evaluate
-from agents.evaluation.bracket_plan import BracketPlan, BracketResult, run_bracket_plan
+from agents.evaluation.plan import BracketPlan, BracketResult, run_bracket_plan
 
 SMALL = {"scenes": "bundled:small", "resolution": 36}
 

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.evaluation_plan import (
+from agents.evaluation.plan import (
     Condition,
     EvaluationPlan,
     digest,

@@ -3,9 +3,9 @@ import pytest
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
-from agents.evaluation.evaluation_plan import EvaluationPlan
-from agents.evaluation.other_scorers import other_scores
-from agents.evaluation.plan_run import run_plan
+from agents.evaluation.engine import other_scores
+from agents.evaluation.jobs import run_plan
+from agents.evaluation.plan import EvaluationPlan
 
 PLAN = EvaluationPlan(
     environment={"scenes": "bundled:small", "split": "test", "resolution": 36},

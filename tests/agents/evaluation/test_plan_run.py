@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from agents.evaluation import engine
-from agents.evaluation.evaluation_plan import Condition, EvaluationPlan
-from agents.evaluation.plan_run import run_plan
+from agents.evaluation.jobs import run_plan
+from agents.evaluation.plan import Condition, EvaluationPlan
 
 STEP = Condition(lighting={"kind": "step", "stops": 4, "at": 3})
 PLAN = EvaluationPlan(

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from agents.evaluation.store import EvaluationStore, part_key, policy_content
+from agents.evaluation.jobs import EvaluationStore, part_key, policy_content
 
 ARRAYS = {"x": np.arange(300).reshape(3, 100), "y": np.linspace(0.0, 1.0, 50)}
 
@@ -47,7 +47,7 @@ def test_keys_depend_on_their_parts_and_the_version(monkeypatch):
     assert first == part_key("k", 1)
     assert first.startswith("k-")
     assert len({first, part_key("k", 2), part_key("l", 1)}) == 3
-    monkeypatch.setattr("agents.evaluation.store.package_version", lambda: "9.9")
+    monkeypatch.setattr("agents.evaluation.jobs.package_version", lambda: "9.9")
     assert part_key("k", 1) != first
 
 

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from agents.evaluation.bracket_plan import MEASURES, BracketPlan, BracketResult, load_bench_plan
-from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
-from agents.evaluation.plan_run import run_plan
+from agents.evaluation.jobs import run_plan
+from agents.evaluation.plan import (
+    MEASURES,
+    BracketPlan,
+    BracketResult,
+    EvaluationPlan,
+    load_bench_plan,
+    plan_scenes,
+)
+from agents.evaluation.result import overall_ranking
 from agents.report import ae_bench
-from agents.report.result_table import overall_ranking
 from simulator.capture.layout import Layout
 
 PLAN = EvaluationPlan(

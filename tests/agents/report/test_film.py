@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from agents.policy import PolicyContext, make_policy
-from agents.report.film import CHART, GAP, PICTURE, TITLE, Recording, film, record, write_film
+from agents.report.plots import CHART, GAP, PICTURE, TITLE, Recording, film, record, write_film
 from tests.agents.conftest import TINY
 
 

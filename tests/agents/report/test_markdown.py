@@ -3,7 +3,7 @@ import base64
 import pytest
 from markdown_it import MarkdownIt
 
-from agents.report.markdown import cell, code, code_block, escape, html_report, markdown_table
+from agents.report.evaluation import cell, code, code_block, escape, html_report, markdown_table
 
 PICTURE = b"\x89PNG\r\n\x1a\n1234"
 #: Names that mean something to Markdown or HTML.

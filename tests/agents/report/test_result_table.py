@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agents import result_rows
-from agents.report import result_table
+from agents.evaluation import result as result_table
 from tests.agents.report.results import COLUMNS, made_result
 
 

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
-from agents.evaluation.result import EvaluationResult
-from agents.report.markdown import cell, code, code_block, escape, html_report, markdown_table
-from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
-from agents.report.result_table import (
+from agents.evaluation.plan import (
+    MEASURES,
+    NOT_OF_THE_PROTOCOL,
+    BracketPlan,
+    BracketResult,
+    EvaluationPlan,
+    digest,
+)
+from agents.evaluation.result import (
+    EvaluationResult,
     Results,
     Rows,
     as_results,
@@ -31,9 +39,102 @@ from agents.report.result_table import (
     static_condition,
     training_seed_rows,
 )
+from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
 from simulator.settings import format_exposure_time
 from simulator.utils.files import write_atomically
 from simulator.utils.results import result_meta, write_results
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
+       max-width: 78rem; margin: 2rem auto; padding: 0 1.2rem; }
+h1 { font-size: 1.7rem; } h2 { margin-top: 2.4rem; border-bottom: 1px solid #ddd; }
+img { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-size: .86rem; display: block; overflow-x: auto; }
+th, td { padding: .22rem .6rem; border-bottom: 1px solid #e6e6e6; white-space: nowrap; }
+thead th { border-bottom: 2px solid #999; } tbody tr:hover { background: #f5f7fa; }
+code { background: #f3f3f3; padding: .08rem .25rem; border-radius: 3px; }
+pre { background: #f3f3f3; padding: .8rem; overflow-x: auto; } pre code { padding: 0; }
+"""
+#: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
+_SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
+
+
+def escape(name: object) -> str:
+    r"""A name from outside, as of a file or a policy, so that Markdown shows it as it is.
+
+    >>> escape("centre_weighted:P"), escape("![x](a.png)")
+    ('centre_weighted:P', '\\!\\[x\\](a.png)')
+    """
+    return _SPECIAL.sub(r"\\\g<0>", " ".join(str(name).split()))
+
+
+def code(text: object) -> str:
+    """Text from outside as code within a line; not for tables, whose cells a bar ends.
+
+    >>> print(code("a | b"), code("`x`"))
+    `a | b` `` `x` ``
+    """
+    line = " ".join(str(text).split())
+    fence = "`" * (_longest_run(line) + 1)
+    pad = " " if line.startswith("`") or line.endswith("`") else ""
+    return f"{fence}{pad}{line}{pad}{fence}"
+
+
+def code_block(lines: Sequence[str]) -> str:
+    """Lines from outside as a block of code."""
+    fence = "`" * max(3, max(map(_longest_run, lines), default=0) + 1)
+    return "\n".join([fence, *(" ".join(line.splitlines()) for line in lines), fence])
+
+
+def _longest_run(text: str) -> int:
+    """Length of the longest run of backticks."""
+    return max(map(len, re.findall("`+", text)), default=0)
+
+
+def markdown_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; columns but the first are aligned to the right."""
+    rule = ["---", *["---:"] * (len(head) - 1)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, rule, *body))
+
+
+def cell(value: Any, form: str) -> str:
+    """A number, a pair, a name or nothing as the text of a cell."""
+    if value is None:
+        return "-"
+    if isinstance(value, list):
+        return f"{value[0]:{form}} to {value[1]:{form}}"
+    return escape(value) if isinstance(value, str) else f"{value:{form}}"
+
+
+def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
+    """The page of a report.
+
+    Args:
+        markdown: CommonMark with tables; raw HTML in it is shown as text.
+        pictures: The picture files that may be shown, by their names in `markdown`; they are put
+            into the page. Of any other only the caption is shown.
+        title: Of the page.
+    """
+    from markdown_it import MarkdownIt
+
+    def image(_: Any, tokens: Any, index: int, *__: Any) -> str:
+        token = tokens[index]
+        file, caption = pictures.get(str(token.attrs["src"])), html.escape(token.content)
+        if file is None:
+            return caption
+        content = base64.b64encode(file.read_bytes()).decode()
+        kind = file.suffix.removeprefix(".")
+        return f'<img src="data:image/{kind};base64,{content}" alt="{caption}">'
+
+    page = MarkdownIt("commonmark", {"html": False}).enable("table")
+    page.add_render_rule("image", image)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<body>\n{page.render(markdown)}</body>\n</html>\n"
+    )
+
 
 _TABLE = (
     ("policy", "policy", ""),
@@ -421,3 +522,86 @@ def _plan_part(plan: EvaluationPlan, described: Mapping[str, Any]) -> list[str]:
     text = f"Environment: {code(described['environment'])}. sha256 of the plan: "
     head = ["condition", "lighting", "delay"]
     return ["## What was run", f"{text}`{described['sha256']}`.", markdown_table(head, body)]
+
+
+#: Headings of the measures of a budget.
+_HEAD = ["policy", "quality", "95 % interval", "to the best", "error [EV]", "unseen", "frames"]
+
+
+def rows_by_budget(
+    plan: BracketPlan, results: Sequence[BracketResult]
+) -> tuple[list[str], list[list[str]]]:
+    """Head and body of a table: the quality that each policy reaches in each budget."""
+    head = ["policy", "all", "95 % interval", *(f"{budget:g} s" for budget in plan.budgets)]
+    body = []
+    for result in results:
+        pair = result.score().pair
+        interval = "too few groups" if pair is None else f"{pair[0]:.4f} to {pair[1]:.4f}"
+        single = (f"{result.score(budget=i).value:.4f}" for i in range(len(plan.budgets)))
+        body.append([result.policy, f"{result.score().value:.4f}", interval, *single])
+    return head, body
+
+
+def write_bracket_report(
+    plan: BracketPlan, results: Sequence[BracketResult], out: Path, *, command: str
+) -> dict[str, Path]:
+    """Writes ``results.json`` and ``report.md`` into `out`; the files by name.
+
+    Args:
+        plan: The plan.
+        results: The best policy first.
+        out: Folder, which exists.
+        command: The command line that repeats the evaluation.
+    """
+    rows: list[dict[str, Any]] = []
+    blocks = []
+    for i, budget in enumerate(plan.budgets):
+        body = []
+        for result in results:
+            own, best = result.score(budget=i), result.score(results[0], budget=i)
+            means = {name: float(result.values[name][:, i].mean()) for name in MEASURES}
+            rows.append(
+                {
+                    "policy": result.policy,
+                    "budget": budget,
+                    "ci95": own.pair,
+                    "to_best": best.value,
+                    "to_best_ci95": best.pair,
+                    "num_groups": len(result.groups),
+                    "training_seeds": len(result.values["quality"]),
+                    **means,
+                }
+            )
+            interval = "-" if own.pair is None else f"{own.pair[0]:.4f} to {own.pair[1]:.4f}"
+            apart = "-" if result is results[0] else str(best)
+            numbers = (
+                f"{means['log_error']:.4f}",
+                f"{means['unseen']:.2%}",
+                f"{means['frames']:.2f}",
+            )
+            body.append(
+                [
+                    escape(result.policy),
+                    f"{own.value:.4f}",
+                    interval,
+                    escape(apart),
+                    *numbers,
+                    f"{means['frames']:.2f}",
+                ]
+            )
+        blocks.append(f"## {budget:g} s\n\n{markdown_table(_HEAD, body)}")
+    meta = result_meta(command, plan.seeds[0]) | {"plan": plan.protocol()}
+    scenes = plan.environment.get("scenes", "bundled")
+    text = [
+        f"# Brackets compared: {plan.name}",
+        code_block(command),
+        f"{len(results[0].groups)} source groups of {scenes!r}; {len(plan.seeds)} episodes of each "
+        f"scene; up to {plan.max_frames} frames, merged. Quality is 1 - mean error / 2 EV; the "
+        "error is that of the log radiance of the samples that a frame shows, unseen the share "
+        "that is white in all. Intervals: paired bootstrap over source groups and training seeds.",
+        *blocks,
+    ]
+    return {
+        "results.json": write_results(out / "results.json", rows, meta),
+        "report.md": write_atomically(out / "report.md", "\n\n".join(text) + "\n"),
+    }
