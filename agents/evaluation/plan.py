@@ -6,31 +6,21 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from ae_env.options import checked_delay
 from ae_env.scenes.folder import sequence_bounds
 from agents.episodes import Episodes
-from agents.evaluation.intervals import Interval, difference_interval
-from agents.evaluation.metrics import group_means
-from agents.policy import Policy, PolicyContext, make_policy, training_seeds
-from simulator.utils.checks import did_you_mean
-from simulator.utils.config_file import Configuration, load_yaml, read_yaml
+from simulator.utils.checks import check_integer, check_number, check_word, did_you_mean
+from simulator.utils.config_file import Configuration, load_yaml
 
 if TYPE_CHECKING:
     from ae_env.grid import ExposureGrid
     from ae_env.options import EnvOptions
-    from ae_env.scenes import Scene
-if TYPE_CHECKING:
-    import gymnasium as gym
-
     from ae_env.scenes import Scene
 
 #: Where an episode may begin; see `start_state`.
@@ -40,25 +30,35 @@ _RESERVED = ("all", "hard", "rest")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+./-]*")
 MAX_FRAMES, MAX_SEED, MAX_SCENES = 10_000, 2**32 - 1, 100_000
 #: Seeds of two entries of a plan's `seeds` are this far apart: more than any plan has scenes.
-_SEED_STRIDE = 2**20
+SEED_STRIDE = 2**20
 #: Arguments of the environment that a condition has, and those that the evaluation itself sets.
 CONDITION_ARGUMENTS = ("lighting", "delay")
-_OWN_ARGUMENTS = ("with_oracle", "max_episode_steps", "autoreset_mode")
+_SET_BY_EVALUATION = (
+    *("with_oracle", "max_episode_steps", "autoreset_mode"),
+    *("budget", "max_frames", "num_envs", "render_mode"),
+)
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
 NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "suite", "hash")
+#: Entries of plans of one measure only.
+_ONLY_OF = {
+    "score": ("conditions", "delays", "starts", "frames", "other_scorers", "other_scorer_scenes"),
+    "quality": ("budgets", "max_frames"),
+}
 
 
 class Condition(Configuration):
-    """The light and the delay of some episodes: the difference to the base environment.
+    """What some episodes have that others have not: light and delay, or the time of a bracket.
 
     Args:
         lighting: As the environment's argument: a name, or a mapping with ``kind``.
         delay: Frames from a decision to the first frame that has it, of all controls or by
             control; as the environment's argument.
+        budget: Time of all frames of a bracket [s]; the plan's `budgets` set it.
     """
 
     lighting: Any = "static"
     delay: Any = 0
+    budget: float | None = None
 
     @field_validator("delay")
     @classmethod
@@ -74,10 +74,13 @@ class Condition(Configuration):
 class EvaluationPlan(Configuration):
     """Everything that decides an evaluation except the policies' own content.
 
+    A plan with `budgets` is of ``ae_env/ExposureBracket-v0``: its measure is the quality of the
+    merged picture, its conditions are the budgets, and it has no entries about frames.
+
     Args:
         name: Shown in the report.
-        environment: Arguments of ``ae_env/AutoExposure-v0`` that all conditions share; `lighting`
-            and `delay` are those of the conditions.
+        environment: Arguments of the environment that all conditions share; `lighting` and `delay`
+            are those of the conditions.
         scene_ids: Scenes to use, in this order; empty for all of the split.
         max_scenes: Use at most so many scenes, source groups in turn; None for all.
         conditions: By name.
@@ -85,6 +88,8 @@ class EvaluationPlan(Configuration):
             ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
         starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
         frames: Actions per episode.
+        budgets: Of brackets: times that all frames of an episode may take together [s].
+        max_frames: Of brackets: frames of an episode at most.
         seeds: Each gives every scene another motion, defocus, phase of the light and noise.
         policies: Names, as `agents.make_policy` takes them.
         other_scorers: Names of scorers that no policy was trained on; chosen states are also rated
@@ -104,6 +109,8 @@ class EvaluationPlan(Configuration):
     delays: tuple[int, ...] = (0,)
     starts: tuple[str, ...] = ("dark", "middle", "bright")
     frames: int = Field(default=24, ge=1, le=MAX_FRAMES)
+    budgets: tuple[float, ...] = ()
+    max_frames: int = Field(default=3, ge=1, le=4)
     seeds: tuple[int, ...] = (0,)
     policies: tuple[str, ...] = ()
     other_scorers: tuple[str, ...] = ()
@@ -112,7 +119,9 @@ class EvaluationPlan(Configuration):
     suite: tuple[str, ...] = ()
     hash: str | None = None
 
-    @field_validator("scene_ids", "delays", "starts", "seeds", "policies", "other_scorers")
+    @field_validator(
+        *("scene_ids", "delays", "starts", "budgets", "seeds", "policies", "other_scorers")
+    )
     @classmethod
     def _no_repeats(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
         if len(set(values)) < len(values):
@@ -121,38 +130,59 @@ class EvaluationPlan(Configuration):
 
     @model_validator(mode="after")
     def _check(self) -> EvaluationPlan:
-        for rule in ("starts", "seeds", "conditions", "delays"):
-            if not getattr(self, rule):
-                raise ValueError(f"`{rule}` must have one entry or more")
+        given = self.model_fields_set
+        for entry in ("starts", "seeds", "conditions", "delays", *({"budgets"} & given)):
+            if not getattr(self, entry):
+                raise ValueError(f"`{entry}` must have one entry or more")
+        for entry in self._unused:
+            if entry in given:
+                also = "no `budgets`" if entry == "max_frames" else "`budgets`"
+                raise ValueError(f"`{entry}` must not be given in a plan that has {also}")
         for start in self.starts:
-            if start not in STARTS:
-                hint = did_you_mean(start, STARTS)
-                raise ValueError(f"`starts` (={start!r}) must be of {list(STARTS)}{hint}")
-        if min(self.seeds) < 0 or max(self.seeds) > MAX_SEED:
-            raise ValueError(f"`seeds` (={list(self.seeds)}) must be in [0, {MAX_SEED}]")
-        for name in self.conditions:
-            if not _NAME.fullmatch(name) or name in _RESERVED:
+            check_word("starts", start, STARTS)
+        for seed in self.seeds:
+            check_integer("seeds", seed, 0, MAX_SEED)
+        for budget in self.budgets:
+            check_number("budgets", budget, 1e-5, 3600.0, more=" s")
+        for name, condition in self.conditions.items():
+            if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:
                 raise ValueError(
                     f"`conditions` (={name!r}): a name must be of letters, digits and _+./-, and "
-                    f"none of {list(_RESERVED)}"
+                    f"none of {list(_RESERVED)}; and none has a `budget`"
                 )
-        for name in (*CONDITION_ARGUMENTS, *_OWN_ARGUMENTS):
+        for name in (*CONDITION_ARGUMENTS, *_SET_BY_EVALUATION):
             if name in self.environment:
                 raise ValueError(f"`environment` must not have `{name}`: give it as a condition's")
         for name, condition in self.all_conditions.items():
             try:
-                options = self.options(condition)
-                options.make_grid(), options.make_camera(), options.make_scorer()
-                options.make_lighting()
-                late = max(options.delays)
-                if late >= self.frames:
-                    raise ValueError(
-                        f"`delay` (={late}) must be below `frames` (={self.frames}): no decision "
-                        "would show"
-                    )
+                self._check_condition(condition)
             except ValueError as error:
                 raise ValueError(f"condition {name!r}: {error}") from error
         return self
+
+    def _check_condition(self, condition: Condition) -> None:
+        options = self.options(condition)
+        options.make_grid(), options.make_camera(), options.make_scorer(), options.make_lighting()
+        if max(options.delays) >= self.frames:
+            raise ValueError(
+                f"`delay` (={max(options.delays)}) must be below `frames` (={self.frames}): no "
+                "decision would show"
+            )
+
+    @property
+    def measure(self) -> Literal["score", "quality"]:
+        """What the policies are compared by: scores of frames, or the quality of brackets."""
+        return "quality" if self.budgets else "score"
+
+    @property
+    def _unused(self) -> tuple[str, ...]:
+        """Entries that plans of the other measure have."""
+        return _ONLY_OF["score" if self.budgets else "quality"]
+
+    @property
+    def env_id(self) -> str:
+        """Id of the environment."""
+        return f"ae_env/{'ExposureBracket' if self.budgets else 'AutoExposure'}-v0"
 
     @property
     def observation(self) -> str:
@@ -161,7 +191,9 @@ class EvaluationPlan(Configuration):
 
     @property
     def all_conditions(self) -> dict[str, Condition]:
-        """`conditions` with every one of `delays`, by the names that the tables show."""
+        """`conditions` with every one of `delays`, or `budgets`, by the names in the tables."""
+        if self.budgets:
+            return {f"{budget:g} s": Condition(budget=budget) for budget in self.budgets}
         found: dict[str, Condition] = {}
         for i, delay in enumerate(self.delays):
             for name, condition in self.conditions.items():
@@ -178,14 +210,16 @@ class EvaluationPlan(Configuration):
         conditions = self.all_conditions
         return next((n for n, c in conditions.items() if c.at_rest), next(iter(conditions)))
 
-    def options(self, condition: Condition | None = None, **changes: Any) -> EnvOptions:
+    def options(self, condition: Condition | None = None) -> EnvOptions:
         """The checked arguments of the environment in `condition`."""
         from ae_env.options import EnvOptions
 
-        return EnvOptions.from_kwargs({**self.arguments(condition or Condition()), **changes})
+        # A bracket's environment sets these itself.
+        own = {"grid": "bracket", "depth": "far"} if self.budgets else {}
+        return EnvOptions.from_kwargs(own | self.arguments(condition or Condition()))
 
     def arguments(self, condition: Condition) -> dict[str, Any]:
-        """Arguments of the environment in `condition`."""
+        """Arguments of the environment's observations and light in `condition`."""
         base = {"split": "test", **self.environment}
         return {**base, "lighting": condition.lighting, "delay": condition.delay}
 
@@ -193,10 +227,12 @@ class EvaluationPlan(Configuration):
         """Every entry as JSON values; objects of a caller's own by the function `other`."""
 
         def converted(value: Any) -> Any:
-            return dict(value) if isinstance(value, Condition) else other(value)
+            if isinstance(value, Condition):
+                return {"lighting": value.lighting, "delay": value.delay}
+            return other(value)
 
-        text = json.dumps(dict(self), default=converted, allow_nan=False)
-        return dict(json.loads(text))
+        entries = {k: v for k, v in dict(self).items() if k not in self._unused}
+        return dict(json.loads(json.dumps(entries, default=converted, allow_nan=False)))
 
     def protocol(self) -> dict[str, Any]:
         """JSON values of everything that decides the episodes and their scores.
@@ -209,7 +245,7 @@ class EvaluationPlan(Configuration):
             raise ValueError(f"every entry of a plan must be a JSON value, not {value!r}")
 
         found = {k: v for k, v in self.describe(refuse).items() if k not in NOT_OF_THE_PROTOCOL}
-        if not self.task:  # plans of before there were tasks keep their digest
+        if not self.task and not self.budgets:  # plans of before there were tasks keep their digest
             del found["task"]
         return found
 
@@ -219,7 +255,8 @@ class EvaluationPlan(Configuration):
         Raises:
             ValueError: If an entry is out of range.
         """
-        return EvaluationPlan.model_validate({**dict(self), **entries})
+        given = {name: getattr(self, name) for name in self.model_fields_set}
+        return EvaluationPlan.model_validate(given | entries)
 
 
 def load_plan(name: str | Path) -> EvaluationPlan:
@@ -302,15 +339,15 @@ def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureG
     """The episodes of a condition of `plan`: starts change slowest, then seeds, scenes fastest.
 
     Episodes that differ in their start only have the same seed: the same motion, defocus, light and
-    noise.
+    noise. Of brackets, which begin with a metered frame, no start is given.
     """
-    own = [(seed * _SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
-    repeats = len(plan.starts)
+    starts = ("random",) if plan.budgets else plan.starts
+    own = [(seed * SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
     return Episodes(
         scenes=scenes,
-        seeds=[seed for seed, _ in own] * repeats,
-        scene=np.array([j for _, j in own] * repeats),
-        starts=[start_state(start, scenes[j], grid) for start in plan.starts for _, j in own],
+        seeds=[seed for seed, _ in own] * len(starts),
+        scene=np.array([j for _, j in own] * len(starts)),
+        starts=[start_state(start, scenes[j], grid) for start in starts for _, j in own],
     )
 
 
@@ -331,217 +368,3 @@ def start_state(start: str, scene: Scene, grid: ExposureGrid) -> int | None:
     if scene.allowed is not None:
         distance = np.where(scene.allowed, distance, np.inf)
     return int(np.argmin(distance))
-
-
-#: Id of the task.
-ENV_ID = "ae_env/ExposureBracket-v0"
-#: What a policy reaches in an episode, as `run_brackets` calls it.
-MEASURES = ("quality", "log_error", "unseen", "frames", "seconds")
-#: Arguments of the environment that the evaluation itself sets.
-_BRACKET_ARGUMENTS = ("budget", "max_frames", "autoreset_mode", "num_envs", "render_mode")
-#: Episodes at a time.
-_BATCH = 32
-
-ProgressB = Callable[[int, int, str], None]
-
-
-class BracketPlan(Configuration):
-    """Everything that decides an evaluation of brackets except the policies' own content.
-
-    Args:
-        name: Shown in the report.
-        environment: Arguments of ``ae_env/ExposureBracket-v0``, such as ``scenes``.
-        scene_ids: Scenes to use, in this order; empty for all of the split.
-        max_scenes: Use at most so many scenes, source groups in turn; None for all.
-        budgets: Times that all frames of an episode may take together [s]; each is run.
-        max_frames: Frames of an episode at most.
-        seeds: Each gives every scene another motion and noise.
-        policies: Names, as `agents.make_policy` takes them.
-        task: Of a plan that is a part of a benchmark: which of its tables has the results.
-        suite: As of `EvaluationPlan`.
-        hash: As of `EvaluationPlan`.
-    """
-
-    name: str = "bracket"
-    environment: dict[str, Any] = Field(default_factory=dict)
-    scene_ids: tuple[str, ...] = ()
-    max_scenes: int | None = Field(default=None, ge=1, le=MAX_SCENES)
-    budgets: tuple[float, ...] = Field(min_length=1)
-    max_frames: int = Field(default=3, ge=1, le=4)
-    seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
-    policies: tuple[str, ...] = ()
-    task: str = ""
-    suite: tuple[str, ...] = ()
-    hash: str | None = None
-
-    @field_validator("scene_ids", "budgets", "seeds", "policies")
-    @classmethod
-    def _no_repeats(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
-        return EvaluationPlan._no_repeats(values)
-
-    @model_validator(mode="after")
-    def _check(self) -> BracketPlan:
-        if min(self.seeds) < 0 or max(self.seeds) > MAX_SEED:
-            raise ValueError(f"`seeds` (={list(self.seeds)}) must be in [0, {MAX_SEED}]")
-        for budget in self.budgets:
-            if not 1e-5 <= budget <= 3600.0:
-                raise ValueError(f"`budgets` (={budget}) must be in [1e-05, 3600] seconds")
-        for name in _BRACKET_ARGUMENTS:
-            if name in self.environment:
-                raise ValueError(f"`environment` must not have `{name}`")
-        self.of_conditions()  # raises where an argument is none
-        return self
-
-    @property
-    def observation(self) -> str:
-        """What policies are shown."""
-        return str(self.environment.get("observation", "uint8"))
-
-    def of_conditions(self) -> EvaluationPlan:
-        """A plan with the same scenes."""
-        environment = {"grid": "bracket", "depth": "far", **self.environment}
-        return EvaluationPlan(
-            environment=environment, scene_ids=self.scene_ids, max_scenes=self.max_scenes
-        )
-
-    def protocol(self) -> dict[str, Any]:
-        """JSON values of everything that decides the episodes and their results."""
-        content = json.loads(self.model_dump_json())
-        return {k: v for k, v in content.items() if k not in NOT_OF_THE_PROTOCOL}
-
-    def changed(self, **entries: Any) -> BracketPlan:
-        """The same plan with other entries, checked."""
-        return BracketPlan.model_validate({**dict(self), **entries})
-
-    def make_envs(
-        self, budget: float, scenes: list[Scene] | None = None
-    ) -> gym.vector.VectorEnv[Any, Any, Any]:
-        """Environments with one of the budgets; by default on the training scenes."""
-        import gymnasium as gym
-
-        import ae_env  # noqa: F401  (registers the environment)
-
-        environment = {**self.environment, "split": "train"}
-        if scenes is not None:
-            environment |= {"scenes": scenes, "split": "all"}
-        return gym.make_vec(
-            ENV_ID,
-            num_envs=_BATCH,
-            autoreset_mode="DISABLED",
-            budget=budget,
-            max_frames=self.max_frames,
-            **environment,
-        )
-
-
-def load_bench_plan(name: str | Path) -> EvaluationPlan | BracketPlan:
-    """The plan of a preset or of a YAML file, of either kind: one of brackets has ``budgets``.
-
-    Raises:
-        ValueError: As `load_plan`.
-    """
-    from ae_env.utils.presets import find_preset
-
-    path = find_preset(str(name), "evaluation")
-    content = read_yaml(path)
-    if isinstance(content, Mapping) and "budgets" in content:
-        return load_yaml(path, BracketPlan)
-    return load_plan(name)
-
-
-@dataclass(frozen=True)
-class BracketResult:
-    """What a policy reached: a row for each training seed, a column for each source group.
-
-    Args:
-        policy: Its name.
-        groups: Source groups, ``(G,)``.
-        values: ``(K, B, G)`` of each of `MEASURES`, by budget.
-    """
-
-    policy: str
-    groups: NDArray[Any]
-    values: Mapping[str, NDArray[np.float64]]
-
-    def score(self, other: BracketResult | None = None, budget: int | None = None) -> Interval:
-        """Mean quality with its interval, over all budgets or one; minus that of `other`."""
-        kept = slice(None) if budget is None else slice(budget, budget + 1)
-        own = self.values["quality"][:, kept].mean(axis=1)
-        base = np.zeros_like(own[:1])
-        if other is not None:
-            base = other.values["quality"][:, kept].mean(axis=1)
-        return difference_interval(own, base, np.ones(len(self.groups)))
-
-    def mean(self, measure: str, chosen: NDArray[np.bool_] | None = None) -> float:
-        """Mean over seeds, budgets and the groups `chosen`."""
-        values = self.values[measure]
-        return float((values if chosen is None else values[..., chosen]).mean())
-
-
-def check_bracket_policies(plan: BracketPlan, scenes: list[Scene]) -> None:
-    """Checks the policies of `plan` before any work.
-
-    Raises:
-        ValueError: If there is none, or one is unknown or does not fit the environment.
-    """
-    if not plan.policies:
-        raise ValueError("`policies` (=[]) must hold at least one policy")
-    with closing(plan.make_envs(plan.budgets[0], scenes[:1])) as envs:
-        context = PolicyContext.from_envs(envs)
-        for policy in plan.policies:
-            for name in training_seeds(policy):
-                make_policy(name, context)
-
-
-def run_bracket_plan(
-    plan: BracketPlan, scenes: list[Scene] | None = None, *, progress: ProgressB | None = None
-) -> list[BracketResult]:
-    """Runs every policy of `plan` in every budget; the best first.
-
-    Args:
-        plan: The plan, with its policies.
-        scenes: Those of the plan where they are loaded already.
-        progress: Called with work done, work in all, and what is being done.
-
-    Raises:
-        ValueError: If a policy is unknown or does not fit the environment; before any work.
-    """
-    from agents.bracketing.policies import run_brackets
-
-    scenes = plan_scenes(plan.of_conditions()) if scenes is None else scenes
-    check_bracket_policies(plan, scenes)
-    found: dict[str, list[list[dict[str, NDArray[np.float64]]]]] = {}
-    groups = np.unique([scene.group for scene in scenes])
-    members = [(policy, name) for policy in plan.policies for name in training_seeds(policy)]
-    for i, budget in enumerate(plan.budgets):
-        with closing(plan.make_envs(budget, scenes)) as envs:
-            context = PolicyContext.from_envs(envs)
-            made = [(policy, name, make_policy(name, context)) for policy, name in members]
-            for j, (policy, name, one) in enumerate(made):
-                if progress is not None:
-                    done = i * len(made) + j
-                    progress(done, len(plan.budgets) * len(made), f"{name}, {budget:g} s")
-                if type(one).fit is not Policy.fit:
-                    with closing(plan.make_envs(budget)) as train:
-                        one.fit(train, plan.seeds[0])
-                runs = [run_brackets(one, envs, seed=seed << 20, name=name) for seed in plan.seeds]
-                merged = {k: np.concatenate([r[k] for r in runs]) for k in (*MEASURES, "group")}
-                means = {
-                    k: group_means(merged[k].astype(np.float64), merged["group"])[0]
-                    for k in MEASURES
-                }
-                found.setdefault(policy, [[] for _ in plan.budgets])[i].append(means)
-    results = [
-        BracketResult(
-            policy,
-            groups,
-            {
-                measure: np.array(
-                    [[m[measure] for m in of_budget] for of_budget in by_budget]
-                ).swapaxes(0, 1)
-                for measure in MEASURES
-            },
-        )
-        for policy, by_budget in found.items()
-    ]
-    return sorted(results, key=lambda result: -result.mean("quality"))
