@@ -15,7 +15,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from ae_env.episodes.compiling import compile_beside
 from ae_env.episodes.draws import Draws
 from ae_env.episodes.light import FrameLight
 from ae_env.episodes.recorded import RecordedBatch, nearest_recorded
@@ -95,7 +94,6 @@ class EpisodeCore:
     def __init__(
         self, options: EnvOptions, num_envs: int, scenes: Sequence[Scene] | None = None
     ) -> None:
-        compile_beside()
         self.options = options
         self.grid = options.make_grid()
         self.camera = options.make_camera()
