@@ -6,19 +6,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 _EXPORTS = {
-    "EvaluationPlan": "evaluation.evaluation_plan",
+    "EvaluationPlan": "evaluation.plan",
     "EvaluationResult": "evaluation.result",
     "MeteringPolicy": "metering.metering_policy",
     "Policy": "policy",
     "PolicyContext": "policy",
     "evaluate": "evaluation.engine",
-    "fit_policies": "evaluation.running",
+    "fit_policies": "evaluation.engine",
     "list_policies": "policy",
-    "load_plan": "evaluation.evaluation_plan",
+    "load_plan": "evaluation.plan",
     "make_policy": "policy",
-    "result_rows": "report.result_table",
-    "run_plan": "evaluation.plan_run",
-    "write_report": "report.evaluation_report",
+    "result_rows": "evaluation.result",
+    "run_plan": "evaluation.jobs",
+    "write_report": "report.evaluation",
 }
 __all__ = sorted(_EXPORTS)
 

@@ -507,7 +507,9 @@ def run_batch(
     for frame in range(frames):
         extra: dict[str, Any] = {}
         if getattr(policy, "privileged", False):
-            extra = {"info": info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}}
+            extra = {
+                "info": info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}
+            }
         begin = time.perf_counter()
         with errors_of(name, "act"):
             actions = policy.act(observations, masks, **extra)

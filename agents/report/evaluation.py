@@ -6,35 +6,31 @@ import base64
 import html
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+import string
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
-from agents.evaluation.plan import (
-    MEASURES,
-    NOT_OF_THE_PROTOCOL,
-    BracketPlan,
-    BracketResult,
-    EvaluationPlan,
-    digest,
-)
+from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.result import (
+    MORE_COLUMNS,
+    ROW_COLUMNS,
     EvaluationResult,
     Results,
-    Rows,
     as_results,
     best_meter,
+    bracket_rows,
     difference_rows,
-    group_values,
-    metrics_csv,
+    group_rows,
     oracle_histogram,
     overall_ranking,
     ranking_rows,
     result_rows,
-    scenes_csv,
+    scene_rows,
     scores_by_kind,
     static_condition,
     training_seed_rows,
@@ -44,6 +40,48 @@ from simulator.settings import format_exposure_time
 from simulator.utils.files import write_atomically
 from simulator.utils.results import result_meta, write_results
 
+#: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function of
+#: it that returns Markdown, or None.
+Cell = str | Callable[[Mapping[str, Any]], object]
+
+#: Columns of the table of scores.
+_SCORES: dict[str, Cell] = {
+    "policy": "{policy}",
+    "normalised": "{normalised_score:.3f}",
+    "95 % interval": "{ci95:.3f}",
+    "mean score": "{mean_score:.3f}",
+    "regret": "{regret:.3f}",
+    "EV error, median": "{ev_error_median:.2f}",
+    "P95": "{ev_error_p95:.2f}",
+    "within 1/3 EV": "{ev_within_third:.0%}",
+    "frames to converge": "{frames_to_converge:.1f}",
+    "overshoot [EV]": "{overshoot:.2f}",
+    "reversals": "{reversals:.2f}",
+    "flicker": "{flicker:.4f}",
+    "clipped high": "{clipped_high:.1%}",
+    "clipped low": "{clipped_low:.1%}",
+    "ms/decision": "{ms_per_decision:.3f}",
+}
+#: Of brackets, for each budget.
+_BRACKETS: dict[str, Cell] = {
+    "policy": "{policy}",
+    "quality": "{quality:.4f}",
+    "95 % interval": "{ci95:.4f}",
+    "to the best": "{to_best:+.3f} ({to_best_ci95:+.3f})",
+    "error [EV]": "{log_error:.4f}",
+    "unseen": "{unseen:.2%}",
+    "frames": "{frames:.2f}",
+}
+#: Tables of several conditions: heading, column of the rows, and format.
+_BY_CONDITION = (
+    ("Normalised score", "normalised_score", ".3f"),
+    ("EV error, P95 [EV]", "ev_error_p95", ".1f"),
+    ("Frames to converge, from the last change of the light on", "frames_to_converge", ".1f"),
+    ("Overshoot [EV]", "overshoot", ".2f"),
+    ("Visible jump (mean change of the companded picture)", "jump", ".4f"),
+)
+#: Source groups in one table on the terminal.
+_GROUPS_ABREAST = 4
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
        max-width: 78rem; margin: 2rem auto; padding: 0 1.2rem; }
@@ -57,6 +95,81 @@ pre { background: #f3f3f3; padding: .8rem; overflow-x: auto; } pre code { paddin
 """
 #: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
 _SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
+
+
+# -- Markdown -------------------------------------------------------------------------------------
+
+
+class _Format(string.Formatter):
+    """Formats of rows: ``{a[b]}`` is an entry of an entry, a pair of numbers is "1 to 2"."""
+
+    def get_field(self, name: str, args: Any, kwargs: Any) -> Any:
+        try:
+            value, used = super().get_field(name, args, kwargs)
+        except (KeyError, IndexError, TypeError):
+            value, used = None, name
+        if value is None or (isinstance(value, float) and np.isnan(value)):
+            raise LookupError(name)
+        return value, used
+
+    def format_field(self, value: Any, spec: str) -> Any:
+        if isinstance(value, list | tuple):
+            return " to ".join(format(one, spec) for one in value)
+        return escape(value) if isinstance(value, str) else format(value, spec)
+
+
+def to_markdown(
+    rows: pd.DataFrame | Iterable[Mapping[str, Any]],
+    columns: Mapping[str, Cell],
+    missing: str = "-",
+) -> str:
+    """A Markdown table with a line for each row; columns but the first are aligned to the right.
+
+    Args:
+        rows: The rows.
+        columns: Content of the cells by heading. Texts of a row are shown as they are, whatever
+            they mean to Markdown; of a function, the result is Markdown.
+        missing: Text of a cell a value of which is missing, None or NaN. Columns without any other
+            cell are left out where it is empty.
+
+    >>> print(to_markdown([{"a": "x|y", "b": [1, 2]}, {"a": "z", "b": None}], {"A": "{a}", "B": "{b:.1f}"}))
+    | A    |          B |
+    |:-----|-----------:|
+    | x\\|y | 1.0 to 2.0 |
+    | z    |          - |
+    """
+    records = rows.to_dict("records") if isinstance(rows, pd.DataFrame) else list(rows)
+    cells = {
+        heading: [cell(row, content, missing) for row in records]
+        for heading, content in columns.items()
+    }
+    if not missing:
+        first = next(iter(cells))
+        cells = {heading: own for heading, own in cells.items() if heading == first or any(own)}
+    return _aligned(pd.DataFrame(cells))
+
+
+def cell(row: Mapping[Any, Any], content: Cell, missing: str = "-") -> str:
+    """Text of a cell, see `to_markdown`."""
+    if callable(content):
+        value = content(row)
+        return missing if value is None else str(value)
+    try:
+        return _Format().vformat(content, (), row)
+    except LookupError:
+        return missing
+
+
+def _wide(frame: pd.DataFrame, form: str) -> str:
+    """A frame of numbers of one kind as Markdown, its index as the first column."""
+    texts = frame.map(lambda value: format(value, form)).rename(columns=escape, index=escape)
+    return _aligned(texts.rename_axis(columns=None).reset_index())
+
+
+def _aligned(frame: pd.DataFrame) -> str:
+    """A frame of texts as Markdown."""
+    align = ["left", *["right"] * (frame.shape[1] - 1)] if len(frame) else None
+    return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
 
 
 def escape(name: object) -> str:
@@ -80,7 +193,7 @@ def code(text: object) -> str:
     return f"{fence}{pad}{line}{pad}{fence}"
 
 
-def code_block(lines: Sequence[str]) -> str:
+def code_block(*lines: str) -> str:
     """Lines from outside as a block of code."""
     fence = "`" * max(3, max(map(_longest_run, lines), default=0) + 1)
     return "\n".join([fence, *(" ".join(line.splitlines()) for line in lines), fence])
@@ -89,21 +202,6 @@ def code_block(lines: Sequence[str]) -> str:
 def _longest_run(text: str) -> int:
     """Length of the longest run of backticks."""
     return max(map(len, re.findall("`+", text)), default=0)
-
-
-def markdown_table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; columns but the first are aligned to the right."""
-    rule = ["---", *["---:"] * (len(head) - 1)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in (head, rule, *body))
-
-
-def cell(value: Any, form: str) -> str:
-    """A number, a pair, a name or nothing as the text of a cell."""
-    if value is None:
-        return "-"
-    if isinstance(value, list):
-        return f"{value[0]:{form}} to {value[1]:{form}}"
-    return escape(value) if isinstance(value, str) else f"{value:{form}}"
 
 
 def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
@@ -136,23 +234,7 @@ def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
     )
 
 
-_TABLE = (
-    ("policy", "policy", ""),
-    ("normalised", "normalised_score", ".3f"),
-    ("95 % interval", "ci95", ".3f"),
-    ("mean score", "mean_score", ".3f"),
-    ("regret", "regret", ".3f"),
-    ("EV error, median", "ev_error_median", ".2f"),
-    ("P95", "ev_error_p95", ".2f"),
-    ("within 1/3 EV", "ev_within_third", ".0%"),
-    ("frames to converge", "frames_to_converge", ".1f"),
-    ("overshoot [EV]", "overshoot", ".2f"),
-    ("reversals", "reversals", ".2f"),
-    ("flicker", "flicker", ".4f"),
-    ("clipped high", "clipped_high", ".1%"),
-    ("clipped low", "clipped_low", ".1%"),
-    ("ms/decision", "ms_per_decision", ".3f"),
-)
+# -- files ----------------------------------------------------------------------------------------
 
 
 def write_report(
@@ -168,9 +250,9 @@ def write_report(
 ) -> dict[str, Path]:
     """Write everything that an evaluation shows into `out`.
 
-    Those are ``results.json``, ``scenes.csv``, ``metrics.csv``, ``report.md``, ``report.html`` and
-    pictures: ``scores.png``, ``ev_error.png``, ``cost.png`` where decisions of one camera were
-    timed, ``contact_sheet.webp`` and so on where the scenes are known.
+    Those are ``results.json`` and ``report.md``; of frames also ``scenes.csv``, ``metrics.csv``,
+    ``report.html`` and pictures: ``scores.png``, ``ev_error.png``, ``cost.png`` where decisions of
+    one camera were timed, ``contact_sheet.webp`` and so on where the scenes are known.
 
     Args:
         results: The return value of `evaluate` or `run_plan`.
@@ -187,21 +269,31 @@ def write_report(
     """
     folder, results = Path(out), as_results(results)
     result = results[static_condition(results)]
-    rows = result_rows(results, source=source, split=split, resamples=resamples)
     ranking = overall_ranking(results, resamples=resamples)
+    if result.measure == "quality":
+        assert result.plan is not None
+        rows = bracket_rows(results, ranking)
+        meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
+        text = _bracket_report(result.plan, rows, command)
+        return {
+            "results.json": write_results(folder / "results.json", _records(rows), meta),
+            "report.md": write_atomically(folder / "report.md", text),
+        }
+    rows = result_rows(results, source=source, split=split, resamples=resamples)
     meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
-    title = f"{rows[0]['source']}, {rows[0]['split']} split"
+    title = f"{rows.source[0]}, {rows.split[0]} split"
     title = title if result.plan is None else result.plan.name
     order = [one.policy for one in ranking]
     order += [name for name in result.tracks if name not in order]
+    contract = _records(rows[list(ROW_COLUMNS)])
     files = {
-        "results.json": write_results(folder / "results.json", rows, meta),
-        "scenes.csv": write_atomically(folder / "scenes.csv", scenes_csv(result)),
-        "metrics.csv": write_atomically(folder / "metrics.csv", metrics_csv(results, rows)),
+        "results.json": write_results(folder / "results.json", contract, meta),
+        "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
+        "metrics.csv": _write_csv(folder / "metrics.csv", _metrics(rows)),
     }
-    shown = [*rows, *(_overall_rows(ranking) if len(results) > 1 else [])]
+    overall = ranking if len(results) > 1 else ()
     pictures = {
-        "scores.png": plot_scores(folder / "scores.png", shown, title),
+        "scores.png": plot_scores(folder / "scores.png", rows, title, overall),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
     }
     costs = {n: t.ms_alone for n, t in result.tracks.items() if t.ms_alone}
@@ -220,6 +312,26 @@ def write_report(
     }
 
 
+def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows as JSON values."""
+    return [{str(key): value for key, value in row.items()} for row in rows.to_dict("records")]
+
+
+def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
+    """Writes rows as CSV, numbers with six digits."""
+    return write_atomically(
+        path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    )
+
+
+def _metrics(rows: pd.DataFrame) -> pd.DataFrame:
+    """Every metric of every policy in every condition, the ends of intervals in two columns."""
+    pairs = [pair or (None, None) for pair in rows.ci95]
+    plain = rows[[name for name in ROW_COLUMNS if name != "ci95"]]
+    ends = pd.DataFrame(pairs, columns=["ci95_low", "ci95_high"])
+    return pd.concat([plain, ends, rows[list(MORE_COLUMNS)]], axis=1)
+
+
 def _meta(
     results: Results, ranking: Sequence[Rank], command: str, resamples: int
 ) -> dict[str, Any]:
@@ -230,6 +342,9 @@ def _meta(
         described = plan.describe()
         protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
         described["sha256"] = digest(protocol)
+    differences = pd.DataFrame()
+    if best is not None:
+        differences = difference_rows(result, best, resamples=resamples)
     return {
         **result_meta(command, result.seed),
         "plan": described,
@@ -240,36 +355,39 @@ def _meta(
         "by_kind": scores_by_kind(result),
         "oracle_histogram": oracle_histogram(result),
         "best_meter": best,
-        "differences_to_best_meter": (
-            [] if best is None else difference_rows(result, best, resamples=resamples)
-        ),
+        "differences_to_best_meter": _records(differences),
         "training_seeds": training_seed_rows(result),
         "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
         "other_scorers": result.other_scores,
     }
 
 
-def _overall_rows(ranking: Sequence[Rank]) -> Rows:
-    """Rows of all conditions together, for the plot of the scores."""
-    return [
-        {
-            "policy": one.policy,
-            "condition": "all conditions",
-            "normalised_score": one.score.value,
-            "ci95": one.score.pair,
-            "num_groups": one.score.num_groups,
-        }
-        for one in ranking
+# -- the report -----------------------------------------------------------------------------------
+
+
+def _bracket_report(plan: EvaluationPlan, rows: pd.DataFrame, command: str) -> str:
+    """``report.md`` of brackets."""
+    scenes = plan.environment.get("scenes", "bundled")
+    parts = [
+        f"# Brackets compared: {escape(plan.name)}",
+        code_block(command),
+        f"{rows.num_groups[0]} source groups of {scenes!r}; {len(plan.seeds)} episodes of each "
+        f"scene; up to {plan.max_frames} frames, merged. Quality is 1 - mean error / 2 EV; the "
+        "error is that of the log radiance of the samples that a frame shows, unseen the share "
+        "that is white in all. Intervals: paired bootstrap over source groups and training seeds.",
     ]
+    for budget, own in rows.groupby("budget", sort=False):
+        parts += [f"## {budget:g} s", to_markdown(own, _BRACKETS)]
+    return "\n\n".join(parts) + "\n"
 
 
 class _Report:
-    """The parts of ``report.md``."""
+    """The parts of ``report.md`` of an evaluation of frames."""
 
     def __init__(
         self,
         results: Results,
-        rows: Rows,
+        rows: pd.DataFrame,
         meta: Mapping[str, Any],
         ranking: Sequence[Rank],
         pictures: Sequence[str],
@@ -278,8 +396,10 @@ class _Report:
         self.ranking, self.pictures = ranking, pictures
         self.static = static_condition(results)
         self.result = results[self.static]
-        conditions = [self.static if r["condition"] == "all" else r["condition"] for r in rows]
-        self.by = {(r["policy"], c): r for r, c in zip(rows, conditions, strict=True)}
+        by = rows.replace({"condition": {"all": self.static}})
+        #: Of each condition as a whole.
+        self.by = by[by.condition.isin(list(results))]
+        self.scores = {one.policy: one.score.value for one in ranking}
 
     def markdown(self, title: str, next_commands: Sequence[str]) -> str:
         """The report as Markdown."""
@@ -303,20 +423,20 @@ class _Report:
         if self.result.plan is not None:
             parts += _plan_part(self.result.plan, self.meta["plan"])
         if next_commands:
-            parts += ["## Next", code_block(next_commands)]
+            parts += ["## Next", code_block(*next_commands)]
         return "\n\n".join(parts) + "\n"
 
     def _introduction(self, title: str) -> list[str]:
-        meta, row, plan = self.meta, self.rows[0], self.result.plan
-        seeds = max(len(track.states) for track in self.result.tracks.values())
+        meta, row, plan = self.meta, self.rows.iloc[0], self.result.plan
+        seeds = self.rows.training_seeds.max()
         resampled = f" and {seeds} training seeds" if seeds > 1 else " (one training seed each)"
         starts = ["random"] if plan is None else plan.starts
         drawn = [self.result.seed] if plan is None else plan.seeds
         return [
             f"# Exposure policies compared: {escape(title)}",
             f"{code(meta['command'])}, {meta['date']}, commit {meta['commit'] or 'unknown'}.",
-            f"{meta['scenes']} scenes of '{escape(row['source'])}' ({row['split']} split) from "
-            f"{row['num_groups']} source groups; {len(self.results)} "
+            f"{meta['scenes']} scenes of '{escape(row.source)}' ({row.split} split) from "
+            f"{row.num_groups} source groups; {len(self.results)} "
             f"condition{'s' * (len(self.results) > 1)} of {meta['episodes']} episodes and "
             f"{meta['frames']} frames each; starts: {', '.join(starts)}; seeds: "
             f"{', '.join(map(str, drawn))}. Normalised score: 0 is a random policy, 1 the oracle, "
@@ -328,144 +448,120 @@ class _Report:
         if not self.ranking:
             return []
         over = f"all {len(self.results)} conditions, each with the same weight"
-        body = []
-        for one in self.ranking:
-            changes = []
-            for change in (one.to_best, one.to_next):
-                if change is None:
-                    changes.append("-")
-                    continue
-                mark = " \\*" if change.significant else ""
-                interval = "" if change.pair is None else f" ({cell(change.pair, '+.3f')})"
-                changes.append(f"{change.value:+.3f}{interval}{mark}")
-            tier = "-" if one.tier is None else str(one.tier)
-            score = [f"{one.score.value:.3f}", cell(one.score.pair, ".3f")]
-            body.append([tier, escape(one.policy), *score, *changes])
-        head = ["tier", "policy", "normalised", "95 % interval", "minus the best", "minus the next"]
+        columns: dict[str, Cell] = {
+            "tier": "{tier}",
+            "policy": "{policy}",
+            "normalised": "{normalised_score:.3f}",
+            "95 % interval": "{ci95:.3f}",
+            "minus the best": lambda row: _change(row["to_best"]),
+            "minus the next": lambda row: _change(row["to_next"]),
+        }
         return [
             "## Ranking",
             f"Over {'all scenes' if len(self.results) == 1 else over}. Differences are paired; "
             "their 95 % intervals hold for all pairs at once, and \\* marks those that leave out "
-            "zero. Policies of one tier are not significantly worse than its first.",
-            markdown_table(head, body),
+            "zero. Policies within a tier do not differ significantly from the tier's best.",
+            to_markdown(self.meta["ranking"], columns),
         ]
 
     def _scores(self) -> list[str]:
         parts = []
         for part in self.result.conditions:
-            own = [r for r in self.rows if r["condition"] == part]
-            own.sort(key=lambda r: -r["normalised_score"])
-            body = [[cell(r[key], form) for _, key, form in _TABLE] for r in own]
+            own = self.rows[self.rows.condition == part]
+            own = own.sort_values("normalised_score", ascending=False, kind="stable")
             parts += [
-                f"## {self.static}, scenes: {part} ({own[0]['num_groups']} groups)",
-                markdown_table([title for title, _, _ in _TABLE], body),
+                f"## {self.static}, scenes: {part} ({own.num_groups.iloc[0]} groups)",
+                to_markdown(own, _SCORES),
             ]
-        if self.rows[0]["num_groups"] < MIN_GROUPS:
-            head, body = group_values(self.result)
-            names = [[escape(group), *values] for group, *values in body]
+        if self.rows.num_groups[0] < MIN_GROUPS:
             parts += [
                 "## Every source group",
                 f"Fewer than {MIN_GROUPS} source groups: no intervals, but every value (mean "
                 "score).",
-                markdown_table([escape(name) for name in head], names),
+                _wide(group_rows(self.result), ".3f"),
             ]
         return parts
 
     def _conditions(self) -> list[str]:
+        picture = "![EV error over time](ev_error.png)"
         if len(self.results) < 2:
-            return ["## EV error over time", "![EV error over time](ev_error.png)"]
-        order = [one.policy for one in self.ranking]
-        names = [*order, *(p for p in self.result.tracks if p not in order)]
-        head = ["condition", *map(escape, names)]
-        parts = ["## Conditions", "![EV error over time](ev_error.png)"]
-        for title, key, form in (
-            ("Normalised score", "normalised_score", ".3f"),
-            ("EV error, P95 [EV]", "ev_error_p95", ".1f"),
-            (
-                "Frames to converge, from the last change of the light on",
-                "frames_to_converge",
-                ".1f",
-            ),
-            ("Overshoot [EV]", "overshoot", ".2f"),
-            ("Visible jump (mean change of the companded picture)", "jump", ".4f"),
+            return ["## EV error over time", picture]
+        names = [*self.scores, *(p for p in self.result.tracks if p not in self.scores)]
+        parts = ["## Conditions", picture]
+        for title, key, form in _BY_CONDITION:
+            table = self.by.pivot(index="condition", columns="policy", values=key)
+            parts += [f"### {title}", _wide(table.loc[list(self.results), names], form)]
+        for title, key, reduce, form in (
+            ("Frames until the exposure stays, median", "frames_to_settle", np.median, ".1f"),
+            ("Share of episodes that converge", "converged", np.mean, ".0%"),
         ):
-            body = [[c, *(f"{self.by[p, c][key]:{form}}" for p in names)] for c in self.results]
-            parts += [f"### {title}", markdown_table(head, body)]
-        settled = [
-            [c, *(f"{np.median(r.episode_metrics(p)['frames_to_settle']):.1f}" for p in names)]
-            for c, r in self.results.items()
-        ]
-        parts += ["### Frames until the exposure stays, median", markdown_table(head, settled)]
-        share = [
-            [c, *(f"{r.episode_metrics(p)['converged'].mean():.0%}" for p in names)]
-            for c, r in self.results.items()
-        ]
-        return [*parts, "### Share of episodes that converge", markdown_table(head, share)]
+            values = {
+                name: [reduce(r.episode_metrics(name)[key]) for r in self.results.values()]
+                for name in names
+            }
+            table = pd.DataFrame(values, index=pd.Index(self.results, name="condition"))
+            parts += [f"### {title}", _wide(table, form)]
+        return parts
 
     def _cost(self) -> list[str]:
-        scores = {one.policy: one.score.value for one in self.ranking}
-        body = [
-            [
-                escape(name),
-                cell(scores.get(name), ".3f"),
-                f"{track.ms_per_decision:.3f}",
-                cell(track.ms_alone, ".3f"),
-                f"{track.captures_per_decision:g}",
-            ]
-            for name, track in self.result.tracks.items()
-        ]
-        head = ["policy", "normalised", "ms, in batches", "ms, one camera alone", "captures"]
+        columns: dict[str, Cell] = {
+            "policy": "{policy}",
+            "normalised": lambda row: cell(
+                {"score": self.scores.get(row["policy"])}, "{score:.3f}"
+            ),
+            "ms, in batches": "{ms_per_decision:.3f}",
+            "ms, one camera alone": "{ms_alone:.3f}",
+            "captures": "{captures_per_decision:g}",
+        }
         picture = ["![Score against time](cost.png)"] if "cost.png" in self.pictures else []
         text = "Time in `act` per decision. The plot shows that of one camera alone."
-        return ["## Score against time", text, *picture, markdown_table(head, body)]
+        own = self.by[self.by.condition == self.static]
+        return ["## Score against time", text, *picture, to_markdown(own, columns)]
 
     def _clipping(self) -> list[str]:
-        def worst(name: str, key: str) -> Callable[[str], float]:
-            return lambda condition: float(self.by[name, condition][key])
-
-        body = []
+        rows = []
         for name in self.result.tracks:
-            line = [escape(name)]
+            own = self.by[self.by.policy == name].set_index("condition")
+            row = {"policy": name}
             for key in ("clipped_high", "clipped_low"):
-                most = max(self.results, key=worst(name, key))
-                line += [f"{self.by[name, self.static][key]:.2%}"]
-                line += [f"{self.by[name, most][key]:.2%} ({most})"]
-            body.append(line)
-        head = ["policy", f"white, {self.static}", "white, worst", f"black, {self.static}"]
-        text = "Share of the pixels at white and at black."
-        return ["## Clipping", text, markdown_table([*head, "black, worst"], body)]
+                worst = own[key].idxmax()
+                row[key] = own.loc[self.static, key]
+                row[f"{key}_worst"] = f"{own.loc[worst, key]:.2%} ({worst})"
+            rows.append(row)
+        columns = {
+            "policy": "{policy}",
+            f"white, {self.static}": "{clipped_high:.2%}",
+            "white, worst": "{clipped_high_worst}",
+            f"black, {self.static}": "{clipped_low:.2%}",
+            "black, worst": "{clipped_low_worst}",
+        }
+        return [
+            "## Clipping",
+            "Share of the pixels at white and at black.",
+            to_markdown(rows, columns),
+        ]
 
     def _kinds(self) -> list[str]:
         kinds = self.meta["by_kind"]
         if len(kinds) < 2:
             return []
-        head = [f"{escape(kind)} ({values['groups']})" for kind, values in kinds.items()]
-        body = [
-            [escape(name), *(f"{values[name]:.3f}" for values in kinds.values())]
-            for name in self.result.tracks
-        ]
+        table = pd.DataFrame(kinds).drop(index="groups").rename_axis("policy")
+        table.columns = [f"{kind} ({values['groups']})" for kind, values in kinds.items()]
         text = f"Normalised score ({self.static}); in brackets the source groups of each kind."
-        return ["## By kind of scene", text, markdown_table(["policy", *head], body)]
+        return ["## By kind of scene", text, _wide(table, ".3f")]
 
     def _other_scorers(self) -> list[str]:
-        table, plan = self.meta["other_scorers"], self.result.plan
-        if not table or plan is None:
+        scores, plan = self.meta["other_scorers"], self.result.plan
+        if not scores or plan is None:
             return []
-        body = [
-            [escape(name), *(f"{own[name]:.3f}" for own in table.values())]
-            for name in self.result.tracks
-        ]
+        table = pd.DataFrame(scores, index=pd.Index(self.result.tracks, name="policy"))
         count = min(plan.other_scorer_scenes, self.meta["scenes"])
         text = (
             f"Mean expected score of the chosen states of {count} scenes under scorers that "
             "nothing was trained on. Scorers that read noise as detail rise with gain: see "
             "`docs/scorers.md`."
         )
-        return [
-            "## Under other scorers",
-            text,
-            markdown_table(["policy", *map(escape, table)], body),
-        ]
+        return ["## Under other scorers", text, _wide(table, ".3f")]
 
     def _paths(self) -> list[str]:
         sheets = [name for name in self.pictures if name.startswith("contact_sheet")]
@@ -481,20 +577,26 @@ class _Report:
         found = self.meta["differences_to_best_meter"]
         if not found:
             return []
-        body = [
-            [
-                escape(d["policy"]),
-                d["condition"],
-                f"{d['difference']:+.3f}",
-                cell(d["ci95"], "+.3f"),
-            ]
-            for d in found
-        ]
+        columns = {
+            "policy": "{policy}",
+            "scenes": "{condition}",
+            "difference": "{difference:+.3f}",
+            "95 % interval": "{ci95:+.3f}",
+        }
         return [
             f"## Difference to the best meter, {code(self.meta['best_meter'])} ({self.static})",
             "Paired on the same episodes; intervals of single differences, not simultaneous.",
-            markdown_table(["policy", "scenes", "difference", "95 % interval"], body),
+            to_markdown(found, columns),
         ]
+
+
+def _change(change: Mapping[str, Any] | None) -> str | None:
+    """A paired difference with its simultaneous interval, marked where it leaves out zero."""
+    if change is None:
+        return None
+    mark = " \\*" if change["significant"] else ""
+    interval = "" if change["simultaneous_ci95"] is None else " ({simultaneous_ci95:+.3f})"
+    return cell(change, "{difference:+.3f}" + interval) + mark
 
 
 def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
@@ -504,104 +606,95 @@ def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
         "exposure_time": format_exposure_time,
         "f_number": lambda v: f"f/{v:g}",
     }
-    body = [
-        [
-            name.replace("_", " "),
-            ", ".join(f"{labels[name](float(v))}: {share:.0%}" for v, share in shares.items()),
-        ]
-        for name, shares in histogram.items()
+    rows = [
+        {
+            "control": name.replace("_", " "),
+            "share": ", ".join(
+                f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()
+            ),
+        }
+        for name, own in histogram.items()
     ]
-    return markdown_table(["control", "share"], body)
+    return to_markdown(rows, {"control": "{control}", "share": "{share}"})
 
 
 def _plan_part(plan: EvaluationPlan, described: Mapping[str, Any]) -> list[str]:
-    body = [
-        [name, escape(condition.lighting), str(condition.delay)]
+    rows = [
+        {"condition": name, "lighting": str(condition.lighting), "delay": str(condition.delay)}
         for name, condition in plan.all_conditions.items()
     ]
+    columns = {name: f"{{{name}}}" for name in rows[0]}
     text = f"Environment: {code(described['environment'])}. sha256 of the plan: "
-    head = ["condition", "lighting", "delay"]
-    return ["## What was run", f"{text}`{described['sha256']}`.", markdown_table(head, body)]
+    return ["## What was run", f"{text}`{described['sha256']}`.", to_markdown(rows, columns)]
 
 
-#: Headings of the measures of a budget.
-_HEAD = ["policy", "quality", "95 % interval", "to the best", "error [EV]", "unseen", "frames"]
+# -- the terminal ---------------------------------------------------------------------------------
 
 
-def rows_by_budget(
-    plan: BracketPlan, results: Sequence[BracketResult]
-) -> tuple[list[str], list[list[str]]]:
-    """Head and body of a table: the quality that each policy reaches in each budget."""
-    head = ["policy", "all", "95 % interval", *(f"{budget:g} s" for budget in plan.budgets)]
-    body = []
-    for result in results:
-        pair = result.score().pair
-        interval = "too few groups" if pair is None else f"{pair[0]:.4f} to {pair[1]:.4f}"
-        single = (f"{result.score(budget=i).value:.4f}" for i in range(len(plan.budgets)))
-        body.append([result.policy, f"{result.score().value:.4f}", interval, *single])
-    return head, body
-
-
-def write_bracket_report(
-    plan: BracketPlan, results: Sequence[BracketResult], out: Path, *, command: str
-) -> dict[str, Path]:
-    """Writes ``results.json`` and ``report.md`` into `out`; the files by name.
+def summary(
+    results: EvaluationResult | Results, ranking: Sequence[Rank] | None = None
+) -> list[tuple[str, pd.DataFrame]]:
+    """Tables of an evaluation for the terminal: titles, and frames of texts.
 
     Args:
-        plan: The plan.
-        results: The best policy first.
-        out: Folder, which exists.
-        command: The command line that repeats the evaluation.
+        results: The return value of `evaluate` or `run_plan`.
+        ranking: Of `overall_ranking`; computed by default.
     """
-    rows: list[dict[str, Any]] = []
-    blocks = []
-    for i, budget in enumerate(plan.budgets):
-        body = []
-        for result in results:
-            own, best = result.score(budget=i), result.score(results[0], budget=i)
-            means = {name: float(result.values[name][:, i].mean()) for name in MEASURES}
-            rows.append(
-                {
-                    "policy": result.policy,
-                    "budget": budget,
-                    "ci95": own.pair,
-                    "to_best": best.value,
-                    "to_best_ci95": best.pair,
-                    "num_groups": len(result.groups),
-                    "training_seeds": len(result.values["quality"]),
-                    **means,
-                }
+    results = as_results(results)
+    static = static_condition(results)
+    result = results[static]
+    ranking = overall_ranking(results) if ranking is None else ranking
+    if result.measure == "quality":
+        return [
+            ("quality of the merged picture, by time of all frames", _budgets(results, ranking))
+        ]
+    if len(results) == 1:
+        rows = result_rows(result, resamples=2000)
+        table = rows.pivot(index="policy", columns="condition", values="normalised_score")
+        table = table.loc[list(result.tracks), list(result.conditions)].map("{:.3f}".format)
+        pairs = rows[rows.condition == "all"].set_index("policy").ci95
+        table["95 % interval (all)"] = [_interval(pair) for pair in pairs[table.index]]
+        title = "normalised score: 0 is random, 1 the best state of every frame"
+    else:
+        table = pd.DataFrame(
+            {
+                "tier": ["-" if one.tier is None else str(one.tier) for one in ranking],
+                "policy": [one.policy for one in ranking],
+                "all conditions": [f"{one.score.value:.3f}" for one in ranking],
+                "95 % interval": [_interval(one.score.pair) for one in ranking],
+                static: [f"{_normalised(result, one.policy):.3f}" for one in ranking],
+            }
+        ).set_index("tier")
+        title = f"normalised score over {len(results)} conditions, and in {static!r}"
+    tables = [(title, table.reset_index())]
+    groups = group_rows(result)
+    if len(groups) < MIN_GROUPS:
+        for first in range(0, len(groups), _GROUPS_ABREAST):
+            own = groups.iloc[first : first + _GROUPS_ABREAST].map("{:.3f}".format).T
+            tables.append(
+                ("mean score of every source group", own.rename_axis("policy").reset_index())
             )
-            interval = "-" if own.pair is None else f"{own.pair[0]:.4f} to {own.pair[1]:.4f}"
-            apart = "-" if result is results[0] else str(best)
-            numbers = (
-                f"{means['log_error']:.4f}",
-                f"{means['unseen']:.2%}",
-                f"{means['frames']:.2f}",
-            )
-            body.append(
-                [
-                    escape(result.policy),
-                    f"{own.value:.4f}",
-                    interval,
-                    escape(apart),
-                    *numbers,
-                    f"{means['frames']:.2f}",
-                ]
-            )
-        blocks.append(f"## {budget:g} s\n\n{markdown_table(_HEAD, body)}")
-    meta = result_meta(command, plan.seeds[0]) | {"plan": plan.protocol()}
-    scenes = plan.environment.get("scenes", "bundled")
-    text = [
-        f"# Brackets compared: {plan.name}",
-        code_block(command),
-        f"{len(results[0].groups)} source groups of {scenes!r}; {len(plan.seeds)} episodes of each "
-        f"scene; up to {plan.max_frames} frames, merged. Quality is 1 - mean error / 2 EV; the "
-        "error is that of the log radiance of the samples that a frame shows, unseen the share "
-        "that is white in all. Intervals: paired bootstrap over source groups and training seeds.",
-        *blocks,
+    return tables
+
+
+def _budgets(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+    """The quality that each policy reaches in each budget, as texts."""
+    rows = [
+        {
+            "policy": one.policy,
+            "all": f"{one.score.value:.4f}",
+            "95 % interval": _interval(one.score.pair, ".4f"),
+            **{name: f"{_normalised(r, one.policy):.4f}" for name, r in results.items()},
+        }
+        for one in ranking
     ]
-    return {
-        "results.json": write_results(out / "results.json", rows, meta),
-        "report.md": write_atomically(out / "report.md", "\n\n".join(text) + "\n"),
-    }
+    return pd.DataFrame(rows)
+
+
+def _normalised(result: EvaluationResult, policy: str) -> float:
+    gains, span = result.group_gains(policy)
+    return float(gains.mean(axis=0).sum() / span.sum())
+
+
+def _interval(pair: list[float] | None, form: str = ".3f") -> str:
+    return cell({"pair": pair}, f"{{pair:{form}}}", "too few groups")

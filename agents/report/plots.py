@@ -1,4 +1,4 @@
-"""The figures of an evaluation: scores, EV error over time, cost, and paths on contact sheets."""
+"""The pictures of a report: figures of an evaluation, contact sheets, and films of an episode."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from simulator.raw.develop import quarter_turns
 from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
-    from PIL import Image
+
+    from agents.evaluation.intervals import Rank
 
 #: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
@@ -45,36 +47,44 @@ _SHEETS, _QUALITY = 2, 75
 _KINDS = ("photograph", "backlit")
 
 
-def plot_scores(path: Path, rows: Sequence[Mapping[str, Any]], title: str = "") -> Path:
+def plot_scores(
+    path: Path, rows: pd.DataFrame, title: str = "", ranking: Sequence[Rank] = ()
+) -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     Args:
         path: File to write.
         rows: As `result_rows` returns them; those of other conditions are left out.
         title: Text above the figure.
+        ranking: Of all conditions together, a part of its own; none where there is one condition.
     """
-    overall = {r["policy"]: r["normalised_score"] for r in rows if r["condition"] == "all"}
-    names = sorted((n for n in overall if n != "oracle"), key=lambda n: overall[n])
+    parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
+    overall = pd.DataFrame(
+        [(r.policy, r.score.value, r.score.pair, r.score.num_groups) for r in ranking],
+        columns=["policy", "normalised_score", "ci95", "num_groups"],
+    )
+    if len(overall):
+        parts["all conditions"] = overall
+    names = parts["all"].sort_values("normalised_score", kind="stable").policy
+    names = [name for name in names if name != "oracle"]
     figure = _figure(7.5, 1.6 + 0.42 * len(names))
     axes = figure.add_subplot()
-    shown = [part for part in _PARTS if any(r["condition"] == part for r in rows)]
+    shown = [part for part in _PARTS if part in parts]
     for part in shown:
         colour, marker, offset = _PARTS[part]
-        own = {r["policy"]: r for r in rows if r["condition"] == part}
-        heights = {n: i + (offset if len(shown) > 1 else 0.0) for i, n in enumerate(names)}
-        groups = next(iter(own.values()))["num_groups"]
-        for name in names:
-            if name in own and own[name]["ci95"] is not None:
-                interval = own[name]["ci95"]
-                axes.plot(interval, [heights[name]] * 2, color=colour, lw=1.6, alpha=0.6)
+        own = parts[part][parts[part].policy.isin(names)]
+        heights = [names.index(name) + offset * (len(shown) > 1) for name in own.policy]
+        for interval, height in zip(own.ci95, heights, strict=True):
+            if interval is not None:
+                axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
         axes.plot(
-            [own[name]["normalised_score"] for name in names if name in own],
-            [heights[name] for name in names if name in own],
+            own.normalised_score,
+            heights,
             color=colour,
             marker=marker,
             linestyle="none",
             markersize=6,
-            label=f"{part} ({groups} groups)",
+            label=f"{part} ({parts[part].num_groups.iloc[0]} groups)",
         )
     axes.axvline(1.0, color="0.35", lw=1.0)
     axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
@@ -269,11 +279,9 @@ def _text(name: str) -> str:
 
 
 def _write(path: Path, figure: Figure) -> Path:
-    from PIL.Image import open as opened
-
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
-    return write_palette_png(path, opened(stream))
+    return write_palette_png(path, Image.open(stream))
 
 
 def write_palette_png(path: Path, picture: Image.Image) -> Path:
@@ -286,10 +294,8 @@ def write_palette_png(path: Path, picture: Image.Image) -> Path:
     Returns:
         `path`.
     """
-    from PIL.Image import Dither
-
     stream = io.BytesIO()
-    indexed = picture.convert("RGB").quantize(256, dither=Dither.NONE)
+    indexed = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     indexed.save(stream, format="PNG", optimize=True)
     return write_atomically(path, stream.getvalue())
 
