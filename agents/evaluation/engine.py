@@ -477,7 +477,7 @@ def run_batch(
     batch: EpisodeBatch,
     frames: int,
     *,
-    oracle: NDArray[np.int64] | None = None,
+    oracle: Ints | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Run one policy over one batch of episodes.
 
@@ -507,9 +507,8 @@ def run_batch(
     for frame in range(frames):
         extra: dict[str, Any] = {}
         if getattr(policy, "privileged", False):
-            extra = {
-                "info": info if oracle is None else {**info, **_oracle_info(base, oracle, frame)}
-            }
+            known = {} if oracle is None else _oracle_info(base, oracle, frame)
+            extra = {"info": {**info, **known}}
         begin = time.perf_counter()
         with errors_of(name, "act"):
             actions = policy.act(observations, masks, **extra)
@@ -535,8 +534,8 @@ def run_batch(
     }
 
 
-def _oracle_info(base: Any, oracle: NDArray[np.int64], frame: int) -> dict[str, NDArray[np.int64]]:
-    """Entries of `info` for oracles: the best states of `frame`, and of the frame they decide on."""
+def _oracle_info(base: Any, oracle: Ints, frame: int) -> dict[str, Ints]:
+    """Entries of `info` for oracles: best states of `frame`, and of the one they decide on."""
     last = oracle.shape[1] - 1
     decided = (oracle[:, min(frame + 1 + delay, last)] for delay in base.delays)
     return {"oracle_state": oracle[:, frame], "clairvoyant_state": base.grid.mixed(*decided)}
@@ -547,7 +546,7 @@ def milliseconds_alone(
     policy: Policy,
     envs: VectorEnv,
     episodes: Episodes,
-    oracle: NDArray[np.int64] | None = None,
+    oracle: Ints | None = None,
 ) -> float:
     """Median time in `act` for one camera alone [ms].
 

@@ -109,7 +109,7 @@ class EvaluationPlan(Configuration):
     delays: tuple[int, ...] = (0,)
     starts: tuple[str, ...] = ("dark", "middle", "bright")
     frames: int = Field(default=24, ge=1, le=MAX_FRAMES)
-    budgets: tuple[float, ...] = ()
+    budgets: tuple[float, ...] | None = Field(default=None, min_length=1)
     max_frames: int = Field(default=3, ge=1, le=4)
     seeds: tuple[int, ...] = (0,)
     policies: tuple[str, ...] = ()
@@ -123,26 +123,26 @@ class EvaluationPlan(Configuration):
         *("scene_ids", "delays", "starts", "budgets", "seeds", "policies", "other_scorers")
     )
     @classmethod
-    def _no_repeats(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
-        if len(set(values)) < len(values):
+    def _no_repeats(cls, values: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        if values is not None and len(set(values)) < len(values):
             raise ValueError(f"must not have an entry twice: {list(values)}")
         return values
 
     @model_validator(mode="after")
     def _check(self) -> EvaluationPlan:
-        given = self.model_fields_set
-        for entry in ("starts", "seeds", "conditions", "delays", *({"budgets"} & given)):
+        for entry in ("starts", "seeds", "conditions", "delays"):
             if not getattr(self, entry):
                 raise ValueError(f"`{entry}` must have one entry or more")
         for entry in self._unused:
-            if entry in given:
+            field = type(self).model_fields[entry]
+            if getattr(self, entry) != field.get_default(call_default_factory=True):
                 also = "no `budgets`" if entry == "max_frames" else "`budgets`"
                 raise ValueError(f"`{entry}` must not be given in a plan that has {also}")
         for start in self.starts:
             check_word("starts", start, STARTS)
         for seed in self.seeds:
             check_integer("seeds", seed, 0, MAX_SEED)
-        for budget in self.budgets:
+        for budget in self.budgets or ():
             check_number("budgets", budget, 1e-5, 3600.0, more=" s")
         for name, condition in self.conditions.items():
             if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:

@@ -132,7 +132,8 @@ def to_markdown(
         missing: Text of a cell a value of which is missing, None or NaN. Columns without any other
             cell are left out where it is empty.
 
-    >>> print(to_markdown([{"a": "x|y", "b": [1, 2]}, {"a": "z", "b": None}], {"A": "{a}", "B": "{b:.1f}"}))
+    >>> rows = [{"a": "x|y", "b": [1, 2]}, {"a": "z", "b": None}]
+    >>> print(to_markdown(rows, {"A": "{a}", "B": "{b:.1f}"}))
     | A    |          B |
     |:-----|-----------:|
     | x\\|y | 1.0 to 2.0 |
@@ -291,9 +292,9 @@ def write_report(
         "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
         "metrics.csv": _write_csv(folder / "metrics.csv", _metrics(rows)),
     }
-    overall = ranking if len(results) > 1 else ()
+    shown = pd.concat([rows, _overall_rows(ranking)]) if len(results) > 1 else rows
     pictures = {
-        "scores.png": plot_scores(folder / "scores.png", rows, title, overall),
+        "scores.png": plot_scores(folder / "scores.png", shown, title),
         "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
     }
     costs = {n: t.ms_alone for n, t in result.tracks.items() if t.ms_alone}
@@ -319,9 +320,8 @@ def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
 
 def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
     """Writes rows as CSV, numbers with six digits."""
-    return write_atomically(
-        path, rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    )
+    text = rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return write_atomically(path, text)
 
 
 def _metrics(rows: pd.DataFrame) -> pd.DataFrame:
@@ -330,6 +330,13 @@ def _metrics(rows: pd.DataFrame) -> pd.DataFrame:
     plain = rows[[name for name in ROW_COLUMNS if name != "ci95"]]
     ends = pd.DataFrame(pairs, columns=["ci95_low", "ci95_high"])
     return pd.concat([plain, ends, rows[list(MORE_COLUMNS)]], axis=1)
+
+
+def _overall_rows(ranking: Sequence[Rank]) -> pd.DataFrame:
+    """Rows of all conditions together, for the plot of the scores."""
+    rows = [(r.policy, r.score.value, r.score.pair, r.score.num_groups) for r in ranking]
+    columns = ["policy", "normalised_score", "ci95", "num_groups"]
+    return pd.DataFrame(rows, columns=columns).assign(condition="all conditions")
 
 
 def _meta(
@@ -506,9 +513,7 @@ class _Report:
     def _cost(self) -> list[str]:
         columns: dict[str, Cell] = {
             "policy": "{policy}",
-            "normalised": lambda row: cell(
-                {"score": self.scores.get(row["policy"])}, "{score:.3f}"
-            ),
+            "normalised": "{score:.3f}",
             "ms, in batches": "{ms_per_decision:.3f}",
             "ms, one camera alone": "{ms_alone:.3f}",
             "captures": "{captures_per_decision:g}",
@@ -516,6 +521,7 @@ class _Report:
         picture = ["![Score against time](cost.png)"] if "cost.png" in self.pictures else []
         text = "Time in `act` per decision. The plot shows that of one camera alone."
         own = self.by[self.by.condition == self.static]
+        own = own.assign(score=own.policy.map(self.scores))
         return ["## Score against time", text, *picture, to_markdown(own, columns)]
 
     def _clipping(self) -> list[str]:
@@ -606,15 +612,10 @@ def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
         "exposure_time": format_exposure_time,
         "f_number": lambda v: f"f/{v:g}",
     }
-    rows = [
-        {
-            "control": name.replace("_", " "),
-            "share": ", ".join(
-                f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()
-            ),
-        }
-        for name, own in histogram.items()
-    ]
+    rows = []
+    for name, own in histogram.items():
+        shares = [f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()]
+        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
     return to_markdown(rows, {"control": "{control}", "share": "{share}"})
 
 
@@ -671,9 +672,8 @@ def summary(
     if len(groups) < MIN_GROUPS:
         for first in range(0, len(groups), _GROUPS_ABREAST):
             own = groups.iloc[first : first + _GROUPS_ABREAST].map("{:.3f}".format).T
-            tables.append(
-                ("mean score of every source group", own.rename_axis("policy").reset_index())
-            )
+            own = own.rename_axis("policy").reset_index()
+            tables.append(("mean score of every source group", own))
     return tables
 
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from agents.evaluation.intervals import Rank
-
 #: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
 _DASHES = ("-", "--", ":", "-.")
@@ -47,24 +45,16 @@ _SHEETS, _QUALITY = 2, 75
 _KINDS = ("photograph", "backlit")
 
 
-def plot_scores(
-    path: Path, rows: pd.DataFrame, title: str = "", ranking: Sequence[Rank] = ()
-) -> Path:
+def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     Args:
         path: File to write.
-        rows: As `result_rows` returns them; those of other conditions are left out.
+        rows: As `result_rows` returns them, and those of ``"all conditions"``, where there are
+            several; those of a single other condition are left out.
         title: Text above the figure.
-        ranking: Of all conditions together, a part of its own; none where there is one condition.
     """
     parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
-    overall = pd.DataFrame(
-        [(r.policy, r.score.value, r.score.pair, r.score.num_groups) for r in ranking],
-        columns=["policy", "normalised_score", "ci95", "num_groups"],
-    )
-    if len(overall):
-        parts["all conditions"] = overall
     names = parts["all"].sort_values("normalised_score", kind="stable").policy
     names = [name for name in names if name != "oracle"]
     figure = _figure(7.5, 1.6 + 0.42 * len(names))

@@ -25,7 +25,7 @@ def result(tmp_path_factory):
 
 def test_means_are_over_frames_then_groups(result):
     table = result.other_scores
-    assert table == other_scores(result, PLAN)  # those of the run are these
+    assert table == other_scores(result)  # those of the run are these
     assert list(table) == ["brightness", "sharpness"]
     # By hand: two scenes of the three, each a group of its own.
     tables = ScoreTables(result.grid, PLAN.options().make_camera(), make_scorer("brightness"))
