@@ -386,7 +386,8 @@ def bracket_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
 
     rows = []
     for result in results.values():
-        assert result.plan is not None and result.plan.budgets is not None
+        assert result.plan is not None
+        assert result.plan.budgets is not None
         names = [one.policy for one in ranking]
         best = result.group_gains(names[0])[0]
         for policy in names:

@@ -82,7 +82,8 @@ def test_a_second_run_does_only_what_is_missing(results, folder, tmp_path, monke
     real = engine.run_batch
 
     def counted(*args, **kwargs):
-        ran.append(args)
+        if args[4] == PLAN.frames:  # not the timing of one camera
+            ran.append(args)
         return real(*args, **kwargs)
 
     monkeypatch.setattr(engine, "run_batch", counted)
