@@ -13,9 +13,9 @@ _EXPORTS = {
     "PolicyContext": "policy",
     "evaluate": "evaluation.engine",
     "fit_policies": "evaluation.engine",
-    "list_policies": "policy",
+    "list_policies": "policy_names",
     "load_plan": "evaluation.plan",
-    "make_policy": "policy",
+    "make_policy": "policy_names",
     "result_rows": "evaluation.result",
     "run_plan": "evaluation.jobs",
     "write_report": "report.evaluation",
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from agents.metering.metering_policy import MeteringPolicy as MeteringPolicy
     from agents.policy import Policy as Policy
     from agents.policy import PolicyContext as PolicyContext
-    from agents.policy import list_policies as list_policies
-    from agents.policy import make_policy as make_policy
+    from agents.policy_names import list_policies as list_policies
+    from agents.policy_names import make_policy as make_policy
     from agents.report.evaluation import write_report as write_report
 
 

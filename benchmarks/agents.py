@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from agents.cli.console import print_files, progress_bars
-from agents.episodes import make_envs
 from agents.evaluation.engine import evaluate, fit_policies
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
-from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
+from agents.policy import PolicyContext
+from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
 from agents.report.evaluation import write_report
+from agents.rollouts import make_envs
 from benchmarks.isolated import ROOT
 
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}

@@ -33,10 +33,11 @@ def record(
     import gymnasium as gym
 
     from ae_env.utils.presets import load_preset
-    from agents.episodes import fitting_arguments
     from agents.evaluation.engine import fit_policies
-    from agents.policy import PolicyContext, make_policy
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy
     from agents.recording import check_dataset_id, record_dataset
+    from agents.rollouts import fitting_arguments
     from simulator.utils.checks import check_word
 
     check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))

@@ -59,13 +59,13 @@ def _use_rest() -> None:
     import numpy as np
     import torch
 
-    from ae_env.scenes.procedural import draw
     from agents.cli.view import DEFAULT_SCENES
     from agents.viewer.library import find_scenes
     from agents.viewer.viewed_scene import View, ViewedScene
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
     from simulator.optics.blur import disc_blur, motion_blur
     from simulator.optics.blur_kernels import Blur, blur_many
+    from simulator.radiance.procedural import draw
 
     library = find_scenes(DEFAULT_SCENES)
     viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))

@@ -19,16 +19,6 @@ from numpy.typing import NDArray
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE, ScoreTables
 from agents.bracketing.policies import run_brackets
-from agents.episodes import (
-    EpisodeBatch,
-    Episodes,
-    action_masks,
-    checked_states,
-    errors_of,
-    expected_scores,
-    fitting_arguments,
-    make_envs,
-)
 from agents.evaluation.plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
@@ -42,7 +32,18 @@ from agents.evaluation.plan import (
 )
 from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
 from agents.metering.reading import linear_signal, signal_codes
-from agents.policy import Policy, PolicyContext, make_policy, training_seeds
+from agents.policy import Policy, PolicyContext
+from agents.policy_names import make_policy, training_seeds
+from agents.rollouts import (
+    EpisodeBatch,
+    RolloutPlan,
+    action_masks,
+    checked_states,
+    errors_of,
+    expected_scores,
+    fitting_arguments,
+    make_envs,
+)
 from simulator.utils.checks import check_integer, check_number
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ Progress = Callable[[int, int, str], None]
 #: Called with frames done since the last call.
 Report = Callable[[float], None]
 
-#: Episodes at a time, at most; of brackets.
+#: RolloutPlan at a time, at most; of brackets.
 BATCH, BRACKET_BATCH = 64, 32
 #: Frames in which the time of one camera's decision is measured, the first ones to warm up.
 TIMED_FRAMES, _WARM_UP = 28, 4
@@ -84,11 +85,11 @@ def evaluate(
         policies: By name in the tables; a list holds the same agent from several training seeds.
         env_options: Arguments of ``ae_env/AutoExposure-v0``, such as
             ``{"scenes": "bundled", "split": "test", "resolution": 64}``.
-        episodes_per_scene: Episodes of each scene, each with its own start, motion and defocus:
+        episodes_per_scene: RolloutPlan of each scene, each with its own start, motion and defocus:
             those of the seeds `seed`, `seed` + 1 and so on.
         frames: Actions per episode.
         seed: Decides the episodes.
-        batch: Episodes at a time, at most.
+        batch: RolloutPlan at a time, at most.
         other_scorers: Names of scorers that no policy was trained on; states that were chosen in
             some of the scenes are also rated by these.
         progress: Called with frames done, frames in all, and the name of the policy.
@@ -180,7 +181,7 @@ class EvaluationRun:
         plan: The plan.
         scenes: Those of the plan; loaded by default.
         device: Torch device of a learnt agent's network.
-        batch: Episodes of frames at a time, at most.
+        batch: RolloutPlan of frames at a time, at most.
     """
 
     def __init__(
@@ -234,7 +235,7 @@ class EvaluationRun:
 
         Args:
             condition: Light and delay, or budget.
-            num_envs: Episodes at a time.
+            num_envs: RolloutPlan at a time.
             frames: Actions that an episode must allow.
             scored: Whether they have the plan's scorer: policies see environments without.
         """
@@ -274,7 +275,7 @@ class EvaluationRun:
             ``defocus`` (J,) and ``movement`` (J, 4) that the episodes drew.
         """
         count, frames, own = self.num_tables, self.plan.frames, self.episodes
-        episodes = Episodes(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
+        episodes = RolloutPlan(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
         envs = self._make_envs(condition, batch_size(count, self.batch), frames, scored=True)
         base: Any = envs.unwrapped
         scores, allowed, drawn = [], [], []
@@ -438,7 +439,7 @@ def fit_policies(
         policies: By name; changed in place.
         env_options: Arguments of the environment; `split` is set to ``"train"``.
         seed: Decides the training episodes.
-        batch: Episodes at a time.
+        batch: RolloutPlan at a time.
         progress: Called before and after each fit.
         training: Environments to use, see `training_envs`, which stay open; by default new ones.
     """
@@ -545,7 +546,7 @@ def milliseconds_alone(
     name: str,
     policy: Policy,
     envs: VectorEnv,
-    episodes: Episodes,
+    episodes: RolloutPlan,
     oracle: Ints | None = None,
 ) -> float:
     """Median time in `act` for one camera alone [ms].

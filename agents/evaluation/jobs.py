@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import threading
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -31,8 +29,8 @@ from agents.evaluation.engine import (
 )
 from agents.evaluation.plan import Condition, EvaluationPlan
 from agents.evaluation.result import EvaluationResult, Track
-from agents.learning.training import check_stop, core_count, run_in_parallel, tell
-from agents.policy import (
+from agents.learning.workers import core_count, run_in_parallel, send_progress
+from agents.policy_names import (
     FORECASTERS,
     LEARNT,
     split_class,
@@ -315,19 +313,8 @@ def _work(task: tuple[EvaluationPlan, Path, str, Job]) -> None:
     global _worker_jobs
     plan, folder, device, job = task
     if _worker_jobs is None:
-        threading.Thread(target=_end_when_stopped, daemon=True).start()
         _worker_jobs = Jobs(plan, folder, device=device)
-    _worker_jobs.do(job, partial(tell, job))
-
-
-def _end_when_stopped() -> None:
-    """Ends a worker soon after Ctrl-C, in the middle of a fit too: parts are written whole."""
-    while True:
-        time.sleep(0.5)
-        try:
-            check_stop()
-        except KeyboardInterrupt:
-            os._exit(1)
+    _worker_jobs.do(job, partial(send_progress, job))
 
 
 # -- what a part depends on -----------------------------------------------------------------------

@@ -18,7 +18,7 @@ from agents.evaluation.intervals import (
     rank,
     score_interval,
 )
-from agents.policy import is_metering
+from agents.policy_names import is_metering
 from simulator.optics.motion_path import Movement
 
 if TYPE_CHECKING:

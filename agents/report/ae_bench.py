@@ -17,7 +17,7 @@ from ae_env.scenes.polyhaven import list_assets
 from agents.evaluation.intervals import Rank
 from agents.evaluation.plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
-from agents.policy import split_class, split_options
+from agents.policy_names import split_class, split_options
 from agents.report.evaluation import Cell, to_markdown
 from simulator.utils.files import write_atomically
 from simulator.utils.results import machine, versions

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from agents.episodes import errors_of
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
 from agents.policy import Policy
+from agents.rollouts import errors_of
 from simulator import RawImage
 from simulator.raw.develop import quarter_turns
 from simulator.utils.files import write_atomically

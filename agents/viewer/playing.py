@@ -12,7 +12,8 @@ import ae_env  # noqa: F401  (registers the environments)
 from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.scenes import Scene
 from agents.evaluation.engine import fit_policies
-from agents.policy import Policy, PolicyContext, make_policy
+from agents.policy import Policy, PolicyContext
+from agents.policy_names import make_policy
 from agents.report.plots import Recording, record
 
 #: Kinds of moving light, and light that stays.
