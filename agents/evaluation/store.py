@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.evaluation.evaluation_plan import digest
+from agents.evaluation.plan import digest
 from agents.policy_names import (
     FORECASTERS,
     LEARNT,

@@ -19,10 +19,6 @@ from agents.evaluation.plan import EvaluationPlan, digest, load_plan
 from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
 from agents.report.evaluation import Cell, to_markdown
-from simulator.utils.files import write_atomically
-from simulator.utils.results import machine, versions
-from agents.report.markdown import escape, markdown_table
-from agents.report.result_table import Results
 from simulator.utils.files import machine, versions, write_atomically
 
 if TYPE_CHECKING:

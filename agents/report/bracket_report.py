@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agents.evaluation.bracket_plan import MEASURES, BracketPlan, BracketResult
-from agents.report.markdown import code_block, escape, markdown_table
+from agents.evaluation.plan import MEASURES, BracketPlan, BracketResult
+from agents.report.evaluation import code_block, escape, markdown_table
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 #: Headings of the measures of a budget.

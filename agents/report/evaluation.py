@@ -37,8 +37,7 @@ from agents.evaluation.result import (
 )
 from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
 from simulator.settings import format_exposure_time
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_atomically, write_results
 
 #: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function of
 #: it that returns Markdown, or None.

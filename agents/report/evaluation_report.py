@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from agents.evaluation.evaluation_plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
 from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
-from agents.evaluation.result import EvaluationResult
-from agents.report.markdown import cell, code, code_block, escape, html_report, markdown_table
-from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
-from agents.report.result_table import (
+from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
+from agents.evaluation.result import (
+    EvaluationResult,
     Results,
     Rows,
     as_results,
@@ -31,6 +29,8 @@ from agents.report.result_table import (
     static_condition,
     training_seed_rows,
 )
+from agents.report.evaluation import cell, code, code_block, escape, html_report, markdown_table
+from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
 from simulator.settings import format_exposure_time
 from simulator.utils.files import result_meta, write_atomically, write_results
 
