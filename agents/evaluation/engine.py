@@ -57,7 +57,7 @@ Progress = Callable[[int, int, str], None]
 #: Called with frames done since the last call.
 Report = Callable[[float], None]
 
-#: RolloutPlan at a time, at most; of brackets.
+#: Episodes at a time, at most; of brackets.
 BATCH, BRACKET_BATCH = 64, 32
 #: Frames in which the time of one camera's decision is measured, the first ones to warm up.
 TIMED_FRAMES, _WARM_UP = 28, 4
@@ -85,11 +85,11 @@ def evaluate(
         policies: By name in the tables; a list holds the same agent from several training seeds.
         env_options: Arguments of ``ae_env/AutoExposure-v0``, such as
             ``{"scenes": "bundled", "split": "test", "resolution": 64}``.
-        episodes_per_scene: RolloutPlan of each scene, each with its own start, motion and defocus:
+        episodes_per_scene: Episodes of each scene, each with its own start, motion and defocus:
             those of the seeds `seed`, `seed` + 1 and so on.
         frames: Actions per episode.
         seed: Decides the episodes.
-        batch: RolloutPlan at a time, at most.
+        batch: Episodes at a time, at most.
         other_scorers: Names of scorers that no policy was trained on; states that were chosen in
             some of the scenes are also rated by these.
         progress: Called with frames done, frames in all, and the name of the policy.
@@ -181,7 +181,7 @@ class EvaluationRun:
         plan: The plan.
         scenes: Those of the plan; loaded by default.
         device: Torch device of a learnt agent's network.
-        batch: RolloutPlan of frames at a time, at most.
+        batch: Episodes of frames at a time, at most.
     """
 
     def __init__(
@@ -235,7 +235,7 @@ class EvaluationRun:
 
         Args:
             condition: Light and delay, or budget.
-            num_envs: RolloutPlan at a time.
+            num_envs: Episodes at a time.
             frames: Actions that an episode must allow.
             scored: Whether they have the plan's scorer: policies see environments without.
         """
@@ -439,7 +439,7 @@ def fit_policies(
         policies: By name; changed in place.
         env_options: Arguments of the environment; `split` is set to ``"train"``.
         seed: Decides the training episodes.
-        batch: RolloutPlan at a time.
+        batch: Episodes at a time.
         progress: Called before and after each fit.
         training: Environments to use, see `training_envs`, which stay open; by default new ones.
     """
