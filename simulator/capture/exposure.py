@@ -20,7 +20,7 @@ from simulator.capture.statistics import DenoisedLight, LightStatistics, Residua
 from simulator.noise.noise_level_function import NoiseLevelFunction, top_up_table
 from simulator.optics.blur import kernel_energy
 from simulator.optics.motion_path import Path
-from simulator.raw.highlights import ABOVE_WHITE
+from simulator.raw.develop import ABOVE_WHITE
 
 #: Signals beyond this many times sensor white are clipped early: they end at white in any case,
 #: and an infinite variance times a zero draw would be NaN.
