@@ -31,9 +31,8 @@ from ae_env.observation import (
     frame_statistics,
 )
 from ae_env.options import COSTS, EnvOptions
-from ae_env.scenes.drawn import DrawnScenes
 from ae_env.scenes.folder import sequence_bounds
-from ae_env.scenes.scene import Scene
+from ae_env.scenes.scene import Scene, SceneSet
 from ae_env.scorers.score_table import ScoreTable, ScoreTables, in_episode, prepare_scene
 from simulator.capture.batch import CaptureBatch
 from simulator.capture.prepared_scene import PreparedScene
@@ -99,7 +98,7 @@ class EpisodeCore:
         self.camera = options.make_camera()
         self.scorer = options.make_scorer()
         self.lighting = options.make_lighting()
-        self.scenes = options.scenes_on_demand() if scenes is None else scenes
+        self.scenes = options.scenes_on_demand() if scenes is None else SceneSet.of(scenes)
         self.tables = ScoreTables(
             self.grid,
             self.camera,
@@ -183,8 +182,7 @@ class EpisodeCore:
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
         apertures = len(self.grid.f_numbers)
-        # Drawn scenes are alike in what they have: the others need not be there yet.
-        scenes = self.scenes[:1] if isinstance(self.scenes, DrawnScenes) else self.scenes
+        scenes = [self.scenes[index] for index in self.scenes.loaded]
         if any(scene.layout is not None for scene in scenes):  # what their discs make of it
             apertures += len(DIAMETERS)
         if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ae_env.scenes.drawn import DrawnScenes
-from ae_env.scenes.scene import Scene
+from ae_env.scenes.scene import Scene, SceneSet
 
 
 class SceneFacts:
@@ -32,25 +31,21 @@ class SceneFacts:
         ValueError: If a scene was made for another number of states.
     """
 
-    def __init__(self, scenes: Sequence[Scene], num_states: int) -> None:
+    def __init__(self, scenes: SceneSet, num_states: int) -> None:
         self._scenes, count = scenes, len(scenes)
         self.allowed = np.ones((count, num_states), bool)
         self.median_speed, self.own_blur = np.zeros((2, count))
         self.has_subject, self.has_map, self._known = np.zeros((3, count), bool)
         self.box_factor = np.ones(count, np.int64)
-        if isinstance(scenes, DrawnScenes):
-            self.scene_ids, self._all_known = scenes.scene_ids, False
-        else:
-            self.scene_ids, self._all_known = tuple(scene.scene_id for scene in scenes), True
-            self._fill(range(count))
+        self.scene_ids, self._all_known = scenes.scene_ids, False
+        self._fill(scenes.loaded)
 
     def look_at(self, indices: np.ndarray) -> None:
         """Makes the facts about the scenes `indices` known: they are about to be shown."""
         if self._all_known or self._known[indices].all():
             return
         new = np.unique(indices[~self._known[indices]]).tolist()
-        if isinstance(self._scenes, DrawnScenes):
-            self._scenes.draw(new)
+        self._scenes.load(new)
         self._fill(new)
         self._all_known = bool(self._known.all())
 

@@ -23,9 +23,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ae_env.scenes.bundled import add_layout
+from ae_env.scenes.bundled import add_layout, cached_scenes
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
-from ae_env.scenes.stored import cached_scenes
 from ae_env.utils.presets import find_preset
 from simulator.camera import CameraProfile
 from simulator.radiance.maps import native_size, perspective, read_radiance

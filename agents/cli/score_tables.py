@@ -46,7 +46,7 @@ def score_tables(
     Example: `ae-env score-tables path/to/raws -o tables`
     """
     from ae_env.grid import ExposureGrid
-    from ae_env.scenes.loading import check_weights
+    from ae_env.scenes.load import check_weights
     from ae_env.scorers import make_scorer
     from agents.score_shards import ShardPlan, check_engine, run
     from simulator import get_camera

@@ -12,7 +12,7 @@ import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.loading import SceneNetworks
+from ae_env.scenes.load import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
 from simulator import CameraSettings, get_camera
@@ -269,7 +269,7 @@ def test_every_source_of_scenes_is_seen_at_its_finest(
     write_hdr(tmp_path / "map.hdr", height=96, width=100)
     bundled = [point_scene(256)]
     monkeypatch.setattr(
-        "ae_env.scenes.loading.bundled_scenes",
+        "ae_env.scenes.load.bundled_scenes",
         lambda split, camera, resolution, **size: bundled if resolution is None else [],
     )
     seen = []
