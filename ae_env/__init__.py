@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from ae_env.scorers import register_scorer as register_scorer
     from ae_env.scorers.score_table import ScoreTable as ScoreTable
     from ae_env.scorers.score_table import ScoreTables as ScoreTables
-    from ae_env.utils.presets import list_presets as list_presets
-    from ae_env.utils.presets import load_preset as load_preset
-    from ae_env.utils.user_code import UserCodeError as UserCodeError
+    from ae_env.utils.user_files import UserCodeError as UserCodeError
+    from ae_env.utils.user_files import list_presets as list_presets
+    from ae_env.utils.user_files import load_preset as load_preset
     from ae_env.vector_env import AutoExposureVectorEnv as AutoExposureVectorEnv
     from ae_env.video import AutoExposureVideoEnv as AutoExposureVideoEnv
     from ae_env.video import AutoExposureVideoVectorEnv as AutoExposureVideoVectorEnv
@@ -73,8 +73,7 @@ _NAMES_BY_MODULE = {
     "scenes": "Scene load_scenes",
     "scorers": "Captures CompositeScorer Scorer list_scorers make_scorer register_scorer",
     "scorers.score_table": "ScoreTable ScoreTables",
-    "utils.user_code": "UserCodeError",
-    "utils.presets": "list_presets load_preset",
+    "utils.user_files": "UserCodeError list_presets load_preset",
     "vector_env": "AutoExposureVectorEnv",
     "video": "AutoExposureVideoEnv AutoExposureVideoVectorEnv",
     "wrappers": (

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ae_env.utils.user_code import find_attribute, load_from_file
+from ae_env.utils.user_files import find_attribute, load_from_file
 from simulator.utils.checks import did_you_mean
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
 from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
 from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest, SceneSet, Split
-from ae_env.utils.user_code import load_attribute
+from ae_env.utils.user_files import load_attribute
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import CameraSimulator
 from simulator.networks.aperture_module import DEAD_ZONE

@@ -25,7 +25,7 @@ from pydantic import Field
 
 from ae_env.scenes.bundled import add_layout, cached_scenes
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
-from ae_env.utils.presets import find_preset
+from ae_env.utils.user_files import find_preset
 from simulator.camera import CameraProfile
 from simulator.radiance.maps import native_size, perspective, read_radiance
 from simulator.utils.cache import cache_dir, cache_key

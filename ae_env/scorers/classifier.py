@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.model_files import find_model_file
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError, find_model_file
 from simulator.utils.checks import check_integer
 
 #: Environment variable that names the ONNX file.

@@ -15,7 +15,7 @@ import torch
 
 from ae_env.scorers.protocol import Captures, ColourMatrix, DependsOn, Domain, Scorer
 from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop
 
 logger = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from torch.nn import functional
 from torch.nn.utils import fuse_conv_bn_eval
 
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.model_files import find_model_file
+from ae_env.utils.user_files import find_model_file
 from simulator.utils.files import as_path, write_atomically
 
 # -- the network: MobileNet v1 with ten ratings as its output -------------------------------------

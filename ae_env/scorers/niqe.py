@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from ae_env.scorers.luma import luma_of
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.model_files import find_model_file
+from ae_env.utils.user_files import find_model_file
 from simulator.utils.files import as_path, write_atomically
 
 # -- statistics of natural pictures ---------------------------------------------------------------

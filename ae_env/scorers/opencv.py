@@ -15,7 +15,7 @@ import torch
 from ae_env.scorers.fidelity import distinct_references, reference_pictures
 from ae_env.scorers.luma import luma_of
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.model_files import find_model_file
+from ae_env.utils.user_files import find_model_file
 
 
 def opencv() -> Any:

@@ -53,7 +53,7 @@ from ae_env.scorers.niqe import Niqe
 from ae_env.scorers.opencv import Brisque, Keypoints, Matches
 from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
 from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
-from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
+from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
 ENTRY_POINT_GROUP = "ae_env.scorers"

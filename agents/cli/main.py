@@ -14,7 +14,7 @@ from rich.logging import RichHandler
 from rich.markup import escape
 
 from ae_env import __version__
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from agents.cli.bench import bench
 from agents.cli.cache_command import cache
 from agents.cli.console import print_line

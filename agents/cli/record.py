@@ -32,7 +32,7 @@ def record(
     """
     import gymnasium as gym
 
-    from ae_env.utils.presets import load_preset
+    from ae_env.utils.user_files import load_preset
     from agents.episodes import fitting_arguments
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext, make_policy

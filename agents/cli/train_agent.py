@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ae_env.utils.presets import find_config
+from ae_env.utils.user_files import find_config
 from agents.cli.console import (
     Device,
     OwnSeed,

@@ -138,7 +138,7 @@ def load_bench_plan(name: str | Path) -> EvaluationPlan | BracketPlan:
     Raises:
         ValueError: As `load_plan`.
     """
-    from ae_env.utils.presets import find_preset
+    from ae_env.utils.user_files import find_preset
 
     path = find_preset(str(name), "evaluation")
     content = read_yaml(path)

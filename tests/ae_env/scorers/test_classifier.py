@@ -11,7 +11,7 @@ import torch
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.classifier import Classifier
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from tests.ae_env.recorded_files import GRID, write_raws
 
 onnx = pytest.importorskip("onnx")
