@@ -22,7 +22,6 @@ from agents.cli.evaluate import evaluate
 from agents.cli.export import export
 from agents.cli.film import film
 from agents.cli.hdr import hdr
-from agents.cli.import_weights import import_weights
 from agents.cli.quickstart import quickstart
 from agents.cli.record import record
 from agents.cli.refocus import refocus
@@ -45,7 +44,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(import_weights, view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
+    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
