@@ -9,9 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.utils.user_files import find_attribute, load_from_file
-from simulator.utils.checks import did_you_mean
-
 if TYPE_CHECKING:
     import gymnasium as gym
 

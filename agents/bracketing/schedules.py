@@ -17,8 +17,6 @@ from scipy.special import ndtri
 from ae_env.episodes.bracket_core import FRAME_GAP
 from ae_env.grid import ExposureGrid
 from ae_env.merging import SATURATED, WORST_EV
-from ae_env.scenes import Scene
-from ae_env.utils.merging import SATURATED, WORST_EV
 from simulator.camera import CameraProfile
 
 Floats = NDArray[np.float64]

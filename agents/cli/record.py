@@ -33,8 +33,6 @@ def record(
     import gymnasium as gym
 
     from ae_env.utils.user_files import load_preset
-    from agents.episodes import fitting_arguments
-    from ae_env.utils.presets import load_preset
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
