@@ -430,7 +430,8 @@ def _checked(scene: Scene) -> Scene:
     for name, kind in types.items():
         found = getattr(scene, name)
         if not isinstance(found, kind):
-            raise ValueError(f"`{name}` (={found!r}) must be a {kind}")
+            shown = found if isinstance(found, str) else type(found).__name__
+            raise ValueError(f"`{name}` (={shown!r}) must be a {getattr(kind, '__name__', kind)}")
     if scene.illuminance is not None:
         check_number("illuminance", scene.illuminance, 1e-300, 1e300, more=" lux")
     gains = tuple(float(gain) for gain in scene.white_balance)
@@ -447,8 +448,8 @@ def _checked(scene: Scene) -> Scene:
     maps["denoised"] = None if denoised is None else denoised[0]
     for name, found in maps.items():
         if found is not None and found.shape != size:
-            shape = tuple(found.shape)
-            raise ValueError(f"`{name}` (shape {shape}) must have the size of `light`, {size}")
+            shapes = f"{tuple(found.shape)} must be that of `light`, {tuple(size)}"
+            raise ValueError(f"`{name}`: height and width {shapes}")
     if mask is not None and mask.dtype != torch.bool:
         raise ValueError(f"`saturated` (dtype {mask.dtype}) must be bool")
     if blur is not None and not bool((torch.isfinite(blur) & (blur >= 0)).all()):
