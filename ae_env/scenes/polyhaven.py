@@ -71,7 +71,7 @@ _CELL = 4
 #: Luminance of linear sRGB.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Raised when the views change.
-_VERSION = 5
+_VERSION = 6
 
 
 class Asset(Configuration):
