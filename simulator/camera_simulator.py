@@ -32,7 +32,7 @@ from simulator.noise.generator import Noise, check_noise
 from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
-from simulator.utils.processor import check_bfloat16
+from simulator.utils.compute import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 
 #: Depth of a scene: it is far or in focus throughout, or it is not known.

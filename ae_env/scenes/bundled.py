@@ -31,8 +31,7 @@ from simulator.radiance.procedural import (
 )
 from simulator.settings import CameraSettings
 from simulator.utils.cache import cache_key, disk_cache
-from simulator.utils.progress import Progress
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import parallel_ranges, progress_bar
 
 logger = logging.getLogger(__name__)
 
@@ -158,16 +157,16 @@ class DrawnScenes(SceneSet):
         many = len(missing) >= _MANY
         if many:
             logger.warning("drawing %s, once for this camera and resolution", self._name)
-        with Progress("drawing scenes", len(missing) if many else 0) as progress:
+        with progress_bar("drawing scenes", len(missing) if many else 0) as advance:
 
             def draw_some(first: int, last: int) -> None:
                 for number in missing[first:last]:
                     start = self._firsts[number]
                     for place, scene in enumerate(self._groups[number].draw(), start=start):
                         self._scenes[place] = _rounded(scene)
-                    progress.advance()
+                    advance()
 
-            in_shares(draw_some, len(missing))
+            parallel_ranges(draw_some, len(missing))
         whole = [scene for scene in self._scenes if scene is not None]
         if len(whole) == len(self):  # which happens once: later calls have none missing
             _store(self._key, whole)

@@ -39,8 +39,8 @@ from simulator.radiance.maps import (
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw
 from simulator.utils.checks import check_flag, check_number, check_word
+from simulator.utils.compute import progress_bar
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
-from simulator.utils.progress import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -302,7 +302,7 @@ def _read_files(
     skipped: list[str] = []
     names = _scene_names(base, list(groups))
     logger.info("reading %d scene files of %s", len(groups), spec)
-    with Progress("reading scene files", len(groups)) as progress:
+    with progress_bar("reading scene files", len(groups)) as advance:
         for path, group in groups.items():
             try:
                 scenes += _read_file(path, names[path], group, options, request, shots)
@@ -311,7 +311,7 @@ def _read_files(
                     more = hint if len(groups) > 1 else ""
                     raise ValueError(f"scene file {str(path)!r}: {error}{more}") from error
                 skipped.append(f"{path.name}: {error}")
-            progress.advance()
+            advance()
     if skipped:
         more = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
         text = "; ".join(skipped[:_MOST_NAMES] + more)

@@ -22,8 +22,7 @@ from agents.evaluation.intervals import Rank
 from agents.policy_names import split_class, split_options
 from agents.report.markdown import escape, markdown_table
 from agents.report.result_table import Results
-from simulator.utils.files import write_atomically
-from simulator.utils.results import machine, versions
+from simulator.utils.files import machine, versions, write_atomically
 
 if TYPE_CHECKING:
     from torch import Tensor

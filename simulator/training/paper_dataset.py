@@ -33,14 +33,18 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import Pair, any_pairs, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.config import SimulatorConfig
 from simulator.training.data import Batch, settings_parameters
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, expose
-from simulator.training.train import TrainingProgress, load_start, make_accelerator, train_stage
+from simulator.training.train import (
+    SimulatorConfig,
+    TrainingProgress,
+    load_start,
+    make_accelerator,
+    train_stage,
+)
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
-from simulator.utils.files import sibling, write_atomically
-from simulator.utils.results import result_meta
+from simulator.utils.files import result_meta, sibling, write_atomically
 
 logger = logging.getLogger(__name__)
 

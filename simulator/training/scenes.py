@@ -1,51 +1,94 @@
-"""Scenes for the reference camera, on which the simulator is trained, validated and tested.
+"""Scenes for the reference camera, and pictures of real detail, that train and test the networks.
 
-All of them are light at the pitch of the photosites, for the camera to sample: procedural scenes
-are drawn there, pictures are cut out at it and never enlarged.
+All of it is light at the pitch of the photosites: procedural scenes, dead leaves, charts and smooth
+shading are drawn there; photographs, radiance maps and raws of a folder of real files (see
+docs/networks.md) are cut out at it and never enlarged.
 
-The split by source group is fixed: procedural groups by their index, photographs and radiance maps
-by name (`ae_env.scenes.pictures.detail_split`). A group has all its views in one split, and the
-scenes of a split stay when `number` grows.
+The split by source group is fixed: drawn groups by their index, files by name (`detail_split`). The
+same place, subject or photographer's series is in one split only, and the scenes of a split stay
+when `number` grows.
 """
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import json
 import logging
 import math
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tifffile
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import distance_transform_edt
 
-from ae_env.scenes.pictures import (
-    FIRST_INDEX,
-    Split,
-    photograph_pictures,
-    radiance_files,
-    recorded_mosaics,
-)
-from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.thin_lens import Lens
 from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
-from simulator.radiance.light import mean_anchor, reference_settings, temperature_tint
-from simulator.radiance.maps import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
+from simulator.radiance.light import (
+    camera_light,
+    mean_anchor,
+    reference_settings,
+    temperature_tint,
+)
+from simulator.radiance.maps import (
+    AZIMUTHS,
+    EV100_RANGE,
+    RADIANCE_SUFFIXES,
+    assumed_ev100,
+    read_radiance,
+)
 from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
-from simulator.radiance.procedural import draw, list_kinds
-from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene
+from simulator.radiance.procedural import LeafStyle, dead_leaves, draw, fractal_noise, list_kinds
+from simulator.raw.read import read_raw
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.settings import incident_ev100
+from simulator.training.data import DetailPicture
 from simulator.utils.checks import check_integer, check_word
 
 logger = logging.getLogger(__name__)
 
+Split = Literal["train", "validation", "test"]
+
+#: Index of the first procedural group of each split.
+FIRST_INDEX = {"train": 0, "validation": 100_000, "test": 200_000}
+#: Groups whose split was fixed before the hash decided; all others follow `detail_split`.
+_FIXED: dict[Split, tuple[str, ...]] = {
+    "train": ("bridge", "dawn", "forest", "lobby"),
+    "validation": ("StillLife", "city"),
+    "test": ("Desk", "apartment", "lab", "park", "sunset", "venice", "warehouse"),
+}
+#: Folders of radiance maps and of photographs.
+_MAP_FOLDERS, _PHOTOGRAPH_FOLDER = ("hdri_pool", "hdri_cc0", "openexr_bsd"), "photo_pool"
+#: Shares of the source groups: training, validation; the rest tests.
+_TRAIN, _VALIDATION = 0.62, 0.70
+#: Raws of known subjects: file name (its beginning) to group and split.
+_RAWS: dict[str, tuple[str, Split]] = {
+    "CRW_0101": ("colour_checker", "train"),
+    "CRW_0104": ("colour_checker", "train"),
+    "CRW_0105": ("colour_checker", "train"),
+    "CRW_0112": ("pantone_strip", "train"),
+    "CRW_0113": ("pantone_strip", "train"),
+    "CRW_0117": ("camera_box", "test"),
+    "CRW_0118": ("camera_box", "test"),
+    "CRW_0119": ("camera_box", "test"),
+    "GOPR0024": ("gopro_courtyard", "train"),
+    "GOPR9231": ("gopro_courtyard", "train"),
+}
+#: Brightest light of a picture, in its medians: lamps beyond it would be all that a mean shows.
+_BRIGHTEST = 64.0
+#: Photosites a side of drawn pictures, and how many of each kind there are in a split.
+_SIZE = 640
+_DRAWN = {"train": 60, "validation": 8, "test": 8}
 #: Most procedural groups of a split, the gap between the first indices of two.
 MOST_GROUPS = 100_000
 #: Every fourth procedural group has no depth: one of the bundled kinds, for noise and exposure.
@@ -78,6 +121,205 @@ _SHARP = 0.36
 ILLUMINANCE = (1.0, 20_000.0)
 #: Largest circle of confusion of the photographs with depth at f/11 [packed pixels].
 _PHOTOGRAPH_BLUR = 6.0
+
+
+# -- pictures -------------------------------------------------------------------------------------
+
+
+def detail_split(group: str) -> Split:
+    """The split of a source group, by a stable hash of its name.
+
+    >>> detail_split("quarry_02") == detail_split("quarry_02")
+    True
+    """
+    for split, names in _FIXED.items():
+        if group in names:
+            return split
+    draw = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+    return "train" if draw < _TRAIN else "validation" if draw < _VALIDATION else "test"
+
+
+def detail_pictures(
+    split: Split, *, data: Path | None, drawn: int | None = None, seed: int = 0
+) -> list[DetailPicture]:
+    """The pictures of a split.
+
+    Args:
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        data: Folder of real files; None uses drawn pictures only. What is missing in it is logged.
+        drawn: Dead leaves, and as many charts and smooth pictures; 60 to train on, else 8.
+        seed: Seed of the drawn pictures.
+
+    Raises:
+        ValueError: If `split` is no split.
+    """
+    check_word("split", split, tuple(FIRST_INDEX))
+    pictures: list[DetailPicture] = []
+    if data is None:
+        logger.warning("no folder of real files (AE_ENV_DATA): training on drawn pictures only")
+    else:
+        pictures += _maps(data, split)
+        pictures += photograph_pictures(data, split)
+        pictures += recorded_mosaics(data, split)
+        pictures += _linear(data, split)
+    pictures += _drawings(split, _DRAWN[split] if drawn is None else drawn, seed)
+    return pictures
+
+
+def radiance_files(data: Path, split: Split) -> Iterator[tuple[Path, str]]:
+    """Radiance maps of a split, each with its source group."""
+    for folder in _MAP_FOLDERS:
+        for path in _files(data / folder, RADIANCE_SUFFIXES):
+            group = _groups(data).get(path.name, path.stem)
+            if detail_split(group) == split:
+                yield path, group
+
+
+def _maps(data: Path, split: Split) -> Iterator[DetailPicture]:
+    for path, group in radiance_files(data, split):
+        light = read_radiance(path)
+        light = light / max(float(np.median(light[1])), 1e-6 * float(light.max()))
+        clipped = torch.from_numpy(np.minimum(light, _BRIGHTEST))
+        yield DetailPicture(path.stem, group, "radiance", clipped)
+
+
+def photograph_pictures(data: Path, split: Split) -> Iterator[DetailPicture]:
+    """Photographs of a split, unprocessed to linear light, 1.0 at the photograph's white."""
+    for path in _files(data / _PHOTOGRAPH_FOLDER, (".jpg", ".png")):
+        group = _groups(data).get(path.name, path.stem)
+        if detail_split(group) == split:
+            rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
+            with Image.open(path) as picture:
+                light = unprocess(np.asarray(picture.convert("RGB")), rng)
+            yield DetailPicture(path.stem, group, "photograph", torch.from_numpy(light))
+
+
+def recorded_mosaics(data: Path, split: Split) -> Iterator[DetailPicture]:
+    """Raws of real sensors at low ISO, of a split."""
+    for path in _files(data / "canon_crw_cc0", (".CRW",)):
+        group, belongs = _RAWS.get(path.stem, (path.stem, detail_split(path.stem)))
+        if belongs == split:
+            raw = read_raw(path)
+            yield DetailPicture(path.stem, group, "mosaic", raw.data, raw.noise)
+    description = data / "gopro_raw" / "meta.json"
+    if not description.is_file():
+        return
+    for name, meta in json.loads(description.read_text(encoding="utf-8")).items():
+        group, belongs = _RAWS.get(name.partition("_")[0], (name, detail_split(name)))
+        if belongs != split:
+            continue
+        with Image.open(description.parent / name) as picture:
+            mosaic = np.asarray(picture).astype(np.float32)
+        planes = np.stack([mosaic[i::2, j::2] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))])
+        black = np.array(meta["black"], np.float32)[:, None, None]
+        light = torch.from_numpy((planes - black) / (meta["white"] - black))
+        slope, offset = (float(v) for v in meta["dng_tags"]["NoiseProfile"].strip("()").split(","))
+        yield DetailPicture(
+            name, group, "mosaic", light, NoiseLevelFunction((slope,) * 4, (offset,) * 4)
+        )
+
+
+def _linear(data: Path, split: Split) -> Iterator[DetailPicture]:
+    """Demosaicked linear frames."""
+    for path in _files(data / "intel_tau_small", (".png",)):
+        if detail_split(path.stem) == split:
+            import cv2
+
+            image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            light = image[:, :, ::-1].transpose(2, 0, 1).astype(np.float32) / 65535.0
+            yield DetailPicture(
+                path.stem, path.stem, "linear", torch.from_numpy(np.ascontiguousarray(light))
+            )
+
+
+def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    files = sorted(p for p in folder.glob("*") if p.suffix in suffixes)
+    if not files:
+        logger.warning("no %s files in %s: they are left out", " or ".join(suffixes), folder)
+    return files
+
+
+@cache
+def _groups(data: Path) -> dict[str, str]:
+    """Source group by file name, where a table beside the files states it."""
+    table = data / "MANIFEST_POOL.csv"
+    if not table.is_file():
+        return {}
+    with table.open(newline="", encoding="utf-8") as stream:
+        return {Path(r["file"]).name: r["group"] for r in csv.DictReader(stream) if r["group"]}
+
+
+# -- drawn pictures -------------------------------------------------------------------------------
+
+
+def _drawings(split: Split, number: int, seed: int) -> Iterator[DetailPicture]:
+    for kind, make in (("leaves", _leaves), ("chart", _chart), ("smooth", _smooth)):
+        for index in range(number):
+            name = f"{kind}-{seed}-{FIRST_INDEX[split] + index:06d}"
+            rng = np.random.default_rng(
+                [zlib.crc32(kind.encode()), seed, FIRST_INDEX[split], index]
+            )
+            yield DetailPicture(name, name, kind, torch.from_numpy(make(rng)))
+
+
+def _leaves(rng: np.random.Generator) -> np.ndarray:
+    """Dead leaves down to less than a photosite: the sharpest edges that can be."""
+    style = LeafStyle(
+        smallest=float(np.exp(rng.uniform(np.log(0.7), np.log(4.0)))),
+        contrast=float(rng.uniform(0.3, 1.1)),
+        chroma=float(rng.uniform(0.1, 0.6)),
+        texture=float(rng.uniform(0.0, 0.5)),
+        palette=int(rng.integers(3, 30)),
+    )
+    return dead_leaves(rng, _SIZE, style)
+
+
+def _chart(rng: np.random.Generator) -> np.ndarray:
+    """Text, gratings, zone plates and checks in two colours."""
+    paper, ink = (np.exp2(rng.uniform(-5.0, 0.0, (2, 1))) * rng.uniform(0.6, 1.0, (2, 3)))[
+        :, :, None
+    ]
+    row, column = np.mgrid[:_SIZE, :_SIZE].astype(np.float32)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        mask = _text(rng)
+    elif kind == 1:
+        angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(2.0), np.log(40.0)))
+        wave = np.sin((row * np.sin(angle) + column * np.cos(angle)) * 2 * np.pi / period)
+        mask = (wave > 0).astype(np.float32) if rng.random() < 0.5 else 0.5 + 0.5 * wave
+    elif kind == 2:
+        centre = rng.uniform(-0.2, 1.2, 2) * _SIZE
+        radius = np.hypot(row - centre[0], column - centre[1])
+        mask = 0.5 + 0.5 * np.cos(np.pi * radius**2 / _SIZE * rng.uniform(0.3, 1.0))
+    else:
+        side = int(rng.integers(1, 48))
+        mask = ((row // side + column // side) % 2).astype(np.float32)
+    light = paper[..., None] * (1.0 - mask) + ink[..., None] * mask
+    return np.ascontiguousarray(light, np.float32)
+
+
+def _text(rng: np.random.Generator) -> np.ndarray:
+    page = Image.new("L", (_SIZE, _SIZE))
+    draw, top = ImageDraw.Draw(page), 0
+    while top < _SIZE:
+        size = int(rng.integers(7, 40))
+        letters = "".join(chr(c) for c in rng.integers(33, 127, 90))
+        words = letters.replace("~", " ").replace("|", " ")
+        draw.text((int(rng.integers(-20, 5)), top), words, 255, ImageFont.load_default(size))
+        top += size + int(rng.integers(1, 8))
+    return np.asarray(page, np.float32) / 255.0
+
+
+def _smooth(rng: np.random.Generator) -> np.ndarray:
+    """Shading without detail: walls, skies, flat fields."""
+    tint = np.exp2(rng.uniform(-0.8, 0.8, 3))[:, None, None]
+    if rng.random() < 0.3:
+        return np.ascontiguousarray(np.broadcast_to(tint, (3, _SIZE, _SIZE)), np.float32)
+    shape = fractal_noise(rng, _SIZE, float(rng.uniform(1.8, 3.0)))
+    return np.asarray(tint * np.exp(rng.uniform(0.02, 0.8) * shape), np.float32)
+
+
+# -- scenes of the reference camera ---------------------------------------------------------------
 
 
 def reference_scenes(
@@ -138,42 +380,49 @@ def _procedural(
         distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
         depth, lens = torch.from_numpy(depths), Lens(FOCAL_LENGTH, distance)
     name = f"reference-{seed}-{first + position:06d}-{kind}"
-    scene = Scene.from_radiance(
+    return _scene(
         drawing.light,
         camera,
+        drawing.illuminance,
+        illuminant=drawing.illuminant,
         scene_id=name,
         group=name,
-        illuminance=drawing.illuminance,
-        illuminant=drawing.illuminant,
         kind=kind,
         source="procedural, ae-env (MIT)",
+        depth=depth,
+        lens=lens,
     )
-    return _from_scene(scene, depth=depth, lens=lens)
 
 
-def _from_scene(scene: Scene, *, illuminance: float | None = None, **fields: Any) -> ReferenceScene:
-    """A scene of one pixel to a photosite for the camera, its light moved into `ILLUMINANCE`.
+def _scene(
+    rgb: np.ndarray,
+    camera: CameraProfile,
+    lux: float,
+    *,
+    scale_known: bool = True,
+    illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    **fields: Any,
+) -> ReferenceScene:
+    """A scene of one pixel to a photosite under `lux`, moved into `ILLUMINANCE`.
 
     Light is relative to the reference settings: under less of it they expose longer, and `light`
-    stays as it is.
+    stays as it is. Where the scale of `rgb` is unknown, its mean is set to a usual exposure.
     """
-    known = scene.illuminance if illuminance is None else illuminance
-    reference = scene.reference
-    if known is not None:
-        lux = min(max(known, ILLUMINANCE[0]), ILLUMINANCE[1])
-        if lux != known:
-            shift = math.log2(lux / known)
-            reference = reference_settings(-reference.log2_exposure + shift)
-        known = lux
+    light, reference, white_balance = camera_light(
+        rgb,
+        camera,
+        illuminance=lux if scale_known else None,
+        ev100=incident_ev100(lux),
+        illuminant=illuminant,
+    )
+    within = min(max(lux, ILLUMINANCE[0]), ILLUMINANCE[1])
+    if within != lux:
+        reference = reference_settings(-reference.log2_exposure + math.log2(within / lux))
     return ReferenceScene(
-        scene_id=scene.scene_id,
-        group=scene.group,
-        kind=scene.kind,
-        light=scene.light[[0, 1, 3]],
+        light=light[[0, 1, 3]],
         reference=reference,
-        illuminance=known,
-        white_balance=scene.white_balance,
-        source=scene.source,
+        illuminance=within,
+        white_balance=white_balance,
         **fields,
     )
 
@@ -304,18 +553,18 @@ def _cut_out(picture: _Picture, camera: CameraProfile, size: int) -> Iterator[Re
         if lux is None:
             lux = assumed_illuminance(name)
             source += f"; light of unknown scale, {lux:g} lux assumed"
-        scene = Scene.from_radiance(
+        yield _scene(
             view[:, top : top + side, left : left + side],
             camera,
+            lux,
+            scale_known=picture.illuminance is not None,
+            illuminant=picture.tint,
             scene_id=name,
             group=picture.group,
-            illuminance=picture.illuminance,
-            ev100=incident_ev100(lux),
-            illuminant=picture.tint,
             kind=picture.kind,
             source=source,
+            in_focus=picture.in_focus,
         )
-        yield _from_scene(scene, illuminance=lux, in_focus=picture.in_focus)
 
 
 def mosaic_scenes(
@@ -327,7 +576,7 @@ def mosaic_scenes(
     cannot be defocused, as each plane has but a quarter of the photosites.
 
     Args:
-        split: See `reference_scenes`; groups are split by `ae_env.scenes.pictures`.
+        split: See `reference_scenes`; groups are split by `detail_split`.
         camera: Camera that photographs them; their colours are left as they were recorded.
         data: Folder of real files.
         size: Height and width [packed pixels], at most.
@@ -479,15 +728,6 @@ def _focused(photograph: _DepthPhotograph, camera: CameraProfile) -> Iterator[Re
     disparity = fill_from_nearest(photograph.disparity)[:height, :width]
     inverse = (disparity + photograph.offset) * photograph.dioptres_per_pixel
     far, middle, front, near = np.quantile(inverse, [0.02, 0.5, 0.95, 0.98])
-    scene = Scene.from_radiance(
-        light,
-        camera,
-        scene_id=photograph.name,
-        group=photograph.name,
-        illuminance=photograph.illuminance,
-        kind="depth_photograph",
-        source=photograph.source,
-    )
     depth = torch.from_numpy((1.0 / inverse).astype(np.float32))
     for name, focus in (("front", front), ("middle", middle)):
         spread = max(near - focus, focus - far)
@@ -495,8 +735,17 @@ def _focused(photograph: _DepthPhotograph, camera: CameraProfile) -> Iterator[Re
         area = _PHOTOGRAPH_BLUR * packed_pitch(camera) * F_NUMBER / spread
         focal_length = 0.5 * (math.sqrt((area * focus) ** 2 + 4.0 * area) - area * focus)
         lens = Lens(float(focal_length), float(1.0 / focus))
-        made = _from_scene(scene, depth=depth, lens=lens)
-        yield replace(made, scene_id=f"{photograph.name}-{name}")
+        yield _scene(
+            light,
+            camera,
+            photograph.illuminance,
+            scene_id=f"{photograph.name}-{name}",
+            group=photograph.name,
+            kind="depth_photograph",
+            source=photograph.source,
+            depth=depth,
+            lens=lens,
+        )
 
 
 def fill_from_nearest(values: np.ndarray) -> np.ndarray:

@@ -5,18 +5,23 @@ defocus with occlusion, the softness of a lens in focus, the colour filter array
 true exposure time and aperture, motion blur, photon noise in electrons, full well, read noise,
 black level, clip, whole digital numbers, and only then an average of neighbours. Each body has a
 small hidden error of shutter, aperture and black level, as real ones do.
+
+A sensor sees each colour at its own place: light is blurred by the lens (about a pixel), each
+photosite takes the colour of its filter, and only then may neighbours of one plane be averaged.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
-from simulator.camera import CameraProfile
+from simulator.camera import BayerPattern, CameraProfile
 from simulator.capture.exposure import SIGNAL_LIMIT
 from simulator.capture.sensor import clip_and_quantise
 from simulator.noise.generator import noise_generator
@@ -25,9 +30,11 @@ from simulator.optics.blur import motion_blur
 from simulator.optics.flicker_integral import Lamp
 from simulator.optics.thin_lens import Lens, defocus
 from simulator.raw.image import check_packed
-from simulator.reference.sampling import average_planes, lens_blur, sample_mosaic
 from simulator.settings import CameraSettings, exposure_ratio
 
+#: Standard deviation of a sharp lens's blur [photosite]: a point is about a pixel wide (its full
+#: width at half maximum is 1.2), between diffraction at f/4 and at f/11 for a pitch of 4 to 6 um.
+LENS_SIGMA = 0.5
 #: A well holds this much more than white at the base ISO: makers set the white level just below it,
 #: so that a saturated pixel reads white in spite of its read noise and of its black level.
 WELL_MARGIN = 0.004
@@ -37,6 +44,57 @@ _STOPS = range(37)
 DRAPED = "draped"
 #: Kind of a scene that a real sensor recorded, with a little noise left.
 MOSAIC = "mosaic"
+
+
+def lens_blur(light: Tensor, sigma: float = LENS_SIGMA) -> Tensor:
+    """Gaussian blur of a lens in focus, borders repeated.
+
+    Args:
+        light: (C, H, W) linear light at the pitch of the photosites.
+        sigma: Standard deviation [photosite]; 0 changes nothing.
+    """
+    if sigma == 0.0:
+        return light
+    reach = max(1, math.ceil(3.0 * sigma))
+    weights = [math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(-reach, reach + 1)]
+    total = sum(weights)
+    height, width = light.shape[-2:]
+    padded = F.pad(light[None], (reach,) * 4, mode="replicate")[0]
+    # Sums of shifted views: for these few taps three times as fast as a depthwise convolution.
+    rows, blurred = torch.zeros_like(padded[:, :height]), torch.zeros_like(light)
+    for i, weight in enumerate(weights):
+        rows += weight / total * padded[:, i : i + height]
+    for i, weight in enumerate(weights):
+        blurred += weight / total * rows[..., i : i + width]
+    return blurred
+
+
+def sample_mosaic(light: Tensor, cfa: BayerPattern = BayerPattern.RGGB) -> Tensor:
+    """The planes R, G1, G2, B that photosites behind a colour filter array take of `light`.
+
+    Args:
+        light: (3, 2H, 2W) red, green and blue at every photosite; a last odd row or column is cut.
+        cfa: Order of the filters.
+
+    Returns:
+        (4, H, W).
+
+    >>> ramp = torch.arange(16.0).reshape(1, 4, 4).expand(3, 4, 4)
+    >>> sample_mosaic(ramp)[:, 0, 0].tolist()
+    [0.0, 1.0, 4.0, 5.0]
+    """
+    height, width = (n // 2 * 2 for n in light.shape[-2:])
+    colours = (0, 1, 1, 2)
+    planes = [
+        light[..., colour, row:height:2, column:width:2]
+        for colour, (row, column) in zip(colours, cfa.offsets, strict=True)
+    ]
+    return torch.stack(planes, dim=-3)
+
+
+def average_planes(planes: Tensor, k: int) -> Tensor:
+    """Means over k x k samples of one plane, (..., 4, H, W) to (..., 4, H // k, W // k)."""
+    return planes if k == 1 else F.avg_pool2d(planes, k)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +129,9 @@ class ReferenceScene:
     scene_id: str
     group: str
     kind: str
-    light: torch.Tensor
+    light: Tensor
     reference: CameraSettings
-    depth: torch.Tensor | None = None
+    depth: Tensor | None = None
     lens: Lens = field(default_factory=Lens)
     illuminance: float | None = None
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -194,8 +252,8 @@ class ReferenceCapture:
         settings: Nominal settings, as the file would state them.
     """
 
-    mean: torch.Tensor
-    sample: torch.Tensor
+    mean: Tensor
+    sample: Tensor
     settings: CameraSettings
 
 
@@ -234,7 +292,7 @@ class ReferenceCamera:
         if sensor_noise:
             camera.read_noise(min(camera.nlf_by_iso))  # raises where there is none
 
-    def blur_diameter(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+    def blur_diameter(self, scene: ReferenceScene, f_number: float) -> Tensor:
         """Diameter of the circle of confusion in the pixels of a capture, >= 0.
 
         Where depth is finer than that it is the root of the mean square, as second moments add.
@@ -252,7 +310,7 @@ class ReferenceCamera:
         squares = F.avg_pool2d(diameter.square()[None], pixels)[0]
         return (squares.sqrt() / pixels).to(torch.float32)
 
-    def _signed_diameter(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+    def _signed_diameter(self, scene: ReferenceScene, f_number: float) -> Tensor:
         """The same with its sign, at and in the pixels of ``scene.light``."""
         if scene.depth is None:
             return torch.zeros_like(scene.light[0], dtype=torch.float64)
@@ -262,7 +320,7 @@ class ReferenceCamera:
         pitch = 2e-6 * self.camera.pixel_pitch_um / scene.pitch
         return scene.lens.circle_of_confusion(scene.depth.double(), exact) / pitch
 
-    def blurred_light(self, scene: ReferenceScene, f_number: float) -> torch.Tensor:
+    def blurred_light(self, scene: ReferenceScene, f_number: float) -> Tensor:
         """Light on the photosites behind the aperture `f_number`, (4, H, W).
 
         Defocus at the pitch of ``scene.light``; light at the pitch of the photosites then goes
@@ -277,14 +335,14 @@ class ReferenceCamera:
 
     def expose(
         self,
-        light: torch.Tensor,
+        light: Tensor,
         reference: CameraSettings,
         settings: CameraSettings,
         *,
         image_speed: float = 0.0,
         lamp: Lamp | None = None,
         start: float = 0.0,
-    ) -> torch.Tensor:
+    ) -> Tensor:
         """Signal without noise at `settings`, with this body's hidden errors, unclipped.
 
         Where the image moves in light that changes, each is integrated by itself.
@@ -306,10 +364,10 @@ class ReferenceCamera:
             moved = moved * torch.from_numpy(bands).to(moved)[:, None]
         return moved * ratio + self._black_offset(light)
 
-    def _black_offset(self, signal: torch.Tensor) -> torch.Tensor:
+    def _black_offset(self, signal: Tensor) -> Tensor:
         return torch.tensor(self.body.black_offset).to(signal)[:, None, None]
 
-    def record(self, signal: torch.Tensor, iso: float, generator: torch.Generator) -> torch.Tensor:
+    def record(self, signal: Tensor, iso: float, generator: torch.Generator) -> Tensor:
         """Digital numbers of `signal`, on the scale where sensor white is 1.
 
         The variance of a sample is that of the camera's noise level function: the noise of the
@@ -342,7 +400,7 @@ class ReferenceCamera:
         recorded = clip_and_quantise(collected + noise + black, self.camera)
         return average_planes(recorded, self.box_factor)
 
-    def _well(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
+    def _well(self, signal: Tensor, iso: float) -> Tensor:
         """Signal of a full well, (4, 1, 1): just above white at the base ISO, more beyond it."""
         base = self.camera.nlf(min(self.camera.nlf_by_iso)).shot
         wells = [
@@ -351,7 +409,7 @@ class ReferenceCamera:
         ]
         return torch.tensor(wells).to(signal)[:, None, None]
 
-    def clip(self, signal: torch.Tensor, iso: float) -> torch.Tensor:
+    def clip(self, signal: Tensor, iso: float) -> Tensor:
         """The mean of a capture of `signal` (..., 4, H, W) at `iso`: clipped to [-pedestal, 1],
         then averaged as `record` does.
         """
@@ -366,7 +424,7 @@ class ReferenceCamera:
         settings: CameraSettings,
         seed: int,
         *,
-        light: torch.Tensor | None = None,
+        light: Tensor | None = None,
         lamp: Lamp | None = None,
         start: float = 0.0,
     ) -> ReferenceCapture:
