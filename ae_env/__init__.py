@@ -8,10 +8,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ae_env.registration import register_envs
 from ae_env.utils.packages import check_package
 
-check_package("simulator")
+check_package("simulator")  # before anything imports it
+
+from ae_env.registration import register_envs  # noqa: E402
 
 if TYPE_CHECKING:
     from ae_env import lighting as lighting

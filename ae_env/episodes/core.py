@@ -111,7 +111,7 @@ class EpisodeCore:
         self._sequence = sequence_bounds(self.scenes) if options.in_sequences else None
         self._facts = first_facts = SceneFacts(self.scenes, len(self.grid))
         if self._sequence is not None:
-            first_facts = SceneFacts(self.first_scenes, len(self.grid))
+            first_facts = SceneFacts(SceneSet.of(self.first_scenes), len(self.grid))
         self._draws = Draws(options, self.first_scenes, first_facts)
         self.scene_ids = self._facts.scene_ids
         states = self.grid.states

@@ -67,7 +67,7 @@ def test_settings_that_no_camera_has_are_refused(options, message):
 
 def test_a_scene_too_dark_for_the_meter_is_named():
     black = replace(random_scene(scene_id="cellar"), light=torch.zeros(4, 8, 8))
-    with pytest.raises(ValueError, match=r"'cellar'.* is too dark for the meter"):
+    with pytest.raises(ValueError, match=r"'cellar'.* is too dark"):
         simulate_source_raw(black)
 
 
