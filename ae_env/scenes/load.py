@@ -26,8 +26,8 @@ from ae_env.utils.user_files import load_attribute
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import CameraSimulator
 from simulator.networks.aperture_module import DEAD_ZONE
-from simulator.networks.denoiser import SIZES
 from simulator.networks.network_cache import NetworkCache
+from simulator.networks.noise_module import SIZES
 from simulator.noise.generator import noise_generator
 from simulator.radiance.light import mean_anchor
 from simulator.raw.image import RawImage
