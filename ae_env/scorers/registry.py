@@ -29,7 +29,7 @@ from typing import Any, TypeVar
 import torch
 
 from ae_env.scorers.classifier import Classifier
-from ae_env.scorers.composite import Balanced, CompositeScorer
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
     AnalyticExposure,
@@ -52,7 +52,15 @@ from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
 from ae_env.scorers.niqe import Niqe
 from ae_env.scorers.opencv import Brisque, Keypoints, Matches
 from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
-from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
+from ae_env.scorers.terms import (
+    Balanced,
+    Banding,
+    Brightness,
+    Highlights,
+    Noise,
+    Shadows,
+    Sharpness,
+)
 from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
