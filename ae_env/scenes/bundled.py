@@ -150,6 +150,7 @@ def _cache_key(
     part: str | None,
 ) -> str:
     return cache_key(
+        "scenes",
         {
             "generator": GENERATOR_VERSION,
             "format": 7,
@@ -162,5 +163,5 @@ def _cache_key(
             "crop": crop,
             "size": size if split == "train" or size == "small" else "normal",
             "part": part,
-        }
+        },
     )

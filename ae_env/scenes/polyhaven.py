@@ -180,7 +180,8 @@ def polyhaven_scenes(request: SceneRequest, *, views: int = VIEWS, seed: int = 0
     key |= {"kinds": [[a.kind, *ILLUMINANCE[a.kind]] for a in assets]}
     size = native_size(request.resolution)
     make = partial(_make, assets, camera, size, resolution, crop, views, seed)
-    scenes = cached_scenes(cache_key(key), make, camera, size if resolution is None else resolution)
+    side = size if resolution is None else resolution
+    scenes = cached_scenes(cache_key("scenes", key), make, camera, side)
     return scenes if plain else [request.sized(scene) for scene in scenes]
 
 

@@ -19,7 +19,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.layout import Layout
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.cache import DiskCache
+from simulator.utils.cache import disk_cache
 
 logger = logging.getLogger(__name__)
 
@@ -53,13 +53,13 @@ def cached_scenes(
 
 def stored_scenes(key: str, camera: CameraProfile, resolution: int | None) -> list[Scene] | None:
     """Those in the cache, None if there are none; arguments as of `cached_scenes`."""
-    return _from_tensors(DiskCache().get("scenes", key), camera, resolution)
+    return _from_tensors(disk_cache().get(key), camera, resolution)
 
 
 def store_scenes(key: str, scenes: list[Scene]) -> None:
     """Puts scenes, `rounded`, into the cache; see `cached_scenes`."""
     if scenes:
-        DiskCache().put("scenes", key, _to_tensors(scenes))
+        disk_cache().put(key, _to_tensors(scenes))
 
 
 def rounded(scene: Scene) -> Scene:

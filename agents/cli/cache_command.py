@@ -18,9 +18,9 @@ def cache(
     """
     from rich.table import Table
 
-    from simulator.utils.cache import DISK_BYTES, DiskCache
+    from simulator.utils.cache import DISK_BYTES, disk_cache
 
-    disk = DiskCache()
+    disk = disk_cache()
     usage = disk.usage()
     if clear:
         disk.clear()

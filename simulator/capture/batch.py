@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -66,11 +66,59 @@ class FrameStatistics:
         return single_normals(self.keys, count)
 
 
-class CaptureBatch:
-    """Photographs n scenes, each at any of S states, on the CPU.
+class FrameSource(Protocol):
+    """Frames of n scenes, each at any of S states: simulated, or looked up if they were recorded.
 
     For each batch of frames, call `prepare`, then `record`. When another scene is to be shown under
-    an index, call `forget` first. A pickled copy works everything out again.
+    an index, call `forget` first.
+    """
+
+    def forget(self, indices: np.ndarray) -> None:
+        """Drops all that is cached for the scenes `indices`."""
+
+    def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
+        """Plans the next frames, and makes their light.
+
+        Args:
+            indices: (B,) of the scenes.
+            states: (B,) at which each is photographed.
+            gains: (B,) light of each exposure relative to the scene's own.
+        """
+
+    def record(
+        self,
+        indices: np.ndarray,
+        states: np.ndarray,
+        seeds: np.ndarray,
+        frames: np.ndarray,
+        *,
+        row_gain: np.ndarray | None = None,
+        codes: np.ndarray | None = None,
+        numbers: np.ndarray | None = None,
+        signals: np.ndarray | None = None,
+    ) -> FrameStatistics:
+        """Records scenes that are prepared, and fills every output that is given.
+
+        Args:
+            indices: (B,) of the scenes.
+            states: (B,) at which each is photographed.
+            seeds: (B,) integers >= 0, of the noise.
+            frames: (B,) numbers that the noise of one seed differs by.
+            row_gain: (B, H) light of each row relative to the gain that was prepared for; None
+                where all rows have the same.
+            codes: (B, 4, H, W) uint8, companded (`simulator.capture.exposure.PEDESTAL`).
+            numbers: (B, 4, H, W) uint16, digital numbers.
+            signals: (B, 4, H, W) float32, on the scale where white is 1.
+        """
+
+    def prepared_scene(self, index: int) -> PreparedScene:
+        """The scene `index` in its own light, as it is photographed."""
+
+
+class CaptureBatch:
+    """`FrameSource` that simulates the frames, on the CPU.
+
+    A pickled copy works everything out again.
 
     Args:
         prepared: Function that returns the scene of an index, in its own light; called when the
@@ -114,7 +162,7 @@ class CaptureBatch:
         self._forget_all()
 
     def forget(self, indices: np.ndarray) -> None:
-        """Drops all that is cached for the scenes `indices`; their memory is used again."""
+        """See `FrameSource`; the memory is used again."""
         count = len(self.states)
         for index in indices.tolist():
             self._rows.forget(slice(index * count, (index + 1) * count))
@@ -124,13 +172,7 @@ class CaptureBatch:
             self._blurred_row[index] = -1
 
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
-        """Plans the next frames, and makes their light.
-
-        Args:
-            indices: (B,) of the scenes.
-            states: (B,) at which each is photographed.
-            gains: (B,) light of each exposure relative to the scene's own.
-        """
+        """See `FrameSource`."""
         rows = indices * len(self.states) + states
         stale = self._rows.gain[rows] != gains
         if stale.any():
@@ -159,19 +201,7 @@ class CaptureBatch:
         numbers: np.ndarray | None = None,
         signals: np.ndarray | None = None,
     ) -> FrameStatistics:
-        """Photographs scenes that are prepared, and fills every output that is given.
-
-        Args:
-            indices: (B,) of the scenes.
-            states: (B,) at which each is photographed.
-            seeds: (B,) integers >= 0, of the noise.
-            frames: (B,) numbers that the noise of one seed differs by.
-            row_gain: (B, H) light of each row relative to the gain that was prepared for; None
-                where all rows have the same.
-            codes: (B, 4, H, W) uint8, companded (`simulator.capture.exposure.PEDESTAL`).
-            numbers: (B, 4, H, W) uint16, digital numbers.
-            signals: (B, 4, H, W) float32, on the scale where white is 1.
-        """
+        """See `FrameSource`."""
         rows, columns = indices * len(self.states) + states, self._rows
         keys, transitions = noise_keys(seeds, frames), self.transitions(indices, states)
         read_noise = None
@@ -202,7 +232,7 @@ class CaptureBatch:
         )
 
     def prepared_scene(self, index: int) -> PreparedScene:
-        """The scene `index` in its own light, as it is photographed."""
+        """See `FrameSource`."""
         return self._light(index).prepared
 
     # -- planning -----------------------------------------------------------------------------

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor, nn
 
-from simulator.utils.cache import DiskCache, LruCache, cache_key, content_digest
+from simulator.utils.cache import LruCache, cache_key, content_digest, disk_cache
 
 #: ``"memory"``, or ``"disk"``: both in memory and in files that later runs find.
 Where = Literal["memory", "disk"]
@@ -32,7 +32,7 @@ class NetworkCache:
             raise ValueError(f"`cache` (={where!r}) must be None or one of {list(get_args(Where))}")
         self.where = where
         self.memory: LruCache[tuple[Tensor, int]] = LruCache(max_bytes)
-        self._disk = DiskCache() if where == "disk" else None
+        self._disk = disk_cache() if where == "disk" else None
         self._fingerprints: dict[int, tuple[list[Any], str]] = {}
 
     def result(
@@ -50,7 +50,7 @@ class NetworkCache:
         A stored result that is not finite, or of another shape, is made again.
 
         Args:
-            kind: One of `simulator.utils.cache.CACHE_KINDS`.
+            kind: Of the result, part of its key.
             modules: The networks that `make` runs; their weights may change in between.
             inputs: Tensors that the result depends on; None where there is none.
             make: Makes the result.
@@ -62,23 +62,22 @@ class NetworkCache:
         given = {name: tensor for name, tensor in inputs.items() if tensor is not None}
         device = next(modules[0].parameters()).device
         description = {
-            "kind": kind,
             "weights": [self._fingerprint(module) for module in modules],
             "inputs": content_digest(given),
             "device": device.type,
             **numbers,
         }
-        key = cache_key(description)
+        key = cache_key(kind, description)
         cached = self.memory.get(key)
         if cached is not None and cached[1] == _changes(cached[0]):
             return cached[0]
-        tensor = self._stored(kind, key, shape)
+        tensor = self._stored(key, shape)
         if tensor is not None:
             tensor = tensor.to(device)
         else:
             tensor = make().contiguous()  # as it comes from disk: later sums round alike
             if self._disk is not None:
-                self._disk.put(kind, key, {"result": tensor})
+                self._disk.put(key, {"result": tensor})
         self.memory.put(key, (tensor, _changes(tensor)), tensor.nbytes)
         return tensor
 
@@ -88,9 +87,9 @@ class NetworkCache:
         shape = inputs[0].shape
         return self.result(kind, [module], named, lambda: module(*inputs), shape=shape)
 
-    def _stored(self, kind: str, key: str, shape: Sequence[int] | None) -> Tensor | None:
+    def _stored(self, key: str, shape: Sequence[int] | None) -> Tensor | None:
         """A result from disk, if there is a plausible one."""
-        stored = None if self._disk is None else self._disk.get(kind, key)
+        stored = None if self._disk is None else self._disk.get(key)
         tensor = None if stored is None else stored.get("result")
         if tensor is None or (shape is not None and tensor.shape != tuple(shape)):
             return None

@@ -1,8 +1,9 @@
-"""The one cache: recently used results in memory, and tensors in files between runs."""
+"""Results that are kept: the most recently used in memory, and files between runs."""
 
 from __future__ import annotations
 
 import functools
+import glob
 import hashlib
 import json
 import logging
@@ -11,28 +12,28 @@ import re
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+import numpy as np
 import platformdirs
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from simulator.utils.checks import check_integer
 from simulator.utils.files import write_atomically
 from simulator.utils.results import package_version
 
 _LOGGER = logging.getLogger(__name__)
 #: Environment variable that names another cache folder.
 CACHE_VARIABLE = "AE_ENV_CACHE"
-#: The cache's folders (score tables are of earlier versions); files elsewhere are never removed.
-CACHE_KINDS = ("scenes", "score_tables", "denoised", "defocus_maps", "opened")
-#: Most bytes that the files take together.
+#: Most bytes of what all runs of a user share.
 DISK_BYTES = 4 * 2**30
-#: Names of the cache's files, finished and half-written, of earlier versions as well; no other
-#: file is ever removed.
+#: Names of a store's files, finished and half-written, of earlier versions as well; no other file
+#: is ever removed.
 _FILE = re.compile(r"\.?(bundled-.*-)?[0-9a-f]{24,32}\.(safetensors|npz)(\..*\.tmp)?")
 #: A half-written file older than this was left by a killed process [s].
 _ABANDONED = 3600.0
@@ -46,18 +47,19 @@ def cache_dir() -> Path:
     return Path(os.path.expanduser(named) if named else platformdirs.user_cache_dir("ae-env"))
 
 
-def cache_key(parts: Mapping[str, Any]) -> str:
-    """Hexadecimal key of a cached result: of all that it depends on, and the package's version.
+def cache_key(kind: str, parts: Any) -> str:
+    """Key of a result: its kind, and a hash of all that it depends on and the package's version.
 
     Args:
-        parts: JSON values by name; the order of the names does not matter.
+        kind: Name of a folder, such as ``"scenes"``.
+        parts: JSON value; the order of names does not matter.
 
-    >>> cache_key({"a": 1, "b": 2}) == cache_key({"b": 2, "a": 1}) != cache_key({"a": 1, "b": 3})
+    >>> cache_key("a", {"b": 1, "c": 2}) == cache_key("a", {"c": 2, "b": 1})
     True
     """
-    content = {"package": package_version(), "parts": dict(parts)}
+    content = {"package": package_version(), "parts": parts}
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()[:24]
+    return f"{kind}/{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
 
 def content_digest(tensors: Mapping[str, torch.Tensor]) -> str:
@@ -92,9 +94,7 @@ class LruCache(Generic[Value]):
     """
 
     def __init__(self, max_bytes: int) -> None:
-        if max_bytes < 0:
-            raise ValueError(f"`max_bytes` (={max_bytes}) must be at least 0")
-        self.max_bytes = max_bytes
+        self.max_bytes = check_integer("max_bytes", max_bytes, 0)
         self._items: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
@@ -136,126 +136,158 @@ class LruCache(Generic[Value]):
         return type(self), (self.max_bytes,)
 
 
-class DiskCache:
-    """Tensors in safetensors files between runs; several processes may share the folder.
+class Store:
+    """Results in files, for later runs: named tensors, arrays and JSON values by key.
 
-    Files are written whole or not at all. A damaged file, or a folder that cannot be read or
-    written, is logged and costs time only.
+    A result is one safetensors file without pickles, JSON values in its header. It is written whole
+    or not at all; several processes may share the folder. A damaged file, or a folder that cannot
+    be read or written, is logged and costs time only.
 
     Args:
-        folder: By default `cache_dir()` at the time of each call.
+        folder: Made where missing.
         max_bytes: Most bytes of all files together; beyond it those used longest ago are removed.
-            Several processes at once may exceed it by a sixteenth each.
+            Several processes at once may exceed it by a sixteenth each. None sets no bound.
     """
 
-    def __init__(self, folder: Path | None = None, *, max_bytes: int = DISK_BYTES) -> None:
-        if max_bytes < 0:
-            raise ValueError(f"`max_bytes` (={max_bytes}) must be at least 0")
-        self._folder, self.max_bytes = folder, max_bytes
+    def __init__(self, folder: Path, *, max_bytes: int | None = None) -> None:
+        if max_bytes is not None:
+            check_integer("max_bytes", max_bytes, 0)
+        self.folder, self.max_bytes = Path(folder), max_bytes
         self._uncounted: int | None = None  # bytes written since the files were last counted
 
-    @property
-    def folder(self) -> Path:
-        """Where the files are."""
-        return cache_dir() if self._folder is None else self._folder
+    def path(self, key: str) -> Path:
+        """The file of a result."""
+        return self.folder / f"{key}.safetensors"
 
-    def path(self, kind: str, key: str) -> Path:
-        """The file of `key`.
+    def get(self, key: str) -> dict[str, Any] | None:
+        """The values of a result by name, as `put` got them; None if not there or damaged.
 
-        Raises:
-            ValueError: If `kind` is none of `CACHE_KINDS`.
-        """
-        if kind not in CACHE_KINDS:
-            raise ValueError(f"`kind` (={kind!r}) must be one of {list(CACHE_KINDS)}")
-        return self.folder / kind / f"{key}.safetensors"
-
-    def get(self, kind: str, key: str) -> dict[str, torch.Tensor] | None:
-        """The tensors of `key` by name; None if they are not there or damaged.
+        Tensors are on the CPU.
 
         Args:
-            kind: One of `CACHE_KINDS`.
             key: As `cache_key` makes it.
         """
-        path = self.path(kind, key)
+        path = self.path(key)
         try:
             content = path.read_bytes()  # at once: another process may remove the file
-            tensors = load(content)
-            # The header is JSON after eight bytes of its length.
-            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-            if header.get("__metadata__", {}).get("digest") != content_digest(tensors):
-                raise ValueError("its content is not what was written")
+            values = _decode(content)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            _warn_once(f"the cache in {self.folder} cannot be read: {error.strerror or error}")
+            _warn_once(f"results in {self.folder} cannot be read: {error.strerror or error}")
             return None
-        except (SafetensorError, ValueError) as error:
-            _LOGGER.warning("cached file %s is damaged (%s) and is made again", path, error)
+        except (SafetensorError, ValueError, LookupError, TypeError) as error:
+            _LOGGER.warning("%s is damaged (%s) and is made again", path, error)
             return None
         with suppress(OSError):
             os.utime(path)  # used just now
-        return tensors
+        return values
 
-    def put(self, kind: str, key: str, tensors: Mapping[str, torch.Tensor]) -> None:
-        """Store `tensors` under `key`; the arguments are those of `get`."""
-        path = self.path(kind, key)
-        own = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-        content = save(own, {"digest": content_digest(own)})
-        if len(content) > self.max_bytes:
+    def put(self, key: str, values: Mapping[str, Any]) -> None:
+        """Stores a result.
+
+        Args:
+            key: As `cache_key` makes it.
+            values: By name; tensors, numpy arrays of numbers, and what JSON can hold.
+        """
+        content = _encode(values)
+        if self.max_bytes is not None and len(content) > self.max_bytes:
             return
         try:
-            write_atomically(path, content)
+            write_atomically(self.path(key), content)
         except OSError as error:  # a full or read-only disk must not stop the run
             reason = os.strerror(error.errno) if error.errno else error
-            _warn_once(f"results could not be cached in {self.folder}: {reason}")
+            _warn_once(f"results could not be stored in {self.folder}: {reason}")
+            return
+        if self.max_bytes is None:
             return
         # Counting files takes longer than writing one: count when a sixteenth was written.
         uncounted = None if self._uncounted is None else self._uncounted + len(content)
         if uncounted is None or uncounted >= self.max_bytes // 16:
-            self._trim()
+            self._trim(self.max_bytes)
             uncounted = 0
         self._uncounted = uncounted
 
     def usage(self) -> dict[str, tuple[int, int]]:
-        """Number of files and bytes by kind."""
-        sizes = {kind: [s.st_size for _, s in self._files(kind)] for kind in CACHE_KINDS}
-        return {kind: (len(own), sum(own)) for kind, own in sizes.items()}
+        """Number of files and bytes by the kind of their keys."""
+        found: dict[str, tuple[int, int]] = {}
+        for path, stat in self._files():
+            files, size = found.get(path.parent.name, (0, 0))
+            found[path.parent.name] = files + 1, size + stat.st_size
+        return found
 
     def clear(self) -> None:
-        """Remove all files of the cache, and its folders where nothing else is in them.
+        """Removes all results, and their folders where nothing else is in them.
 
         Raises:
             OSError: If a file cannot be removed.
         """
-        for kind in CACHE_KINDS:
-            for path, _ in self._files(kind):
-                path.unlink(missing_ok=True)
+        paths = [path for path, _ in self._files()]
+        for path in paths:
+            path.unlink(missing_ok=True)
+        for folder in {path.parent for path in paths}:
             with suppress(OSError):
-                (self.folder / kind).rmdir()
+                folder.rmdir()
 
-    def _files(self, kind: str) -> Iterator[tuple[Path, os.stat_result]]:
-        with suppress(OSError):  # no such folder, or one that may not be listed
-            for path in sorted((self.folder / kind).iterdir()):
-                with suppress(OSError):  # another process has removed it
-                    if _FILE.fullmatch(path.name):
-                        yield path, path.stat()
+    def _files(self) -> list[tuple[Path, os.stat_result]]:
+        found = []
+        for name in sorted(glob.glob("*/*", root_dir=self.folder, include_hidden=True)):
+            path = self.folder / name
+            with suppress(OSError):  # another process has removed it
+                if _FILE.fullmatch(path.name):
+                    found.append((path, path.stat()))
+        return found
 
-    def _trim(self) -> None:
-        """Remove the files used longest ago until a sixteenth of the bound is free.
+    def _trim(self, max_bytes: int) -> None:
+        """Removes the files used longest ago until a sixteenth of the bound is free.
 
         So the bound holds until the files are counted again.
         """
-        files = [found for kind in CACHE_KINDS for found in self._files(kind)]
+        files = self._files()
         total = sum(stat.st_size for _, stat in files)
         recent = time.time() - _ABANDONED
         for path, stat in sorted(files, key=lambda f: max(f[1].st_atime_ns, f[1].st_mtime_ns)):
-            if total <= self.max_bytes - self.max_bytes // 16:
+            if total <= max_bytes - max_bytes // 16:
                 return
             if path.suffix == ".tmp" and stat.st_mtime > recent:
                 continue  # another process is writing it
             with suppress(OSError):
                 path.unlink()
                 total -= stat.st_size
+
+
+def disk_cache() -> Store:
+    """What all runs of this user share, in `cache_dir`, at most `DISK_BYTES`."""
+    return Store(cache_dir(), max_bytes=DISK_BYTES)
+
+
+def _encode(values: Mapping[str, Any]) -> bytes:
+    tensors, arrays, others = {}, [], {}
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            arrays.append(name)
+            tensors[name] = torch.from_numpy(np.array(value, order="C"))
+        elif isinstance(value, torch.Tensor):
+            tensors[name] = value.detach().cpu().contiguous()
+        else:
+            others[name] = value
+    text = json.dumps({"arrays": arrays, "values": others})
+    return save(tensors, {"json": text, "digest": _digest(tensors, text)})
+
+
+def _decode(content: bytes) -> dict[str, Any]:
+    tensors = load(content)
+    # The header is JSON after eight bytes of its length.
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])["__metadata__"]
+    if header["digest"] != _digest(tensors, header["json"]):
+        raise ValueError("its content is not what was written")
+    described = json.loads(header["json"])
+    arrays = {name: tensors[name].numpy() for name in described["arrays"]}
+    return {**tensors, **arrays, **described["values"]}
+
+
+def _digest(tensors: Mapping[str, torch.Tensor], text: str) -> str:
+    return hashlib.sha256(f"{content_digest(tensors)} {text}".encode()).hexdigest()
 
 
 @functools.cache

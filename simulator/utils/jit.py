@@ -10,7 +10,6 @@ import functools
 import logging
 import multiprocessing
 import re
-import time
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,12 +22,9 @@ from numba import types
 from numba.core import event
 
 from simulator.utils.progress import Progress
-from simulator.utils.second_process import is_compiling
 
 logger = logging.getLogger(__name__)
 _PACKAGES = ("simulator", "ae_env")
-#: How often it is looked whether a second process has compiled a kernel [s].
-_PAUSE = 0.02
 #: Kernels that a default environment needs for its first frame, about.
 _FIRST_KERNELS = 12
 #: What is said where something is compiled that was not kept from an earlier run.
@@ -68,42 +64,20 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     return compiled
 
 
-def is_cached(dispatcher: Any) -> bool:
-    """Whether a kernel was compiled before, or is compiled again in each process in any case."""
-    return not _is_kept(dispatcher) or bool(dispatcher._cache._cache_file._load_index())
-
-
 def _is_kept(dispatcher: Any) -> bool:
     """Whether what is compiled of a kernel is kept for other processes."""
     return hasattr(getattr(dispatcher, "_cache", None), "_cache_file")
 
 
 def _adapt_cache(dispatcher: Any, module: Path) -> None:
-    """Make numba's cache of a kernel stale when any module changes that the kernel depends on.
+    """Makes numba's cache of a kernel stale when any module changes that the kernel depends on.
 
     Numba itself looks at the kernel's own module alone, but the functions and constants that a
-    kernel names are compiled into it. Also, a full disk must not be an error, and what a second
-    process compiles is waited for.
+    kernel names are compiled into it. Also, a full disk must not be an error.
     """
     cache = dispatcher._cache
-    index, save, load = cache._cache_file, cache.save_overload, cache.load_overload
+    index, save = cache._cache_file, cache.save_overload
     index._source_stamp = (index._source_stamp, _checksum(module))
-    name = f"{dispatcher.py_func.__module__}.{dispatcher.py_func.__name__}"
-
-    def load_when_compiled(*arguments: Any) -> Any:
-        waits = False
-        while True:
-            may_come = is_compiling(name)
-            found = load(*arguments)
-            if found is not None or not may_come:
-                break
-            waits = True
-            _announcer.bar.show()
-            time.sleep(_PAUSE)
-        if waits:
-            _announcer.bar.advance()
-            _announcer.bar.close()
-        return found
 
     def save_if_possible(*arguments: Any) -> None:
         try:
@@ -111,7 +85,7 @@ def _adapt_cache(dispatcher: Any, module: Path) -> None:
         except OSError as error:
             logger.info("%s; it is compiled again in each process", error)
 
-    cache.save_overload, cache.load_overload = save_if_possible, load_when_compiled
+    cache.save_overload = save_if_possible
 
 
 @functools.cache

@@ -14,7 +14,7 @@ from ae_env.scenes.dead_leaves import dead_leaves
 from ae_env.scenes.photographs import PHOTOGRAPHS, unprocess
 from ae_env.scenes.procedural import HARD_KINDS, draw, list_kinds
 from simulator.camera import get_camera
-from simulator.utils.cache import DiskCache
+from simulator.utils.cache import disk_cache
 
 CAMERA = get_camera("nikon_z6")
 WHITE = 100 * 2.5 / (120 * np.pi)  # signal of a white surface at the incident-light exposure
@@ -145,8 +145,8 @@ def test_cached_scenes_equal_fresh_ones(
 
     fresh = load()
     (file,) = (tmp_path / "scenes").glob("*.safetensors")
-    content, cache = file.read_bytes(), DiskCache()
-    stored = cache.get("scenes", file.stem)
+    content, cache, key = file.read_bytes(), disk_cache(), f"scenes/{file.stem}"
+    stored = cache.get(key)
     for a, b in zip(fresh, load(), strict=True):
         assert torch.equal(a.light, b.light)
         assert a.content == b.content  # of the light and the layout
@@ -159,7 +159,7 @@ def test_cached_scenes_equal_fresh_ones(
         if isinstance(damaged, bytes):
             file.write_bytes(damaged)
         else:
-            cache.put("scenes", file.stem, {**stored, "light": damaged})
+            cache.put(key, {**stored, "light": damaged})
         again = load()
         assert "damaged" in caplog.text
         assert all(torch.equal(a.light, b.light) for a, b in zip(fresh, again, strict=True))

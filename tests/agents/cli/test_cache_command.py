@@ -11,7 +11,7 @@ def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None
     (folder / "denoised").mkdir()
     (folder / "denoised" / f"{5:024d}.safetensors").write_bytes(b"x" * 123)
     (folder / "denoised" / "mine.safetensors").write_bytes(b"x")
-    expected = {"scenes": ["2", "2,000"], "denoised": ["1", "123"], "score tables": ["0", "0"]}
+    expected = {"scenes": ["2", "2,000"], "denoised": ["1", "123"]}
     for arguments in ((), ("--clear",)):
         code, out, _ = ae_env("cache", *arguments)
         assert code == 0

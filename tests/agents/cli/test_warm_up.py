@@ -28,7 +28,6 @@ _WARM_UP = """
 import importlib, pkgutil
 import gymnasium as gym, numba
 from agents.cli.warm_up import warm_up
-from simulator.utils.jit import is_cached
 import ae_env, simulator
 
 make_vec = gym.make_vec
@@ -38,7 +37,7 @@ warm_up()
 for package in (ae_env, simulator):
     for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         for name, value in vars(importlib.import_module(found.name)).items():
-            if isinstance(value, numba.core.dispatcher.Dispatcher) and not is_cached(value):
+            if isinstance(value, numba.core.dispatcher.Dispatcher) and not value.signatures:
                 print("missing", name)
 """
 

@@ -13,7 +13,7 @@ from torch import nn
 
 from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, get_camera
 from simulator.networks.network_cache import NetworkCache
-from simulator.utils.cache import DiskCache
+from simulator.utils.cache import disk_cache
 
 CAMERA = get_camera("nikon_z6")
 SOURCE = CameraSettings(6400, 1 / 1024, 8)
@@ -140,5 +140,5 @@ def test_an_implausible_result_on_disk_is_made_again(wrong: torch.Tensor, folder
     cache = NetworkCache("disk")
     assert torch.equal(cache.called("opened", module, image), image)
     (file,) = (folder / "opened").iterdir()
-    DiskCache().put("opened", file.stem, {"result": wrong})
+    disk_cache().put(f"opened/{file.stem}", {"result": wrong})
     assert torch.equal(NetworkCache("disk").called("opened", module, image), image)
