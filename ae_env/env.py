@@ -61,7 +61,7 @@ class AutoExposureBase(SpecProperty):
 
         Bundled ones that are not cached yet are drawn when they are looked at.
         """
-        return self.core.first_scenes
+        return self.core.episodes.first_scenes
 
     @property
     def scene_ids(self) -> tuple[str, ...]:

@@ -58,7 +58,7 @@ _LOADED: LruCache[Sequence[Scene]] = LruCache(2**30)
 
 
 class EnvArguments(TypedDict, total=False):
-    """Arguments of all environments; `AutoExposureEnv` documents them, `EnvOptions` has defaults."""
+    """Arguments of all environments; see `AutoExposureEnv`. The defaults are in `EnvOptions`."""
 
     scenes: SceneSpec
     split: Split
@@ -346,7 +346,7 @@ def takes_env_arguments(
                         f"{init.__qualname__}() got an unexpected keyword argument {name!r}"
                         f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
                     )
-            init(*args, **{**defaults, **kwargs})  # type: ignore[arg-type]
+            init(*args, **{**defaults, **kwargs})
 
         shown = signature.replace(parameters=list(parameters.values()))
         checked.__signature__ = shown  # type: ignore[attr-defined]

@@ -107,8 +107,9 @@ class _Bracket(AutoExposureBase):
     def _set_limits(self, budget: float, max_frames: int) -> None:
         self._budget = check_number("budget", budget, 1e-5, _MOST_SECONDS, more=" seconds")
         self._max_frames = check_integer("max_frames", max_frames, 1, _MOST_FRAMES)
-        limits = {"budget": self._budget, "max_frames": self._max_frames}
-        self._make_task = functools.partial(ExposureBracket, **limits)
+        self._make_task = functools.partial(
+            ExposureBracket, budget=self._budget, max_frames=self._max_frames
+        )
 
     @property
     def budget(self) -> float:

@@ -1,8 +1,8 @@
 """Files and functions of the packages that a reset and a step enter.
 
 Run ``python -m benchmarks.trace_step``: it prints a table in Markdown, and with ``--files`` also
-the files. Counted with `sys.setprofile` in one default environment, after scenes are loaded and
-kernels compiled: functions of Python, comprehensions and closures among them, but not compiled kernels.
+the files. Counted with `sys.setprofile` in a default environment, after scenes are loaded and
+kernels compiled. Comprehensions and compiled kernels that Python calls are functions, too.
 Episodes differ in what moves, so several are traced: the table has the median and the most.
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,9 +15,8 @@ from ae_env.episodes.state import Episodes
 from ae_env.scenes.scene import WHITE_SIGNAL, Scene, mean_anchor
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.merging import LOG_FLOOR, WORST_EV, log_error, merge
-from simulator.capture.batch import FrameSource, FrameStatistics
+from simulator.capture.batch import FrameStatistics
 from simulator.capture.layout import Layout
-from simulator.capture.sensor import Transitions
 from simulator.optics.motion_path import Taps, path_blur_apart
 from simulator.settings import exposure_ratio
 
@@ -62,14 +61,11 @@ class ExposureBracket:
         ValueError: If the scenes are recorded.
     """
 
-    outputs = ("numbers",)
-    in_chunks = False
-
     def __init__(
         self,
         episodes: Episodes,
-        captures: FrameSource,
-        transitions: Callable[[np.ndarray, np.ndarray], Transitions] | None,
+        captures: object,
+        transitions: object,
         *,
         budget: float,
         max_frames: int,
@@ -82,6 +78,8 @@ class ExposureBracket:
             )
         self.budget, self.max_frames = budget, max_frames
         self.stop, self.num_actions = len(grid), len(grid) + 1
+        self.outputs: tuple[str, ...] = ("numbers",)
+        self.in_chunks = False
         self._episodes, self._scenes, self._grid, self._camera = (
             episodes,
             episodes.scenes,

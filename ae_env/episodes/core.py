@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from ae_env.episodes.lookup import LookupBatch
-from ae_env.episodes.scores import AutoExposure
+from ae_env.episodes.scores import AutoExposure, FindTransitions
 from ae_env.episodes.state import Episode, Episodes
 from ae_env.observation import (
     HISTOGRAM_BINS,
@@ -33,7 +33,6 @@ from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.sensor import Transitions
 from simulator.noise.generator import Noise
 from simulator.optics.disc_bank import DIAMETERS
 
@@ -146,17 +145,9 @@ class Task(Protocol):
         """Expected scores of all states in the current frame of environment `env_index`."""
 
 
-class MakeTask(Protocol):
-    """Constructor of a `Task` from the episodes and what records them."""
-
-    def __call__(
-        self,
-        episodes: Episodes,
-        captures: FrameSource,
-        transitions: Callable[[np.ndarray, np.ndarray], Transitions] | None,
-        /,
-    ) -> Task:
-        """The task; `transitions` gives light and exposures where rewards are expectations."""
+#: Constructor of a task, from the episodes, what records their frames, and the light and exposures
+#: behind frames where rewards are expectations.
+MakeTask = Callable[[Episodes, FrameSource, FindTransitions | None], Task]
 
 
 class EpisodeCore:

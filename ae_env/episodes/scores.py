@@ -11,6 +11,7 @@ import torch
 
 from ae_env.episodes.state import Episodes
 from ae_env.options import COSTS
+from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.protocol import Captures, reads_pixels
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
@@ -24,6 +25,8 @@ from simulator.utils.cache import LruCache
 _MANY = 8
 #: Memory for score tables [byte]: some eight thousand of 64 states.
 TABLES_BYTES = 2**25
+#: Light and exposures behind the frames of scenes (B,) at states (B,): `CaptureBatch.transitions`.
+FindTransitions = Callable[[np.ndarray, np.ndarray], Transitions]
 
 
 class AutoExposure:
@@ -48,7 +51,7 @@ class AutoExposure:
         self,
         episodes: Episodes,
         captures: FrameSource,
-        transitions: Callable[[np.ndarray, np.ndarray], Transitions] | None,
+        transitions: FindTransitions | None,
     ) -> None:
         self._episodes, self._captures, self._transitions = episodes, captures, transitions
         self._options = options = episodes.options
@@ -70,7 +73,7 @@ class AutoExposure:
         self._reads_tables = expected and not tables.closed_form
         self._reads_images = not expected and not tables.closed_form
         reads_codes = bool(self._terms.parts) and not expected
-        self.outputs = ("signals",) if self._reads_images else ()
+        self.outputs: tuple[str, ...] = ("signals",) if self._reads_images else ()
         if reads_codes or "flicker" in options.costs:  # else no code of every sample is made
             self.outputs += ("codes",)
         self.in_chunks = self._reads_images or (
@@ -117,8 +120,9 @@ class AutoExposure:
         """(K,) False: no episode ends by itself."""
         return ~takes
 
-    def displaced(self, env_index: int) -> None:
-        """No subject moves between frames."""
+    def displaced(self, env_index: int) -> Scene | None:
+        """None: no subject moves between frames."""
+        return None
 
     def observation(self, env_indices: np.ndarray) -> dict[str, np.ndarray]:
         """Nothing beside the frame."""

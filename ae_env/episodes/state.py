@@ -173,7 +173,7 @@ class Episodes:
         """Scenes that episodes draw from: of a sequence, its first frame."""
         if self._bounds is None:
             return self.scenes
-        return [self.scenes[i] for i in self._firsts]
+        return [self.scenes[i] for i in self._firsts.tolist()]
 
     def _ensure_loaded(self, indices: np.ndarray) -> None:
         """Loads the scenes `indices` and learns their facts: they are about to be shown."""
