@@ -49,6 +49,7 @@ class ExposureBracket:
     Args:
         episodes: The episodes, with their scenes and options.
         captures: Not used.
+        scorer: Not used.
         transitions: Not used.
         budget: Time that all frames of an episode may take together [s].
         max_frames: Frames of an episode at most.
@@ -65,6 +66,7 @@ class ExposureBracket:
         self,
         episodes: Episodes,
         captures: object,
+        scorer: object,
         transitions: object,
         *,
         budget: float,

@@ -30,6 +30,7 @@ from ae_env.observation import (
 from ae_env.options import EnvOptions
 from ae_env.scenes.drawn import DrawnScenes
 from ae_env.scenes.scene import Scene
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
 from simulator.capture.batch import CaptureBatch, FrameSource, FrameStatistics
 from simulator.capture.prepared_scene import PreparedScene
@@ -145,9 +146,9 @@ class Task(Protocol):
         """Expected scores of all states in the current frame of environment `env_index`."""
 
 
-#: Constructor of a task, from the episodes, what records their frames, and the light and exposures
-#: behind frames where rewards are expectations.
-MakeTask = Callable[[Episodes, FrameSource, FindTransitions | None], Task]
+#: Constructor of a task, from the episodes, what records their frames, the scorer, and the light and
+#: exposures behind frames where rewards are expectations.
+MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
 
 
 class EpisodeCore:
@@ -171,8 +172,9 @@ class EpisodeCore:
         scenes: Sequence[Scene] | None = None,
     ) -> None:
         self.options, self._make_task = options, make_task
-        self.scenes = options.scenes_on_demand() if scenes is None else scenes
-        self.episodes = episodes = Episodes(options, num_envs, self.scenes)
+        scorer = options.make_scorer()  # what it raises comes before scenes are loaded
+        self.episodes = episodes = Episodes(options, num_envs, scenes)
+        self.scenes = episodes.scenes
         self.grid, self.camera = episodes.grid, episodes.camera
         self.scene_ids = episodes.scene_ids
         states = self.grid.states
@@ -196,7 +198,7 @@ class EpisodeCore:
                 cache_light=num_envs * self._cached_frames() * frame_bytes <= LIGHT_CACHE_BYTES,
             )
             transitions = batch.transitions if options.reward == "expected" else None
-        self.task = make_task(episodes, self._captures, transitions)
+        self.task = make_task(episodes, self._captures, scorer, transitions)
         self.num_actions = self.task.num_actions
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -13,6 +13,7 @@ from ae_env.episodes.state import Episodes
 from ae_env.options import COSTS
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import describe_captures
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.protocol import Captures, reads_pixels
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator.capture.batch import FrameSource, FrameStatistics
@@ -37,6 +38,7 @@ class AutoExposure:
     Args:
         episodes: The episodes, with their scenes and options.
         captures: What records their frames.
+        scorer: Rates the frames.
         transitions: Light and exposures behind frames, `CaptureBatch.transitions`, where parts that
             are measured on frames are replaced by their expectation; else None.
 
@@ -51,6 +53,7 @@ class AutoExposure:
         self,
         episodes: Episodes,
         captures: FrameSource,
+        scorer: CompositeScorer,
         transitions: FindTransitions | None,
     ) -> None:
         self._episodes, self._captures, self._transitions = episodes, captures, transitions
@@ -59,7 +62,7 @@ class AutoExposure:
         self.tables = tables = ScoreTables(
             episodes.grid,
             episodes.camera,
-            options.make_scorer(),
+            scorer,
             noise=bool(options.noise),
             tolerance=options.tolerance,
         )

@@ -93,7 +93,7 @@ class Episodes:
     Args:
         options: The environment's arguments.
         count: Number of environments, n.
-        scenes: All scenes; of sequences, all frames.
+        scenes: Those of `options` where they are loaded already; of sequences, all frames.
 
     Attributes:
         grid: The states.
@@ -118,12 +118,15 @@ class Episodes:
         ValueError: If a scene was made for another number of states.
     """
 
-    def __init__(self, options: EnvOptions, count: int, scenes: Sequence[Scene]) -> None:
-        self.options, self.scenes = options, scenes
+    def __init__(
+        self, options: EnvOptions, count: int, scenes: Sequence[Scene] | None = None
+    ) -> None:
+        self.options = options
         self.grid: ExposureGrid = options.make_grid()
         self.camera: CameraProfile = options.make_camera()
         self.lighting: Lighting = options.make_lighting()
         self.static = type(self.lighting) is Lighting
+        self.scenes = options.scenes_on_demand() if scenes is None else scenes
         # With one delay of all controls a state needs not be put together.
         self._delays = options.delays if len(set(options.delays)) > 1 else options.delays[:1]
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
@@ -140,7 +143,7 @@ class Episodes:
         # (scenes, S) state that is shown where another is asked for; None where each can be.
         self._shown_state: np.ndarray | None = None
         if options.recorded is not None:
-            self._shown_state = np.stack([nearest_recorded(s, self.grid) for s in scenes])
+            self._shown_state = np.stack([nearest_recorded(s, self.grid) for s in self.scenes])
 
     # -- the scenes ---------------------------------------------------------------------------
 
