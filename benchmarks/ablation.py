@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.learning_curve import LearningCurve, load_curve
+from agents.learning.training import LearningCurve, load_curve
 from agents.report.plots import learning_figure
 from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, table
 from benchmarks.isolated import ROOT

@@ -26,8 +26,7 @@ from agents.cli.console import print_files, progress_bars
 from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator.utils.files import data_folder as data_root
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
 #: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function.

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from ae_env.scenes.reference_scenes import reference_scenes
 from agents.applications.exposure_fusion import fuse
 from agents.applications.hdr import bracket_exposures, developed, hdr_picture
 from benchmarks.captures import psnr
@@ -21,7 +20,8 @@ from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
 from simulator import CameraSimulator, RawImage, get_camera
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import reference_scenes
 
 CAMERA, F_NUMBER = "nikon_z6", 8.0
 ISOS = (100, 1600, 6400)

@@ -165,6 +165,6 @@ BENCHMARK = Benchmark(
     title="The viewer's latency",
     parts=parts,
     report=report,
-    code=("agents/viewer", "agents/cli/view", "benchmarks/viewer"),
+    code=("agents/viewer", "agents/cli/show", "benchmarks/viewer"),
 )
 run = BENCHMARK.run

@@ -8,10 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
-from ae_env.scenes.pictures import detail_split
 from benchmarks.features import judging, pairs, training
 from benchmarks.features.detector import CELL, Detector, Features, mutual_matches, sample
 from benchmarks.features.judging import SIZE, area_under, measures
+from simulator.training.scenes import detail_split
 
 cv2 = pytest.importorskip("cv2")
 

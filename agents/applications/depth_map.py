@@ -9,8 +9,8 @@ from typing import Literal, get_args
 import numpy as np
 from PIL import Image
 
-from ae_env.scenes.reference_scenes import fill_from_nearest
 from agents.applications.hdr import import_openexr
+from simulator.training.scenes import fill_from_nearest
 
 #: What the numbers of a file are: distances, or inverse distances.
 DepthKind = Literal["distance", "disparity"]

@@ -10,37 +10,12 @@ from typing import Annotated, Any
 import typer
 
 from agents.cli.console import Seed, make_folder
-from simulator.utils.checks import check_word
 
 BENCHMARKS = (
-    *(
-        "ablation",
-        "agents",
-        "bracketing",
-        "brackets",
-        "cluster",
-        "colour_checker",
-        "convergence",
-        "defects",
-        "denoising",
-        "features",
-    ),
-    *(
-        "hdr",
-        "libcamera",
-        "onboard",
-        "paper",
-        "ptc",
-        "recorded",
-        "refocus",
-        "scorers",
-        "simulator",
-        "stability",
-        "throughput",
-        "transfer",
-    ),
-    "viewer",
-    "work_precision",
+    *("ablation", "agents", "bracketing", "brackets", "cluster", "colour_checker", "convergence"),
+    *("defects", "denoising", "features", "hdr", "libcamera", "onboard", "paper", "ptc"),
+    *("recorded", "refocus", "scorers", "simulator", "stability", "throughput", "transfer"),
+    *("viewer", "work_precision"),
 )
 #: The checkout that this package runs from; the benchmarks are not installed with it.
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -82,6 +57,8 @@ def bench(
 
     Example: `ae-env bench throughput --quick --out /tmp/results`
     """
+    from simulator.utils.checks import check_word
+
     name = name.replace("-", "_")
     check_word("name", name, BENCHMARKS)
     if against is not None and name != "throughput":

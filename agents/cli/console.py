@@ -14,9 +14,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from simulator.utils.files import write_atomically
-
 console = Console()
+
+# -- options of several commands: no module of a command imports anything heavy, see main.py ------
 
 MAX_SEED = 2**63 - 1
 Seed = Annotated[int, typer.Option(help="Seed of everything random.", min=0, max=MAX_SEED)]
@@ -27,6 +27,48 @@ OnError = Annotated[
     str, typer.Option(help="A file of --scenes that cannot be read: stop, or skip with a warning.")
 ]
 Device = Annotated[str, typer.Option(help="Torch device: auto, cpu, cuda.")]
+Policies = Annotated[
+    list[str] | None, typer.Option(help="A policy; give the option several times.")
+]
+Raw = Annotated[Path, typer.Argument(help="Any Bayer raw that LibRaw reads.")]
+OutDng = Annotated[Path, typer.Option("--out", "-o", help="DNG to write.")]
+Png = Annotated[Path | None, typer.Option(help="Also write the developed picture here.")]
+SourceIso = Annotated[
+    float | None, typer.Option(help="ISO speed of RAW, instead of what the file says.")
+]
+SourceShutter = Annotated[str | None, typer.Option(help="Exposure time of RAW [s].")]
+SourceAperture = Annotated[str | None, typer.Option(help="F-number of RAW.")]
+Weights = Annotated[
+    str,
+    typer.Option(
+        help="Largest network that may run: nano, compact, large; a file of weights; or none to "
+        "only add noise."
+    ),
+]
+Depth = Annotated[
+    str,
+    typer.Option(help="far, or unknown: estimate what is out of focus and blur it as f/ opens."),
+]
+Cache = Annotated[bool, typer.Option(help="Cache the outputs of the networks between runs.")]
+Tolerance = Annotated[
+    float,
+    typer.Option(
+        help="Error that a capture may have, in units of the target's noise: the cheapest way "
+        "within it is taken, or else the best; 0 for the best."
+    ),
+]
+Noise = Annotated[
+    str,
+    typer.Option(
+        help="exact: drawn; bank: looked up in a bank of normals, faster; or sensor: drawn with "
+        "the row noise and the tails of a calibrated camera's read noise."
+    ),
+]
+#: `simulator.capture.plan.DEFAULT_TOLERANCE`, which a test compares: help imports no torch.
+TOLERANCE = 0.1
+
+
+# -- the terminal ---------------------------------------------------------------------------------
 
 
 @contextmanager
@@ -77,9 +119,19 @@ def print_files(files: Mapping[str, Path]) -> None:
 
 def save_picture(path: Path, picture: Any) -> Path:
     """Writes a PIL image as PNG."""
+    from simulator.utils.files import write_atomically
+
     buffer = io.BytesIO()
     picture.save(buffer, format="PNG")
     return write_atomically(path, buffer.getvalue())
+
+
+def command_line() -> str:
+    """The command line that the user typed, for result files."""
+    return shlex.join(["ae-env", *sys.argv[1:]])
+
+
+# -- checks of options ----------------------------------------------------------------------------
 
 
 def parse_seconds(text: str, name: str = "shutter") -> float:
@@ -189,8 +241,3 @@ def torch_device(name: str) -> str:
     if name != "cpu" and not (cuda and name.partition(":")[0] == "cuda"):
         raise ValueError(f"`device` (={name!r}) must be auto, cpu{', cuda' if cuda else ''} here")
     return name
-
-
-def command_line() -> str:
-    """The command line that the user typed, for result files."""
-    return shlex.join(["ae-env", *sys.argv[1:]])

@@ -14,6 +14,7 @@ from agents.cli.console import (
     MAX_SEED,
     Device,
     OnError,
+    Policies,
     command_line,
     console,
     make_folder,
@@ -41,9 +42,6 @@ _CONDITION = ("lighting", "delay")
 _OF_BENCHMARKS = ("observation",)
 _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 
-Policies = Annotated[
-    list[str] | None, typer.Option(help="A policy; give the option several times.")
-]
 Preset = Annotated[
     str | None,
     typer.Option(

@@ -1,7 +1,13 @@
-"""The command line: the commands together, and what becomes of their errors."""
+"""The command line: the commands together, and what becomes of their errors.
+
+Help and usage errors come at once: the modules of the commands import nothing heavy (torch, numba,
+gymnasium, NumPy), and each command imports what it needs when it runs. `ae_env` itself loads
+gymnasium, so it is imported in functions, too.
+"""
 
 from __future__ import annotations
 
+import importlib.metadata
 import logging
 import signal
 import sys
@@ -13,28 +19,14 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 
-from ae_env import __version__
-from ae_env.utils.user_code import UserCodeError
 from agents.cli.bench import bench
-from agents.cli.cache_command import cache
 from agents.cli.console import print_line
+from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
-from agents.cli.export import export
-from agents.cli.film import film
-from agents.cli.hdr import hdr
-from agents.cli.import_weights import import_weights
 from agents.cli.quickstart import quickstart
-from agents.cli.record import record
-from agents.cli.refocus import refocus
-from agents.cli.scenes import scenes
-from agents.cli.score_tables import score_tables
-from agents.cli.scorers import convert_nima, scorers
-from agents.cli.simulate import simulate
-from agents.cli.sweep import sweep
-from agents.cli.train_agent import train
-from agents.cli.train_simulator import train_simulator
-from agents.cli.view import view
-from agents.cli.warm_up import warm_up
+from agents.cli.show import convert_nima, film, scorers, view
+from agents.cli.simulate import hdr, refocus, simulate, sweep
+from agents.cli.train import export, train, train_simulator
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -45,7 +37,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(import_weights, view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
+    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)
@@ -82,6 +74,8 @@ def main() -> None:
     except Exception as error:  # whatever it is, the user gets one line; --debug shows the rest
         if "--debug" in sys.argv:
             raise
+        from ae_env.utils.user_code import UserCodeError
+
         Console(stderr=True).print(f"[bold red]error[/] {escape(_one_line(error))}", soft_wrap=True)
         usage = isinstance(error, _USAGE) and not isinstance(error, UserCodeError)
         raise SystemExit(2 if usage else 1) from None
@@ -118,7 +112,7 @@ def _one_line(error: Exception) -> str:
 
 def _version(asked: bool) -> None:
     if asked:
-        print_line(f"ae-env {__version__}")
+        print_line(f"ae-env {importlib.metadata.version('ae-env')}")
         raise typer.Exit
 
 

@@ -39,8 +39,7 @@ def train(
 
     Example: `ae-env train configs/ppo.yaml --out runs/ppo`
     """
-    from agents.learning.learning_curve import load_curve
-    from agents.learning.training import load_config, train_agent
+    from agents.learning.training import load_config, load_curve, train_agent
     from agents.report.plots import plot_learning
     from simulator.utils.files import sibling
 

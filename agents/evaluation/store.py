@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation.evaluation_plan import digest
-from agents.policy import (
+from agents.policy_names import (
     FORECASTERS,
     LEARNT,
     split_class,
@@ -31,8 +31,7 @@ from agents.policy import (
     training_seeds,
     weight_files,
 )
-from simulator.utils.files import sibling, write_atomically
-from simulator.utils.results import package_version
+from simulator.utils.files import package_version, sibling, write_atomically
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene

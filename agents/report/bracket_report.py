@@ -8,8 +8,7 @@ from typing import Any
 
 from agents.evaluation.bracket_plan import MEASURES, BracketPlan, BracketResult
 from agents.report.markdown import code_block, escape, markdown_table
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_atomically, write_results
 
 #: Headings of the measures of a budget.
 _HEAD = ["policy", "quality", "95 % interval", "to the best", "error [EV]", "unseen", "frames"]

@@ -32,8 +32,7 @@ from agents.report.result_table import (
     training_seed_rows,
 )
 from simulator.settings import format_exposure_time
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_atomically, write_results
 
 _TABLE = (
     ("policy", "policy", ""),

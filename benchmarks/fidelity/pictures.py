@@ -13,14 +13,14 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ae_env.scenes.reference_scenes import depth_photographs, reference_scenes
 from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import load_models
 from benchmarks.harness import RUNS, Row, data_root, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import depth_photographs, reference_scenes
 
 CAMERA = "nikon_z6"
 #: The published picture; a quick run leaves it alone.

@@ -17,7 +17,7 @@ from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, sensor_signal
 
 if TYPE_CHECKING:
-    from simulator.reference.reference_camera import ReferenceScene
+    from simulator.reference.camera import ReferenceScene
 
 Stage = Literal["exposure", "noise", "aperture", "all"]
 

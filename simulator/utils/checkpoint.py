@@ -13,8 +13,7 @@ from typing import Any
 
 import torch
 
-from simulator.utils.files import write_atomically
-from simulator.utils.results import package_version
+from simulator.utils.files import package_version, write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: Least time between two checkpoints of a training [s].
@@ -76,7 +75,7 @@ class Checkpoint:
     Args:
         path: The file; None writes and reads nothing.
         identity: JSON value that says what is trained and how. A checkpoint of another training, or
-            of another version of this package, is not resumed but kept under another name.
+            of another version of this package, is not resumed but replaced.
         state: Called for the state to write; see `save_checkpoint`.
         writes: False in the processes of a distributed training that only read.
     """
@@ -101,15 +100,10 @@ class Checkpoint:
         if stored is None:
             return None
         if stored.get("identity") != self.identity:
-            assert self.path is not None
-            other = self.path.with_name(f"{self.path.name}.other")
-            if self.writes:
-                self.path.replace(other)
             _LOGGER.warning(
-                "checkpoint %s is of a training with other settings or of another version: it is "
-                "kept as %s, and training restarts",
+                "checkpoint %s is of a training with other settings or of another version: "
+                "training restarts",
                 self.path,
-                other.name,
             )
             return None
         return dict(stored["state"])

@@ -27,7 +27,7 @@ def test_every_environment_that_is_warmed_up_can_be_made(monkeypatch: pytest.Mon
 _WARM_UP = """
 import importlib, pkgutil
 import gymnasium as gym, numba
-from agents.cli.warm_up import warm_up
+from agents.cli.data import warm_up
 import ae_env, simulator
 
 make_vec = gym.make_vec

@@ -2,6 +2,7 @@ import json
 import multiprocessing
 import os
 import time
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,11 @@ import pytest
 import torch
 import yaml
 
-from agents.bracketing.learnt import BracketTraining
-from agents.learning import training
+from agents.learning import training, workers
 from agents.learning.ppo import PPOTraining
-from agents.learning.regression_training import RegressionTraining
+from agents.learning.regression import RegressionTraining
+from agents.learning.training import LearningCurve, load_curve
+from simulator.utils import checkpoint
 from simulator.utils.files import sibling
 
 CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
@@ -36,7 +38,7 @@ def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs(path: Path) -> None:
     config, text = training.load_config(path), yaml.safe_load(path.read_text())
-    kinds = {"regression": RegressionTraining, "ppo": PPOTraining, "bracket": BracketTraining}
+    kinds = {"regression": RegressionTraining, "ppo": PPOTraining}
     kind = kinds[config.agent]
     hyperparameters = config.hyperparameters()
     assert isinstance(hyperparameters, kind)
@@ -52,7 +54,7 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
         (
             "agent: dqn",
-            r"agent \(='dqn'\): Input should be 'regression', 'ppo', 'bracket' or 'forecaster'",
+            r"agent \(='dqn'\): Input should be 'regression', 'ppo' or 'forecaster'",
         ),
         ("", r"is empty: it must map entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
@@ -131,6 +133,12 @@ def test_a_failed_save_keeps_the_training_and_its_log(tmp_path: Path, monkeypatc
     assert json.loads((tmp_path / "agent.json").read_text())["training"]["training"]["seed"] == 1
 
 
+def _train_with_a_checkpoint_each_step(job: training.TrainingJob) -> None:
+    checkpoint.INTERVAL = -1.0
+    progress = partial(workers.send_progress, job.name)
+    training.train_agent(job.config, job.out, progress=progress)
+
+
 @pytest.mark.usefixtures("quick_spawn")
 def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
     trainings = {"regression": {"frames": 240}, "ppo": {"total_timesteps": 240}}
@@ -138,10 +146,11 @@ def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
     running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
 
     def stop(*_: object) -> None:
-        raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
+        if running.is_file():
+            raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
 
     with pytest.raises(KeyboardInterrupt):
-        training.train_in_parallel(todo, workers=1, progress=stop)
+        workers.run_in_parallel(_train_with_a_checkpoint_each_step, todo, workers=1, progress=stop)
     assert running.is_file()
     assert not waiting.exists()
     seen: list[int] = []
@@ -157,29 +166,29 @@ def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
 
 
 def _share(job: int) -> None:
-    training.tell(job, torch.get_num_threads())
+    workers.send_progress(job, torch.get_num_threads())
     if job == 2:
         raise ValueError("job 2 has failed")
 
 
 @pytest.mark.usefixtures("quick_spawn")
 def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "core_count", lambda: 6)
+    monkeypatch.setattr(workers, "core_count", lambda: 6)
     seen: list[tuple[object, ...]] = []
     with pytest.raises(ValueError, match="job 2 has failed"):
-        training.run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
+        workers.run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
     assert (2, 3) in seen
 
 
 def _never_end(job: int) -> None:
-    training.tell(os.getpid())
+    workers.send_progress(os.getpid())
     time.sleep(600)
 
 
 def _wait_for_ever(pipe: Connection) -> None:
     contexts = {"spawn": multiprocessing.get_context("fork")}
     multiprocessing.get_context = contexts.__getitem__  # type: ignore[assignment]
-    training.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
+    workers.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
 
 
 def _runs(pid: int) -> bool:
@@ -202,3 +211,37 @@ def test_workers_do_not_outlive_a_killed_parent(forkserver: Any) -> None:
     while any(_runs(pid) for pid in workers):
         assert time.monotonic() < end, "they work on for nobody"
         time.sleep(0.05)
+
+
+def test_rows_are_means_over_parts_of_the_training(tmp_path: Path) -> None:
+    curve = LearningCurve(tmp_path / "agent.csv")
+    for done in range(1, 1001):  # a row every 5 frames
+        curve(done, 1000, {"reward": float(done)})
+    found = load_curve(tmp_path / "agent.csv")
+    assert found["frames"] == list(range(5, 1001, 5))
+    assert found["reward"] == list(range(3, 1000, 5))
+
+
+def test_a_training_that_resumes_repeats_no_frames(tmp_path: Path) -> None:
+    path = tmp_path / "agent.csv"
+    first = LearningCurve(path)
+    for done in (200, 400, 600, 800):
+        first(done, 1000, {"mse": 1.0})
+    second = LearningCurve(path)  # its checkpoint was written after 500 frames
+    for done in (600, 800, 1000):
+        second(done, 1000, {"mse": 2.0})
+    found = load_curve(path)
+    assert found["frames"] == [200, 400, 600, 800, 1000]
+    assert found["mse"] == [1, 1, 2, 2, 2]
+    other = LearningCurve(path)  # another training of the same name
+    other(1000, 1000, {"reward": 3.0})
+    assert load_curve(path) == {"frames": [1000.0], "reward": [3.0]}
+
+
+@pytest.mark.parametrize("text", ["name,price\ntable,12\n", "", "frames,mse\n1\n", "\x00"])
+def test_a_file_of_something_else_is_not_replaced(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "agent.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"agent.csv is not a learning curve"):
+        LearningCurve(path)
+    assert path.read_text() == text

@@ -1,0 +1,283 @@
+"""Data: ``ae-env scenes``, ``record``, ``score-tables``, ``cache`` and ``warm-up``."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from contextlib import closing
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated, Any
+
+import typer
+
+from agents.cli.console import (
+    Seed,
+    console,
+    make_folder,
+    print_files,
+    print_line,
+    progress_bars,
+)
+
+scenes = typer.Typer(no_args_is_help=True)
+
+#: Environments whose first frames need the compiled code of all environments between them.
+_CASES: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("AutoExposure-v0", {}),
+    ("AutoExposure-v0", {"observation": "statistics"}),
+    ("AutoExposure-v0", {"observation": "linear", "lighting": "flicker"}),
+    ("AutoExposure-v0", {"observation": "dn", "noise": "exact"}),
+    ("AutoExposure-v0", {"noise": "sensor", "camera": "canon_5d4", "scenes": "bundled:small"}),
+    ("AutoExposure-v0", {"split": "test", "source": "raw"}),
+    ("AutoExposureVideo-v0", {}),
+    ("ExposureBracket-v0", {}),
+)
+
+
+@scenes.callback()
+def _scenes() -> None:
+    """Sets of real scenes.
+
+    Example: `ae-env scenes download`
+    """
+
+
+@scenes.command()
+def download(
+    url: Annotated[
+        str | None, typer.Option(help="Another server's folder that holds NAME_1k.hdr.")
+    ] = None,
+) -> None:
+    """Fetch Poly Haven's panoramas (CC0) for `--scenes polyhaven`; a second run resumes the first.
+
+    They go to the cache folder (`ae-env cache` names it). Those that AE_ENV_DATA holds are not
+    fetched. A proxy is taken from the environment.
+
+    Example: `ae-env scenes download`
+    """
+    from ae_env.scenes.polyhaven import URL, download, list_assets
+
+    with progress_bars() as progress, progress("maps") as task:
+        fetched = download(url=url or URL, progress=task)
+    console.print(f"{len(fetched)} of {len(list_assets())} maps were fetched, all are there")
+    print_line("try next: ae-env quickstart --scenes polyhaven --out real_scenes")
+
+
+def record(
+    policy: Annotated[str, typer.Option(help="The policy that acts.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Name, such as ae_env/matrix-v0.")],
+    task: Annotated[
+        str, typer.Option(help="AutoExposure-v0 or AutoExposureVideo-v0.")
+    ] = "AutoExposure-v0",
+    env: Annotated[
+        str | None, typer.Option(help="Preset of the environment, or a YAML file.")
+    ] = None,
+    scenes: Annotated[str | None, typer.Option(help="Scenes to draw from.")] = None,
+    split: Annotated[str | None, typer.Option(help="train (default), test or all.")] = None,
+    episodes: Annotated[int, typer.Option(help="How many.", min=1, max=1_000_000)] = 200,
+    seed: Seed = 0,
+) -> None:
+    """Record episodes of a policy as a Minari dataset.
+
+    It lies in Minari's folder, or in that of MINARI_DATASETS_PATH; `minari list local` shows it.
+
+    Example: `ae-env record --policy matrix:tuned -o ae_env/matrix-v0`
+    """
+    import gymnasium as gym
+
+    from ae_env.utils.presets import load_preset
+    from agents.evaluation.running import fit_policies
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy
+    from agents.recording import check_dataset_id, record_dataset
+    from agents.rollouts import fitting_arguments
+    from simulator.utils.checks import check_word
+
+    check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))
+    check_dataset_id(out)
+    given = {"split": split, "scenes": scenes}
+    options: dict[str, Any] = {
+        "split": "train",
+        **({} if env is None else load_preset(env)),
+        **{name: value for name, value in given.items() if value is not None},
+    }
+    task = f"ae_env/{task}"
+    with closing(gym.make_vec(f"ae_env:{task}", num_envs=1, **options)) as envs:
+        acting = make_policy(policy, PolicyContext.from_envs(envs))
+        arguments = {k: v for k, v in options.items() if k != "max_episode_steps"}
+        arguments |= {"grid": "video"} if "Video" in task and "grid" not in arguments else {}
+        arguments = fitting_arguments(arguments, options.get("resolution", 64))
+    with progress_bars() as progress:
+        with progress("fitting") as bar:
+            fit_policies({policy: acting}, arguments, seed=seed, progress=bar)
+        with progress("episodes") as bar:
+            dataset = record_dataset(
+                acting, policy, task, options, out, episodes=episodes, seed=seed, progress=bar
+            )
+    mean = sum(one.rewards.sum() for one in dataset.iterate_episodes()) / dataset.total_steps
+    console.print(f"{dataset.total_steps:,} steps, mean reward {mean:.3f}")
+    print_line(f'read it with: minari.load_dataset("{out}")')
+
+
+def score_tables(
+    what: Annotated[
+        str, typer.Argument(help="A folder or glob of raws and radiance maps, or one of them.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the shards.")] = Path(
+        "score_tables"
+    ),
+    on: Annotated[
+        str,
+        typer.Option(
+            help="local: this process; ray: a Ray on this machine; or a cluster's address, such as "
+            "ray://head:10001 or auto."
+        ),
+    ] = "local",
+    workers: Annotated[int, typer.Option(help="Processes on Ray.", min=1)] = 2,
+    per_shard: Annotated[int, typer.Option(help="Files of a shard.", min=1)] = 16,
+    resolution: Annotated[int, typer.Option(help="Packed pixels a side.", min=1)] = 64,
+    grid: Annotated[
+        str, typer.Option(help="Exposure grid: default, third_stop, video, bracket.")
+    ] = "default",
+    scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
+    camera: Annotated[str, typer.Option(help="Camera for radiance maps.")] = "nikon_z6",
+    weights: Annotated[
+        str, typer.Option(help="Networks that take the noise out of raws; none for none.")
+    ] = "compact",
+    captures: Annotated[bool, typer.Option(help="Also write the captures.")] = False,
+    seed: Seed = 0,
+) -> None:
+    """Score every exposure state of many raws or radiance maps; writes Parquet, shard by shard.
+
+    Run it again to continue. Needs the extra `tables`; a cluster the extra `ray`.
+
+    Example: `ae-env score-tables path/to/raws -o tables`
+    """
+    from ae_env.grid import ExposureGrid
+    from ae_env.scenes.loading import check_weights
+    from ae_env.scorers import make_scorer
+    from agents.score_shards import ShardPlan, check_engine, run
+    from simulator import get_camera
+
+    try:
+        import pyarrow  # noqa: F401
+    except ModuleNotFoundError:
+        raise ImportError(
+            "`ae-env score-tables` needs the extra tables: pip install 'ae-env[tables]'"
+        ) from None
+    check_engine(on)
+    ExposureGrid.from_spec(grid), make_scorer(scorer), get_camera(camera)
+    if weights != "none":
+        check_weights(weights)
+    plan = ShardPlan.of(
+        what,
+        out,
+        per_shard=per_shard,
+        resolution=resolution,
+        camera=camera,
+        grid=grid,
+        scorer=scorer,
+        weights=weights,
+        captures=captures,
+        seed=seed,
+    )
+    make_folder(out)
+    begun = perf_counter()
+    with progress_bars() as progress, progress("shards") as task:
+        made = run(plan, on, task, workers)
+    if not made:
+        print_line("every shard was there already")
+        return
+    scenes, bad = (sum(int(one[name]) for one in made) for name in ("scenes", "bad"))
+    seconds = perf_counter() - begun
+    print_line(f"{scenes} scenes in {seconds:.1f} s, {bad} files that could not be read")
+    if bad:
+        print_line(f"which and why: {out}/bad-*.jsonl")
+    if not scenes:
+        raise RuntimeError("none of these files could be made a scene")
+    print_files({"score tables": out / "tables-*.parquet"})
+
+
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all of it.")] = False,
+) -> None:
+    """Show what is cached between runs (scenes, networks' outputs), or clear it.
+
+    Example: `ae-env cache --clear`; the folder is another one where AE_ENV_CACHE names it.
+    """
+    from rich.table import Table
+
+    from simulator.utils.cache import DISK_BYTES, disk_cache
+
+    disk = disk_cache()
+    usage = disk.usage()
+    if clear:
+        disk.clear()
+    table = Table(title="removed" if clear else f"cached, at most {DISK_BYTES >> 30} GiB")
+    table.add_column("kind")
+    table.add_column("files", justify="right")
+    table.add_column("bytes", justify="right")
+    for kind, (files, size) in usage.items():
+        table.add_row(kind.replace("_", " "), f"{files:,}", f"{size:,}")
+    console.print(table)
+    print_line(f"folder: {disk.folder}")
+
+
+def warm_up() -> None:
+    """Compile the simulator and draw the bundled scenes, as a container's build would.
+
+    Both are kept: the code beside the sources or in NUMBA_CACHE_DIR, the scenes in AE_ENV_CACHE.
+    So that all processors of a cluster have code, run it on one of each model.
+
+    Example: `ae-env warm-up`
+    """
+    logging.getLogger("simulator.utils.compute").setLevel(logging.ERROR)  # it proposes this command
+    with progress_bars() as progress, progress("warming up") as task:
+        for done, (name, arguments) in enumerate(_CASES):
+            task(done, len(_CASES) + 1, ", ".join([name, *map(str, arguments.values())]))
+            _play(name, arguments)
+        task(len(_CASES), len(_CASES) + 1, "raw files and the viewer")
+        _use_rest()
+        task(len(_CASES) + 1, len(_CASES) + 1)
+    console.print("try next: ae-env quickstart")
+
+
+def _play(name: str, arguments: dict[str, Any]) -> None:
+    """Draws the scenes of an environment and plays some steps."""
+    import gymnasium as gym
+    import numpy as np
+
+    envs = gym.make_vec(f"ae_env:ae_env/{name}", num_envs=16, **arguments)
+    list(envs.unwrapped.scenes)  # type: ignore[attr-defined]  # draws every one
+    envs.reset(seed=0)
+    for _ in range(4):
+        envs.step(np.arange(16))
+    envs.close()
+
+
+def _use_rest() -> None:
+    """Does what those environments do not: raw files, the viewer, blur along rows, painting."""
+    import numpy as np
+    import torch
+
+    from agents.cli.show import DEFAULT_SCENES
+    from agents.viewer.library import find_scenes
+    from agents.viewer.viewed_scene import View, ViewedScene
+    from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
+    from simulator.optics.blur import disc_blur, motion_blur
+    from simulator.optics.blur_kernels import Blur, blur_many
+    from simulator.radiance.procedural import draw
+
+    library = find_scenes(DEFAULT_SCENES)
+    viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))
+    view = View(viewed.best(), speed=5.0, defocus=4.0)
+    viewed.readout(view, viewed.picture(view).capture)
+    with tempfile.TemporaryDirectory() as folder:
+        raw = read_raw(viewed.write_dng(Path(folder, "any.dng"), view))
+    estimate_nlf(raw.data)
+    numbers = raw.to_mosaic().astype(np.float64)  # files hold integers
+    light = RawImage.from_mosaic(numbers, raw.settings, raw.camera).data
+    disc_blur(motion_blur(light, 2.5), 2.5)
+    blur_many([Blur(light, extent_px=2.5, moved=torch.empty_like(light))])
+    draw("dead_leaves", np.random.default_rng(0))  # the scenes may all have been in the cache

@@ -1,0 +1,214 @@
+"""What there is to look at: ``ae-env view``, ``film``, ``scorers`` (and ``convert-nima``)."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from agents.cli.console import (
+    TOLERANCE,
+    Cache,
+    Depth,
+    Device,
+    Policies,
+    Seed,
+    Tolerance,
+    Weights,
+    check_outputs,
+    console,
+    make_folder,
+    print_files,
+    print_line,
+    progress_bars,
+    torch_device,
+)
+from agents.cli.simulate import check_depth, make_simulator
+
+#: What is shown where nothing is named; `ae-env warm-up` draws it.
+DEFAULT_SCENES = "bundled:small"
+#: Policies of a film where none is given.
+POLICIES = ("average:tuned", "average:tuned?foresight=model", "regression:video?foresight=learnt")
+
+
+def view(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="[RAW|FOLDER|SCENE]",
+            help="A raw or radiance map, a folder of them, scenes such as bundled or polyhaven, or "
+            "the id of a bundled scene.",
+        ),
+    ] = DEFAULT_SCENES,
+    port: Annotated[int, typer.Option(help="Port to serve at; 0 for any.", min=0, max=65535)] = 0,
+    open_browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the page in the default browser.")
+    ] = True,
+    scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
+    weights: Weights = "compact",
+    depth: Depth = "far",
+    tolerance: Tolerance = TOLERANCE,
+    device: Device = "auto",
+    cache: Cache = True,
+) -> None:
+    """Look at a scene in the browser: any settings, all scores, episodes of two policies.
+
+    The page is served to this machine alone, until Ctrl-C. Needs the extra `view`.
+
+    Example: `ae-env view IMG_0001.CRW`
+    """
+    try:
+        from agents.viewer.server import free_port, serve
+    except ModuleNotFoundError as error:
+        if error.name not in ("nicegui", "fastapi"):
+            raise
+        raise ImportError(
+            "`ae-env view` needs the extra view: pip install 'ae-env[view]'"
+        ) from None
+    from ae_env.scorers import make_scorer
+    from agents.viewer.library import find_scenes
+    from agents.viewer.page import Options
+    from simulator.capture.plan import check_tolerance
+
+    check_depth(depth, weights)
+    check_tolerance(tolerance)
+    make_scorer(scorer)
+    port = free_port(port)
+    simulator = make_simulator(weights, torch_device(device), cache)
+    with progress_bars() as progress, progress("scenes") as task:
+        library = find_scenes(what)
+        task(1, 1)
+    options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
+    serve(options, port, open_browser, _tell)
+
+
+def _tell(address: str) -> None:
+    print_line(f"open {address}")
+    print_line("Ctrl-C stops")
+    console.file.flush()
+
+
+def film(
+    policy: Policies = None,
+    light: Annotated[
+        str, typer.Option(help="Kind of moving light: tunnels, sines, shadows, clouds, pans...")
+    ] = "tunnels",
+    scenes: Annotated[str, typer.Option(help="Scenes to draw from.")] = "bundled",
+    scene: Annotated[str | None, typer.Option(help="Id of the scene; drawn by default.")] = None,
+    frames: Annotated[int, typer.Option(help="Actions of the episode.", min=1)] = 64,
+    seed: Seed = 0,
+    out: Annotated[Path, typer.Option(help="The animated GIF.")] = Path("film.gif"),
+) -> None:
+    """Film one episode of AutoExposureVideo-v0: policies side by side, in the same moving light.
+
+    Example: `ae-env film --policy average:tuned --policy ppo:video --light shadows`
+    """
+    import gymnasium as gym
+
+    import ae_env  # noqa: F401  (registers the environment)
+    from ae_env.lighting.moving import KIND_SETS, MOVES
+    from agents.evaluation.running import fit_policies
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy
+    from agents.report.film import film as write
+    from simulator.utils.checks import check_word
+
+    check_outputs(out=(out, ".gif"))
+    check_word("light", light, (*MOVES, *KIND_SETS))
+    options: dict[str, Any] = {"scenes": scenes, "split": "test"}
+    envs = gym.make_vec(
+        "ae_env/AutoExposureVideo-v0",
+        num_envs=1,
+        **options,
+        lighting={"kind": "moving", "kinds": light},
+        max_episode_steps=frames + 1,
+        render_mode="rgb_array",
+        with_oracle=True,
+    )
+    with closing(envs), progress_bars() as progress:
+        if scene is not None:
+            _check_scene(scene, envs)
+        context = PolicyContext.from_envs(envs)
+        policies = {name: make_policy(name, context) for name in policy or POLICIES}
+        with progress("fitting") as task:
+            fit_policies(policies, {"scenes": "bundled", "grid": "video"}, progress=task)
+        with progress("film") as task:
+            write(policies, envs, out, frames=frames, seed=seed, scene=scene, progress=task)
+    print_files({"film": out})
+
+
+def _check_scene(scene: str, envs: Any) -> None:
+    """Raises a `ValueError` unless `envs` have `scene`."""
+    from simulator.utils.checks import did_you_mean
+
+    known = [one.scene_id for one in envs.unwrapped.scenes]
+    if scene not in known:
+        raise ValueError(
+            f"`scene` (={scene!r}) must be the id of a test scene, such as {known[0]!r}"
+            f"{did_you_mean(scene, known)}"
+        )
+
+
+def scorers() -> None:
+    """List all known scorers, those of installed packages included.
+
+    Example: `ae-env scorers` lists them; docs/plug-in-a-scorer.md says how to add one.
+    """
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from ae_env.scorers.registry import describe_scorers
+
+    table = Table(title="scorers: all in [0, 1], higher is better", box=box.SIMPLE_HEAD)
+    for title in ("name", "sees", "depends on"):
+        table.add_column(title, no_wrap=True)
+    table.add_column("what it is", overflow="fold")
+    for row in describe_scorers():
+        what = Text(f"broken: {row.error}", "red") if row.error else Text(row.summary)
+        if row.needs:
+            what.append(f" Needs {row.needs}.", "dim")
+        if row.package != "ae-env":
+            what.append(f" From {row.package}.", "dim")
+        table.add_row(Text(row.name), row.domain, row.depends_on, what)
+    console.print(table)
+    print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")
+
+
+def convert_nima(
+    file: Annotated[Path, typer.Argument(help="The published Keras weights, .h5 or .hdf5.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="The .safetensors; by default in the cache folder."),
+    ] = None,
+) -> None:
+    """Convert NIMA's published Keras weights for the scorers nima_aesthetic and nima_technical.
+
+    Example: `ae-env convert-nima weights_mobilenet_aesthetic_0.07.hdf5`
+
+    Needs h5py: `pip install 'ae-env[nima]'`.
+    """
+    from ae_env.scorers.nima import PUBLISHED, convert_nima, published_as
+    from simulator.utils.cache import cache_dir
+    from simulator.utils.files import as_path
+
+    if not as_path(file).is_file():
+        raise ValueError(f"`file` (={str(file)!r}) must be the file of Keras weights")
+    kind = published_as(file.read_bytes())
+    if out is None and kind is None:
+        raise ValueError(
+            f"`file` (={str(file)!r}) is not one of the published files (git blob ids "
+            f"{', '.join(PUBLISHED.values())}): say what it becomes with --out, such as "
+            "--out nima_aesthetic.safetensors"
+        )
+    target = cache_dir() / f"{kind}.safetensors" if out is None else out
+    make_folder(target.parent, file=target)
+    convert_nima(file, target)
+    text = f"the published weights of {kind}" if kind else "not one of the published files"
+    print_line(f"{file.name}: {text}")
+    print_files({"weights": target})
+    name = kind or "nima_aesthetic"
+    if out is not None:
+        print_line(f"next: export AE_ENV_{name.upper()}={target.resolve()}")

@@ -1,0 +1,184 @@
+"""Trainings and their results: ``ae-env train``, ``train-simulator`` and ``export``."""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from agents.cli.console import (
+    Device,
+    OwnSeed,
+    check_outputs,
+    command_line,
+    console,
+    make_folder,
+    print_files,
+    print_line,
+    progress_bars,
+    torch_device,
+)
+
+if TYPE_CHECKING:
+    from agents.learning.training import AgentConfig
+
+#: Evaluations of the tasks; that of still light is the command's own default.
+_PRESETS = {"ae_env/AutoExposureVideo-v0": "video", "ae_env/ExposureBracket-v0": "bracket"}
+
+
+def train(
+    config: Annotated[Path, typer.Argument(help="YAML such as configs/regression.yaml.")],
+    out: Annotated[Path, typer.Option(help="File name of the agent, without suffix.")] = Path(
+        "runs/agent"
+    ),
+    seed: OwnSeed = None,
+    device: Device = "cpu",
+    tensorboard: Annotated[Path | None, typer.Option(help="Folder for a TensorBoard log.")] = None,
+) -> None:
+    """Train an agent; a second run resumes the first.
+
+    Example: `ae-env train configs/ppo.yaml --out runs/ppo`
+    """
+    from ae_env.utils.presets import find_config
+    from agents.learning.training import load_config, load_curve, train_agent
+    from agents.report.plots import plot_learning
+    from simulator.utils.files import sibling
+
+    device = torch_device(device)
+    agent = load_config(find_config(config))
+    file = sibling(out, ".json")
+    make_folder(file.parent, file=file)
+    if seed is not None:
+        agent = agent.with_seed(seed)
+    with progress_bars() as progress, progress(f"training {agent.agent}") as task:
+
+        def report(done: int, total: int, values: dict[str, float]) -> None:
+            task(done, total, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
+
+        train_agent(agent, out, progress=report, device=device, tensorboard=tensorboard)
+    files = {"weights": sibling(out, ".safetensors"), "description": file}
+    curve = sibling(out, ".csv")
+    if curve.is_file():
+        picture = plot_learning(sibling(out, ".png"), {agent.agent: load_curve(curve)})
+        files |= {"learning curve": curve, "its picture": picture}
+    print_files(files)
+    print_line("next: " + shlex.join(["ae-env", "evaluate", *_evaluation(agent, out)]))
+
+
+def _evaluation(agent: AgentConfig, out: Path) -> list[str]:
+    """Options that evaluate the agent on what it was trained for."""
+    if agent.agent == "forecaster":
+        return ["--preset", "video", "--policy", f"regression:video?foresight={out}"]
+    words = ["--policy", f"{agent.agent}:{out}"]
+    preset = _PRESETS.get(agent.task)
+    if preset is not None:
+        words = ["--preset", preset, *words]
+    if preset is None and isinstance(agent.environment.get("grid"), str):
+        words += ["--grid", agent.environment["grid"]]
+    for name in ("observation", "resolution"):
+        if name in agent.environment:
+            words += [f"--{name}", str(agent.environment[name])]
+    return words if agent.environment.get("sensors", True) else [*words, "--no-sensors"]
+
+
+def train_simulator(
+    config: Annotated[Path, typer.Argument(help="YAML such as configs/simulator/compact.yaml.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; by default runs/simulator/NAME-OF-THE-CONFIG.")
+    ] = None,
+    seed: OwnSeed = None,
+    device: Device = "auto",
+    tensorboard: Annotated[bool, typer.Option(help="Log to OUT/tensorboard.")] = True,
+) -> None:
+    """Train the simulator's modules stage by stage; a second run resumes the first.
+
+    Example: `ae-env train-simulator configs/simulator/compact.yaml`
+
+    Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
+    """
+    from ae_env.utils.presets import find_config
+    from simulator.networks.weights import build_modules
+    from simulator.training.train import load_config, load_start, train_and_save
+
+    training = load_config(find_config(config))
+    if seed is not None:
+        training = training.model_copy(update={"seed": seed})
+    if training.start is not None:
+        load_start(training, build_modules(training.preset))
+    folder = Path("runs/simulator") / config.stem if out is None else out
+    make_folder(folder)
+    device = torch_device(device)
+    with progress_bars() as progress:
+        tasks: dict[str, Any] = {}
+        with contextlib.ExitStack() as stack:
+
+            def report(name: str, share: float, values: dict[str, float]) -> None:
+                if name not in tasks:
+                    tasks[name] = stack.enter_context(progress(name))
+                tasks[name](share, 1.0, ", ".join(f"{k} {v:.3f}" for k, v in values.items()))
+
+            weights = train_and_save(
+                training,
+                folder / training.preset,
+                command=command_line(),
+                device=device,
+                tensorboard=tensorboard,
+                progress=report,
+            )
+    print_files({"weights": weights, "model card": weights.with_suffix(".json")})
+    if training.preset in ("compact", "paper"):
+        command = shlex.join(["ae-env", "simulate", "RAW", "--weights", str(weights)])
+        print_line(f"next: {command} ...")
+
+
+def export(
+    policy: Annotated[
+        str, typer.Argument(help="regression, ppo, regression:video, regression:PATH or ppo:PATH.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The .onnx file.")] = Path("policy.onnx"),
+) -> None:
+    """Export a trained agent to ONNX, to run it without torch (`agents.onboard.Controller`).
+
+    Its states, and what it keeps in mind between frames, are in the same file.
+
+    Example: `ae-env export regression -o policy.onnx`
+    """
+    import gymnasium as gym
+
+    from agents.learning.weights import load_agent, trained_grid
+    from agents.onboard.controller import Controller
+    from agents.onboard.export import export_agent
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy, training_seeds
+
+    kind = policy.partition(":")[0].partition("?")[0]
+    if kind not in ("regression", "ppo") or "*" in policy or "?" in policy:
+        raise ValueError(
+            f"`policy` (={policy!r}) must be regression or ppo, alone or with :video or :PATH"
+        )
+    check_outputs(out=(out, ".onnx"))
+    name = training_seeds(policy)[0]
+    _, card = load_agent(name.partition(":")[2], kind)
+    seen, grid = card["context"], trained_grid(card)
+    states = {n: list(getattr(grid, n)) for n in ("isos", "exposure_times", "f_numbers")}
+    with contextlib.closing(
+        gym.make_vec(
+            "ae_env:ae_env/AutoExposure-v0",
+            num_envs=1,
+            scenes="bundled:small",
+            resolution=seen["resolution"][-1],
+            sensors=seen["sensors"],
+            grid=states,
+        )
+    ) as envs:
+        agent = make_policy(name, PolicyContext.from_envs(envs))
+    file = export_agent(agent, out)
+    controller = Controller(file)
+    console.print(
+        f"{len(controller.states)} states, frames of {controller.frame_shape}, "
+        f"{file.stat().st_size / 1e6:.2f} MB"
+    )
+    print_files({"agent": file})

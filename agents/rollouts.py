@@ -1,0 +1,216 @@
+"""Episodes for fitting and evaluation: the same for every policy, whatever the batch size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from ae_env.utils.user_code import UserCodeError
+from agents.policy import Observations
+
+if TYPE_CHECKING:
+    from ae_env.scenes import Scene
+    from ae_env.scenes.loading import SceneSpec
+
+ENV_ID = "ae_env/AutoExposure-v0"
+#: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
+MIN_TRAINING_GROUPS = 15
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def make_envs(
+    env_options: Mapping[str, Any], *, num_envs: int, frames: int, with_oracle: bool = False
+) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """Environments for `evaluate` and `fit_policies`: no autoreset, episodes of `frames` and more.
+
+    Args:
+        env_options: Arguments of the environment, such as ``{"split": "test"}``.
+        num_envs: Episodes at a time.
+        frames: Actions that an episode must allow.
+        with_oracle: Whether `info` holds ``oracle_state``.
+    """
+    import ae_env  # noqa: F401  (registers the environment)
+
+    options = {**env_options, "with_oracle": with_oracle, "autoreset_mode": "DISABLED"}
+    # One frame more than is used: the episode must not end inside the evaluation.
+    return gym.make_vec(ENV_ID, num_envs=num_envs, max_episode_steps=frames + 1, **options)
+
+
+def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[str, Any], bool]:
+    """Arguments of an environment to train on for an evaluation on `scenes`.
+
+    Returns:
+        Its ``scenes``, with the ``grid`` of recorded ones; and whether they are others, the bundled
+        ones, because `scenes` has too few source groups for a training split.
+    """
+    from ae_env.options import EnvOptions
+    from ae_env.scenes.loading import BUNDLED, REAL
+
+    if isinstance(scenes, str) and scenes in (*BUNDLED, *REAL):
+        return {"scenes": scenes}, False
+    options = EnvOptions(scenes=scenes, split="all", resolution=resolution)
+    groups = {scene.group for scene in options.load_scenes()}
+    if len(groups) >= MIN_TRAINING_GROUPS:
+        return {"scenes": scenes}, False
+    found: dict[str, Any] = {"scenes": "bundled"}
+    if options.recorded is not None:
+        grid = options.make_grid()
+        found["grid"] = {name: list(values) for name, values in asdict(grid).items()}
+    return found, True
+
+
+def fitting_arguments(environment: Mapping[str, Any], resolution: int) -> dict[str, Any]:
+    """`environment`, arguments of one that a policy is judged in, with scenes to fit it on."""
+    scenes = environment.get("scenes", "bundled")
+    if not isinstance(scenes, str | Mapping):
+        return dict(environment)
+    own = {name: value for name, value in environment.items() if name != "scenes"}
+    return training_arguments(scenes, resolution)[0] | own
+
+
+def scenes_of(envs: gym.vector.VectorEnv[Any, Any, Any]) -> list[Scene]:
+    """The scenes that the episodes of `envs` draw from."""
+    base: Any = envs.unwrapped
+    return list(base.scenes)
+
+
+def expected_scores(envs: gym.vector.VectorEnv[Any, Any, Any]) -> Floats:
+    """q of every state in the current frame of each episode, ``(N, S)``."""
+    base: Any = envs.unwrapped
+    return np.array(base.expected_scores(), dtype=np.float64)
+
+
+def action_masks(envs: gym.vector.VectorEnv[Any, Any, Any]) -> NDArray[np.bool_]:
+    """States that the scene of each episode allows, ``(N, S)``."""
+    base: Any = envs.unwrapped
+    return np.array(base.action_masks(), dtype=np.bool_)
+
+
+@dataclass(frozen=True)
+class EpisodeBatch:
+    """One batch of freshly reset episodes.
+
+    Args:
+        index: Numbers of the episodes, ``(N,)``.
+        observations: Of the reset frame.
+        info: Of the reset frame.
+        action_masks: Allowed states, ``(N, S)`` bool.
+        groups: Source group of each episode's scene, ``(N,)``.
+        valid: False for the copies that fill the last batch.
+        seed: Seed of the batch's first episode.
+    """
+
+    index: Ints
+    observations: Observations
+    info: Mapping[str, Any]
+    action_masks: NDArray[np.bool_]
+    groups: NDArray[Any]
+    valid: NDArray[np.bool_]
+    seed: int
+
+
+@dataclass(frozen=True)
+class RolloutPlan:
+    """Episodes that are run one batch after the other.
+
+    The seed alone decides an episode's motion, defocus, noise and start, so that an episode is the
+    same in a batch of any size.
+
+    Args:
+        scenes: What is photographed.
+        seeds: Seed of each episode, length E.
+        scene: Index of each episode's scene, ``(E,)``.
+        starts: State in which each begins; None where the seed draws it.
+    """
+
+    scenes: Sequence[Scene]
+    seeds: Sequence[int]
+    scene: Ints
+    starts: Sequence[int | None]
+
+    @classmethod
+    def of_each_scene(
+        cls, scenes: Sequence[Scene], *, count: int, seed: int, most: int | None = None
+    ) -> RolloutPlan:
+        """All scenes, `count` times in a row; episode i has the seed ``seed + i``.
+
+        Args:
+            scenes: The scenes.
+            count: Episodes of each.
+            seed: Of the first.
+            most: Use so many scenes at most, evenly over the list; None for all.
+        """
+        used = len(scenes) if most is None else min(most, len(scenes))
+        scene = np.tile(np.arange(used) * len(scenes) // used, count)
+        seeds = range(seed, seed + len(scene))
+        return cls(scenes, seeds, scene, [None] * len(scene))
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    def batches(self, envs: gym.vector.VectorEnv[Any, Any, Any]) -> Iterator[EpisodeBatch]:
+        """Resets `envs` to each batch in turn; the last one repeats its episodes to be full."""
+        for begin in range(0, len(self), envs.num_envs):
+            index = np.arange(begin, min(begin + envs.num_envs, len(self)))
+            valid = np.arange(envs.num_envs) < len(index)
+            index = np.concatenate([index, np.resize(index, envs.num_envs - len(index))])
+            scenes = [self.scenes[i] for i in self.scene[index]]
+            options = {
+                "scene": [scene.scene_id for scene in scenes],
+                "state": [self.starts[int(i)] for i in index],
+            }
+            seeds: Any = [self.seeds[int(i)] for i in index]
+            observations, info = envs.unwrapped.reset(seed=seeds, options=options)
+            yield EpisodeBatch(
+                index=index,
+                observations=observations,
+                info=info,
+                action_masks=action_masks(envs),
+                groups=np.array([scene.group for scene in scenes]),
+                valid=valid,
+                seed=int(self.seeds[begin]),
+            )
+
+
+@contextmanager
+def errors_of(policy: str, method: str) -> Iterator[None]:
+    """An error that a policy raises inside becomes a `UserCodeError` that names the policy."""
+    try:
+        yield
+    except Exception as error:  # the policy may be the user's own, and raise anything
+        text = f"policy {policy!r}: `{method}` raised {type(error).__name__}: {error}"
+        raise UserCodeError(text) from error
+
+
+def checked_states(name: str, actions: Any, masks: NDArray[np.bool_]) -> Ints:
+    """The actions that a policy returned, as int64.
+
+    Raises:
+        UserCodeError: Unless they are allowed states, one per camera.
+    """
+    try:
+        array = np.asarray(actions)
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor of a GPU
+        array = np.empty(0, object)
+    if array.shape != masks.shape[:1] or not np.issubdtype(array.dtype, np.integer):
+        raise UserCodeError(
+            f"policy {name!r}: `act` must return {masks.shape[0]} integers, one per camera, not "
+            f"{type(actions).__name__} of shape {array.shape} and dtype {array.dtype}"
+        )
+    outside = (array < 0) | (array >= masks.shape[1])
+    if outside.any():
+        raise UserCodeError(
+            f"policy {name!r}: state {array[outside][0]} is not in [0, {masks.shape[1]})"
+        )
+    forbidden = ~np.take_along_axis(masks, array[:, None], axis=1)[:, 0]
+    if forbidden.any():
+        raise UserCodeError(f"policy {name!r}: state {array[forbidden][0]} is masked in this scene")
+    return array.astype(np.int64)

@@ -1,0 +1,252 @@
+"""Radiance maps (.hdr, .exr): reading them, views into panoramas, and their assumed light.
+
+A radiance map is linear but relative: nothing in it says how many lux it shows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from simulator.radiance.procedural import NATIVE_SIZE
+from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
+
+logger = logging.getLogger(__name__)
+
+#: File endings read here.
+RADIANCE_SUFFIXES = (".hdr", ".exr")
+#: Directions of the views cut from a panorama [degrees], and their field of view.
+AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
+FIELD_OF_VIEW = 60.0
+#: Range of the EV100 assumed for a map of unknown light.
+EV100_RANGE = (3.0, 14.0)
+#: Maps whose median lies beyond 2 to this power, or below its inverse, are scaled first.
+_USUAL_EXPONENT = 20
+
+
+def read_radiance(path: str | Path) -> np.ndarray:
+    """Linear light of an .hdr or .exr file.
+
+    Values that are not light are repaired, and the repair is logged: NaN and negative values
+    (ringing of a filter, colours outside the gamut) become 0, +inf the largest finite value.
+
+    Args:
+        path: The file. Its primaries are taken to be sRGB's, as those files usually have; alpha and
+            further channels are ignored; a file with luminance only is grey.
+
+    Returns:
+        (3, H, W) float32 of arbitrary scale, finite and at least 0.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ImportError: If the extra ``hdr`` is not installed.
+        ValueError: If the file cannot be read, holds no light or is neither kind, or claims more
+            pixels than `simulator.utils.files` allows for a file of its length.
+    """
+    path = as_path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"`path` (={str(path)!r}) must be an existing file")
+    suffix = path.suffix.lower()
+    if suffix not in RADIANCE_SUFFIXES:
+        raise ValueError(f"`path` (={path.name!r}) must end in one of {list(RADIANCE_SUFFIXES)}")
+    try:
+        image = _read_hdr(path) if suffix == ".hdr" else _read_exr(path)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ValueError(f"radiance map {str(path)!r} cannot be read: {error}") from error
+    return _clean(image.astype(np.float32, copy=False), path)
+
+
+def near_one(image: np.ndarray) -> np.ndarray:
+    """A map of unknown scale whose median is far from 1, divided by a power of two near to it."""
+    _, exponent = math.frexp(float(np.quantile(image[image > 0], 0.5, method="lower")))
+    if abs(exponent) <= _USUAL_EXPONENT:
+        return image
+    with np.errstate(over="ignore", under="ignore"):
+        return np.asarray(np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100)))
+
+
+def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
+    """Packed pixels a side of a view before it is resized to `resolution`.
+
+    The largest multiple of `resolution` up to 256 and up to the `available` pixels, and at least
+    `resolution` itself.
+
+    >>> native_size(64), native_size(100), native_size(512), native_size(64, 150)
+    (256, 200, 512, 128)
+    """
+    size = min(NATIVE_SIZE, available)
+    if resolution is None:
+        return size
+    return resolution * max(1, size // max(resolution, 1))
+
+
+def assumed_ev100(group: str) -> float:
+    """EV100 of a map of unknown light, in [3, 14], by a hash of its source group.
+
+    >>> assumed_ev100("forest") == assumed_ev100("forest")
+    True
+    """
+    fraction = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+    low, high = EV100_RANGE
+    return round(low + fraction * (high - low), 2)
+
+
+def perspective(
+    panorama: np.ndarray,
+    azimuth: float,
+    size: int,
+    field_of_view: float = FIELD_OF_VIEW,
+    pitch: float = 0.0,
+) -> np.ndarray:
+    """A pin-hole view into an equirectangular panorama (gnomonic projection).
+
+    Args:
+        panorama: (3, H, W) linear light, W = 2 H; columns are longitudes from -180 degrees, rows
+            latitudes from +90 degrees.
+        azimuth: Longitude of the view's middle [degrees].
+        size: Height and width of the view [pixels].
+        field_of_view: Horizontal and vertical angle of the view [degrees], in (0, 150].
+        pitch: Angle of the view's middle above the horizon [degrees].
+
+    Returns:
+        (3, size, size) float32. Sampled bilinearly at least as densely as the panorama has
+        pixels, then box-averaged, so that small lamps keep their energy.
+    """
+    if not 0.0 < field_of_view <= 150.0:
+        raise ValueError(f"`field_of_view` (={field_of_view!r}) must be in (0, 150] degrees")
+    half = math.tan(math.radians(field_of_view) / 2.0)
+    per_radian = panorama.shape[2] / (2.0 * math.pi)
+    dense = max(1, math.ceil(per_radian / (size / (2.0 * half))))
+    axis = half * ((np.arange(size * dense) + 0.5) / (size * dense) * 2.0 - 1.0)
+    sine, cosine = math.sin(math.radians(pitch)), math.cos(math.radians(pitch))
+    right, up = axis[None, :], cosine * -axis[:, None] + sine
+    forward = cosine + sine * axis[:, None]
+    longitude = math.radians(azimuth) + np.arctan2(right, forward)
+    latitude = np.arctan2(up, np.hypot(forward, right))
+    column = (longitude / (2.0 * math.pi) + 0.5) * panorama.shape[2] - 0.5
+    row = (0.5 - latitude / math.pi) * panorama.shape[1] - 0.5
+    view = _bilinear(panorama, row, column)
+    return np.asarray(
+        view.reshape(3, size, dense, size, dense).mean(axis=(2, 4)).astype(np.float32)
+    )
+
+
+def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Values of (3, H, W) at fractional positions: columns wrap around, rows are clamped."""
+    height, width = image.shape[1:]
+    wide = np.concatenate([image[..., -1:], image, image[..., :1]], axis=2)
+    # grid_sample counts from -1 to 1 over the whole pixels, of which there are two more in a row.
+    x = (np.mod(column + 0.5, width) + 1.0) * 2.0 / (width + 2) - 1.0
+    y = (row + 0.5) * 2.0 / height - 1.0
+    places = torch.from_numpy(np.stack([x, y], axis=-1).astype(np.float32))
+    values = torch.nn.functional.grid_sample(
+        torch.from_numpy(wide)[None], places[None], padding_mode="border", align_corners=False
+    )
+    return values[0].numpy()
+
+
+def central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
+    """The middle of `image`, box-averaged by the largest integer that leaves `size` pixels."""
+    height, width = image.shape[1:]
+    k = min(height, width) // size
+    if k == 0:
+        raise ValueError(
+            f"radiance map {name!r} ({height} x {width}) must have at least {size} pixels a side"
+        )
+    top, left = (height - k * size) // 2, (width - k * size) // 2
+    square = image[:, top : top + k * size, left : left + k * size]
+    return np.asarray(square.reshape(3, size, k, size, k).mean(axis=(2, 4)))
+
+
+def _read_hdr(path: Path) -> np.ndarray:
+    try:
+        import cv2
+    except ImportError:
+        raise ImportError(f"reading {path.name!r} needs OpenCV: pip install ae-env[hdr]") from None
+    content = path.read_bytes()
+    _refuse_lies(path, *_hdr_size(content), len(content))
+    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
+    try:
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
+    except cv2.error as error:
+        raise ValueError(f"radiance map {str(path)!r} cannot be decoded: {error}") from error
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    if image is None or image.dtype != np.float32:
+        raise ValueError(f"radiance map {str(path)!r} must be a complete Radiance RGBE file")
+    return image[:, :, ::-1].transpose(2, 0, 1)
+
+
+def _hdr_size(content: bytes) -> tuple[int, int]:
+    """Rows and columns that a Radiance file claims; 0 where it does not say."""
+    found = re.search(rb"^[-+]Y (\d{1,18}) [-+]X (\d{1,18})\s*$", content[:65536], re.MULTILINE)
+    return (int(found[1]), int(found[2])) if found else (0, 0)
+
+
+def _refuse_lies(path: Path, height: int, width: int, size: int) -> None:
+    bomb = refuse_bomb(height, width, size, per_byte=MAX_RADIANCE_PIXELS_PER_BYTE)
+    if bomb:
+        raise ValueError(f"radiance map {str(path)!r} {bomb}")
+
+
+def _exr_size(file: Any) -> tuple[int, int]:
+    """Rows and columns of all parts of an OpenEXR file, below one another; channels in threes."""
+    height = width = 0
+    for part in file.parts:
+        low, high = (np.asarray(corner, np.int64) for corner in part.header["dataWindow"])
+        columns, rows = (high - low + 1).tolist()
+        height += rows * -(-len(part.header["channels"]) // 3)
+        width = max(width, columns)
+    return height, width
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ImportError(f"reading {path.name!r} needs OpenEXR: pip install ae-env[hdr]") from None
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            _refuse_lies(path, *_exr_size(file), path.stat().st_size)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: c.pixels for name, c in file.channels().items()}
+    except (RuntimeError, ValueError) as error:
+        if "radiance map" in str(error):
+            raise
+        raise ValueError(
+            f"radiance map {str(path)!r} must be a complete OpenEXR file, but OpenEXR says: {error}"
+        ) from error
+    names = ("R", "G", "B") if "G" in channels else ("Y", "Y", "Y")
+    missing = sorted({n for n in names if n not in channels})
+    if missing:
+        raise ValueError(
+            f"radiance map {str(path)!r} (channels {sorted(channels)}) must have R, G, B or Y"
+        )
+    planes = [np.asarray(channels[n], np.float32) for n in names]
+    if len({p.shape for p in planes}) != 1:
+        raise ValueError(f"radiance map {str(path)!r} must have R, G and B of the same size")
+    return np.stack(planes)
+
+
+def _clean(image: np.ndarray, path: Path) -> np.ndarray:
+    undefined, infinite, negative = np.isnan(image), np.isposinf(image), image < 0
+    if undefined.any() or infinite.any() or negative.any():
+        finite = np.where(undefined | negative | infinite, 0.0, image)
+        image = np.where(infinite, finite.max(), finite)
+        logger.info(
+            "radiance map %s: %d NaN and %d negative values set to 0, %d infinite to the maximum",
+            *(path.name, undefined.sum(), negative.sum(), infinite.sum()),
+        )
+    if not image.any():
+        raise ValueError(f"radiance map {str(path)!r} must hold some light, but is 0 everywhere")
+    return np.ascontiguousarray(image, np.float32)
