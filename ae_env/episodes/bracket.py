@@ -14,11 +14,6 @@ import torch
 from ae_env.episodes.state import Episodes
 from ae_env.scenes.scene import WHITE_SIGNAL, Scene, mean_anchor
 from ae_env.scorers.score_table import ScoreTable
-from ae_env.episodes.core import EpisodeCore, Frames
-from ae_env.observation import encode_observation, frame_statistics
-from ae_env.options import EnvOptions
-from ae_env.scenes.scene import Scene
-from ae_env.scorers.score_table import ScoreTable, prepare_scene
 from ae_env.utils.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from simulator.capture.batch import FrameStatistics
 from simulator.capture.layout import Layout

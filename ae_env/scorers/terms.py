@@ -28,8 +28,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.sensor import Transitions, record
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import addresses, as_pointer, in_shares, kernel
 
 #: Memory for tabulated expectations [byte].
 _BYTES = 2**25
