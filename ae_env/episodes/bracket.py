@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ae_env.episodes.state import Episodes
-from ae_env.scenes.scene import WHITE_SIGNAL, Scene, mean_anchor
+from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
 from ae_env.utils.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from simulator.capture.batch import FrameStatistics
