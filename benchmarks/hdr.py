@@ -223,9 +223,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         f"2^{np.log2(DARKEST):.0f} of the raw's white:",
         table([m for m in means if any(m[f"{k} radiance_ev"] is not None for k in keys)], errors),
     ]
-    page.insert(2, "![a raw, fused with its noise, by ae-env hdr, and its light fused](hdr.png)")
+    page.insert(2, "![a raw, fused with its noise, by ae-env hdr, and its light fused](hdr.webp)")
     figure = picture(meta["seed"], meta["quick"])
-    return Report([*rows, *means], page, figures={"hdr.png": figure})
+    return Report([*rows, *means], page, figures={"hdr.webp": figure})
 
 
 def _cell(key: str, *names: str) -> Any:

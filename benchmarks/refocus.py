@@ -196,8 +196,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "The paper's module is trained by `configs/simulator/paper.yaml` (on f/11 to f/4); it "
         "stands here where `runs/simulator/paper` holds its weights.",
     ]
-    page.insert(2, "![a scene at f/11, and opened to f/1.4](refocus.png)")
-    return Report([*rows, *means], page, figures={"refocus.png": picture(meta["seed"])})
+    page.insert(2, "![a scene at f/11, and opened to f/1.4](refocus.webp)")
+    return Report([*rows, *means], page, figures={"refocus.webp": picture(meta["seed"])})
 
 
 def _cell(f_number: float) -> Callable[[Row], str]:

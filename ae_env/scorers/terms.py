@@ -22,8 +22,7 @@ from scipy.special import ndtr
 
 from ae_env.observation import PEDESTAL, decode_observation, encode_array, encode_observation
 from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.pixel_blur import PixelBlur
-from ae_env.scorers.protocol import Captures, DependsOn, Domain
+from ae_env.scorers.protocol import Captures, DependsOn, Domain, PixelBlur
 from simulator.camera import CameraProfile
 from simulator.capture.sensor import Transitions, record
 from simulator.settings import CameraSettings

@@ -185,7 +185,7 @@ def _edges(evs: tuple[float, ...], gain: float) -> tuple[NDArray[np.intp], Float
     """
     import torch
 
-    from ae_env.scorers.luma import srgb_decode
+    from ae_env.scorers.measures import srgb_decode
 
     # What the edge is of the exposed picture.
     linear = srgb_decode(torch.arange(1, BINS, dtype=torch.float64) / BINS).numpy()
@@ -221,7 +221,7 @@ def shim_reading(
     """One update of Shim's controller: the gamma that shows most gradient tells where to go.
 
     The picture (sRGB luma in [0, 1]) is raised to the powers gamma of `GAMMAS`; that with the most
-    gradient information (`ae_env.scorers.detail.shim_gradient`; between the powers, the top of a
+    gradient information (`ae_env.scorers.measures.shim_gradient`; between the powers, the top of a
     parabola) is g. The exposure is multiplied by ``1 + a K_p (R - 1)`` with
     ``R = 1 + d tan((1 - g) arctan(1 / d))``, a = 1/2 where g >= 1, else 1, K_p = 2, d = 1. A step
     that lowers the metric itself is halved: otherwise scenes with two peaks never come to rest.
@@ -233,7 +233,7 @@ def shim_reading(
     """
     import torch
 
-    from ae_env.scorers.detail import shim_gradient
+    from ae_env.scorers.measures import shim_gradient
 
     frame = _Frame(observations, estimate, camera)
     base = _table(frame.shift)  # (N, CODES)
@@ -254,7 +254,7 @@ def zhang_reading(
 ) -> Reading:
     """One gradient step of Zhang's controller on the soft percentile of the squared gradient.
 
-    With M = `ae_env.scorers.detail.zhang_gradient` of the picture (sRGB luma), the EV moves by
+    With M = `ae_env.scorers.measures.zhang_gradient` of the picture (sRGB luma), the EV moves by
     ``3 d ln M / d EV``, at most 2 EV; the derivative is the difference of the frame exposed a
     quarter of an EV brighter and darker, through the known response (sRGB, clipped). A step that
     lowers M is halved: M has a kink where pixels begin to clip. Where M is 0, a picture that
@@ -263,7 +263,7 @@ def zhang_reading(
     Source: Z. Zhang, C. Forster, D. Scaramuzza, ICRA 2017 (p 0.7, k 5); relative to M, because its
     size differs between scenes by orders of magnitude.
     """
-    from ae_env.scorers.detail import zhang_gradient
+    from ae_env.scorers.measures import zhang_gradient
 
     frame = _Frame(observations, estimate, camera)
     metric = frame.metric(zhang_gradient)

@@ -24,8 +24,8 @@ from simulator.training.scenes import depth_photographs, reference_scenes
 
 CAMERA = "nikon_z6"
 #: The published picture; a quick run leaves it alone.
-IMAGE = ROOT / "docs" / "images" / "simulator_stages.png"
-QUICK_IMAGE = RUNS / "simulator" / "simulator_stages.png"
+IMAGE = ROOT / "docs" / "images" / "simulator_stages.webp"
+QUICK_IMAGE = RUNS / "simulator" / "simulator_stages.webp"
 #: Height and width of the crops [packed pixel].
 CROP = 72
 COLUMNS = ("whole picture", "input", "EXP", "NS", "Full", "ground truth")

@@ -31,6 +31,7 @@ from simulator.optics.flicker_integral import Lamp
 from simulator.optics.thin_lens import Lens, defocus
 from simulator.raw.image import check_packed
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.utils.checks import check_integer
 
 #: Standard deviation of a sharp lens's blur [photosite]: a point is about a pixel wide (its full
 #: width at half maximum is 1.2), between diffraction at f/4 and at f/11 for a pitch of 4 to 6 um.
@@ -283,11 +284,9 @@ class ReferenceCamera:
     ) -> None:
         if not camera.nlf_by_iso:
             raise ValueError(f"`camera` (={camera.name!r}) must have a noise calibration")
-        if box_factor < 1:
-            raise ValueError(f"`box_factor` (={box_factor!r}) must be >= 1")
         self.camera = camera
         self.body = BodyError.none() if body is None else body
-        self.box_factor = box_factor
+        self.box_factor = check_integer("box_factor", box_factor, 1)
         self.sensor_noise = sensor_noise
         if sensor_noise:
             camera.read_noise(min(camera.nlf_by_iso))  # raises where there is none

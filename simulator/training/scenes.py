@@ -51,6 +51,7 @@ from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unproce
 from simulator.radiance.procedural import LeafStyle, dead_leaves, draw, fractal_noise, list_kinds
 from simulator.raw.read import read_raw
 from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
+from simulator.reference.sequences import ILLUMINANCE
 from simulator.settings import incident_ev100
 from simulator.training.data import DetailPicture
 from simulator.utils.checks import check_integer, check_word
@@ -117,8 +118,6 @@ _BLURRED = {
 }
 #: See `_edge_ratio`: that of edges averaged over square pixels is 0.4.
 _SHARP = 0.36
-#: Illuminance of reference scenes [lux] (paper, section 4.1); brighter scenes are put at the end.
-ILLUMINANCE = (1.0, 20_000.0)
 #: Largest circle of confusion of the photographs with depth at f/11 [packed pixels].
 _PHOTOGRAPH_BLUR = 6.0
 
@@ -521,7 +520,11 @@ def _views(name: str, image: np.ndarray) -> dict[str, np.ndarray]:
 
 def _sharpened(light: np.ndarray) -> np.ndarray:
     """`light`, or its means over 2 x 2 pixels where it is softer than edges that pixels average."""
-    return _tile_means(light) if _edge_ratio(light[1]) < _SHARP else light
+    if _edge_ratio(light[1]) >= _SHARP:
+        return light
+    height, width = (n // 2 for n in light.shape[1:])
+    tiles = light[:, : 2 * height, : 2 * width].reshape(3, height, 2, width, 2)
+    return np.asarray(tiles.mean(axis=(2, 4)))
 
 
 def _edge_ratio(values: np.ndarray) -> float:
@@ -533,12 +536,6 @@ def _edge_ratio(values: np.ndarray) -> float:
     logs = np.log(values + 0.02 * np.median(values) + 1e-9)
     near, far = (np.square(logs[:, n:] - logs[:, :-n]).mean() for n in (1, 2))
     return float(near / max(far, 1e-12))
-
-
-def _tile_means(light: np.ndarray) -> np.ndarray:
-    height, width = (n // 2 for n in light.shape[1:])
-    tiles = light[:, : 2 * height, : 2 * width].reshape(3, height, 2, width, 2)
-    return np.asarray(tiles.mean(axis=(2, 4)))
 
 
 def _cut_out(picture: _Picture, camera: CameraProfile, size: int) -> Iterator[ReferenceScene]:

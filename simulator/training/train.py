@@ -254,10 +254,7 @@ def train_and_save(
     """
     folder = path.parent
     accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
-    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
-        torch.default_generator.manual_seed(config.seed)
-        modules = build_modules(config.preset)
-    start = None if config.start is None else load_start(config, modules)
+    modules, start = first_modules(config)
     sources = {
         split: _Source(config, make_scenes or scenes_of, make_pictures or pictures_of, split)
         for split in _SPLITS
@@ -289,17 +286,35 @@ def train_and_save(
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
-        modules.to("cpu").eval()
         residual = None
         if "noise" in modules:
-            module = cast(NoiseModule, modules["noise"])
+            module = cast(NoiseModule, modules["noise"].cpu().eval())
             residual = calibrate(module, sources["validation"].crops).to_card()
-        meta = result_meta(command, config.seed)
         done = {"start": start, "scenes": sources["train"].kinds, "stages": stages}
-        origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
-        card = {"training": config.card(), **done, "residual": residual, **origin}
-        save_modules(path, modules, config.preset, card)
+        save_trained(path, modules, config, command, **done, residual=residual)
     return sibling(path, ".safetensors")
+
+
+def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any] | None]:
+    """The modules that a training begins with, and what the card of its start says, if any.
+
+    Raises:
+        ValueError: If `config.start` is not weights of this preset.
+    """
+    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
+        torch.default_generator.manual_seed(config.seed)
+        modules = build_modules(config.preset)
+    return modules, None if config.start is None else load_start(config, modules)
+
+
+def save_trained(
+    path: Path, modules: nn.ModuleDict, config: SimulatorConfig, command: str, **entries: Any
+) -> None:
+    """Writes trained weights, and a card of the configuration, of `entries` and of their origin."""
+    meta = result_meta(command, config.seed)
+    origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
+    card = {"training": config.card(), **entries, **origin}
+    save_modules(path, modules.to("cpu").eval(), config.preset, card)
 
 
 def scenes_of(config: SimulatorConfig, split: Split) -> list[ReferenceScene]:
@@ -502,17 +517,8 @@ def train_stage(
     if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
         parts["scaler"] = accelerator.scaler
 
-    def now() -> dict[str, Any]:
-        states = {part: own.state_dict() for part, own in parts.items()}
-        return {"step": clock.step, "seconds": clock.seconds, **states}
-
     writes = accelerator.is_main_process
-    state = Checkpoint(checkpoint, [name, identity], now, writes=writes)
-    past = state.load()
-    if past is not None:
-        clock.step, clock.seconds = int(past["step"]), float(past["seconds"])
-        for part, own in parts.items():
-            own.load_state_dict(past[part])
+    state = _resume(checkpoint, [name, identity], clock, parts, writes=writes)
     wrapped, stepper = accelerator.prepare(loss, optimizer)
     means: dict[str, float] = {}
     process = accelerator.process_index
@@ -537,6 +543,24 @@ def train_stage(
             state.save_when_due()
     trained.load_state_dict(average.module.state_dict())
     return clock
+
+
+def _resume(
+    path: Path, identity: Any, clock: Clock, parts: dict[str, Any], *, writes: bool
+) -> Checkpoint:
+    """The checkpoint of a stage, whose state is loaded into `clock` and `parts` if there is one."""
+
+    def state() -> dict[str, Any]:
+        states = {name: part.state_dict() for name, part in parts.items()}
+        return {"step": clock.step, "seconds": clock.seconds, **states}
+
+    checkpoint = Checkpoint(path, identity, state, writes=writes)
+    past = checkpoint.load()
+    if past is not None:
+        clock.step, clock.seconds = int(past["step"]), float(past["seconds"])
+        for name, part in parts.items():
+            part.load_state_dict(past[name])
+    return checkpoint
 
 
 @dataclass

@@ -20,26 +20,8 @@ _LOGGER = logging.getLogger(__name__)
 INTERVAL = 20.0
 
 
-def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
-    """Writes the state of a training with `torch.save`, whole or not at all.
-
-    Where the file cannot be written, as on a full disk, a warning is logged, the previous
-    checkpoint stays, and the training goes on.
-
-    Args:
-        path: The file; its folder is made.
-        state: Tensors, numbers, text, and dicts and lists of them, such as state dicts.
-    """
-    content = io.BytesIO()
-    torch.save(dict(state), content)
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as error:
-        _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
-
-
 def load_checkpoint(path: str | Path) -> dict[str, Any] | None:
-    """What `save_checkpoint` wrote, with its tensors on the CPU.
+    """The content of the file of a `Checkpoint`, with its tensors on the CPU.
 
     Nothing but tensors and plain values is unpickled (``weights_only=True``), so a checkpoint from
     somebody else runs no code.
@@ -76,7 +58,8 @@ class Checkpoint:
         path: The file; None writes and reads nothing.
         identity: JSON value that says what is trained and how. A checkpoint of another training, or
             of another version of this package, is not resumed but replaced.
-        state: Called for the state to write; see `save_checkpoint`.
+        state: Called for the state to write: tensors, numbers, text, and dicts and lists of them,
+            such as state dicts.
         writes: False in the processes of a distributed training that only read.
     """
 
@@ -109,10 +92,18 @@ class Checkpoint:
         return dict(stored["state"])
 
     def save(self) -> None:
-        """Writes the state now."""
+        """Writes the state now, whole or not at all.
+
+        Where the file cannot be written, as on a full disk, a warning is logged, the previous
+        checkpoint stays, and the training goes on.
+        """
         if self.path is not None and self.writes:
-            state = {"identity": self.identity, "state": dict(self.state())}
-            save_checkpoint(self.path, state)
+            content = io.BytesIO()
+            torch.save({"identity": self.identity, "state": dict(self.state())}, content)
+            try:
+                write_atomically(self.path, content.getvalue())
+            except OSError as error:
+                _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
         self._saved = time.monotonic()
 
     def save_when_due(self) -> None:

@@ -12,7 +12,6 @@ from agents.cli import main as cli
 COMMANDS = [
     "bench",
     "cache",
-    "convert-nima",
     "evaluate",
     "export",
     "film",
@@ -28,7 +27,7 @@ COMMANDS += ["hdr", "refocus", "train-simulator", "score-tables", "view"]
 COMMANDS += ["warm-up"]
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
-NO_SEED = (*NO_OUT, "convert-nima", "export", "hdr")
+NO_SEED = (*NO_OUT, "export", "hdr")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
 from agents import Policy

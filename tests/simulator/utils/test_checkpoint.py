@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import save
 
 from simulator.utils import checkpoint
-from simulator.utils.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from simulator.utils.checkpoint import Checkpoint
 
 
 def store(path: Path | None, identity: Any = "a", **values: Any) -> Checkpoint:
@@ -35,13 +35,13 @@ def test_it_saves_when_it_is_due_and_at_the_end(tmp_path, monkeypatch):
 
 def test_a_full_disk_stops_no_training(tmp_path, monkeypatch, caplog):
     path = tmp_path / "run"
-    save_checkpoint(path, {"step": 1})
+    store(path, step=1).save()
     error = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr("simulator.utils.files.os.replace", Mock(side_effect=error))
-    save_checkpoint(path, {"step": 2})
+    store(path, step=2).save()
     assert "not saved" in caplog.text
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
-    assert load_checkpoint(path) == {"step": 1}
+    assert store(path).load() == {"step": 1}
 
 
 @pytest.mark.parametrize(
