@@ -23,7 +23,6 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-from ae_env.scorers.classifier import Classifier
 from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
@@ -48,7 +47,6 @@ from ae_env.scorers.measures import (
     WellExposedness,
     Zhang,
 )
-from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
 from ae_env.scorers.opencv import Keypoints, Matches
 from ae_env.scorers.protocol import Scorer
 from ae_env.scorers.terms import (
