@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+import functools
+import inspect
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal, ParamSpec, TypedDict, get_args
 
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, MovingLighting, make_lighting
@@ -40,11 +42,37 @@ MAX_DELAY, CONTROLS = 16, ("iso", "exposure_time", "f_number")
 _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
+P = ParamSpec("P")
+
+
+class EnvArguments(TypedDict, total=False):
+    """Arguments of all environments; see `AutoExposureEnv`. The defaults are in `EnvOptions`."""
+
+    scenes: SceneSpec
+    split: Split
+    grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None
+    scorer: str | Mapping[str, float] | Scorer
+    costs: Mapping[str, float] | None
+    observation: ObservationKind
+    sensors: bool
+    resolution: int
+    crop: Crop
+    motion: Motion | float
+    depth: Depth | float
+    lighting: str | Mapping[str, Any] | Lighting
+    delay: int | Mapping[str, int]
+    source: Source
+    camera: str | CameraProfile
+    simulator: str | None
+    noise: bool | Noise
+    tolerance: float
+    reward: Reward
+    with_oracle: bool
 
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Arguments of `AutoExposureEnv` and `AutoExposureVectorEnv`, which document them."""
+    """`EnvArguments` with their defaults, checked; ``costs=None`` is the same as no costs."""
 
     scenes: SceneSpec = "bundled"
     split: Split = "train"
@@ -68,6 +96,8 @@ class EnvOptions:
     with_oracle: bool = False
 
     def __post_init__(self) -> None:
+        if self.costs is None:
+            object.__setattr__(self, "costs", {})
         if isinstance(self.scenes, str) and not self.scenes:
             raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
         check_word("split", self.split, get_args(Split))
@@ -215,6 +245,50 @@ class EnvOptions:
             simulator=self.simulator,
             noise=self.noise,
         )
+
+
+def takes_env_arguments(
+    without: Collection[str] = (), **defaults: Any
+) -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Decorates a constructor that passes `EnvArguments` on.
+
+    Its signature shows all of them. An unknown one stays Python's own `TypeError` with its wording,
+    which Gymnasium's consumers look for; the message proposes the nearest name.
+
+    Args:
+        without: Arguments that the task does not have.
+        defaults: Other defaults than those of `EnvOptions` and of the constructor.
+    """
+
+    def decorate(init: Callable[P, None]) -> Callable[P, None]:
+        signature = inspect.signature(init)
+        own = signature.parameters.values()
+        parameters = {p.name: p for p in own if p.kind is not inspect.Parameter.VAR_KEYWORD}
+        for each in fields(EnvOptions):
+            if each.name not in without:
+                default = None if each.default is MISSING else each.default
+                keyword = inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY)
+                taken = keyword.replace(default=default, annotation=each.type)
+                parameters.setdefault(each.name, taken)
+        for name, default in defaults.items():
+            parameters[name] = parameters[name].replace(default=default)
+        known = [name for name in parameters if name != "self"]
+
+        @functools.wraps(init)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> None:
+            for name in kwargs:
+                if name not in known:
+                    raise TypeError(
+                        f"{init.__qualname__}() got an unexpected keyword argument {name!r}"
+                        f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
+                    )
+            init(*args, **{**defaults, **kwargs})
+
+        shown = signature.replace(parameters=list(parameters.values()))
+        checked.__signature__ = shown  # type: ignore[attr-defined]
+        return checked
+
+    return decorate
 
 
 def checked_delay(delay: Any) -> int | dict[str, int]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ae_env.episodes.bracket_core import FRAME_GAP
+from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.merging import LOG_FLOOR, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
 from agents.bracketing.schedules import BINS, Floats, Ints, Schedules, bin_of
