@@ -88,6 +88,8 @@ def record(
 
     from ae_env.utils.user_files import load_preset
     from agents.evaluation.running import fit_policies
+    from ae_env.utils.presets import load_preset
+    from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
     from agents.recording import check_dataset_id, record_dataset
