@@ -12,8 +12,6 @@ from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.load import simulate_source_raw
 from ae_env.scenes.polyhaven import list_assets
 from ae_env.scenes.scene import Crop, Split
-from agents.evaluation.evaluation_plan import groups_in_turn
-from ae_env.scenes.scene import Crop
 from agents.evaluation.plan import groups_in_turn
 from benchmarks.fidelity.models import weights
 from simulator import CameraProfile
