@@ -85,7 +85,6 @@ def record(
     Example: `ae-env record --policy matrix:tuned -o ae_env/matrix-v0`
     """
     import gymnasium as gym
-    from ae_env.utils.presets import load_preset
 
     from ae_env.utils.user_files import load_preset
     from agents.evaluation.engine import fit_policies
