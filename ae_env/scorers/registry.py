@@ -23,7 +23,7 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-from ae_env.scorers.composite import Balanced, CompositeScorer
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
     AnalyticExposure,
