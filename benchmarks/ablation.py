@@ -43,10 +43,10 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     """Trains a variant, unless its file is there, and judges it."""
     import time
 
-    from agents.evaluation.evaluation_plan import load_plan
-    from agents.evaluation.plan_run import run_plan
+    from agents.evaluation.jobs import run_plan
+    from agents.evaluation.plan import load_plan
+    from agents.evaluation.result import overall_ranking
     from agents.learning.training import AgentConfig, load_config, train_agent
-    from agents.report.result_table import overall_ranking
 
     training, environment = VARIANTS.get(variant, ({}, {}))
     name = "".join(c if c.isalnum() else "-" for c in variant)

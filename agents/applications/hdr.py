@@ -46,7 +46,7 @@ def hdr_picture(
     """Simulates a bracket of `raw`, each picture with little noise, and fuses it.
 
     What is saturated in the raw is taken as a neutral highlight, brighter than white where every
-    plane is clipped (`simulator.raw.highlights`). Holding it white in
+    plane is clipped (`simulator.raw.develop`). Holding it white in
     the darkest pictures would make halos around it.
 
     Args:

@@ -87,7 +87,7 @@ def record(
     import gymnasium as gym
 
     from ae_env.utils.presets import load_preset
-    from agents.evaluation.running import fit_policies
+    from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
     from agents.recording import check_dataset_id, record_dataset

@@ -11,7 +11,7 @@ from nicegui import run, ui
 from PIL import Image
 
 from ae_env.grid import ExposureGrid
-from agents.report.film import FRAME_RATE, Recording
+from agents.report.plots import FRAME_RATE, Recording
 from agents.viewer.drawings import BEST, POLICIES, chart
 from agents.viewer.playing import LIGHTS, STILL, play
 from agents.viewer.viewed_scene import ViewedScene

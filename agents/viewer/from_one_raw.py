@@ -11,7 +11,7 @@ from PIL import Image
 
 from agents.applications.hdr import hdr_picture, linear_rgb, write_exr
 from agents.applications.refocus import refocus
-from agents.report.upright import upright_picture
+from agents.report.plots import upright_picture
 from simulator import CameraSimulator, RawImage, render_srgb, write_dng
 from simulator.utils.files import write_atomically
 

@@ -13,8 +13,7 @@ from benchmarks.harness import data_root
 from benchmarks.isolated import ROOT
 from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraSimulator, get_camera
-from simulator.networks.denoiser import SIZES
-from simulator.networks.noise_module import NoiseModule
+from simulator.networks.noise_module import SIZES, NoiseModule
 from simulator.networks.weights import load_modules
 from simulator.reference.camera import ReferenceScene
 from simulator.training.scenes import reference_scenes

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_integer
 from simulator.utils.compute import kernel, parallel_ranges
 
 PLANES = ("R", "G1", "G2", "B")
@@ -61,8 +61,7 @@ class RawImage:
         if len(gains) != 3 or not all(np.isfinite(g) and g > 0 for g in gains):
             raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
         object.__setattr__(self, "white_balance", gains)
-        if not isinstance(self.box_factor, Integral) or self.box_factor < 1:
-            raise ValueError(f"`box_factor` (={self.box_factor!r}) must be an integer >= 1")
+        check_integer("box_factor", self.box_factor, 1)
 
     @classmethod
     def from_mosaic(

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -15,7 +15,7 @@ from pydantic import Field, field_validator, model_validator
 from ae_env.options import checked_delay
 from ae_env.scenes.folder import sequence_bounds
 from agents.rollouts import RolloutPlan
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import check_integer, check_number, check_word, did_you_mean
 from simulator.utils.config_file import Configuration, load_yaml
 
 if TYPE_CHECKING:
@@ -30,25 +30,35 @@ _RESERVED = ("all", "hard", "rest")
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+./-]*")
 MAX_FRAMES, MAX_SEED, MAX_SCENES = 10_000, 2**32 - 1, 100_000
 #: Seeds of two entries of a plan's `seeds` are this far apart: more than any plan has scenes.
-_SEED_STRIDE = 2**20
+SEED_STRIDE = 2**20
 #: Arguments of the environment that a condition has, and those that the evaluation itself sets.
 CONDITION_ARGUMENTS = ("lighting", "delay")
-_OWN_ARGUMENTS = ("with_oracle", "max_episode_steps", "autoreset_mode")
+_SET_BY_EVALUATION = (
+    *("with_oracle", "max_episode_steps", "autoreset_mode"),
+    *("budget", "max_frames", "num_envs", "render_mode"),
+)
 #: Entries that say how results are shown, or which policies run: another run of the same plan.
 NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "suite", "hash")
+#: Entries of plans of one measure only.
+_ONLY_OF = {
+    "score": ("conditions", "delays", "starts", "frames", "other_scorers", "other_scorer_scenes"),
+    "quality": ("budgets", "max_frames"),
+}
 
 
 class Condition(Configuration):
-    """The light and the delay of some episodes: the difference to the base environment.
+    """What some episodes have that others have not: light and delay, or the time of a bracket.
 
     Args:
         lighting: As the environment's argument: a name, or a mapping with ``kind``.
         delay: Frames from a decision to the first frame that has it, of all controls or by
             control; as the environment's argument.
+        budget: Time of all frames of a bracket [s]; the plan's `budgets` set it.
     """
 
     lighting: Any = "static"
     delay: Any = 0
+    budget: float | None = None
 
     @field_validator("delay")
     @classmethod
@@ -64,10 +74,13 @@ class Condition(Configuration):
 class EvaluationPlan(Configuration):
     """Everything that decides an evaluation except the policies' own content.
 
+    A plan with `budgets` is of ``ae_env/ExposureBracket-v0``: its measure is the quality of the
+    merged picture, its conditions are the budgets, and it has no entries about frames.
+
     Args:
         name: Shown in the report.
-        environment: Arguments of ``ae_env/AutoExposure-v0`` that all conditions share; `lighting`
-            and `delay` are those of the conditions.
+        environment: Arguments of the environment that all conditions share; `lighting` and `delay`
+            are those of the conditions.
         scene_ids: Scenes to use, in this order; empty for all of the split.
         max_scenes: Use at most so many scenes, source groups in turn; None for all.
         conditions: By name.
@@ -75,6 +88,8 @@ class EvaluationPlan(Configuration):
             ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
         starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
         frames: Actions per episode.
+        budgets: Of brackets: times that all frames of an episode may take together [s].
+        max_frames: Of brackets: frames of an episode at most.
         seeds: Each gives every scene another motion, defocus, phase of the light and noise.
         policies: Names, as `agents.make_policy` takes them.
         other_scorers: Names of scorers that no policy was trained on; chosen states are also rated
@@ -94,6 +109,8 @@ class EvaluationPlan(Configuration):
     delays: tuple[int, ...] = (0,)
     starts: tuple[str, ...] = ("dark", "middle", "bright")
     frames: int = Field(default=24, ge=1, le=MAX_FRAMES)
+    budgets: tuple[float, ...] | None = Field(default=None, min_length=1)
+    max_frames: int = Field(default=3, ge=1, le=4)
     seeds: tuple[int, ...] = (0,)
     policies: tuple[str, ...] = ()
     other_scorers: tuple[str, ...] = ()
@@ -102,47 +119,70 @@ class EvaluationPlan(Configuration):
     suite: tuple[str, ...] = ()
     hash: str | None = None
 
-    @field_validator("scene_ids", "delays", "starts", "seeds", "policies", "other_scorers")
+    @field_validator(
+        *("scene_ids", "delays", "starts", "budgets", "seeds", "policies", "other_scorers")
+    )
     @classmethod
-    def _no_repeats(cls, values: tuple[Any, ...]) -> tuple[Any, ...]:
-        if len(set(values)) < len(values):
+    def _no_repeats(cls, values: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        if values is not None and len(set(values)) < len(values):
             raise ValueError(f"must not have an entry twice: {list(values)}")
         return values
 
     @model_validator(mode="after")
     def _check(self) -> EvaluationPlan:
-        for rule in ("starts", "seeds", "conditions", "delays"):
-            if not getattr(self, rule):
-                raise ValueError(f"`{rule}` must have one entry or more")
+        for entry in ("starts", "seeds", "conditions", "delays"):
+            if not getattr(self, entry):
+                raise ValueError(f"`{entry}` must have one entry or more")
+        for entry in self._unused:
+            field = type(self).model_fields[entry]
+            if getattr(self, entry) != field.get_default(call_default_factory=True):
+                also = "no `budgets`" if entry == "max_frames" else "`budgets`"
+                raise ValueError(f"`{entry}` must not be given in a plan that has {also}")
         for start in self.starts:
-            if start not in STARTS:
-                hint = did_you_mean(start, STARTS)
-                raise ValueError(f"`starts` (={start!r}) must be of {list(STARTS)}{hint}")
-        if min(self.seeds) < 0 or max(self.seeds) > MAX_SEED:
-            raise ValueError(f"`seeds` (={list(self.seeds)}) must be in [0, {MAX_SEED}]")
-        for name in self.conditions:
-            if not _NAME.fullmatch(name) or name in _RESERVED:
+            check_word("starts", start, STARTS)
+        for seed in self.seeds:
+            check_integer("seeds", seed, 0, MAX_SEED)
+        for budget in self.budgets or ():
+            check_number("budgets", budget, 1e-5, 3600.0, more=" s")
+        for name, condition in self.conditions.items():
+            if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:
                 raise ValueError(
                     f"`conditions` (={name!r}): a name must be of letters, digits and _+./-, and "
-                    f"none of {list(_RESERVED)}"
+                    f"none of {list(_RESERVED)}; and none has a `budget`"
                 )
-        for name in (*CONDITION_ARGUMENTS, *_OWN_ARGUMENTS):
+        for name in (*CONDITION_ARGUMENTS, *_SET_BY_EVALUATION):
             if name in self.environment:
                 raise ValueError(f"`environment` must not have `{name}`: give it as a condition's")
         for name, condition in self.all_conditions.items():
             try:
-                options = self.options(condition)
-                options.make_grid(), options.make_camera(), options.make_scorer()
-                options.make_lighting()
-                late = max(options.delays)
-                if late >= self.frames:
-                    raise ValueError(
-                        f"`delay` (={late}) must be below `frames` (={self.frames}): no decision "
-                        "would show"
-                    )
+                self._check_condition(condition)
             except ValueError as error:
                 raise ValueError(f"condition {name!r}: {error}") from error
         return self
+
+    def _check_condition(self, condition: Condition) -> None:
+        options = self.options(condition)
+        options.make_grid(), options.make_camera(), options.make_scorer(), options.make_lighting()
+        if max(options.delays) >= self.frames:
+            raise ValueError(
+                f"`delay` (={max(options.delays)}) must be below `frames` (={self.frames}): no "
+                "decision would show"
+            )
+
+    @property
+    def measure(self) -> Literal["score", "quality"]:
+        """What the policies are compared by: scores of frames, or the quality of brackets."""
+        return "quality" if self.budgets else "score"
+
+    @property
+    def _unused(self) -> tuple[str, ...]:
+        """Entries that plans of the other measure have."""
+        return _ONLY_OF["score" if self.budgets else "quality"]
+
+    @property
+    def env_id(self) -> str:
+        """Id of the environment."""
+        return f"ae_env/{'ExposureBracket' if self.budgets else 'AutoExposure'}-v0"
 
     @property
     def observation(self) -> str:
@@ -151,7 +191,9 @@ class EvaluationPlan(Configuration):
 
     @property
     def all_conditions(self) -> dict[str, Condition]:
-        """`conditions` with every one of `delays`, by the names that the tables show."""
+        """`conditions` with every one of `delays`, or `budgets`, by the names in the tables."""
+        if self.budgets:
+            return {f"{budget:g} s": Condition(budget=budget) for budget in self.budgets}
         found: dict[str, Condition] = {}
         for i, delay in enumerate(self.delays):
             for name, condition in self.conditions.items():
@@ -168,14 +210,16 @@ class EvaluationPlan(Configuration):
         conditions = self.all_conditions
         return next((n for n, c in conditions.items() if c.at_rest), next(iter(conditions)))
 
-    def options(self, condition: Condition | None = None, **changes: Any) -> EnvOptions:
+    def options(self, condition: Condition | None = None) -> EnvOptions:
         """The checked arguments of the environment in `condition`."""
         from ae_env.options import EnvOptions
 
-        return EnvOptions.from_kwargs({**self.arguments(condition or Condition()), **changes})
+        # A bracket's environment sets these itself.
+        own = {"grid": "bracket", "depth": "far"} if self.budgets else {}
+        return EnvOptions.from_kwargs(own | self.arguments(condition or Condition()))
 
     def arguments(self, condition: Condition) -> dict[str, Any]:
-        """Arguments of the environment in `condition`."""
+        """Arguments of the environment's observations and light in `condition`."""
         base = {"split": "test", **self.environment}
         return {**base, "lighting": condition.lighting, "delay": condition.delay}
 
@@ -183,10 +227,12 @@ class EvaluationPlan(Configuration):
         """Every entry as JSON values; objects of a caller's own by the function `other`."""
 
         def converted(value: Any) -> Any:
-            return dict(value) if isinstance(value, Condition) else other(value)
+            if isinstance(value, Condition):
+                return {"lighting": value.lighting, "delay": value.delay}
+            return other(value)
 
-        text = json.dumps(dict(self), default=converted, allow_nan=False)
-        return dict(json.loads(text))
+        entries = {k: v for k, v in dict(self).items() if k not in self._unused}
+        return dict(json.loads(json.dumps(entries, default=converted, allow_nan=False)))
 
     def protocol(self) -> dict[str, Any]:
         """JSON values of everything that decides the episodes and their scores.
@@ -199,7 +245,7 @@ class EvaluationPlan(Configuration):
             raise ValueError(f"every entry of a plan must be a JSON value, not {value!r}")
 
         found = {k: v for k, v in self.describe(refuse).items() if k not in NOT_OF_THE_PROTOCOL}
-        if not self.task:  # plans of before there were tasks keep their digest
+        if not self.task and not self.budgets:  # plans of before there were tasks keep their digest
             del found["task"]
         return found
 
@@ -209,7 +255,8 @@ class EvaluationPlan(Configuration):
         Raises:
             ValueError: If an entry is out of range.
         """
-        return EvaluationPlan.model_validate({**dict(self), **entries})
+        given = {name: getattr(self, name) for name in self.model_fields_set}
+        return EvaluationPlan.model_validate(given | entries)
 
 
 def load_plan(name: str | Path) -> EvaluationPlan:
@@ -292,15 +339,15 @@ def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureG
     """The episodes of a condition of `plan`: starts change slowest, then seeds, scenes fastest.
 
     Episodes that differ in their start only have the same seed: the same motion, defocus, light and
-    noise.
+    noise. Of brackets, which begin with a metered frame, no start is given.
     """
-    own = [(seed * _SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
-    repeats = len(plan.starts)
+    starts = ("random",) if plan.budgets else plan.starts
+    own = [(seed * SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
     return RolloutPlan(
         scenes=scenes,
-        seeds=[seed for seed, _ in own] * repeats,
-        scene=np.array([j for _, j in own] * repeats),
-        starts=[start_state(start, scenes[j], grid) for start in plan.starts for _, j in own],
+        seeds=[seed for seed, _ in own] * len(starts),
+        scene=np.array([j for _, j in own] * len(starts)),
+        starts=[start_state(start, scenes[j], grid) for start in starts for _, j in own],
     )
 
 

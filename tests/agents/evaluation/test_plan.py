@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from agents.evaluation.evaluation_plan import (
+from agents.evaluation.plan import (
     Condition,
     EvaluationPlan,
     digest,
@@ -34,16 +34,24 @@ def test_delays_multiply_the_conditions_that_have_none_of_their_own():
     ("entries", "message"),
     [
         ({"starts": ["drak"]}, r"`starts` \(='drak'\).*did you mean 'dark'"),
-        ({"starts": []}, "`starts` must have one entry or more"),
-        ({"seeds": [0, 0]}, "must not have an entry twice"),
-        ({"seeds": [-1]}, r"must be in \[0, 4294967295\]"),
-        ({"frames": 0}, "greater than or equal to 1"),
+        ({"starts": []}, "`starts`"),
+        ({"seeds": [0, 0]}, "seeds\n"),
+        ({"seeds": [-1]}, r"`seeds` \(=-1\)"),
+        ({"frames": 0}, "frames\n"),
         ({"conditions": {"hard": {}}}, "none of"),
         ({"conditions": {"a": {"lighting": "disco"}}}, "condition 'a': `lighting`"),
         ({"conditions": {"a": {"delay": 99}}}, r"`delay` \(=99\) must be an integer in \[0, 16\]"),
         ({"environment": {"lighting": "sine"}}, "must not have `lighting`"),
         ({"environment": {"scorrer": "noise"}}, "did you mean `scorer`"),
-        ({"polices": ["random"]}, "Extra inputs"),
+        ({"polices": ["random"]}, "polices\n"),
+        ({"budgets": []}, "budgets\n"),
+        ({"budgets": [0.1, 0.1]}, "budgets\n"),
+        ({"budgets": [0.0]}, r"`budgets` \(=0.0\)"),
+        ({"budgets": [0.1], "environment": {"budget": 1}}, "must not have `budget`"),
+        ({"budgets": [0.1], "environment": {"scene": "bundled"}}, "scene"),
+        ({"budgets": [0.1], "frames": 3}, "`frames`"),
+        ({"max_frames": 2}, "`max_frames`"),
+        ({"conditions": {"a": {"budget": 1.0}}}, "`budget`"),
     ],
 )
 def test_mistakes_in_a_plan_are_told(entries, message):
@@ -52,9 +60,10 @@ def test_mistakes_in_a_plan_are_told(entries, message):
 
 
 def test_presets_are_valid():
-    plans = {name: load_plan(name) for name in ("quick", "standard")}
+    plans = {name: load_plan(name) for name in ("quick", "standard", "bracket")}
     assert all(plan.policies for plan in plans.values())
-    assert [len(plan.all_conditions) for plan in plans.values()] == [4, 24]
+    assert [len(plan.all_conditions) for plan in plans.values()] == [4, 24, 2]
+    assert [plan.measure for plan in plans.values()] == ["score", "score", "quality"]
 
 
 def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
@@ -64,9 +73,19 @@ def test_the_hash_of_a_plan_does_not_depend_on_the_order_or_on_who_runs():
     assert digest(again.protocol()) == digest(PLAN.protocol())
     assert digest(PLAN.changed(frames=9).protocol()) != digest(PLAN.protocol())
     assert digest(1, "a") != digest("1a")
-    # Of the plan as it was when AE-Bench v1 was published: its hash must not move.
-    found = digest(load_plan("ae_bench_v1").protocol())
-    assert found == "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd"
+
+
+#: Of the plans as they were when they were published: their digests must not move.
+PUBLISHED = {
+    "ae_bench_v1": "20d6df59f3a8569bfb6c658410b2fafe0fd86f4aa307622ac77f1e88ffefc2cd",
+    "ae_bench_v2_still": "856f17927b9315102f1ff743f630fa0c315a1e8d9ab029d2335aca23c8eba6e0",
+    "ae_bench_v2_video": "ae0cafd1d4b00e651ecbc12fe7e7dbd565619a40c56a5007352e6141d279bbe3",
+    "ae_bench_v2_bracket": "bb8f3ec9034d3ec41c93463cd8054ba24ef816ee16dd51b30df48f12518a8bed",
+}
+
+
+def test_published_plans_keep_their_digest():
+    assert {name: digest(load_plan(name).protocol()) for name in PUBLISHED} == PUBLISHED
 
 
 @pytest.fixture(scope="module")
