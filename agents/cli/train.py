@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from agents.learning.training import AgentConfig
 
 #: Evaluations of the tasks; that of still light is the command's own default.
-_PRESETS = {"ae_env/AutoExposureVideo-v0": "video", "ae_env/ExposureBracket-v0": "bracket"}
+_PRESETS = {"ae_env/AutoExposureVideo-v0": "video"}
 
 
 def train(
