@@ -46,9 +46,9 @@ if TYPE_CHECKING:
     from ae_env.tasks import AutoExposureVideoVectorEnv as AutoExposureVideoVectorEnv
     from ae_env.tasks import ExposureBracketEnv as ExposureBracketEnv
     from ae_env.tasks import ExposureBracketVectorEnv as ExposureBracketVectorEnv
-    from ae_env.utils.presets import list_presets as list_presets
-    from ae_env.utils.presets import load_preset as load_preset
-    from ae_env.utils.user_code import UserCodeError as UserCodeError
+    from ae_env.utils.user_files import UserCodeError as UserCodeError
+    from ae_env.utils.user_files import list_presets as list_presets
+    from ae_env.utils.user_files import load_preset as load_preset
     from ae_env.vector_env import AutoExposureVectorEnv as AutoExposureVectorEnv
     from ae_env.wrappers import ContinuousActions as ContinuousActions
     from ae_env.wrappers import ControlActions as ControlActions

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from ae_env.episodes.state import Episodes
+from ae_env.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable
-from ae_env.utils.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from simulator.capture.batch import FrameStatistics
 from simulator.capture.layout import Layout
 from simulator.optics.motion_path import Taps, path_blur_apart

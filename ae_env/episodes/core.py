@@ -28,7 +28,6 @@ from ae_env.observation import (
     frame_statistics,
 )
 from ae_env.options import EnvOptions
-from ae_env.scenes.drawn import DrawnScenes
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.score_table import ScoreTable, in_episode, prepare_scene
@@ -148,6 +147,8 @@ class Task(Protocol):
 
 #: Constructor of a task, from the episodes, the source of their frames, the scorer, and light and
 #: exposures behind frames where rewards are expectations.
+#: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
+#: and exposures behind frames where rewards are expectations.
 MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
 
 
@@ -220,8 +221,7 @@ class EpisodeCore:
     def _cached_frames(self) -> int:
         """Blurred frames that are cached for an episode at most."""
         apertures = len(self.grid.f_numbers)
-        # Drawn scenes are alike in what they have: the others need not be there yet.
-        scenes = self.scenes[:1] if isinstance(self.scenes, DrawnScenes) else self.scenes
+        scenes = [self.scenes[index] for index in self.scenes.loaded]
         if any(scene.layout is not None for scene in scenes):  # what their discs make of it
             apertures += len(DIAMETERS)
         if self.options.depth == "unknown":  # also what opens them: a bank of blurs, its results

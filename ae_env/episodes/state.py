@@ -14,9 +14,8 @@ from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, RollingShutter
 from ae_env.options import EnvOptions
-from ae_env.scenes.drawn import DrawnScenes
 from ae_env.scenes.folder import sequence_bounds
-from ae_env.scenes.scene import Scene
+from ae_env.scenes.scene import Scene, SceneSet
 from simulator.camera import CameraProfile
 from simulator.optics.motion_path import Movement
 from simulator.utils.checks import check_integer, did_you_mean
@@ -126,7 +125,7 @@ class Episodes:
         self.camera: CameraProfile = options.make_camera()
         self.lighting: Lighting = options.make_lighting()
         self.static = type(self.lighting) is Lighting
-        self.scenes = options.scenes_on_demand() if scenes is None else scenes
+        self.scenes = options.scenes_on_demand() if scenes is None else SceneSet.of(scenes)
         # With one delay of all controls a state needs not be put together.
         self._delays = options.delays if len(set(options.delays)) > 1 else options.delays[:1]
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
@@ -153,12 +152,8 @@ class Episodes:
         self._median_speed, self._own_blur = np.zeros((2, count))
         self._has_subject, self._has_map, self._known = np.zeros((3, count), bool)
         self.box_factor = np.ones(count, np.int64)
-        self.scene_ids: tuple[str, ...]
-        if isinstance(self.scenes, DrawnScenes):
-            self.scene_ids = self.scenes.scene_ids
-        else:
-            self.scene_ids = tuple(scene.scene_id for scene in self.scenes)
-            self._ensure_loaded(np.arange(count))
+        self.scene_ids = self.scenes.scene_ids
+        self._ensure_loaded(np.array(self.scenes.loaded, np.int64))
         # First and last frame of the sequence that each scene is a frame of.
         self._bounds: tuple[np.ndarray, np.ndarray] | None = None
         self._firsts = np.arange(count)
@@ -183,8 +178,7 @@ class Episodes:
         if self._known[indices].all():
             return
         new = np.unique(indices[~self._known[indices]]).tolist()
-        if isinstance(self.scenes, DrawnScenes):
-            self.scenes.draw(new)  # several at once: on several threads
+        self.scenes.load(new)  # several at once: on several threads
         for index in new:
             scene = self.scenes[index]
             self.allowed[index] = _allowed_states(scene, len(self.grid))

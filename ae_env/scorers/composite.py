@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ae_env.scorers.protocol import Captures, ColourMatrix, DependsOn, Domain, Scorer
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop
 
 logger = logging.getLogger(__name__)

@@ -58,7 +58,7 @@ from ae_env.scorers.terms import (
     Shadows,
     Sharpness,
 )
-from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
+from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
 ENTRY_POINT_GROUP = "ae_env.scorers"

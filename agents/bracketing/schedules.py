@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.grid import ExposureGrid
-from ae_env.utils.merging import SATURATED, WORST_EV
+from ae_env.merging import SATURATED, WORST_EV
 from simulator.camera import CameraProfile
 
 Floats = NDArray[np.float64]

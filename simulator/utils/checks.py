@@ -34,6 +34,19 @@ def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -
     raise ValueError(f"`{name}` (={value!r}) must be one of {rule}{hint}")
 
 
+def check_type(name: str, value: Any, *kinds: type | None) -> None:
+    """Raises a `ValueError` unless `value` is an instance of one of `kinds`, of which None is one.
+
+    >>> check_type("raw", 3, str, None)
+    Traceback (most recent call last):
+    ValueError: `raw` (of type int) must be of type str or None
+    """
+    known = tuple(type(None) if kind is None else kind for kind in kinds)
+    if not isinstance(value, known):
+        rule = " or ".join("None" if kind is None else kind.__name__ for kind in kinds)
+        raise ValueError(f"`{name}` (of type {type(value).__name__}) must be of type {rule}")
+
+
 def check_flag(name: str, value: Any) -> None:
     """Raises a `ValueError` unless `value` is True or False."""
     if not isinstance(value, bool):
