@@ -12,7 +12,6 @@ import io
 import json
 import math
 import re
-import string
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
