@@ -145,6 +145,8 @@ class Task(Protocol):
         """Expected scores of all states in the current frame of environment `env_index`."""
 
 
+#: Constructor of a task, from the episodes, the source of their frames, the scorer, and light and
+#: exposures behind frames where rewards are expectations.
 #: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
 #: and exposures behind frames where rewards are expectations.
 MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
