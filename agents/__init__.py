@@ -13,9 +13,9 @@ _EXPORTS = {
     "PolicyContext": "policy",
     "evaluate": "evaluation.engine",
     "fit_policies": "evaluation.running",
-    "list_policies": "policy",
+    "list_policies": "policy_names",
     "load_plan": "evaluation.evaluation_plan",
-    "make_policy": "policy",
+    "make_policy": "policy_names",
     "result_rows": "report.result_table",
     "run_plan": "evaluation.plan_run",
     "write_report": "report.evaluation_report",
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from agents.metering.metering_policy import MeteringPolicy as MeteringPolicy
     from agents.policy import Policy as Policy
     from agents.policy import PolicyContext as PolicyContext
-    from agents.policy import list_policies as list_policies
-    from agents.policy import make_policy as make_policy
+    from agents.policy_names import list_policies as list_policies
+    from agents.policy_names import make_policy as make_policy
     from agents.report.evaluation_report import write_report as write_report
     from agents.report.result_table import result_rows as result_rows
 

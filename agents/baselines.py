@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.scenes.folder import find_files
-from agents.episodes import Episodes, expected_scores, scenes_of
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.raw.read import read_raw
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_word
@@ -21,7 +21,7 @@ from simulator.utils.files import RAW_SUFFIXES
 if TYPE_CHECKING:
     import gymnasium as gym
 
-#: What oracles know, and the entry of ``info`` that tells it.
+#: What oracles know, and the entry of ``info`` that holds it.
 ORACLES = {"last_frame": "oracle_state", "clairvoyant": "clairvoyant_state"}
 #: Episodes per scene from which the best constant state is taken.
 FIT_EPISODES = 2
@@ -61,7 +61,7 @@ class BestFixed(Policy):
 
     def fit(self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int = 0) -> None:
         """Average the expected scores of all states over the scenes of `envs`."""
-        episodes = Episodes.of_each_scene(
+        episodes = RolloutPlan.of_each_scene(
             scenes_of(envs), count=FIT_EPISODES, seed=seed, most=FIT_SCENES
         )
         scores = [expected_scores(envs)[batch.valid] for batch in episodes.batches(envs)]
@@ -93,7 +93,7 @@ class Oracle(Policy):
     def __init__(self, context: PolicyContext, knows: str = "last_frame") -> None:
         super().__init__(context)
         check_word("knows", knows, tuple(ORACLES))
-        self.name, self._told = f"oracle:{knows}", ORACLES[knows]
+        self.name, self._oracle_info = f"oracle:{knows}", ORACLES[knows]
 
     def act(
         self,
@@ -102,12 +102,12 @@ class Oracle(Policy):
         info: Mapping[str, Any] | None = None,
     ) -> NDArray[np.int64]:
         """The best allowed state in the light that it knows."""
-        if info is None or self._told not in info:
+        if info is None or self._oracle_info not in info:
             needs = "environments made with_oracle=True"
-            if self._told != "oracle_state":
+            if self._oracle_info != "oracle_state":
                 needs = "an evaluation, which knows the light to come"
             raise ValueError(f"policy {self.name!r} needs `info` of {needs}")
-        return np.asarray(info[self._told], dtype=np.int64).copy()
+        return np.asarray(info[self._oracle_info], dtype=np.int64).copy()
 
 
 class Recorded(Policy):

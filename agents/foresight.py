@@ -52,7 +52,7 @@ class Foresight:
         self._matched = MatchedReadings(context.camera)
         #: Frames from the one in hand to the first that has this decision's ISO, time, aperture.
         self.leads = tuple(1 + delay for delay in context.delays)
-        self._asked: list[Ints] = []  # the newest last
+        self._actions: list[Ints] = []  # the newest last
 
     def observe(self, reading: Reading, observations: Observations) -> Reading:
         """Take in one frame of each camera, and what a light meter reads in it.
@@ -62,14 +62,14 @@ class Foresight:
         """
         reading = self._matched.update(reading, observations)
         self._tracker.update(reading, frame_ev100(observations))
-        if not self._asked:  # what the first frame was taken with stays until a decision is there
-            self._asked = [self._shown(observations)] * max(self.leads)
+        if not self._actions:  # what the first frame was taken with stays until a decision is there
+            self._actions = [self._shown(observations)] * max(self.leads)
         return reading
 
     @property
-    def asked(self) -> Ints:
+    def pending_action(self) -> Ints:
         """States that were asked for last, ``(N,)``."""
-        return self._asked[-1]
+        return self._actions[-1]
 
     def ev100(self, frames: int) -> Floats:
         """EV100 that a meter is expected to read `frames` after the frame in hand, ``(N,)``."""
@@ -85,14 +85,14 @@ class Foresight:
             scores: From the metered EV100 of a frame to come, ``(N,)``, to the expected score of
                 every state in it, ``(N, S)``.
         """
-        total: Floats = np.zeros((len(self._asked[0]), 1, 1, 1))
+        total: Floats = np.zeros((len(self._actions[0]), 1, 1, 1))
         for frame in sorted(set(self.leads)):
             promised = self._expected(scores, frame).reshape(-1, *self.grid.shape)
             for axis, lead in enumerate(self.leads):
                 if lead < frame:
                     promised = promised.max(axis=1 + axis, keepdims=True)
                 elif lead > frame:
-                    asked = self.grid.controls(self._asked[frame - lead])[:, axis]
+                    asked = self.grid.controls(self._actions[frame - lead])[:, axis]
                     index = asked.reshape(-1, 1, 1, 1)
                     promised = np.take_along_axis(promised, index, axis=1 + axis)
             total = total + promised
@@ -108,9 +108,9 @@ class Foresight:
         ]
         return np.sum(found, axis=0)
 
-    def decided(self, states: Ints) -> None:
+    def record_action(self, states: Ints) -> None:
         """Remember what was asked for after the frame in hand, ``(N,)``."""
-        self._asked = [*self._asked[1:], states]
+        self._actions = [*self._actions[1:], states]
 
     def _shown(self, observations: Observations) -> Ints:
         """States that the frames in hand were taken with, ``(N,)``."""

@@ -15,8 +15,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.episodes import checked_states, errors_of
 from agents.policy import Policy
+from agents.rollouts import checked_states, errors_of
 
 #: The variable that names Minari's folder.
 _ROOT = "MINARI_DATASETS_PATH"

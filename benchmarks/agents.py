@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from agents.cli.console import print_files, progress_bars
-from agents.episodes import make_envs
 from agents.evaluation.engine import evaluate
 from agents.evaluation.running import fit_policies
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
-from agents.policy import CLASSIC_METERS, PROGRAMS, PolicyContext, make_policy
+from agents.policy import PolicyContext
+from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
 from agents.report.evaluation_report import write_report
+from agents.rollouts import make_envs
 from benchmarks.isolated import ROOT
 
 CONFIGS = {name: ROOT / "configs" / f"{name}.yaml" for name in ("regression", "ppo")}

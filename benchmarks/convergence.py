@@ -16,11 +16,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from agents import PolicyContext, evaluate, make_policy
-from agents.episodes import make_envs
 from agents.evaluation.metrics import THIRD_EV
 from agents.evaluation.result import EvaluationResult
 from agents.metering.libcamera_agc import ExposureFilter
-from agents.policy import METERS
+from agents.policy_names import METERS
+from agents.rollouts import make_envs
 from benchmarks.harness import Benchmark, Part, Report, Row, table
 
 #: Policies that are watched.

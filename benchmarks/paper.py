@@ -31,11 +31,15 @@ from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, pivot, table
 from simulator import CameraSimulator, RawImage, exposure_ratio
 from simulator.networks.weights import load_modules
 from simulator.noise.noise_level_function import noise_variance
-from simulator.raw.dataset import PARAMETERS
 from simulator.reference.sequences import any_pairs
-from simulator.training.captured import CapturedSequence, split_dataset, train_on_captures
 from simulator.training.config import SimulatorConfig, load_config
 from simulator.training.data import settings_parameters
+from simulator.training.paper_dataset import (
+    PARAMETERS,
+    CapturedSequence,
+    split_dataset,
+    train_on_captures,
+)
 
 #: What is trained: the paper's networks, parameter concatenation and decoupled learning.
 TRAINED = ("paper", "pc", "dl")

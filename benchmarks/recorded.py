@@ -27,7 +27,7 @@ from ae_env.scenes.loading import DEFAULT_SIMULATOR, SceneNetworks
 from ae_env.scenes.recorded import RecordedOptions, merged_scene
 from ae_env.scenes.recorded_files import PREFIX
 from ae_env.scenes.reference_scenes import reference_scenes
-from ae_env.scenes.scene import MEAN_SIGNAL, Crop, Scene
+from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from benchmarks import brackets
@@ -44,6 +44,7 @@ from benchmarks.harness import (
     table,
 )
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
+from simulator.radiance.light import MEAN_SIGNAL
 from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
 
 CAMERA = "nikon_z6"

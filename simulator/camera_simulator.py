@@ -173,8 +173,8 @@ class CameraSimulator:
         Args:
             name: Largest noise module that may run, ``"nano"``, ``"compact"`` or ``"large"``; which
                 one up to it does, `tolerance` decides. Or the path of weights that
-                `ae-env train-simulator` or `ae-env import-weights` wrote, whose noise module is the
-                only one then.
+                `ae-env train-simulator` wrote, or of the authors' (docs/networks.md), whose noise
+                module is the only one then.
             device: See `CameraSimulator`.
             precision: See `CameraSimulator`.
             cache: See `CameraSimulator`.
@@ -182,7 +182,7 @@ class CameraSimulator:
                 errors of the one body that was trained on and are wrong for any other.
 
         Raises:
-            ValueError: If there are no such weights, or they are damaged or those of a baseline.
+            ValueError: If there are no such weights, or they are damaged.
         """
         from simulator.networks.weights import load_modules
 
@@ -192,9 +192,6 @@ class CameraSimulator:
         whole = next((m for m, _ in loaded.values() if "aperture" in m), None)
         if whole is None:  # a noise module alone
             whole = load_modules("compact")[0]
-        for modules, own in loaded.values():
-            if "noise" not in modules:
-                raise ValueError(f"`name` (={str(name)!r}) holds the baseline {own['preset']!r}")
         simulator = cls(device=device, precision=precision, cache=cache)
         simulator.noises = tuple(
             simulator._ready(cast(NoiseModule, modules["noise"])) for modules, _ in loaded.values()

@@ -11,7 +11,7 @@ from PIL import Image
 from benchmarks import paper
 from simulator import CameraSimulator
 from simulator.networks.weights import build_modules, save_modules
-from simulator.training.captured import split_dataset
+from simulator.training.paper_dataset import split_dataset
 from tests.simulator.training.captures import write_dataset
 
 

@@ -14,12 +14,13 @@ import torch
 from ae_env.episodes.core import EpisodeCore, Frames
 from ae_env.observation import encode_observation, frame_statistics
 from ae_env.options import EnvOptions
-from ae_env.scenes.scene import WHITE_SIGNAL, Scene, mean_anchor
+from ae_env.scenes.scene import Scene
 from ae_env.scorers.score_table import ScoreTable, prepare_scene
 from ae_env.utils.merging import LOG_FLOOR, WORST_EV, log_error, merge
 from simulator.capture.layout import Layout
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.optics.motion_path import Taps, path_blur_apart
+from simulator.radiance.light import WHITE_SIGNAL, mean_anchor
 from simulator.settings import exposure_ratio
 
 #: Time from the end of an exposure to the begin of the next [s].

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ae_env.scenes.loading import SceneSpec, load_scenes
-from ae_env.scenes.scene import MEAN_SIGNAL, WHITE_SIGNAL, Scene, reference_settings
+from ae_env.scenes.scene import Scene
+from simulator.radiance.light import MEAN_SIGNAL, WHITE_SIGNAL, reference_settings
 
 __all__ = [
     "MEAN_SIGNAL",

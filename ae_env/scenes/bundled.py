@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
 
-from ae_env.scenes.depth import drape
 from ae_env.scenes.drawn import DrawnScenes, SceneSource
-from ae_env.scenes.photographs import PHOTOGRAPHS, photograph_scenes, scene_ids
-from ae_env.scenes.procedural import (
+from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
+from ae_env.scenes.stored import stored_scenes
+from simulator.camera import CameraProfile
+from simulator.radiance.depth import draw_layout
+from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
+from simulator.radiance.procedural import (
     GENERATOR_VERSION,
     HARD_KINDS,
     MOTION_SPEED,
     draw,
 )
-from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
-from ae_env.scenes.stored import stored_scenes
-from simulator.camera import CameraProfile
 from simulator.utils.cache import cache_key
 
 Split = Literal["train", "test", "all"]
@@ -95,7 +96,7 @@ def _sources(
 
     def source(scene_ids: Sequence[str], draw: Callable[[], Iterable[Scene]]) -> SceneSource:
         def make() -> list[Scene]:
-            return [drape(scene).resized(resolution, crop) for scene in draw()]
+            return [add_layout(scene).resized(resolution, crop) for scene in draw()]
 
         return SceneSource(tuple(scene_ids), make)
 
@@ -104,7 +105,7 @@ def _sources(
             yield source([_name(kind, index)], partial(_procedural_scenes, kind, index, camera))
     photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
-        yield source(scene_ids(photograph), partial(photograph_scenes, photograph, camera))
+        yield source(photograph.scene_ids, partial(_photograph_scenes, photograph, camera))
 
 
 def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
@@ -139,6 +140,27 @@ def _procedural_scenes(kind: str, index: int, camera: CameraProfile) -> Iterator
         median_speed=MOTION_SPEED if kind == "motion" else DEFAULT_SPEED,
         source="procedural, ae-env (MIT)",
     )
+
+
+def _photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator[Scene]:
+    """The scenes of one photograph, a pixel of it one packed pixel, all in one source group."""
+    drawings = photograph_drawings(photograph)
+    for scene_id, drawing in zip(photograph.scene_ids, drawings, strict=True):
+        yield Scene.from_radiance(
+            drawing.light,
+            camera,
+            scene_id=scene_id,
+            group=photograph.name,
+            illuminance=drawing.illuminance,
+            illuminant=drawing.illuminant,
+            kind="photograph",
+            source=f"scikit-image {photograph.file}: {photograph.credit}",
+        )
+
+
+def add_layout(scene: Scene) -> Scene:
+    """The scene with a procedural layout, which its name decides (`draw_layout`)."""
+    return replace(scene, layout=draw_layout(scene.scene_id, *scene.light.shape[1:]))
 
 
 def _cache_key(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import glob
 import logging
+import math
 import re
 import time
 from collections import Counter
@@ -16,9 +17,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import torch
 
-from ae_env.scenes.radiance import RADIANCE_SUFFIXES, radiance_scenes
-from ae_env.scenes.recorded_files import PICTURE_SUFFIXES
 from ae_env.scenes.recorded_files import PREFIX as RECORDED
 from ae_env.scenes.scene import Scene, SceneRequest
 from ae_env.scenes.split import (
@@ -31,9 +31,22 @@ from ae_env.scenes.split import (
     scenes_of_split,
     too_few_groups,
 )
+from simulator.camera import CameraProfile
+from simulator.radiance.light import camera_from_srgb, mean_anchor
+from simulator.radiance.maps import (
+    AZIMUTHS,
+    FIELD_OF_VIEW,
+    RADIANCE_SUFFIXES,
+    assumed_ev100,
+    central_square,
+    native_size,
+    near_one,
+    perspective,
+    read_radiance,
+)
 from simulator.raw.read import read_raw
 from simulator.utils.checks import check_flag, check_number, check_word
-from simulator.utils.files import RAW_SUFFIXES
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 
 logger = logging.getLogger(__name__)
 
@@ -366,3 +379,91 @@ def _report_skipped(spec: str | Path, skipped: Mapping[Path, Exception], total: 
             f"skipped ({text})"
         )
     logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)
+
+
+# -- radiance maps ---------------------------------------------------------------------------------
+
+
+def radiance_scenes(
+    path: str | Path,
+    request: SceneRequest,
+    *,
+    name: str,
+    group: str,
+    ev100: float | None = None,
+    **fields: Any,
+) -> Iterator[Scene]:
+    """The scenes of one radiance map, all in one source group.
+
+    A radiance map is linear but relative: nothing in it says how many lux it shows. Its views are
+    therefore put at an EV100 between 3 and 14 drawn by a stable hash of the source group (an
+    assumption, stated in each scene's `source`), and their `illuminance` is None unless given.
+
+    A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
+    with a field of view of 60 degrees; any other gives its central square. Both have about 256
+    packed pixels a side, as the bundled scenes have, before `Scene.resized`. A map with at least as
+    many pixels there as photosites (512 x 512) is sampled through the colour filter array, so is a
+    coarser one with ``crop="native"`` if it has those of the crop; of others the planes share their
+    places, and the log says so (`Scene.sampled`).
+
+    Args:
+        path: The file.
+        request: Camera and size; without a resolution the views have 256 packed pixels a side.
+        name: Prefix of the scene ids.
+        group: Source group.
+        ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
+            their relative brightness), if known; see `assumed_ev100`.
+        **fields: Further arguments of `Scene.from_radiance`.
+    """
+    image = read_radiance(path)
+    if "illuminance" not in fields:
+        image = near_one(image)
+    height, width = image.shape[1:]
+    if "illuminance" not in fields and ev100 is None:
+        ev100 = assumed_ev100(group)
+        fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
+    fields.setdefault("source", Path(path).name)
+    if abs(width / height - 2.0) <= 0.01:
+        available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
+        size, sampled = _view_size(request, native_size(request.resolution), available)
+        views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
+    else:
+        available = min(height, width)
+        size = native_size(request.resolution, available)
+        size, sampled = _view_size(request, size, available)
+        views = [(name, central_square(image, size, Path(path).name))]
+    if not sampled:
+        logger.info(
+            "radiance map %s: %d pixels a view, fewer than photosites: planes share their places",
+            *(Path(path).name, available),
+        )
+    try:
+        levels = [_log2_level(view, request.camera) for _, view in views]
+    except ValueError as error:
+        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
+    for (scene_id, view), level in zip(views, levels, strict=True):
+        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
+            fields["ev100"] = ev100 + level - float(np.mean(levels))
+        try:
+            scene = Scene.from_radiance(
+                view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
+            )
+        except ValueError as error:
+            raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
+        yield request.sized(scene)
+
+
+def _view_size(request: SceneRequest, size: int, available: int) -> tuple[int, bool]:
+    """Pixels a side of a view of `size` packed pixels, and whether they are photosites."""
+    if available >= 2 * size:
+        return 2 * size, True
+    if request.crop == "native" and request.resolution and available >= 2 * request.resolution:
+        return available // 2 * 2, True
+    return size, False
+
+
+def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
+    """log2 of the mean of a view's green, clipped at white, relative to 0.12."""
+    matrix, _ = camera_from_srgb(camera)
+    green = torch.from_numpy(np.tensordot(matrix[1], view, axes=1))
+    return -math.log2(mean_anchor(green))

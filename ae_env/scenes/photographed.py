@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ae_env.scenes.scene import Scene, mean_anchor
+from ae_env.scenes.scene import Scene
 from simulator.noise.generator import noise_generator
+from simulator.radiance.light import mean_anchor
 from simulator.raw.image import RawImage
 from simulator.reference.reference_camera import ReferenceCamera
 from simulator.settings import CameraSettings

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
-from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise
-from ae_env.scenes.photographs import unprocess
-from ae_env.scenes.radiance import RADIANCE_SUFFIXES, read_radiance
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance.maps import RADIANCE_SUFFIXES, read_radiance
+from simulator.radiance.photographs import unprocess
+from simulator.radiance.procedural import LeafStyle, dead_leaves, fractal_noise
 from simulator.raw.read import read_raw
 from simulator.training.crops import DetailPicture
 from simulator.utils.checks import check_word

@@ -23,12 +23,12 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ae_env.scenes.depth import drape
-from ae_env.scenes.radiance import native_size, perspective, read_radiance
+from ae_env.scenes.bundled import add_layout
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
 from ae_env.scenes.stored import cached_scenes
 from ae_env.utils.presets import find_preset
 from simulator.camera import CameraProfile
+from simulator.radiance.maps import native_size, perspective, read_radiance
 from simulator.utils.cache import cache_dir, cache_key
 from simulator.utils.config_file import Configuration, load_yaml
 from simulator.utils.files import data_folder
@@ -197,7 +197,7 @@ def _make(
     logger.info("cutting %d views from each of %d panoramas", views, len(assets))
     for asset in assets:
         for scene in asset_views(asset, camera, size=size, views=views, seed=seed):
-            yield drape(scene).resized(resolution, crop)
+            yield add_layout(scene).resized(resolution, crop)
 
 
 def asset_views(

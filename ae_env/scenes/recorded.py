@@ -23,11 +23,12 @@ from ae_env.scenes.recorded_files import (
     recorded_grid,
     state_of,
 )
-from ae_env.scenes.scene import MEAN_SIGNAL, Scene, SceneRequest
+from ae_env.scenes.scene import Scene, SceneRequest
 from ae_env.scenes.split import log_groups, scenes_of_split
 from ae_env.utils.merging import SATURATED, merge
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance.light import MEAN_SIGNAL
 from simulator.raw.develop import develop_inverse
 from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw

@@ -25,12 +25,10 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from ae_env.grid import ExposureGrid
 from simulator.raw.read import read_settings
 from simulator.settings import CameraSettings
-from simulator.utils.files import RAW_SUFFIXES
+from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 
 #: How a text names a recorded grid.
 PREFIX = "recorded:"
-#: Endings of developed pictures.
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 #: Two values of a setting are the same within this share: recorded ones are rounded.
 SAME = 0.035
 #: Most states of a grid that is put together from files.

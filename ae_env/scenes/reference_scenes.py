@@ -25,9 +25,6 @@ import torch
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
-from ae_env.scenes.colour import temperature_tint
-from ae_env.scenes.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
-from ae_env.scenes.photographs import PHOTOGRAPHS, read_photograph, unprocess
 from ae_env.scenes.pictures import (
     FIRST_INDEX,
     Split,
@@ -35,11 +32,14 @@ from ae_env.scenes.pictures import (
     radiance_files,
     recorded_mosaics,
 )
-from ae_env.scenes.procedural import draw, list_kinds
-from ae_env.scenes.radiance import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
-from ae_env.scenes.scene import Scene, mean_anchor, reference_settings
+from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.optics.thin_lens import Lens
+from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
+from simulator.radiance.light import mean_anchor, reference_settings, temperature_tint
+from simulator.radiance.maps import AZIMUTHS, EV100_RANGE, assumed_ev100, read_radiance
+from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
+from simulator.radiance.procedural import draw, list_kinds
 from simulator.reference.reference_camera import DRAPED, MOSAIC, ReferenceScene
 from simulator.settings import incident_ev100
 from simulator.utils.checks import check_integer, check_word
@@ -91,8 +91,8 @@ def reference_scenes(
 ) -> list[ReferenceScene]:
     """The scenes of `split`: procedural ones, photographs, and views into radiance maps.
 
-    Of the procedural groups three quarters have depth (`ae_env.scenes.depth`), a third of these
-    with everything in focus; the rest are the bundled kinds, in turn. Nothing else has depth.
+    Of the procedural groups three quarters have depth (`simulator.radiance.depth`), a third of
+    these with everything in focus; the rest are the bundled kinds, in turn. Nothing else has depth.
 
     Args:
         split: ``"train"``, ``"validation"`` or ``"test"``.

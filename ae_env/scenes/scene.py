@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from ae_env.scenes.colour import camera_from_srgb, check_rgb
 from simulator.camera import CameraProfile
 from simulator.capture.aperture_blur import MapApertureBlur
 from simulator.capture.blurred_light import BlurredLight
@@ -21,58 +20,13 @@ from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.residual import Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.highlights import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
-from simulator.reference.sampling import lens_blur, sample_mosaic
-from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
+from simulator.settings import CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
 from simulator.utils.checks import check_number
 
-# -- the scale of a scene's light -----------------------------------------------------------------
-
-#: Signal of a perfectly white diffuse surface at the incident-light exposure, ``x = 0.663 * R``.
-#: Luminance R E / pi in ISO 12232's ``x = 100 L t / (120 N^2)`` with ``E = 2.5 * 2**EV100``.
-WHITE_SIGNAL = 100.0 * LUX_AT_EV0 / (SATURATION_CONSTANT * math.pi)
-#: Mean of green, clipped at white, that a scene of unknown light is anchored to.
-MEAN_SIGNAL = 0.12
-#: ISO and f-number of the reference settings made here; the exposure time follows from the EV.
-_REFERENCE_ISO, _REFERENCE_F_NUMBER = 100.0, 4.0
-
-
-def reference_settings(ev100: float) -> CameraSettings:
-    """ISO 100, f/4 and the exposure time at which ``-log2_exposure`` is `ev100`.
-
-    >>> reference_settings(10.0)
-    CameraSettings(iso=100.0, exposure_time=0.015625, f_number=4.0)
-    """
-    unit = CameraSettings(_REFERENCE_ISO, 1.0, _REFERENCE_F_NUMBER)
-    return replace(unit, exposure_time=2.0 ** (-unit.log2_exposure - ev100))
-
-
-def mean_anchor(green: torch.Tensor) -> float:
-    """Factor at which the mean of `green` (any shape), clipped at 1, is `MEAN_SIGNAL`.
-
-    Clipping keeps a sun of 10,000 times white from deciding the exposure of everything else.
-    """
-    values = green.double().clamp(min=0.0).flatten()
-    lit = float((values > 0).double().mean())
-    if lit <= MEAN_SIGNAL:
-        raise ValueError(
-            f"`light` is 0 in all but {lit:.1%} of its pixels: no exposure brings its mean to "
-            f"{MEAN_SIGNAL}; give `illuminance`"
-        )
-    low, high = -40.0, 40.0  # log2 of the factor, found by bisection
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if float((values * 2.0**middle).clamp_(max=1.0).mean()) < MEAN_SIGNAL:
-            low = middle
-        else:
-            high = middle
-    return float(2.0 ** (0.5 * (low + high)))
-
-
-#: EV100 of a radiance map of unknown scale, unless the caller knows better.
-DEFAULT_EV100 = 10.0
 #: Median image speed of a moving episode [frame heights / s].
 DEFAULT_SPEED = 0.125
 
@@ -429,17 +383,14 @@ class Scene:
                 each becomes a packed pixel, all four planes of it at one place.
             **fields: Further fields of `Scene`.
         """
-        image = check_rgb(rgb)
-        matrix, white = camera_from_srgb(camera, illuminant)
-        planes = torch.from_numpy(matrix).float() @ image.reshape(3, -1)
-        planes = planes.clamp_(min=0.0).reshape(image.shape)
-        light = sample_mosaic(lens_blur(planes), camera.cfa) if sampled else planes[[0, 1, 1, 2]]
-        if illuminance is not None:
-            reference = reference_settings(incident_ev100(illuminance))
-            light *= WHITE_SIGNAL
-        else:
-            reference = reference_settings(ev100)
-            light *= mean_anchor(light[1:3] if sampled else light[1])
+        light, reference, white_balance = camera_light(
+            rgb,
+            camera,
+            illuminance=illuminance,
+            ev100=ev100,
+            illuminant=illuminant,
+            sampled=sampled,
+        )
         return cls.from_array(
             light,
             reference,
@@ -447,7 +398,7 @@ class Scene:
             scene_id=scene_id,
             group=group,
             illuminance=illuminance,
-            white_balance=(white[1] / white[0], 1.0, white[1] / white[2]),
+            white_balance=white_balance,
             kind=kind,
             sampled=sampled,
             **fields,

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from ae_env.scenes.procedural import NATIVE_SIZE
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.capture.layout import Layout
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.radiance.procedural import NATIVE_SIZE
 from simulator.settings import CameraSettings
 from simulator.utils.cache import disk_cache
 

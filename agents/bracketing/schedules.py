@@ -16,7 +16,6 @@ from scipy.special import ndtri
 
 from ae_env.episodes.bracket_core import FRAME_GAP
 from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene
 from ae_env.utils.merging import SATURATED, WORST_EV
 from simulator.camera import CameraProfile
 
@@ -30,14 +29,6 @@ _QUANTILES = 11
 _NORMALS = ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
 #: Time by which a schedule may exceed what is left: rounding [s].
 _SLACK = 1e-9
-
-
-def light_histogram(scene: Scene, reference: float) -> Floats:
-    """(L,) shares of a scene's samples in `BINS`, relative to `reference` (EV100)."""
-    light = scene.clean_light.flatten().double().numpy()
-    place = np.log2(np.maximum(light, 1e-12)) - scene.reference.log2_exposure - reference
-    counts: Floats = np.bincount(bin_of(place), minlength=len(BINS)) / len(light)
-    return counts
 
 
 def bin_of(place: Floats) -> Ints:

@@ -24,6 +24,9 @@ from agents.cli.console import print_line
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
 from agents.cli.import_weights import import_weights
+from agents.cli.export import export
+from agents.cli.film import film
+from agents.cli.hdr import hdr
 from agents.cli.quickstart import quickstart
 from agents.cli.show import convert_nima, film, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
@@ -38,7 +41,7 @@ app = typer.Typer(
 )
 for command in (
     *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
-    *(import_weights, view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
+    *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)
 app.command(no_args_is_help=True)(bench)

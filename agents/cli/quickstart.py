@@ -120,11 +120,11 @@ def run_quickstart(
         device: Torch device of the agents' networks.
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
-    from agents.episodes import make_envs, training_arguments
     from agents.evaluation.engine import evaluate
     from agents.evaluation.evaluation_plan import MAX_SEED
     from agents.evaluation.running import fit_policies
     from agents.report.evaluation_report import write_report
+    from agents.rollouts import make_envs, training_arguments
     from simulator.utils.checks import check_integer
 
     check_integer("seed", seed, 0, MAX_SEED + 1 - EPISODES)
@@ -188,8 +188,9 @@ def _train(
 def _policies(
     environment: dict[str, Any], agents: Mapping[str, Path], device: str
 ) -> dict[str, Policy]:
-    from agents.episodes import make_envs
-    from agents.policy import PolicyContext, make_policy
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy
+    from agents.rollouts import make_envs
 
     envs = make_envs(environment, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)

@@ -23,7 +23,8 @@ from agents.evaluation.evaluation_plan import (
 )
 from agents.evaluation.intervals import Interval, difference_interval
 from agents.evaluation.metrics import group_means
-from agents.policy import Policy, PolicyContext, make_policy, training_seeds
+from agents.policy import Policy, PolicyContext
+from agents.policy_names import make_policy, training_seeds
 from simulator.utils.config_file import Configuration, load_yaml, read_yaml
 
 if TYPE_CHECKING:

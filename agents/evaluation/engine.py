@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import TIE
-from agents.episodes import Episodes, action_masks, expected_scores, fitting_arguments, make_envs
 from agents.evaluation.evaluation_plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
@@ -38,7 +37,9 @@ from agents.evaluation.running import (
     run_batch,
     training_envs,
 )
-from agents.policy import Policy, PolicyContext, make_policy, training_seeds
+from agents.policy import Policy, PolicyContext
+from agents.policy_names import make_policy, training_seeds
+from agents.rollouts import RolloutPlan, action_masks, expected_scores, fitting_arguments, make_envs
 from simulator.utils.checks import check_integer
 
 if TYPE_CHECKING:
@@ -248,7 +249,7 @@ class EvaluationRun:
             ``defocus`` (J,) and ``movement`` (J, 4) that the episodes drew.
         """
         count, frames, own = self.num_tables, self.plan.frames, self.episodes
-        episodes = Episodes(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
+        episodes = RolloutPlan(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
         envs = self._make_envs(condition, batch_size(count, self.batch), frames, judged=True)
         base: Any = envs.unwrapped
         scores, allowed, drawn = [], [], []

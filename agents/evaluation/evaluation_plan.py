@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ae_env.options import checked_delay
 from ae_env.scenes.folder import sequence_bounds
-from agents.episodes import Episodes
+from agents.rollouts import RolloutPlan
 from simulator.utils.checks import did_you_mean
 from simulator.utils.config_file import Configuration, load_yaml
 
@@ -288,7 +288,7 @@ def groups_in_turn(scenes: Sequence[Scene], count: int | None) -> list[Scene]:
     return [scenes[i] for i in chosen]
 
 
-def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureGrid) -> Episodes:
+def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureGrid) -> RolloutPlan:
     """The episodes of a condition of `plan`: starts change slowest, then seeds, scenes fastest.
 
     Episodes that differ in their start only have the same seed: the same motion, defocus, light and
@@ -296,7 +296,7 @@ def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureG
     """
     own = [(seed * _SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
     repeats = len(plan.starts)
-    return Episodes(
+    return RolloutPlan(
         scenes=scenes,
         seeds=[seed for seed, _ in own] * repeats,
         scene=np.array([j for _, j in own] * repeats),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -28,7 +26,7 @@ from agents.evaluation.store import (
     policy_content,
     scene_content,
 )
-from agents.learning.training import check_stop, core_count, run_in_parallel, tell
+from agents.learning.workers import core_count, run_in_parallel, send_progress
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
@@ -290,16 +288,5 @@ def _work(task: tuple[EvaluationPlan, Path, str, Job]) -> None:
     global _worker_run
     plan, folder, device, job = task
     if _worker_run is None:
-        threading.Thread(target=_end_when_stopped, daemon=True).start()
         _worker_run = StoredRun(plan, folder, device=device)
-    _worker_run.do(job, partial(tell, job))
-
-
-def _end_when_stopped() -> None:
-    """Ends a worker soon after Ctrl-C, in the middle of a fit too: parts are written whole."""
-    while True:
-        time.sleep(0.5)
-        try:
-            check_stop()
-        except KeyboardInterrupt:
-            os._exit(1)
+    _worker_run.do(job, partial(send_progress, job))

@@ -10,16 +10,16 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.episodes import (
+from agents.metering.reading import linear_signal, signal_codes
+from agents.policy import Policy
+from agents.rollouts import (
     EpisodeBatch,
-    Episodes,
+    RolloutPlan,
     action_masks,
     checked_states,
     errors_of,
     make_envs,
 )
-from agents.metering.reading import linear_signal, signal_codes
-from agents.policy import Policy
 from simulator.utils.checks import check_number
 
 Ints = NDArray[np.int64]
@@ -146,7 +146,7 @@ def _told(base: Any, oracle: Ints, frame: int) -> dict[str, Ints]:
 
 
 def milliseconds_alone(
-    name: str, policy: Policy, envs: VectorEnv, episodes: Episodes, oracle: Ints | None = None
+    name: str, policy: Policy, envs: VectorEnv, episodes: RolloutPlan, oracle: Ints | None = None
 ) -> float:
     """Median time in `act` for one camera alone [ms].
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation.evaluation_plan import digest
-from agents.policy import (
+from agents.policy_names import (
     FORECASTERS,
     LEARNT,
     split_class,

@@ -18,8 +18,8 @@ from pydantic import Field
 from torch import nn
 
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
-from agents.learning.agent_weights import MAX_WIDTH, load_agent, load_into
 from agents.learning.optimisation import Optimisation
+from agents.learning.weights import MAX_WIDTH, load_agent, load_into
 from agents.metering.matching import ZoneMatcher
 from agents.metering.reading import (
     BLACK_SIGNAL,

@@ -24,10 +24,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.agent_weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.learning.history import NUMBERS, MeterHistory, WithHistory, with_history
 from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead
 from agents.learning.sb3_adapter import MovedFrames, SB3VectorAdapter
+from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.policy import Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
 from simulator.utils.config_file import Configuration

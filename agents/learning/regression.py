@@ -7,7 +7,6 @@ each weighted by the network's own confidence.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,21 +20,14 @@ from torch import nn
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
 from agents.foresight import Floats, Foresight, LightTracker
-from agents.learning.agent_weights import NetworkPolicy, trained_grid
 from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
 from agents.learning.networks import ExposureFeatures, StateHead
+from agents.learning.weights import NetworkPolicy, trained_grid
 from agents.metering.meters import make_meter
 from agents.metering.reading import Meter, Reading
 from agents.metering.trend import TrendTracker
-from agents.policy import (
-    FORECASTERS,
-    LEARNT,
-    Observations,
-    PolicyContext,
-    masked_argmax,
-    weight_files,
-)
-from simulator.utils.checks import check_flag
+from agents.policy import Observations, PolicyContext, masked_argmax
+from agents.policy_names import FORECASTERS, LEARNT, weight_files
 
 #: Dropout of the CNN's channels, relative to that of the features.
 _OF_CHANNELS = 0.4
@@ -90,31 +82,6 @@ class ScoreRegressor(nn.Module):
         return torch.sigmoid(scores), log_variance.clamp(*_LOG_VARIANCE)
 
 
-class Ensemble(nn.Module):
-    """Several trainings as one network (Lakshminarayanan et al., NeurIPS 2017).
-
-    A training's score counts with the precision that it gives it; their mean precision is that of
-    the ensemble.
-
-    Args:
-        members: Networks of the same inputs and states.
-    """
-
-    def __init__(self, members: Sequence[nn.Module]) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(members)
-
-    def forward(
-        self, codes: torch.Tensor, settings: torch.Tensor, sensors: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """As of `ScoreRegressor`."""
-        found = [member(codes, settings, sensors) for member in self.members]
-        scores = torch.stack([score for score, _ in found])
-        precision = torch.exp(-torch.stack([log_variance for _, log_variance in found]))
-        weighted = (precision * scores).sum(dim=0) / precision.sum(dim=0)
-        return weighted, -precision.mean(dim=0).log()
-
-
 def observation_tensors(
     observations: Observations, device: torch.device | str = "cpu"
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
@@ -125,7 +92,7 @@ def observation_tensors(
     return codes, settings, None if sensors is None else torch.as_tensor(sensors, device=device)
 
 
-def as_if_at(settings: NDArray[np.floating], stops: Floats) -> NDArray[np.float32]:
+def shift_ev(settings: NDArray[np.floating], stops: Floats) -> NDArray[np.float32]:
     """Settings (N, 3) of frames in `stops` (N,) more light that look alike: of a lower gain [EV].
 
     The network reads the absolute light off a frame and its settings.
@@ -149,7 +116,6 @@ class RegressionPolicy(NetworkPolicy):
             that promises most in the frames that its controls are in effect in. ``"trend"``: an
             alpha-beta filter expects it; ``"learnt"``: the forecasters that come with the package
             (`LightForecaster`); or the file of another one, or a pattern of several.
-        ensemble: `weights` is a pattern of several trainings, which decide together (`Ensemble`).
     """
 
     kind = "regression"
@@ -161,15 +127,7 @@ class RegressionPolicy(NetworkPolicy):
         network: nn.Module | None = None,
         device: str = "cpu",
         foresight: str = "none",
-        ensemble: bool = False,
     ) -> None:
-        check_flag("ensemble", ensemble)
-        if ensemble and network is None:
-            files = weight_files(str(weights))
-            if not files:
-                raise ValueError(f"`weights` (={str(weights)!r}): no .safetensors file fits")
-            members = [RegressionPolicy(context, file, device=device).network for file in files]
-            weights, network = None, Ensemble(members)
         self.foresight = foresight
         self._forecasters: list[LightForecaster] = []
         if foresight not in ("none", "trend"):
@@ -248,9 +206,9 @@ class RegressionPolicy(NetworkPolicy):
         frame = codes, np.array(observations["settings"]), sensors, reading
         self._recent = [*self._recent, frame][-RECENT:]
         utility = foresight.utility(self._scores_in)
-        utility[np.arange(len(utility)), foresight.asked] += HYSTERESIS
+        utility[np.arange(len(utility)), foresight.pending_action] += HYSTERESIS
         chosen = masked_argmax(utility, action_masks)
-        foresight.decided(chosen)
+        foresight.record_action(chosen)
         return chosen
 
     def _scores_in(self, ev100: Floats) -> Floats:
@@ -262,7 +220,7 @@ class RegressionPolicy(NetworkPolicy):
         white = newest.saturated >= WHITE_SHARE
         ev100 = np.where(white, newest.ev100, ev100)
         for codes, settings, sensors, reading in self._recent:
-            shifted = torch.from_numpy(as_if_at(settings, ev100 - reading.ev100)).to(device)
+            shifted = torch.from_numpy(shift_ev(settings, ev100 - reading.ev100)).to(device)
             with torch.inference_mode():
                 scores, log_variance = self.network(codes, shifted, sensors)
             precision = torch.exp(-log_variance).double().cpu().numpy()

@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 
-from agents.learning.agent_weights import MAX_WIDTH
 from agents.learning.augmentation import moved
 from agents.learning.optimisation import Optimisation
 from agents.learning.regression import RegressionPolicy, ScoreRegressor, observation_tensors
+from agents.learning.weights import MAX_WIDTH
 from agents.policy import Observations, PolicyContext
 from simulator.utils.config_file import Configuration
 

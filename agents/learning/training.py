@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from agents.bracketing.learnt import BracketTraining, train_bracket
-from agents.learning.agent_weights import describe_agent, load_agent, save_agent
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
 from agents.learning.learning_curve import LearningCurve
 from agents.learning.regression_training import RegressionTraining, train_regression
+from agents.learning.weights import describe_agent, load_agent, save_agent
+from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling
@@ -28,39 +23,28 @@ from simulator.utils.files import sibling
 if TYPE_CHECKING:
     from agents.learning.ppo import PPOTraining
 
-    Hyperparameters = RegressionTraining | PPOTraining | BracketTraining | ForecasterTraining
+    Hyperparameters = RegressionTraining | PPOTraining | ForecasterTraining
 
 #: Called with frames done, frames in all, and the latest losses.
 Progress = Callable[[int, int, dict[str, float]], None]
-#: Seconds between two looks at the messages of the workers.
-_PATIENCE = 0.2
-#: In a worker: set when it is to end, and where its progress goes.
-_stop: Any = None
-_messages: Any = None
-
-
-#: The task that the bracketing agent learns, and no other.
-BRACKET_TASK = "ae_env/ExposureBracket-v0"
 
 
 class AgentConfig(Configuration):
     """A training of an agent.
 
     Args:
-        agent: ``"regression"`` or ``"ppo"``; ``"bracket"``, which needs `ExposureBracket-v0`; or
-            ``"forecaster"``, which needs no environment.
+        agent: ``"regression"``, ``"ppo"``, or ``"forecaster"``, which needs no environment.
         task: Id of the environment.
         environment: Arguments of it.
         max_episode_steps: Actions of an episode; by default those of the task.
         num_envs: Episodes side by side.
-        training: Hyperparameters, those of `RegressionTraining`, `PPOTraining`, `BracketTraining`
-            or `ForecasterTraining`.
+        training: Hyperparameters: `RegressionTraining`, `PPOTraining` or `ForecasterTraining`.
     """
 
-    agent: Literal["regression", "ppo", "bracket", "forecaster"]
-    task: Literal[
-        "ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0", "ae_env/ExposureBracket-v0"
-    ] = "ae_env/AutoExposure-v0"
+    agent: Literal["regression", "ppo", "forecaster"]
+    task: Literal["ae_env/AutoExposure-v0", "ae_env/AutoExposureVideo-v0"] = (
+        "ae_env/AutoExposure-v0"
+    )
     environment: dict[str, Any] = Field(default_factory=dict)
     max_episode_steps: int | None = Field(default=None, ge=1, le=10**6)
     num_envs: int = Field(default=64, ge=1, le=4096)
@@ -76,14 +60,8 @@ class AgentConfig(Configuration):
                 unused = type(self).model_fields[name].get_default(call_default_factory=True)
                 if getattr(self, name) != unused:
                     raise ValueError(f"`{name}` is not used by a forecaster: it sees no pictures")
-        if (self.agent == "bracket") != (self.task == BRACKET_TASK):
-            raise ValueError(f"`task` (={self.task!r}) is not one that agent {self.agent!r} learns")
-        environment = dict(self.environment)
-        if self.task == BRACKET_TASK:
-            for name in ("budget", "max_frames"):  # which its constructor checks
-                environment.pop(name, None)
         try:
-            options = EnvOptions.from_kwargs(environment)
+            options = EnvOptions.from_kwargs(self.environment)
             options.make_grid(), options.make_camera(), options.make_scorer()
             options.make_lighting()
         except ValueError as error:
@@ -108,8 +86,6 @@ class AgentConfig(Configuration):
         kind: type[Hyperparameters] = RegressionTraining
         if self.agent == "ppo":
             from agents.learning.ppo import PPOTraining as kind
-        elif self.agent == "bracket":
-            kind = BracketTraining
         elif self.agent == "forecaster":
             kind = ForecasterTraining
         try:
@@ -217,8 +193,6 @@ def train_agent(
         }
         if isinstance(training, RegressionTraining):
             network = train_regression(envs, training, **common)
-        elif isinstance(training, BracketTraining):
-            network = train_bracket(envs, training, **common)
         else:
             from agents.learning.ppo import train_ppo
 
@@ -288,7 +262,7 @@ def train_in_parallel(
         progress: Called with the job's name, frames done, frames in all, and losses.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C; every job has its checkpoint, the same call resumes.
+        KeyboardInterrupt: After Ctrl-C; the same call resumes from the checkpoints.
     """
     waiting = [job for job in jobs if not is_trained(job.config, job.out)]
     run_in_parallel(_train, waiting, workers=workers, progress=progress)
@@ -299,110 +273,8 @@ def _train(job: TrainingJob) -> None:
 
     def report(done: int, total: int, values: dict[str, float]) -> None:
         nonlocal last
-        check_stop()
         if done == total or done - last >= total // 200:
             last = done
-            tell(job.name, done, total, values)
+            send_progress(job.name, done, total, values)
 
     train_agent(job.config, job.out, progress=report, device=job.device)
-
-
-def run_in_parallel(
-    work: Callable[[Any], object],
-    jobs: Sequence[Any],
-    *,
-    workers: int | None = None,
-    progress: Callable[..., None] | None = None,
-) -> None:
-    """Calls ``work(job)`` for every job, in processes of their own.
-
-    Args:
-        work: A function of a module, which reports with `tell`.
-        jobs: Values that can be sent to another process.
-        workers: Processes at a time, each with its share of the cores; by default one per core.
-        progress: Called with the arguments of every `tell`.
-
-    Raises:
-        KeyboardInterrupt: After Ctrl-C, when every running job has ended at its next `tell`.
-    """
-    if not jobs:
-        return
-    cores = core_count()
-    workers = min(workers or cores, len(jobs))
-    context = multiprocessing.get_context("spawn")
-    stop, messages = context.Event(), context.SimpleQueue()
-
-    def deliver() -> None:
-        while not messages.empty():
-            message = messages.get()
-            if progress is not None:
-                progress(*message)
-
-    with ProcessPoolExecutor(
-        workers,
-        mp_context=context,
-        initializer=_start_worker,
-        initargs=(stop, messages, max(1, cores // workers)),
-    ) as pool:
-        try:
-            running = {pool.submit(_run, work, job) for job in jobs}
-            while running:
-                done, running = wait(running, timeout=_PATIENCE, return_when=FIRST_COMPLETED)
-                deliver()
-                for future in done:
-                    future.result()
-        finally:  # after an error or Ctrl-C, the jobs that still run end at their next `tell`
-            stop.set()
-            pool.shutdown(cancel_futures=True)
-
-
-def core_count() -> int:
-    """Cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def tell(*message: object) -> None:
-    """In a worker: sends progress to the process that waits.
-
-    Raises:
-        KeyboardInterrupt: If the worker is to end.
-    """
-    check_stop()
-    _messages.put(message)
-
-
-def check_stop() -> None:
-    """In a worker: ends the job if it is to end; elsewhere does nothing.
-
-    Raises:
-        KeyboardInterrupt: If the worker is to end.
-    """
-    if _stop is not None and _stop.is_set():
-        raise KeyboardInterrupt
-
-
-def _run(work: Callable[[Any], object], job: Any) -> None:
-    check_stop()  # a pool hands out one job more than it has workers, which cannot be cancelled
-    work(job)
-
-
-def _start_worker(stop: Any, messages: Any, threads: int) -> None:
-    """Prepares a worker process."""
-    global _stop, _messages
-    _stop, _messages = stop, messages
-    # Ctrl-C reaches every process of a terminal. Only the one that waits decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    import torch
-
-    torch.set_num_threads(threads)
-
-
-def _end_with_parent() -> None:
-    """Ends this process as soon as the one that started it has ended, however that ended."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
-from agents.episodes import Episodes, expected_scores, scenes_of
 from agents.foresight import Foresight
 from agents.metering.meters import make_meter
 from agents.metering.programs import (
@@ -30,7 +29,9 @@ from agents.metering.reading import (
 )
 from agents.metering.trend import TrendTracker
 from agents.metering.tuned import ScoreRegression
-from agents.policy import PROGRAMS, Observations, Policy, PolicyContext, masked_argmax
+from agents.policy import Observations, Policy, PolicyContext, masked_argmax
+from agents.policy_names import PROGRAMS
+from agents.rollouts import RolloutPlan, expected_scores, scenes_of
 from simulator.utils.checks import check_word
 
 if TYPE_CHECKING:
@@ -73,7 +74,7 @@ class MeteringPolicy(Policy):
 
     Args:
         context: The camera, the grid and the observation.
-        meter: One of `agents.policy.METERS`, such as ``"average"``.
+        meter: One of `agents.policy_names.METERS`, such as ``"average"``.
         program: ``"P"``, ``"A"`` (aperture priority), ``"S"`` (shutter priority), ``"M"`` (aperture
             and shutter by hand), ``"tuned"`` or ``"tuned_blind"`` (never uses the sensors).
         compensation: Exposure compensation [EV], positive is brighter.
@@ -163,7 +164,7 @@ class MeteringPolicy(Policy):
             utility = self._tuned_utility(readings) if tuned else self._program_utility(readings)
         self._previous = masked_argmax(utility, action_masks)
         if foresight is not None:
-            foresight.decided(self._previous)
+            foresight.record_action(self._previous)
         return self._previous.copy()
 
     def observe(self, observations: Observations) -> NDArray[np.float64]:
@@ -253,7 +254,7 @@ class MeteringPolicy(Policy):
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
         """Readings after the meter has settled, scores of all states, source groups."""
         features, scores, groups = [], [], []
-        drawn = Episodes.of_each_scene(
+        drawn = RolloutPlan.of_each_scene(
             scenes_of(envs), count=per_scene, seed=seed, most=FIT_EPISODES // 2
         )
         for batch in drawn.batches(envs):

@@ -24,7 +24,8 @@ from agents.metering.reading import (
     linear_signal,
     mean_reading,
 )
-from agents.policy import METERS, Observations
+from agents.policy import Observations
+from agents.policy_names import METERS
 from simulator.camera import CameraProfile
 from simulator.utils.checks import did_you_mean
 
@@ -44,7 +45,7 @@ MATRIX_CALIBRATION_EV = 0.7
 
 
 def make_meter(name: str, camera: CameraProfile) -> Meter:
-    """The meter called `name`, one of `agents.policy.METERS`, for `camera`.
+    """The meter called `name`, one of `agents.policy_names.METERS`, for `camera`.
 
     Raises:
         ValueError: If there is none; the message proposes the nearest name.

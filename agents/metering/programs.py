@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.grid import ExposureGrid
-from agents.policy import MANUAL_PROGRAMS
+from agents.policy_names import MANUAL_PROGRAMS
 from simulator.utils.checks import check_number, check_word
 
 Floats = NDArray[np.float64]

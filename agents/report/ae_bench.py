@@ -19,7 +19,7 @@ from agents.evaluation import metrics
 from agents.evaluation.bracket_plan import BracketPlan, BracketResult, load_bench_plan
 from agents.evaluation.evaluation_plan import EvaluationPlan, digest
 from agents.evaluation.intervals import Rank
-from agents.policy import split_class, split_options
+from agents.policy_names import split_class, split_options
 from agents.report.markdown import escape, markdown_table
 from agents.report.result_table import Results
 from simulator.utils.files import write_atomically

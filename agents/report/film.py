@@ -12,8 +12,8 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from agents.episodes import errors_of
 from agents.policy import Policy
+from agents.rollouts import errors_of
 from simulator.utils.files import write_atomically
 
 #: Size of a picture, height of the chart below it and of the title above [pixel].

@@ -19,7 +19,7 @@ from agents.evaluation.intervals import (
     score_interval,
 )
 from agents.evaluation.result import CONDITIONS, EvaluationResult
-from agents.policy import is_metering
+from agents.policy_names import is_metering
 
 Rows = list[dict[str, Any]]
 Results = Mapping[str, EvaluationResult]

@@ -9,7 +9,7 @@ from typing import Any
 from nicegui import run, ui
 
 from ae_env.grid import ExposureGrid
-from agents.policy import METERS, PROGRAMS
+from agents.policy_names import METERS, PROGRAMS
 from agents.viewer.drawings import histogram, score_colour
 from agents.viewer.playing import SETTLED, settled
 from agents.viewer.stage import Stage

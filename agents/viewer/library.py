@@ -12,9 +12,9 @@ from typing import Any
 
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
-from ae_env.scenes.radiance import RADIANCE_SUFFIXES
 from ae_env.scenes.recorded_files import PREFIX
 from simulator import RawImage, get_camera, read_raw
+from simulator.radiance.maps import RADIANCE_SUFFIXES
 from simulator.raw.develop import quarter_turns
 from simulator.utils.checks import did_you_mean
 from simulator.utils.files import RAW_SUFFIXES

@@ -12,7 +12,8 @@ import ae_env  # noqa: F401  (registers the environments)
 from ae_env.lighting.moving import KIND_SETS, MOVES
 from ae_env.scenes import Scene
 from agents.evaluation.running import fit_policies
-from agents.policy import Policy, PolicyContext, make_policy
+from agents.policy import Policy, PolicyContext
+from agents.policy_names import make_policy
 from agents.report.film import Recording, record
 
 #: Kinds of moving light, and light that stays.

@@ -17,9 +17,9 @@ from ae_env.scenes.pictures import (
     radiance_files,
     recorded_mosaics,
 )
-from ae_env.scenes.radiance import read_radiance
 from benchmarks.harness import data_root
 from simulator import develop
+from simulator.radiance.maps import read_radiance
 from simulator.raw.develop import GREY_CARD_SIGNAL
 
 #: Brightest light of a map, in its medians.

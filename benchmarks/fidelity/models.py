@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torch import nn
-
 from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.harness import data_root
 from benchmarks.isolated import ROOT
+from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraSimulator, get_camera
 from simulator.networks.denoiser import SIZES
 from simulator.networks.noise_module import NoiseModule
@@ -42,7 +41,7 @@ class Models:
 
     simulators: dict[str, CameraSimulator]
     corrected: dict[str, CameraSimulator]
-    baselines: dict[str, nn.Module]
+    baselines: dict[str, ParameterConcatenation | DecoupledNet]
     cards: dict[str, dict[str, Any]]
 
 
@@ -58,7 +57,7 @@ def train_missing() -> None:
     """Trains what is not there by its configuration; a training that was stopped continues."""
     for name in (*PRESETS, *BASELINES):
         if weights(name) is None:
-            command = [sys.executable, "-m", "agents.cli", "train-simulator"]
+            command = [sys.executable, "-m", "benchmarks.paper_baselines", "train-simulator"]
             subprocess.run([*command, str(CONFIGS / f"{name}.yaml")], cwd=ROOT, check=True)
 
 
@@ -83,7 +82,7 @@ def load_models() -> Models:
         }
         for correct in (False, True)
     )
-    baselines = {name: loaded[name][0]["baseline"] for name in BASELINES if name in loaded}
+    baselines: Any = {n: loaded[n][0]["baseline"] for n in BASELINES if n in loaded}
     return Models(own, corrected, baselines, {name: card for name, (_, card) in loaded.items()})
 
 

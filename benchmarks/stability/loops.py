@@ -12,8 +12,8 @@ import numpy as np
 
 import ae_env  # noqa: F401  registers the environment
 from agents import PolicyContext, make_policy
-from agents.episodes import make_envs
-from agents.policy import CLASSIC_METERS
+from agents.policy_names import CLASSIC_METERS
+from agents.rollouts import make_envs
 from benchmarks.harness import Row
 from benchmarks.stability.case import row
 

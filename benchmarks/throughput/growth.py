@@ -15,7 +15,6 @@ import torch
 from scipy.stats import linregress
 
 import ae_env  # noqa: F401  registers the environment
-from ae_env.scenes.dead_leaves import dead_leaves
 from benchmarks.harness import Part, Row
 from benchmarks.isolated import forget_peak, median_seconds, peak_memory, timed
 from simulator import (
@@ -27,6 +26,7 @@ from simulator import (
     get_camera,
 )
 from simulator.optics.blur import disc_blur
+from simulator.radiance.procedural import dead_leaves
 
 #: Packed heights and widths: 16 thousand to 24 million samples, which are the sensor's pixels.
 PIXELS = ((64, 64), (128, 128), (256, 256), (512, 512), (1024, 1024), (2000, 3000))

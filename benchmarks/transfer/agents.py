@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from agents.cli.console import progress_bars
-from agents.episodes import make_envs
 from agents.evaluation.engine import evaluate
 from agents.evaluation.intervals import Interval, difference_interval, score_interval
 from agents.evaluation.result import EvaluationResult
@@ -20,11 +19,12 @@ from agents.learning.training import (
     TrainingJob,
     is_trained,
     load_config,
-    run_in_parallel,
-    tell,
     train_agent,
 )
-from agents.policy import PolicyContext, make_policy
+from agents.learning.workers import run_in_parallel, send_progress
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
+from agents.rollouts import make_envs
 from benchmarks.harness import Row
 from benchmarks.isolated import ROOT
 from benchmarks.transfer.worlds import (
@@ -118,19 +118,17 @@ def _train(job: TrainingJob) -> None:
     last, began = 0, time.perf_counter()
     resumes = Path(f"{job.out}.checkpoint").is_file()
     before = training_seconds(job.out) if resumes else 0.0
+    job.out.parent.mkdir(parents=True, exist_ok=True)
 
     def report(done: int, total: int, _: Mapping[str, float]) -> None:
         nonlocal last
         if done == total or done - last >= total // 100:
             last = done
-            tell(job.name, done, total)
+            seconds = before + time.perf_counter() - began
+            _seconds_file(job.out).write_text(f"{seconds:.1f}\n", encoding="ascii")
+            send_progress(job.name, done, total)
 
-    job.out.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        train_agent(job.config, job.out, progress=report)
-    finally:  # after Ctrl-C, too: the next run continues
-        seconds = before + time.perf_counter() - began
-        _seconds_file(job.out).write_text(f"{seconds:.1f}\n", encoding="ascii")
+    train_agent(job.config, job.out, progress=report)
 
 
 def training_seconds(out: Path) -> float:

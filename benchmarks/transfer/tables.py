@@ -22,9 +22,9 @@ from ae_env.scenes.photographed import photographed
 from ae_env.scenes.scene import Crop
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.cli.console import progress_bars
-from agents.episodes import Episodes, make_envs
 from agents.evaluation.intervals import difference_interval, score_interval
 from agents.evaluation.metrics import group_means
+from agents.rollouts import RolloutPlan, make_envs
 from benchmarks.harness import FinishedParts, Row
 from benchmarks.transfer.worlds import (
     EXP,
@@ -131,7 +131,7 @@ def drawn_moves(scenes: Sequence[Scene], seed: int) -> list[dict[str, Any]]:
         base: Any = envs.unwrapped
         return [
             base.episode(int(i)).moves
-            for batch in Episodes.of_each_scene(scenes, count=1, seed=seed).batches(envs)
+            for batch in RolloutPlan.of_each_scene(scenes, count=1, seed=seed).batches(envs)
             for i in np.flatnonzero(batch.valid)
         ]
 

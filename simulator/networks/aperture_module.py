@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from simulator.networks.denoiser import ResidualBlock
-from simulator.networks.ncs_networks import NcsAttentionUNet
 from simulator.networks.unet import AttentionUNet
 from simulator.optics.blur import box_mean, disc_blur
 from simulator.optics.disc_bank import DiscBank, added_blur
+from simulator.utils.checks import check_word
 
 AperturePreset = Literal["compact", "paper", "ncs"]
 #: Blur below this diameter [pixel] cannot be told from sharpness, and is left as it is.
@@ -52,15 +52,12 @@ class ApertureModule(nn.Module):
 
     def __init__(self, preset: AperturePreset = "compact") -> None:
         super().__init__()
-        if preset not in get_args(AperturePreset):
-            raise ValueError(
-                f"`preset` (={preset!r}) must be one of {list(get_args(AperturePreset))}"
-            )
+        check_word("preset", preset, get_args(AperturePreset))
         self.preset = preset
         if preset == "compact":
             self.network: nn.Module = DefocusMap()
         else:
-            self.network = AttentionUNet() if preset == "paper" else NcsAttentionUNet()
+            self.network = AttentionUNet(preset)
 
     def forward(
         self, image: Tensor, deviation: Tensor, f_source: Tensor, f_target: Tensor

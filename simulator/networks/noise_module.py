@@ -12,22 +12,16 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from simulator.capture.residual import Residual
 from simulator.networks.denoiser import SIZES, Denoiser
-from simulator.networks.ncs_networks import NcsUNet
 from simulator.networks.unet import UNet
 from simulator.noise.generator import frame_normals, noise_keys
 from simulator.optics.blur import box_mean
+from simulator.utils.checks import check_word
 
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]
 #: Side of the window that smooths the signal which the noise level is read from.
 _SMOOTHING = 5
 #: Seed of the sample of noise that the authors' network is shown.
 _SAMPLE_SEED = 1234
-
-
-def check_preset(preset: str) -> None:
-    """Raises a `ValueError` unless `preset` is known."""
-    if preset not in get_args(Preset):
-        raise ValueError(f"`preset` (={preset!r}) must be one of {list(get_args(Preset))}")
 
 
 class NoiseModule(nn.Module):
@@ -43,13 +37,13 @@ class NoiseModule(nn.Module):
 
     def __init__(self, preset: Preset = "compact") -> None:
         super().__init__()
-        check_preset(preset)
+        check_word("preset", preset, get_args(Preset))
         self.preset = preset
         self.residual: Residual | None = None  # known once it is trained
-        if preset in SIZES:
-            self.network: nn.Module = Denoiser(preset)
+        if preset == "paper" or preset == "ncs":
+            self.network: nn.Module = UNet(preset)
         else:
-            self.network = UNet() if preset == "paper" else NcsUNet()
+            self.network = Denoiser(preset)
 
     @property
     def commutes(self) -> bool:

@@ -1,31 +1,54 @@
-"""Two U-Nets: that of Brooks et al. (2019) for the noise, and the attention U-Net for the aperture.
+"""Two U-Nets, for the noise and for the aperture, each in two variants.
 
-Both are networks of the preset `paper`. Their layers take maps of any size, down to 1 x 1.
+``"paper"``: that of Brooks et al. (2019) and the attention U-Net, as the paper describes them.
+``"ncs"``: those of the code that the paper's authors released, layer by layer. docs/networks.md
+lists the differences. Both variants take maps of any size, down to 1 x 1.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from simulator.utils.checks import check_word
+
+Variant = Literal["paper", "ncs"]
+#: Channels of each level, finest first.
+WIDTHS: dict[Variant, tuple[int, ...]] = {
+    "paper": (32, 64, 128, 256, 512),
+    "ncs": (64, 128, 256, 512, 512),
+}
+ATTENTION_WIDTHS = (32, 64, 128, 256, 512)
 #: Slope of every LeakyReLU below zero.
 LEAK = 0.2
 #: A map that deviates less than this (relative to its mean where that exceeds one) is flat.
 FLAT = 1e-5
-#: The attention U-Net counts f-numbers in units of this one, so that they are of order one. It only
+#: The paper's variant counts f-numbers in units of this one, so that they are of order one. It only
 #: rescales the learnt w_s and w_m.
 F_NUMBER_UNIT = 8.0
+#: The authors' pictures have sizes that are multiples of this: they are halved four times.
+MULTIPLE = 16
+#: f/22 is this many whole stops below f/1.
+_STOPS_OF_F22 = 9
 
 
-def check_widths(widths: Sequence[int]) -> tuple[int, ...]:
-    """`widths` as a tuple; ValueError unless it names the channels of two or more levels."""
-    checked = tuple(widths)
-    if len(checked) < 2 or not all(isinstance(w, int) and w >= 1 for w in checked):
-        raise ValueError(f"`widths` (={widths!r}) must be two or more integers >= 1")
+def _checked(variant: Variant, widths: Sequence[int]) -> tuple[int, ...]:
+    """`widths` as a tuple, of a known variant."""
+    check_word("variant", variant, get_args(Variant))
+    checked, least = tuple(widths), 2 if variant == "paper" else 5
+    if len(checked) < least or not all(isinstance(w, int) and w >= 1 for w in checked):
+        raise ValueError(f"`widths` (={widths!r}) must be {least} or more integers >= 1")
     return checked
+
+
+def _left(variant: Variant, widths: tuple[int, ...]) -> tuple[int, ...]:
+    """Channels per level on the way up, coarsest first: the paper's, or one level finer in ncs."""
+    return widths[-2::-1] if variant == "paper" else (*widths[-3::-1], widths[0])
 
 
 def halve(x: Tensor) -> Tensor:
@@ -36,6 +59,12 @@ def halve(x: Tensor) -> Tensor:
 def resize_to(x: Tensor, skip: Tensor) -> Tensor:
     """`x` bilinearly enlarged to the height and width of `skip`, whatever they are."""
     return F.interpolate(x, size=skip.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def _padded(image: Tensor) -> Tensor:
+    """`image` (B, C, H, W), its last row and column repeated up to a multiple of `MULTIPLE`."""
+    height, width = image.shape[-2:]
+    return F.pad(image, (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")
 
 
 def convolution(inputs: int, outputs: int, *, bias: bool = True) -> nn.Conv2d:
@@ -76,30 +105,41 @@ def instance_norm(x: Tensor, scale: Tensor, shift: Tensor, eps: float = 1e-5) ->
     return torch.addcmul(shift.to(wide)[:, :, None, None], centred, gain).to(x.dtype)
 
 
-def _level(inputs: int, outputs: int) -> nn.Sequential:
+def _leaky_level(inputs: int, outputs: int) -> nn.Sequential:
     """Two convolutions, each with LeakyReLU."""
-    return nn.Sequential(
-        convolution(inputs, outputs),
-        nn.LeakyReLU(LEAK),
-        convolution(outputs, outputs),
-        nn.LeakyReLU(LEAK),
-    )
+    layers = [(convolution(i, outputs), nn.LeakyReLU(LEAK)) for i in (inputs, outputs)]
+    return nn.Sequential(*(layer for pair in layers for layer in pair))
+
+
+def _normalised_level(inputs: int, outputs: int) -> nn.Sequential:
+    """Two convolutions, borders zero, each with batch normalisation and ReLU."""
+    layers: list[nn.Module] = []
+    for channels in (inputs, outputs):
+        layers += [
+            nn.Conv2d(channels, outputs, 3, padding=1),
+            nn.BatchNorm2d(outputs),
+            nn.ReLU(),
+        ]
+    return nn.Sequential(*layers)
 
 
 class UNet(nn.Module):
     """Predicts the residual that takes the noise out of a packed raw.
 
-    Two 3 x 3 convolutions with LeakyReLU(0.2) a level, max-pooling on the way down, bilinear
-    upsampling and concatenated skips on the way up, a last 3 x 3 convolution without activation.
-    7.85 M parameters at the default widths. The weights are drawn from torch's global generator.
+    ``"paper"``: two 3 x 3 convolutions with LeakyReLU(0.2) a level, max-pooling on the way down,
+    bilinear upsampling and concatenated skips on the way up, a last 3 x 3 convolution without
+    activation; 7.85 M parameters at the default widths. ``"ncs"``: batch normalisation after each
+    convolution, zero borders, a last 1 x 1 convolution; 13.4 M. Use it in evaluation mode: in
+    training mode the normalisation takes its statistics from the batch. The weights are drawn from
+    torch's global generator.
 
     Args:
-        widths: Channels of each level, finest first, two levels or more, each >= 1.
-        inputs: Input planes, >= 1: the raw's four and the four of its noise-level map.
-        outputs: Output planes, >= 1.
+        variant: ``"paper"`` or ``"ncs"``.
+        widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1; by
+            default `WIDTHS`.
 
     Raises:
-        ValueError: If `widths` has fewer than two levels or a channel count below one.
+        ValueError: If an argument is none of these.
 
     Source: Brooks et al. 2019, Unprocessing Images for Learned Raw Denoising. Two things differ
     from what its authors released: two convolutions a level, not three, and replicated borders.
@@ -108,36 +148,39 @@ class UNet(nn.Module):
     torch.Size([1, 4, 5, 3])
     """
 
-    def __init__(
-        self,
-        *,
-        widths: Sequence[int] = (32, 64, 128, 256, 512),
-        inputs: int = 8,
-        outputs: int = 4,
-    ) -> None:
+    def __init__(self, variant: Variant = "paper", *, widths: Sequence[int] | None = None) -> None:
         super().__init__()
-        widths = check_widths(widths)
+        widths = _checked(variant, WIDTHS.get(variant, ()) if widths is None else widths)
+        self.variant, left = variant, _left(variant, widths)
+        level = _leaky_level if variant == "paper" else _normalised_level
         self.encoder = nn.ModuleList(
-            _level(previous, width)
-            for previous, width in zip((inputs, *widths), widths, strict=False)
+            level(previous, width) for previous, width in zip((8, *widths), widths, strict=False)
         )
         self.decoder = nn.ModuleList(
-            _level(coarse + fine, fine)
-            for fine, coarse in zip(widths[-2::-1], widths[:0:-1], strict=True)
+            level(skip + below, width)
+            for skip, below, width in zip(
+                widths[-2::-1], (widths[-1], *left[:-1]), left, strict=True
+            )
         )
-        self.tail = convolution(widths[0], outputs)
-        with torch.no_grad():
-            self.tail.weight.mul_(0.1)  # starts near "no change"
+        if variant == "paper":
+            self.tail = convolution(widths[0], 4)
+            with torch.no_grad():
+                self.tail.weight.mul_(0.1)  # starts near "no change"
+        else:
+            self.tail = nn.Conv2d(widths[0], 4, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Residual of a raw.
 
         Args:
-            x: (B, 8, H, W), raw and noise-level map, any H, W >= 1.
+            x: (B, 8, H, W), any H, W >= 1: the raw and its noise-level map, or for ``"ncs"`` the
+                raw and the same with a sample of its noise.
 
         Returns:
             (B, 4, H, W), to be added to the raw.
         """
+        paper, (height, width) = self.variant == "paper", x.shape[-2:]
+        x = x if paper else _padded(x)
         skips: list[Tensor] = []
         for level in self.encoder:
             x = level(halve(x) if skips else x)
@@ -145,51 +188,86 @@ class UNet(nn.Module):
         skips.pop()
         for level in self.decoder:
             skip = skips.pop()
-            x = level(torch.cat([resize_to(x, skip), skip], dim=1))
+            if paper:
+                x = level(torch.cat([resize_to(x, skip), skip], dim=1))
+            else:
+                x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=True)
+                x = level(torch.cat([skip, x], dim=1))
         residual: Tensor = self.tail(x)
-        return residual
+        return residual[..., :height, :width]
+
+
+# -- the attention U-Net --------------------------------------------------------------------------
+
+
+def light_of_aperture(f_number: Tensor) -> Tensor:
+    """The number that stands for an f-number in the authors' code: 1 at f/22, twice that a stop.
+
+    Thirds of stops go linearly between: 1, 4/3, 5/3, 2.
+
+    Args:
+        f_number: (B,) effective f-numbers, such as sqrt(2) ** 9 for f/22.
+
+    >>> light = light_of_aperture(torch.tensor([2.0 ** (9 / 2), 2.0 ** (26 / 6), 4.0]))
+    >>> [round(value, 5) for value in light.tolist()]
+    [1.0, 1.33333, 32.0]
+    """
+    stops = _STOPS_OF_F22 - 2.0 * f_number.double().log2()
+    whole = (stops + 1e-9).floor()  # rounding must not take a whole stop for the one below
+    return (torch.exp2(whole) * (1.0 + stops - whole)).to(f_number.dtype)
 
 
 class ApertureNorm(nn.Module):
     """Adaptive aperture normalisation.
 
     ``A(x) = (w_s [n1, n2] + b_s) * (x - mean(x)) / std(x) + (w_m [n1, n2] + b_m)``, per channel,
-    mean and deviation over the map. Starts at b_s = 1, b_m = 0.
+    mean and deviation over the map. The paper's variant starts at b_s = 1, b_m = 0.
 
     Args:
         width: Channels, >= 1.
+        variant: Of the network.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, variant: Variant = "paper") -> None:
         super().__init__()
         self.affine = nn.Linear(2, 2 * width)  # w_s and w_m, b_s and b_m
-        nn.init.xavier_normal_(self.affine.weight)
-        with torch.no_grad():
-            self.affine.bias[:width] = 1.0
-            self.affine.bias[width:] = 0.0
+        if variant == "paper":
+            nn.init.xavier_normal_(self.affine.weight)
+            with torch.no_grad():
+                self.affine.bias[:width] = 1.0
+                self.affine.bias[width:] = 0.0
 
     def forward(self, x: Tensor, aperture: Tensor) -> Tensor:
-        """(B, C, H, W) with f-numbers (B, 2) in units of `F_NUMBER_UNIT`, to the same shape."""
+        """(B, C, H, W) with the apertures of source and target (B, 2), to the same shape."""
         scale, shift = self.affine(aperture).chunk(2, dim=1)
         return instance_norm(x, scale, shift)
 
 
 class NormalisedConvolution(nn.Module):
-    """Convolution and aperture normalisation; no bias, the normalisation would cancel it.
+    """Convolution and aperture normalisation.
+
+    The paper's has no bias, as the normalisation cancels it, and replicated borders; the authors'
+    weights have one, and borders are zero.
 
     Args:
         inputs: Input channels, >= 1.
         outputs: Output channels, >= 1.
-        kernel: 3 for a 3 x 3 convolution with replicated borders, 1 for 1 x 1.
+        kernel: 3 or 1.
+        variant: Of the network.
     """
 
-    def __init__(self, inputs: int, outputs: int, *, kernel: int = 3) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, *, kernel: int = 3, variant: Variant = "paper"
+    ) -> None:
         super().__init__()
-        if kernel == 3:
+        paper = variant == "paper"
+        if kernel == 3 and paper:
             self.convolution = convolution(inputs, outputs, bias=False)
         else:
-            self.convolution = nn.Conv2d(inputs, outputs, kernel, bias=False)
-        self.norm = ApertureNorm(outputs)
+            self.convolution = nn.Conv2d(
+                inputs, outputs, kernel, padding=kernel // 2, bias=not paper
+            )
+        self.norm = ApertureNorm(outputs, variant)
 
     def forward(self, x: Tensor, aperture: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H, W)."""
@@ -200,10 +278,10 @@ class NormalisedConvolution(nn.Module):
 class _ApertureLevel(nn.Module):
     """Two convolutions, each with `ApertureNorm` and ReLU."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, variant: Variant) -> None:
         super().__init__()
-        self.first = NormalisedConvolution(inputs, outputs)
-        self.second = NormalisedConvolution(outputs, outputs)
+        self.first = NormalisedConvolution(inputs, outputs, variant=variant)
+        self.second = NormalisedConvolution(outputs, outputs, variant=variant)
 
     def forward(self, x: Tensor, aperture: Tensor) -> Tensor:
         """(B, inputs, H, W) to (B, outputs, H, W)."""
@@ -216,30 +294,47 @@ class SkipAttention(nn.Module):
     beta_s is one map, from the skip and the gating signal of the coarser level. beta_c is the
     excitation of a global average of ``A(skip) + A(gate)``. The average of a normalised map is
     zero, so that of A is ``w_m [n1, n2] + b_m`` whatever the image, the convolution in front and
-    the scale; the sum of the two is again one linear function of the f-numbers. Only this function
-    is computed, and learnt, here.
+    the scale; the sum of the two is again one linear function of the f-numbers. In the paper's
+    variant only this function is computed, and learnt; the released one computes the maps.
 
     Args:
         width: Channels of skip and of gate, >= 1.
+        inner: Channels inside, >= 1.
+        variant: Of the network.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, inner: int, variant: Variant = "paper") -> None:
         super().__init__()
-        inner, reduced = max(width // 2, 1), max(width // 4, 1)
-        self.from_skip = NormalisedConvolution(width, inner, kernel=1)
-        self.from_gate = NormalisedConvolution(width, inner, kernel=1)
-        self.to_map = NormalisedConvolution(inner, 1, kernel=1)
-        self.average = nn.Linear(2, width)  # w_m and b_m of both branches, added
-        self.excite = nn.Sequential(
-            nn.Linear(width, reduced), nn.ReLU(), nn.Linear(reduced, width), nn.Sigmoid()
-        )
-        nn.init.xavier_normal_(self.average.weight)
-        nn.init.zeros_(self.average.bias)
-        nn.init.ones_(self.excite[0].bias)  # type: ignore[arg-type]  # else units may start dead
+        point = functools.partial(NormalisedConvolution, kernel=1, variant=variant)
+        self.from_skip, self.from_gate = point(width, inner), point(width, inner)
+        self.to_map = point(inner, 1)
+        if variant == "paper":
+            reduced = max(width // 4, 1)
+            self.average = nn.Linear(2, width)  # w_m and b_m of both branches, added
+            self.excite = nn.Sequential(
+                nn.Linear(width, reduced), nn.ReLU(), nn.Linear(reduced, width), nn.Sigmoid()
+            )
+            nn.init.xavier_normal_(self.average.weight)
+            nn.init.zeros_(self.average.bias)
+            nn.init.ones_(self.excite[0].bias)  # type: ignore[arg-type]  # no unit starts dead
+        else:
+            reduced = max(inner // 4, 1)
+            self.mean_skip, self.mean_gate = point(width, inner), point(width, inner)
+            self.excite = nn.Sequential(
+                nn.Conv2d(inner, reduced, 1, bias=False),
+                nn.ReLU(),
+                nn.Conv2d(reduced, width, 1, bias=False),
+                nn.Sigmoid(),
+            )
+        self.variant = variant
 
     def forward(self, skip: Tensor, gate: Tensor, aperture: Tensor) -> Tensor:
-        """(B, C, H, W), (B, C, H, W) and f-numbers (B, 2), to the rescaled skip."""
-        channels = self.channel_attention(aperture)[:, :, None, None]
+        """(B, C, H, W), (B, C, H, W) and apertures (B, 2), to the rescaled skip."""
+        if self.variant == "paper":
+            channels = self.channel_attention(aperture)[:, :, None, None]
+        else:
+            mean = self.mean_gate(gate, aperture) + self.mean_skip(skip, aperture)
+            channels = self.excite(mean.mean(dim=(2, 3), keepdim=True))
         return skip * self.spatial_attention(skip, gate, aperture) * channels
 
     def spatial_attention(self, skip: Tensor, gate: Tensor, aperture: Tensor) -> Tensor:
@@ -248,7 +343,7 @@ class SkipAttention(nn.Module):
         return torch.sigmoid(self.to_map(joint, aperture))
 
     def channel_attention(self, aperture: Tensor) -> Tensor:
-        """beta_c in (0, 1), (B, C), from the f-numbers (B, 2) alone."""
+        """The paper's beta_c in (0, 1), (B, C), from the f-numbers (B, 2) alone."""
         result: Tensor = self.excite(self.average(aperture))
         return result
 
@@ -256,20 +351,24 @@ class SkipAttention(nn.Module):
 class AttentionUNet(nn.Module):
     """Predicts the residual that a wider aperture's defocus adds to a packed raw.
 
-    A U-Net of two 3 x 3 convolutions a level, each followed by `ApertureNorm` and ReLU; bilinear
+    A U-Net of two 3 x 3 convolutions a level, each followed by `ApertureNorm` and ReLU;
     upsampling, a convolution, and skips rescaled by `SkipAttention` on the way up; a last 1 x 1
-    convolution. The f-numbers enter every normalisation and, as in the paper, as two planes
+    convolution. The apertures enter every normalisation and, as in the paper, as two planes
     beside the image; being constant, these cancel in the first normalisation as a bias would.
-    8.78 M parameters at the default widths. A constant image has a constant residual, which
-    depends on the f-numbers only. Run it in float32: so many normalisations in a row multiply
-    differences, and bfloat16's rounding grows to half the residual of a new network. The weights
-    are drawn from torch's global generator.
+    A constant image has a constant residual, which depends on the apertures only. Run it in
+    float32: so many normalisations in a row multiply differences, and bfloat16's rounding grows to
+    half the residual of a new network. The weights are drawn from torch's global generator.
+
+    ``"paper"``: f-numbers, bilinear upsampling, replicated borders; 8.78 M parameters at the
+    default widths. ``"ncs"``: `light_of_aperture`, nearest-neighbour upsampling, zero borders;
+    8.85 M.
 
     Args:
-        widths: Channels of each level, finest first, two levels or more, each >= 1.
+        variant: ``"paper"`` or ``"ncs"``.
+        widths: Channels of each level, finest first, two levels or more (ncs: five), each >= 1.
 
     Raises:
-        ValueError: If `widths` has fewer than two levels or a channel count below one.
+        ValueError: If an argument is none of these.
 
     Source: Ouyang et al. 2021, Neural Camera Simulators, section 3.3; its figure's unstated sizes
     as in Oktay et al. 2018, Attention U-Net (half the channels inside the spatial attention).
@@ -279,30 +378,38 @@ class AttentionUNet(nn.Module):
     torch.Size([1, 4, 5, 3])
     """
 
-    def __init__(self, *, widths: Sequence[int] = (32, 64, 128, 256, 512)) -> None:
+    def __init__(
+        self, variant: Variant = "paper", *, widths: Sequence[int] = ATTENTION_WIDTHS
+    ) -> None:
         super().__init__()
-        widths = check_widths(widths)
+        widths = _checked(variant, widths)
+        self.variant = variant
         fine, coarse = widths[-2::-1], widths[:0:-1]
+        # Released: inside the attention of the finest level there are as many as outside.
+        inner = _left(variant, widths) if variant == "ncs" else [max(f // 2, 1) for f in fine]
         self.encoder = nn.ModuleList(
-            _ApertureLevel(previous, width)
+            _ApertureLevel(previous, width, variant)
             for previous, width in zip((6, *widths), widths, strict=False)
         )
         self.upward = nn.ModuleList(
-            NormalisedConvolution(c, f) for f, c in zip(fine, coarse, strict=True)
+            NormalisedConvolution(c, f, variant=variant) for f, c in zip(fine, coarse, strict=True)
         )
-        self.attention = nn.ModuleList(SkipAttention(f) for f in fine)
-        self.decoder = nn.ModuleList(_ApertureLevel(2 * f, f) for f in fine)
+        self.attention = nn.ModuleList(
+            SkipAttention(f, i, variant) for f, i in zip(fine, inner, strict=True)
+        )
+        self.decoder = nn.ModuleList(_ApertureLevel(2 * f, f, variant) for f in fine)
         self.tail = nn.Conv2d(widths[0], 4, 1)
-        with torch.no_grad():
-            self.tail.weight.mul_(0.1)  # starts near "no change"
-            self.tail.bias.zero_()  # type: ignore[union-attr]
+        if variant == "paper":
+            with torch.no_grad():
+                self.tail.weight.mul_(0.1)  # starts near "no change"
+                self.tail.bias.zero_()  # type: ignore[union-attr]
 
     def forward(self, image: Tensor, f_numbers: Tensor) -> Tensor:
         """Residual of an image.
 
         Args:
             image: (B, 4, H, W), any H, W >= 1, of order one.
-            f_numbers: (B, 2), source's and target's, in [0.5, 1024].
+            f_numbers: (B, 2), effective f-numbers of source and target, in [0.5, 1024].
 
         Returns:
             (B, 4, H, W), to be added to the image.
@@ -314,8 +421,13 @@ class AttentionUNet(nn.Module):
         if f_numbers.shape != (batch, 2):
             shape = tuple(f_numbers.shape)
             raise ValueError(f"`f_numbers` (of shape {shape}) must have shape ({batch}, 2)")
-        aperture = f_numbers.to(image) / F_NUMBER_UNIT
-        x = torch.cat([image, aperture[:, :, None, None].expand(-1, -1, height, width)], dim=1)
+        paper = self.variant == "paper"
+        x = image if paper else _padded(image)
+        if paper:
+            aperture = f_numbers.to(image) / F_NUMBER_UNIT
+        else:
+            aperture = light_of_aperture(f_numbers).to(image)
+        x = torch.cat([x, aperture[:, :, None, None].expand(-1, -1, *x.shape[-2:])], dim=1)
         skips: list[Tensor] = []
         for level in self.encoder:
             x = level(halve(x) if skips else x, aperture)
@@ -323,7 +435,8 @@ class AttentionUNet(nn.Module):
         skips.pop()
         for upward, attention, level in zip(self.upward, self.attention, self.decoder, strict=True):
             skip = skips.pop()
-            x = F.relu(upward(resize_to(x, skip), aperture))
+            x = resize_to(x, skip) if paper else F.interpolate(x, scale_factor=2.0, mode="nearest")
+            x = F.relu(upward(x, aperture))
             x = level(torch.cat([attention(skip, x, aperture), x], dim=1), aperture)
         residual: Tensor = self.tail(x)
-        return residual
+        return residual[..., :height, :width]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -19,31 +19,39 @@ from simulator.capture.residual import Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule
-from simulator.networks.paper_baselines import DecoupledNet, ParameterConcatenation
+from simulator.utils.checks import check_word, did_you_mean
 from simulator.utils.files import sibling, write_atomically
 
-#: Everything that can be trained: the simulator's networks in three sizes (nano and large are noise
-#: modules alone), the paper's, those of its authors' released code, and the paper's two baselines.
-PRESETS = ("nano", "compact", "large", "paper", "ncs", "pc", "dl")
+
+def _all_three(preset: Any) -> nn.ModuleDict:
+    aperture = ApertureModule(preset)
+    return nn.ModuleDict(
+        {"exposure": ExposureModule(), "noise": NoiseModule(preset), "aperture": aperture}
+    )
+
+
+def _noise_alone(preset: Any) -> nn.ModuleDict:
+    return nn.ModuleDict({"noise": NoiseModule(preset)})
+
+
+#: What makes the untrained modules of a preset, by stage: the simulator's networks in three sizes,
+#: the paper's, and those of its authors' released code. `benchmarks.paper_baselines` adds the
+#: paper's two baselines.
+BUILDERS: dict[str, Callable[[], nn.ModuleDict]] = {
+    "nano": partial(_noise_alone, "nano"),
+    "compact": partial(_all_three, "compact"),
+    "large": partial(_noise_alone, "large"),
+    "paper": partial(_all_three, "paper"),
+    "ncs": partial(_all_three, "ncs"),
+}
 #: Increased when the networks change such that older weights no longer fit.
 FORMAT_VERSION = 2
 
 
 def build_modules(preset: str) -> nn.ModuleDict:
     """The untrained modules of a preset, by stage."""
-    if preset == "pc":
-        return nn.ModuleDict({"baseline": ParameterConcatenation()})
-    if preset == "dl":
-        return nn.ModuleDict({"baseline": DecoupledNet()})
-    if preset in ("nano", "large"):
-        return nn.ModuleDict({"noise": NoiseModule(preset)})  # type: ignore[arg-type]
-    return nn.ModuleDict(
-        {
-            "exposure": ExposureModule(),
-            "noise": NoiseModule(preset),  # type: ignore[arg-type]
-            "aperture": ApertureModule(preset),  # type: ignore[arg-type]
-        }
-    )
+    check_word("preset", preset, tuple(BUILDERS))
+    return BUILDERS[preset]()
 
 
 def list_pretrained() -> list[str]:
@@ -147,27 +155,21 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     """
     if not isinstance(name, str | Path) or not str(name):
         raise ValueError(f"`weights` (={name!r}) must be a name or a path")
-    folder = resources.files("simulator").joinpath("pretrained")
     known = list_pretrained()
     path: Any = name
     if str(name) in known:
-        path = folder.joinpath(str(name))
+        path = resources.files("simulator").joinpath("pretrained", str(name))
     else:
-        files = sibling(name, ".json"), sibling(name, ".safetensors")
-        missing = [f for f in files if not f.is_file()]
-        if missing:
-            near = difflib.get_close_matches(str(name), known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            if str(name) in PRESETS:
-                hint = f"; train it: ae-env train-simulator configs/simulator/{name}.yaml"
-            if str(name) == "ncs":
-                hint = "; get them by: ae-env import-weights ncs FOLDER -o ncs.safetensors"
-            raise ValueError(
-                f"`weights` (={str(name)!r}) must be one of {known} or the path of a .safetensors "
-                f"file with its .json; there is no {missing[0]}{hint}"
-            )
+        for file in (sibling(name, ".json"), sibling(name, ".safetensors")):
+            if not file.is_file():
+                raise ValueError(
+                    f"`weights` (={str(name)!r}) must be one of {known} or the path of a "
+                    f".safetensors file with its .json; there is no {file}{_hint(str(name), known)}"
+                )
     tensors, card = read_pair(path)
     _check_card(card, name)
+    if card["preset"] == "ncs":
+        tensors = _from_authors(tensors)
     modules = build_modules(card["preset"])
     try:
         modules.load_state_dict(tensors)
@@ -180,6 +182,14 @@ def load_modules(name: str | Path) -> tuple[nn.ModuleDict, dict[str, Any]]:
     return modules.to(memory_format=torch.channels_last), card  # type: ignore[call-overload]
 
 
+def _hint(name: str, known: list[str]) -> str:
+    if name == "ncs":
+        return "; docs/networks.md says how to convert the authors' files"
+    if name in BUILDERS:
+        return f"; train it: ae-env train-simulator configs/simulator/{name}.yaml"
+    return did_you_mean(name, known)
+
+
 def _check_card(card: dict[str, Any], name: str | Path) -> None:
     if card.get("format") != FORMAT_VERSION:
         raise ValueError(
@@ -188,8 +198,82 @@ def _check_card(card: dict[str, Any], name: str | Path) -> None:
         )
     if "sha256" not in card:
         raise ValueError(f"`weights` (={str(name)!r}): the .json must hold the hash, `sha256`")
-    if card.get("preset") not in PRESETS:
+    preset = card.get("preset")
+    if not isinstance(preset, str) or preset not in BUILDERS:
         raise ValueError(
-            f"`weights` (={str(name)!r}): unknown preset {card.get('preset')!r} in the .json, the "
-            f"presets are {list(PRESETS)}"
+            f"`weights` (={str(name)!r}): unknown preset {preset!r} in the .json, the presets are "
+            f"{list(BUILDERS)}"
         )
+
+
+# -- the weights that the paper's authors released ------------------------------------------------
+
+#: Planes R, G1, B, G2 of the authors' pictures in the order of ours, R, G1, G2, B.
+_PLANES = [0, 1, 3, 2]
+#: Tensors by our name: along which dimension they have planes, and in which order these come.
+_PLANAR = {
+    "exposure.b": (0, _PLANES),
+    "noise.network.encoder.0.0.weight": (1, [*_PLANES, *(4 + p for p in _PLANES)]),
+    "noise.network.tail.weight": (0, _PLANES),
+    "noise.network.tail.bias": (0, _PLANES),
+    "aperture.network.encoder.0.first.convolution.weight": (1, [*_PLANES, 4, 5]),
+    "aperture.network.tail.weight": (0, _PLANES),
+    "aperture.network.tail.bias": (0, _PLANES),
+}
+
+
+def _from_authors(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors by our names, planes in our order; those that have our names already as they are.
+
+    The file holds the state of the authors' modules as ``exposure.``, ``noise.`` and ``aperture.``
+    (docs/networks.md has the script that writes it).
+    """
+    if "exposure.w" in tensors:
+        return tensors
+    scalars = {"exposure.linear.weight": "exposure.w", "exposure.bias": "exposure.b"}
+    ours, found = dict(_layers()), {}
+    for theirs, tensor in tensors.items():
+        layer, _, entry = theirs.rpartition(".")
+        name = scalars.get(theirs, f"{ours.get(layer, layer)}.{entry}")
+        if name in _PLANAR:
+            dimension, order = _PLANAR[name]
+            if tensor.ndim > dimension and tensor.shape[dimension] == len(order):
+                tensor = tensor.index_select(dimension, torch.tensor(order))
+        found[name] = tensor.reshape(()) if name == "exposure.w" else tensor
+    return found
+
+
+def _layers() -> Iterator[tuple[str, str]]:
+    """The authors' and our names of the layers of both U-Nets."""
+    noise, aperture = "noise.network", "aperture.network"
+    for index in (0, 1, 3, 4):  # two convolutions, each with its normalisation
+        yield f"noise.inc.conv.conv.{index}", f"{noise}.encoder.0.{index}"
+        for level in range(4):
+            down, up = f"down{level + 1}.mpconv.1.conv", f"up{level + 1}.conv.conv"
+            yield f"noise.{down}.{index}", f"{noise}.encoder.{level + 1}.{index}"
+            yield f"noise.{up}.{index}", f"{noise}.decoder.{level}.{index}"
+    yield "noise.outc.conv", f"{noise}.tail"
+
+    def normalised(theirs: str, ours: str) -> Iterator[tuple[str, str]]:
+        convolution, norm = (f"aperture.{theirs}".replace("*", kind) for kind in ("conv", "norm"))
+        yield convolution, f"{aperture}.{ours}.convolution"
+        yield f"{norm}.style.linear", f"{aperture}.{ours}.norm.affine"
+
+    def level_of(theirs: str, ours: str) -> Iterator[tuple[str, str]]:
+        yield from normalised(f"{theirs}.*1", f"{ours}.first")
+        yield from normalised(f"{theirs}.*2", f"{ours}.second")
+
+    for index in range(5):
+        yield from level_of(f"Conv{index + 1}", f"encoder.{index}")
+    for index, level in enumerate((5, 4, 3, 2)):
+        yield from normalised(f"Up{level}.*", f"upward.{index}")
+        yield from level_of(f"Up_conv{level}", f"decoder.{index}")
+        theirs, ours = f"Att{level}", f"attention.{index}"
+        yield from normalised(f"{theirs}.W_g_*1", f"{ours}.from_gate")
+        yield from normalised(f"{theirs}.W_x_*1", f"{ours}.from_skip")
+        yield from normalised(f"{theirs}.psi_*", f"{ours}.to_map")
+        yield from normalised(f"{theirs}.W_g_*2", f"{ours}.mean_gate")
+        yield from normalised(f"{theirs}.W_x_*2", f"{ours}.mean_skip")
+        yield f"aperture.{theirs}.conv_down", f"{aperture}.{ours}.excite.0"
+        yield f"aperture.{theirs}.conv_up", f"{aperture}.{ours}.excite.2"
+    yield "aperture.Conv", f"{aperture}.tail"

@@ -18,6 +18,8 @@ RAW_SUFFIXES = (
     *(".orf", ".pef", ".ptx", ".pxn", ".raf", ".raw", ".rw2", ".rwl", ".sr2", ".srf", ".srw"),
     ".x3f",
 )
+#: Endings of developed pictures.
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 #: Most pixels that a raw or a radiance map may claim: more than any camera with a Bayer array has.
 MAX_PIXELS = 2**28

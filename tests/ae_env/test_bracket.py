@@ -15,10 +15,10 @@ from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from ae_env import ExposureGrid, Scene
 from ae_env.episodes.bracket_core import displaced
-from ae_env.scenes.scene import WHITE_SIGNAL, reference_settings
 from ae_env.utils.merging import log_error, merge
 from simulator.camera import get_camera
 from simulator.capture.layout import Layout
+from simulator.radiance.light import WHITE_SIGNAL, reference_settings
 from tests.ae_env.environments import SMALL, assert_equal, check_parity, make_env, make_envs
 
 ID = "ae_env/ExposureBracket-v0"

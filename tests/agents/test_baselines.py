@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from agents import evaluate
-from agents.episodes import make_envs
-from agents.policy import PolicyContext, make_policy
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
+from agents.rollouts import make_envs
 from simulator import CameraSettings, RawImage, get_camera, write_dng
 
 FRAMES = {"raw": np.zeros((500, 4, 8, 8), np.uint8)}

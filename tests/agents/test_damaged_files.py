@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ae_env.scenes.radiance import read_radiance
 from agents.learning.training import AgentConfig
+from simulator.radiance.maps import read_radiance
 from simulator.training.config import SimulatorConfig
 from simulator.utils.config_file import load_yaml
 

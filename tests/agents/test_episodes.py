@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from agents.episodes import fitting_arguments, training_arguments
+from agents.rollouts import fitting_arguments, training_arguments
 from tests.ae_env.recorded_files import GRID, write_raws
 
 STATES = {
@@ -37,7 +37,7 @@ def test_a_fitted_policy_is_recorded_on_a_recorded_grid(
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     write_raws(tmp_path / "grid" / "a")
     few: tuple[dict[str, Any], bool] = ({"scenes": "bundled:small", "grid": STATES}, True)
-    monkeypatch.setattr("agents.episodes.training_arguments", lambda *_: few)
+    monkeypatch.setattr("agents.rollouts.training_arguments", lambda *_: few)
     (tmp_path / "env.yaml").write_text("{scenes: 'recorded:grid', split: train, resolution: 36}")
     options = ("--env", "env.yaml", "--split", "all", "--episodes", "1")  # no scene to train on
     code, _, error = ae_env("record", "--policy", "average", "-o", "ae/mine-v0", *options)
@@ -51,7 +51,7 @@ def test_a_fitted_policy_is_judged_on_a_recorded_grid(
     write_raws(tmp_path / "grid" / "a")
     write_raws(tmp_path / "grid" / "b", tuple(GRID)[1:], seed=1)
     few: tuple[dict[str, Any], bool] = ({"scenes": "bundled:small", "grid": STATES}, True)
-    monkeypatch.setattr("agents.episodes.training_arguments", lambda *_: few)
+    monkeypatch.setattr("agents.rollouts.training_arguments", lambda *_: few)
     options = ("--split", "all", "--resolution", "36", "--episodes", "1", "--frames", "2")
     policies = ("--policy", "best_fixed", "--policy", "average", "--policy", "oracle")
     code, out, _ = ae_env(

@@ -9,7 +9,7 @@ import pytest
 from agents.foresight import POINTS, Foresight
 from agents.metering.reading import Reading
 from agents.metering.trend import TrendTracker
-from agents.policy import make_policy
+from agents.policy_names import make_policy
 
 
 class Known:
@@ -39,7 +39,7 @@ def test_every_control_is_chosen_for_the_first_frame_that_has_it(context, photog
     foresight = Foresight(delayed, Known(lambda frames: frames))
     start, asked = 21, 62
     foresight.observe(_reading(9.0), photograph(np.ones((64, 64)), 9.0, start))
-    foresight.decided(np.array([asked]))
+    foresight.record_action(np.array([asked]))
     foresight.observe(_reading(9.0), photograph(np.ones((64, 64)), 9.0, start))
     found = foresight.utility(lambda ev: tables[float(ev[0])][None])[0]
 

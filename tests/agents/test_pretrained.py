@@ -4,9 +4,9 @@ from itertools import combinations
 import pytest
 
 from agents import PolicyContext, evaluate, make_policy
-from agents.episodes import make_envs
 from agents.evaluation.store import policy_content
-from agents.policy import training_seeds
+from agents.policy_names import training_seeds
+from agents.rollouts import make_envs
 
 SCENES = {"scenes": "bundled:small", "split": "test", "resolution": 64}
 
@@ -45,13 +45,6 @@ def test_agents_for_moving_light_come_with_their_forecasts():
     content = {n: policy_content(n) for n in ("regression", *names)}
     assert len(set(content.values())) == 5
     assert content["average:P"] == ""
-    # The trainings together are one agent, and no worse than on average.
-    together = "regression:video?ensemble=true"
-    assert training_seeds(together) == [together]
-    names = [together, *training_seeds("regression:video")]
-    result = evaluate({n: make_policy(n, context) for n in names}, video, frames=32, batch=16)
-    gains = [result.group_gains(n)[0].mean() for n in names]
-    assert gains[0] > sum(gains[1:]) / 3
     still = PolicyContext.from_envs(make_envs(SCENES, num_envs=1, frames=1))
     with pytest.raises(ValueError, match="was trained with exposure_times from"):
         make_policy("regression:video", still)

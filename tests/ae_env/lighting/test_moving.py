@@ -6,7 +6,7 @@ import pytest
 from ae_env.lighting import FlickerLighting, make_lighting
 from ae_env.lighting.moving import KIND_SETS, MOVES, read_pans
 from ae_env.scenes.polyhaven import light_around, list_assets, split_assets
-from ae_env.scenes.radiance import read_radiance
+from simulator.radiance.maps import read_radiance
 
 PHASES = np.random.default_rng(0).random(60)
 #: Most stops away from where the light begins (sines begin anywhere), most stops between frames.

@@ -10,10 +10,9 @@ import torch
 
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.bundled import _procedural
-from ae_env.scenes.dead_leaves import dead_leaves
-from ae_env.scenes.photographs import PHOTOGRAPHS, unprocess
-from ae_env.scenes.procedural import HARD_KINDS, draw, list_kinds
 from simulator.camera import get_camera
+from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
+from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
 from simulator.utils.cache import disk_cache
 
 CAMERA = get_camera("nikon_z6")

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes import depth
-from ae_env.scenes.dead_leaves import dead_leaves
-from ae_env.scenes.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
+from ae_env.scenes.bundled import add_layout
 from ae_env.scenes.measured_depth import depth_scenes
+from simulator.radiance import depth
+from simulator.radiance.depth import FOCUSES, DepthDrawing, draw_depth, lens_and_depth
+from simulator.radiance.procedural import dead_leaves
 from tests.ae_env.scorer_images import CAMERA, make_scene
 
 PITCH = 11.88e-6  # packed pixels of the Nikon Z6
@@ -73,7 +74,7 @@ def test_errors_name_the_argument() -> None:
 def test_draped_pictures_are_laid_out() -> None:
     """Most are focused on the nearest thing, and none without a subject that can be seen."""
     scenes = [make_scene(np.ones((4, 40, 48)), 100.0, scene_id=f"{i}") for i in range(60)]
-    layouts = [depth.drape(scene).layout for scene in scenes]
+    layouts = [add_layout(scene).layout for scene in scenes]
     in_focus = 0
     for layout in layouts:
         assert layout is not None
@@ -90,10 +91,10 @@ def test_draped_pictures_are_laid_out() -> None:
 def test_layouts_depend_on_the_name_alone() -> None:
     """One scene has one layout at every resolution: the finer, averaged."""
     light = np.random.default_rng(0).random((4, 128, 128))
-    fine = depth.drape(make_scene(light, 100.0, scene_id="a"))
-    again = depth.drape(make_scene(light * 0.5, 200.0, scene_id="a"))
-    other = depth.drape(make_scene(light, 100.0, scene_id="b"))
-    small = depth.drape(make_scene(light[:, :64, :64], 100.0, scene_id="a"))
+    fine = add_layout(make_scene(light, 100.0, scene_id="a"))
+    again = add_layout(make_scene(light * 0.5, 200.0, scene_id="a"))
+    other = add_layout(make_scene(light, 100.0, scene_id="b"))
+    small = add_layout(make_scene(light[:, :64, :64], 100.0, scene_id="a"))
     resized = fine.resized(64).layout
     assert None not in (fine.layout, again.layout, other.layout, small.layout, resized)
     assert torch.equal(fine.layout.defocus, again.layout.defocus)

@@ -21,8 +21,8 @@ from ae_env.scenes.polyhaven import (
     incident_light,
     list_assets,
 )
-from ae_env.scenes.scene import WHITE_SIGNAL
 from simulator import get_camera
+from simulator.radiance.light import WHITE_SIGNAL
 
 CAMERA = get_camera("nikon_z6")
 

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from ae_env.scenes import load_scenes
-from ae_env.scenes.radiance import assumed_ev100, perspective, radiance_scenes, read_radiance
+from ae_env.scenes.folder import radiance_scenes
 from ae_env.scenes.scene import SceneRequest
 from simulator import get_camera
+from simulator.radiance.maps import assumed_ev100, perspective, read_radiance
 from tests.ae_env.scene_files import write_exr
 
 CAMERA = get_camera("nikon_z6")

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from skimage.color import rgb2xyz
 
 from ae_env.scenes import Scene
-from ae_env.scenes.colour import camera_from_srgb, temperature_tint
 from simulator import CameraSettings, NoiseLevelFunction, get_camera
 from simulator.camera import CameraProfile
+from simulator.radiance.light import camera_from_srgb, temperature_tint
 from simulator.raw.image import RawImage
 from tests.strategies import SEEDS, lights
 

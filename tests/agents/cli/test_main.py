@@ -24,11 +24,11 @@ COMMANDS = [
     "sweep",
     "train",
 ]
-COMMANDS += ["hdr", "import-weights", "refocus", "train-simulator", "score-tables", "view"]
+COMMANDS += ["hdr", "refocus", "train-simulator", "score-tables", "view"]
 COMMANDS += ["warm-up"]
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
-NO_SEED = (*NO_OUT, "convert-nima", "export", "hdr", "import-weights")
+NO_SEED = (*NO_OUT, "convert-nima", "export", "hdr")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
 from agents import Policy

@@ -11,7 +11,7 @@ from PIL import Image
 
 from agents.cli import quickstart
 from agents.cli.quickstart import BASELINES, next_commands, run_quickstart
-from agents.learning.agent_weights import load_agent
+from agents.learning.weights import load_agent
 from simulator import RawImage, write_dng
 
 FILES = {"results.json", "scenes.csv", "metrics.csv", "report.md", "report.html", "scores.png"}
@@ -64,9 +64,9 @@ def test_bundled_scenes_then_raws_of_ones_own(raw: RawImage, tmp_path: Path, mon
     assert all(line in report for line in next_commands("bundled:small", out, done.agents))
 
     # Few raws have no training split; the agents are there already.
-    monkeypatch.setattr("agents.learning.training.ProcessPoolExecutor", None)
+    monkeypatch.setattr("agents.learning.workers.ProcessPoolExecutor", None)
     monkeypatch.setattr(
-        "agents.episodes.training_arguments", lambda _: ({"scenes": "bundled:small"}, True)
+        "agents.rollouts.training_arguments", lambda _: ({"scenes": "bundled:small"}, True)
     )
     mine = tmp_path / "my raws"
     mine.mkdir()

@@ -30,12 +30,6 @@ def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
     ("config", "options"),
     [
         (
-            "agent: bracket\ntask: ae_env/ExposureBracket-v0\n"
-            "environment: {scenes: 'bundled:small', resolution: 36}\n"
-            "num_envs: 4\ntraining: {frames: 8, batch_size: 4, steps_per_frame: 1, width: 4}\n",
-            ("--preset", "bracket", "--policy", "bracket:a", "--resolution", "36"),
-        ),
-        (
             "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n",
             ("--preset", "video", "--policy", "regression:video?foresight=a"),
         ),

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from agents import Policy, evaluate, fit_policies, make_policy, run_plan
-from agents.episodes import make_envs
 from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
 from agents.policy import PolicyContext
+from agents.rollouts import make_envs
 
 OPTIONS = {"scenes": "bundled:small", "split": "test", "resolution": 36}
 

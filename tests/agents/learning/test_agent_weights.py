@@ -10,9 +10,10 @@ from safetensors.torch import load_file
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning import agent_weights
+from agents.learning import weights as agent_weights
 from agents.learning.regression import RegressionPolicy, ScoreRegressor
-from agents.policy import PolicyContext, make_policy
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
 from simulator.utils.files import sibling
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learning.agent_weights import describe_agent, save_agent
 from agents.learning.ppo import PPOPolicy, PPOTraining, train_ppo
-from agents.policy import PolicyContext, make_policy
+from agents.learning.weights import describe_agent, save_agent
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
 
 TRAINING = PPOTraining(total_timesteps=96, n_steps=4, batch_size=8, n_epochs=2, width=16, seed=3)
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch import nn
 
-from agents.learning.regression import Ensemble, RegressionPolicy
+from agents.learning.regression import RegressionPolicy
 from agents.policy import PolicyContext
 
 
@@ -72,17 +72,3 @@ def test_frames_of_other_light_are_forgotten(context: PolicyContext, photograph)
     same = photograph(np.ones((64, 64)), 8.0, [far])
     frames = {name: np.concatenate([darker[name], same[name]]) for name in same}
     assert policy.act(frames).tolist() == [9, 3]
-
-
-def test_an_ensemble_counts_scores_with_their_precision() -> None:
-    """Of 0.2 with precision 1 and 0.8 with precision 3: 0.65, with precision 2."""
-
-    def member(score: float, precision: float) -> nn.Module:
-        network = nn.Module()
-        network.forward = lambda *_: (torch.tensor([[score]]), -torch.tensor([[precision]]).log())
-        return network
-
-    frame = torch.zeros(1)
-    scores, log_variance = Ensemble([member(0.2, 1.0), member(0.8, 3.0)])(frame, frame, None)
-    assert scores.item() == pytest.approx(0.65)
-    assert np.exp(-log_variance.item()) == pytest.approx(2.0)

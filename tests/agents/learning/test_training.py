@@ -2,6 +2,7 @@ import json
 import multiprocessing
 import os
 import time
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,10 @@ import pytest
 import torch
 import yaml
 
-from agents.bracketing.learnt import BracketTraining
-from agents.learning import training
+from agents.learning import training, workers
 from agents.learning.ppo import PPOTraining
 from agents.learning.regression_training import RegressionTraining
+from simulator.utils import checkpoint
 from simulator.utils.files import sibling
 
 CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.yaml"))
@@ -36,7 +37,7 @@ def tiny(agent: str = "regression", **changes: Any) -> training.AgentConfig:
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_configs(path: Path) -> None:
     config, text = training.load_config(path), yaml.safe_load(path.read_text())
-    kinds = {"regression": RegressionTraining, "ppo": PPOTraining, "bracket": BracketTraining}
+    kinds = {"regression": RegressionTraining, "ppo": PPOTraining}
     kind = kinds[config.agent]
     hyperparameters = config.hyperparameters()
     assert isinstance(hyperparameters, kind)
@@ -52,7 +53,7 @@ def test_shipped_configs(path: Path) -> None:
         ("agent: ppo\nnum_env: 3", r"num_env \(=3\): unknown.*mean `num_envs`"),
         (
             "agent: dqn",
-            r"agent \(='dqn'\): Input should be 'regression', 'ppo', 'bracket' or 'forecaster'",
+            r"agent \(='dqn'\): Input should be 'regression', 'ppo' or 'forecaster'",
         ),
         ("", r"is empty: it must map entries"),
         ("agent: ppo\nnum_envs: 0", r"num_envs \(=0\): .*greater than or equal to 1"),
@@ -131,6 +132,12 @@ def test_a_failed_save_keeps_the_training_and_its_log(tmp_path: Path, monkeypatc
     assert json.loads((tmp_path / "agent.json").read_text())["training"]["training"]["seed"] == 1
 
 
+def _train_with_a_checkpoint_each_step(job: training.TrainingJob) -> None:
+    checkpoint.INTERVAL = -1.0
+    progress = partial(workers.send_progress, job.name)
+    training.train_agent(job.config, job.out, progress=progress)
+
+
 @pytest.mark.usefixtures("quick_spawn")
 def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
     trainings = {"regression": {"frames": 240}, "ppo": {"total_timesteps": 240}}
@@ -138,10 +145,11 @@ def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
     running, waiting = (sibling(job.out, ".checkpoint") for job in todo)
 
     def stop(*_: object) -> None:
-        raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
+        if running.is_file():
+            raise KeyboardInterrupt  # as Ctrl-C does in the process that waits
 
     with pytest.raises(KeyboardInterrupt):
-        training.train_in_parallel(todo, workers=1, progress=stop)
+        workers.run_in_parallel(_train_with_a_checkpoint_each_step, todo, workers=1, progress=stop)
     assert running.is_file()
     assert not waiting.exists()
     seen: list[int] = []
@@ -157,29 +165,29 @@ def test_an_interrupted_call_resumes(tmp_path: Path) -> None:
 
 
 def _share(job: int) -> None:
-    training.tell(job, torch.get_num_threads())
+    workers.send_progress(job, torch.get_num_threads())
     if job == 2:
         raise ValueError("job 2 has failed")
 
 
 @pytest.mark.usefixtures("quick_spawn")
 def test_threads_are_shared_and_an_error_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "core_count", lambda: 6)
+    monkeypatch.setattr(workers, "core_count", lambda: 6)
     seen: list[tuple[object, ...]] = []
     with pytest.raises(ValueError, match="job 2 has failed"):
-        training.run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
+        workers.run_in_parallel(_share, [1, 2], progress=lambda *message: seen.append(message))
     assert (2, 3) in seen
 
 
 def _never_end(job: int) -> None:
-    training.tell(os.getpid())
+    workers.send_progress(os.getpid())
     time.sleep(600)
 
 
 def _wait_for_ever(pipe: Connection) -> None:
     contexts = {"spawn": multiprocessing.get_context("fork")}
     multiprocessing.get_context = contexts.__getitem__  # type: ignore[assignment]
-    training.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
+    workers.run_in_parallel(_never_end, [0, 1], workers=2, progress=pipe.send)
 
 
 def _runs(pid: int) -> bool:

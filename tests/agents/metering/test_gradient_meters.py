@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from agents.metering.meters import make_meter
-from agents.policy import make_policy
+from agents.policy_names import make_policy
 
 
 @pytest.mark.parametrize("name", ["shim", "zhang"])

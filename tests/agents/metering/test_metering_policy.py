@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from agents.episodes import make_envs
 from agents.metering.metering_policy import EVTracker, MeteringPolicy, ReferenceFrames
 from agents.metering.reading import Reading, frame_ev100
 from agents.metering.tuned import ScoreRegression
-from agents.policy import MANUAL_PROGRAMS, METERS, PolicyContext, make_policy
+from agents.policy import PolicyContext
+from agents.policy_names import MANUAL_PROGRAMS, METERS, make_policy
+from agents.rollouts import make_envs
 
 CONTROLLERS = (*METERS, "rpi_agc")
 SMALL = {"scenes": "bundled:small", "split": "all", "resolution": 36}

@@ -5,7 +5,7 @@ import pytest
 
 from ae_env.observation import decode_observation
 from agents.metering.meters import make_meter, weight_map
-from agents.policy import METERS
+from agents.policy_names import METERS
 
 GREY = np.ones((64, 64))
 

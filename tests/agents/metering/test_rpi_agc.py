@@ -7,7 +7,7 @@ import pytest
 from ae_env.grid import ExposureGrid
 from agents.metering.libcamera_agc import ZONE_WEIGHTS, ExposureFilter
 from agents.metering.rpi_agc import zone_map
-from agents.policy import make_policy
+from agents.policy_names import make_policy
 
 GREY = np.ones((64, 64))
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from agents.policy import PolicyContext, make_policy
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
 from agents.report.film import CHART, GAP, PICTURE, TITLE, Recording, film, record, write_film
 from tests.agents.conftest import TINY
 

@@ -1,4 +1,4 @@
-"""Networks of the released layout in plain torch layers, saved whole as the authors save theirs.
+"""Networks of the released layout in plain torch layers.
 
 What they compute is written down again from the layers, without our code, so that it can be
 compared with what our networks make of the same weights.
@@ -6,12 +6,6 @@ compared with what our networks make of the same weights.
 
 from __future__ import annotations
 
-import sys
-import types
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -152,15 +146,6 @@ class AttenUnet_style(nn.Module):
         return m.Conv(x)
 
 
-#: The authors' Python modules that the classes seem to come from.
-HOMES = {
-    "exposure_module": (ExposureNet,),
-    "unet_model": (UNet,),
-    "unet_parts": (Holder,),
-    "unet_attention_decouple": (Norm, conv_block, up_conv, Attention_block, AttenUnet_style),
-}
-
-
 def make_released(seed: int = 0) -> dict[str, nn.Module]:
     """Untrained networks by the name of the demo's files, statistics of the norms not neutral."""
     generator = torch.Generator().manual_seed(seed)
@@ -173,38 +158,3 @@ def make_released(seed: int = 0) -> dict[str, nn.Module]:
             tensor.data.copy_(0.5 + torch.rand(tensor.shape, generator=generator))
         norm.num_batches_tracked.fill_(7)  # type: ignore[union-attr]
     return {name: module.eval() for name, module in made.items()}
-
-
-@contextmanager
-def at_home() -> Iterator[None]:
-    """While it lasts, the classes above are those of the authors' Python modules."""
-    was = {c: c.__module__ for classes in HOMES.values() for c in classes}
-    for home, classes in HOMES.items():
-        sys.modules[home] = types.ModuleType(home)
-        for own in classes:
-            own.__module__ = home
-            setattr(sys.modules[home], own.__name__, own)
-    try:
-        yield
-    finally:
-        for home in HOMES:
-            del sys.modules[home]
-        for own, module in was.items():
-            own.__module__ = module
-
-
-def save_released(
-    path: Path, module: nn.Module, *, legacy: bool = True, parallel: bool = False
-) -> Path:
-    """Writes a checkpoint as the authors' training does, by default as torch 1.3 wrote it."""
-    held = nn.DataParallel(module) if parallel else module
-    checkpoint = {
-        "model": held,
-        "iteration": 544000,
-        "optimizer": torch.optim.Adam(module.parameters()).state_dict(),
-        "learning_rate": 1e-3,
-    }
-    with at_home(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the source of the classes is not found
-        torch.save(checkpoint, path, _use_new_zipfile_serialization=not legacy)
-    return path

@@ -5,14 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from simulator.networks.weights import PRESETS, build_modules
+from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
+from simulator.networks.weights import BUILDERS, build_modules
 
 SIZES = ((1, 1), (2, 3), (17, 1), (16, 19))
 #: Black, negative, ordinary, saturated, blinding.
 LEVELS = (0.0, -0.07, 2.0**-14, 0.2, 1.0, 1e4)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", [*BUILDERS])
 @torch.inference_mode()
 def test_flat_tiny_and_blinding_images_stay_finite(preset: str) -> None:
     torch.manual_seed(0)

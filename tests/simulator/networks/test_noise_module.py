@@ -73,7 +73,7 @@ def test_sizes_of_the_family(preset: Preset, limit: int) -> None:
     assert limit / 2 < sum(p.numel() for p in module.parameters()) <= limit
     assert module.commutes
     assert module.residual is None
-    with pytest.raises(ValueError, match=r"`preset` \(='tiny'\) must be one of \['nano', 'compact"):
+    with pytest.raises(ValueError, match="`preset`"):
         NoiseModule("tiny")  # type: ignore[arg-type]
 
 

@@ -146,7 +146,7 @@ def test_statistics_of_half_precision_are_not_half_precise() -> None:
 
 def attention(width: int = 8) -> SkipAttention:
     torch.manual_seed(0)
-    return SkipAttention(width).double()
+    return SkipAttention(width, width // 2).double()
 
 
 def test_channel_attention_needs_only_the_f_numbers() -> None:

@@ -161,21 +161,11 @@ def test_shipped_weights_load_by_name(
         build_modules("compcat")
 
 
-def test_a_baseline_is_no_simulator(tmp_path: Path) -> None:
-    save_modules(tmp_path / "pc", build_modules("pc"), "pc", {})
-    loaded, card = load_modules(tmp_path / "pc")
-    assert (list(loaded), card["preset"]) == (["baseline"], "pc")
-    with pytest.raises(ValueError, match=r"holds the baseline 'pc'"):
-        CameraSimulator.from_pretrained(tmp_path / "pc", device="cpu")
-
-
 @pytest.mark.parametrize(
     ("preset", "stage", "parameters"),
     [
         ("paper", "noise", 7_849_220),  # weights 9 * in * out and biases of 19 convolutions
         ("paper", "aperture", 8_784_324),
-        ("pc", "baseline", 77_046),  # CAN32 of Chen et al. 2017, six more inputs
-        ("dl", "baseline", 4_884_288),  # 7 numbers a weight of twenty convolutions, 19 norms
     ],
 )
 def test_sizes_of_the_published_networks(preset: str, stage: str, parameters: int) -> None:

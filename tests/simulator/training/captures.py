@@ -4,8 +4,8 @@ import csv
 from pathlib import Path
 
 from simulator import CameraSettings, RawImage
-from simulator.raw.dataset import PARAMETERS, packed_camera, write_packed_sequence
 from simulator.reference.reference_camera import BodyError, ReferenceCamera
+from simulator.training.paper_dataset import PARAMETERS, packed_camera, write_packed_sequence
 from tests.simulator.training.scenes import scene
 
 #: All expose a white card to 0.17 to 0.66 of sensor white.

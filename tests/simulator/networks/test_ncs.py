@@ -1,26 +1,28 @@
-"""Weights of the released layout, made here: read without running them, and computed alike."""
+"""The preset `ncs` against networks of the released layout, made here of plain torch layers."""
 
 from __future__ import annotations
 
 import copy
-import pickle
-import zipfile
+import hashlib
+import json
+import re
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
-from simulator.networks.authors_weights import FILES, author_names, read_authors_weights
-from simulator.networks.ncs_networks import light_of_aperture
 from simulator.networks.noise_module import variance_map
-from simulator.networks.weights import save_modules
-from tests.simulator.networks.released_modules import make_released, save_released
+from simulator.networks.unet import light_of_aperture
+from simulator.networks.weights import load_modules
+from tests.simulator.networks.released_modules import make_released
 
 #: Planes R, G1, G2, B as R, G1, B, G2, and back.
 SWAP = [0, 1, 3, 2]
 F11, F4 = 2.0 ** (7 / 2), 4.0
+DOCS = Path(__file__).parents[3] / "docs" / "networks.md"
 
 
 @pytest.fixture(scope="module")
@@ -29,29 +31,30 @@ def released() -> dict[str, nn.Module]:
 
 
 @pytest.fixture(scope="module")
-def folder(released: dict[str, nn.Module], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One file of each kind there is: old format, of several GPUs, zip."""
+def weights(released: dict[str, nn.Module], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the script of docs/networks.md makes of the authors' checkpoints."""
     folder = tmp_path_factory.mktemp("demo")
+    for name, module in released.items():
+        held = nn.DataParallel(module) if name == "unet_model" else module
+        torch.save({"model": held, "iteration": 544000}, folder / name)
+    script = re.search(r"needs the authors' files -->\n```python\n(.*?)```", DOCS.read_text(), re.S)
+    assert script is not None
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.serialization, "location_tag", lambda _: "cuda:7")
-        save_released(folder / "exp_model", released["exp_model"])
-        save_released(folder / "unet_model", released["unet_model"], parallel=True)
-        save_released(folder / "ap_model", released["ap_model"], legacy=False)
-    (folder / "notes.txt").write_text("no weights")
-    return folder
+        patch.chdir(folder)
+        exec(script[1], {})
+    return folder / "ncs.safetensors"
 
 
 @pytest.fixture(scope="module")
-def ncs(folder: Path) -> nn.ModuleDict:
-    return read_authors_weights(folder)[0]
+def ncs(weights: Path) -> nn.ModuleDict:
+    return load_modules(weights)[0]
 
 
 def test_parameters_are_as_many_as_published(ncs: nn.ModuleDict, released) -> None:
-    counts = [sum(p.numel() for p in ncs[kind].parameters()) for kind in FILES]
-    assert counts == [5, 13_398_404, 8_852_224]  # 13.4 M and 8.85 M
-    for (kind, name), count in zip(FILES.items(), counts, strict=True):
-        assert sum(p.numel() for p in released[name].parameters()) == count
-        assert author_names()[kind].keys() == released[name].state_dict().keys()
+    counts = {kind: sum(p.numel() for p in module.parameters()) for kind, module in ncs.items()}
+    assert counts == {"exposure": 5, "noise": 13_398_404, "aperture": 8_852_224}
+    assert float(ncs["exposure"].w) == pytest.approx(0.97)
+    assert ncs["exposure"].b.tolist() == pytest.approx([0.001, 0.002, 0.004, 0.003])
 
 
 def close(ours: Tensor, theirs: Tensor, tolerance: float = 1e-5) -> None:
@@ -76,11 +79,10 @@ def test_networks_compute_what_the_released_ones_do(ncs: nn.ModuleDict, released
 
 
 @torch.no_grad()
-def test_the_full_run_is_that_of_the_released_demo(ncs, released, tmp_path: Path) -> None:
+def test_the_full_run_is_that_of_the_released_demo(weights: Path, released) -> None:
     """Every stage by the formulas of their demo, of the sample of noise that ours draws."""
-    save_modules(tmp_path / "ncs.safetensors", ncs, "ncs", {})
     simulator = CameraSimulator.from_pretrained(
-        tmp_path / "ncs.safetensors", device="cpu", body_correction=True, cache=None
+        weights, device="cpu", body_correction=True, cache=None
     )
     camera = get_camera("nikon_z6")
     data = 0.05 + 0.1 * torch.rand(4, 32, 32, generator=torch.Generator().manual_seed(0))
@@ -111,9 +113,8 @@ def test_the_full_run_is_that_of_the_released_demo(ncs, released, tmp_path: Path
     close(stages.opened, opened[SWAP], 2e-4)  # rounding, as above
 
 
-def test_plan_and_simulate_are_deterministic(ncs: nn.ModuleDict, tmp_path: Path) -> None:
-    save_modules(tmp_path / "ncs", ncs, "ncs", {})
-    simulator = CameraSimulator.from_pretrained(tmp_path / "ncs", device="cpu", cache=None)
+def test_plan_and_simulate_are_deterministic(weights: Path) -> None:
+    simulator = CameraSimulator.from_pretrained(weights, device="cpu", cache=None)
     data = 0.05 + 0.1 * torch.rand(4, 21, 19, generator=torch.Generator().manual_seed(0))
     raw = RawImage(data, CameraSettings(6400, 1 / 64, 11.0), get_camera("nikon_z6"))
     target = CameraSettings(100, 1.0, 4.0)
@@ -140,46 +141,21 @@ def test_apertures_are_those_of_the_released_table() -> None:
     assert found.tolist() == pytest.approx(list(table.values()), rel=1e-5)
 
 
-def test_a_plain_state_dict_is_taken(released, folder: Path, tmp_path: Path) -> None:
-    for name in ("unet_model", "ap_model"):
-        (tmp_path / name).hardlink_to(folder / name)
-    torch.save(released["exp_model"].state_dict(), tmp_path / "exp_model.pth")
-    modules, card = read_authors_weights(tmp_path)
-    assert float(modules["exposure"].w) == pytest.approx(0.97)
-    assert modules["exposure"].b.tolist() == pytest.approx([0.001, 0.002, 0.004, 0.003])
-    assert card["source"]["exposure"]["file"] == "exp_model.pth"
-    assert "none stated" in card["licence"]
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "tensor"),
     [
-        ({"surplus": torch.zeros(1)}, r"exp`: unknown names for the exposure module: 'surplus'"),
-        ({"bias": None}, "names that are missing for the exposure module: 'bias'"),
-        ({"bias": torch.zeros(3)}, r"bias \(of shape \(3,\)\) must be of \(4,\)"),
-        ({"bias": torch.full((4,), torch.nan)}, "must be finite, not so in 'bias'"),
-        ({"bias": torch.zeros(4, dtype=torch.int64)}, r"bias \(of torch.int64\) must be floating"),
-        ({"bias": None, "linear.weight": None, "w": torch.ones(1)}, "none of its names is known"),
+        ("exposure.surplus", torch.zeros(1)),
+        ("exposure.bias", None),
+        ("exposure.bias", torch.zeros(3)),
+        ("noise.outc.conv.bias", torch.zeros(3)),
+        ("exposure.bias", torch.full((4,), torch.nan)),
     ],
 )
-def test_tensors_that_do_not_fit(released, tmp_path: Path, change, message: str) -> None:
-    state = {**released["exp_model"].state_dict(), **change}
-    torch.save({k: v for k, v in state.items() if v is not None}, tmp_path / "exp")
-    with pytest.raises(ValueError, match=message):
-        read_authors_weights(tmp_path)
-
-
-def test_files_that_are_missing_or_there_twice(released, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"must be a folder of .* but does not exist"):
-        read_authors_weights(tmp_path / "none")
-    with zipfile.ZipFile(tmp_path / "pictures.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("a.txt", "no network")
-    (tmp_path / "notes.pkl").write_bytes(pickle.dumps("nor is this"))
-    torch.save(released["exp_model"].state_dict(), tmp_path / "exp_2")
-    with pytest.raises(
-        ValueError, match=r"must also hold unet_model \(noise\), ap_model .*found: exp_2"
-    ):
-        read_authors_weights(tmp_path)
-    torch.save(released["exp_model"].state_dict(), tmp_path / "exp_4")
-    with pytest.raises(ValueError, match="one file of the exposure module, not both exp_2 and"):
-        read_authors_weights(tmp_path)
+def test_tensors_that_do_not_fit(weights: Path, tmp_path: Path, name: str, tensor) -> None:
+    tensors = load_file(weights)
+    tensors.pop(name, None)
+    save_file(tensors | ({} if tensor is None else {name: tensor}), tmp_path / "a.safetensors")
+    digest = hashlib.sha256((tmp_path / "a.safetensors").read_bytes()).hexdigest()
+    (tmp_path / "a.json").write_text(json.dumps({"format": 2, "preset": "ncs", "sha256": digest}))
+    with pytest.raises(ValueError, match="`weights`"):
+        load_modules(tmp_path / "a")

@@ -7,24 +7,28 @@ dead leaves of its own. Wherever several cover a pixel, the nearest is seen.
 Depth is drawn as the signed circle of confusion at f/11, because that is what decides how much
 such a scene can teach about defocus, and then converted to metres for a lens of 50 mm.
 
-`drape` lays a picture without depth over such surfaces: it draws a layout only, and paints nothing.
+`draw_layout` gives a picture without depth such surfaces: it draws their layout and paints nothing.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ae_env.scenes.colour import temperature_tint
-from ae_env.scenes.dead_leaves import LeafStyle, dead_leaves, fractal_noise, paint_leaves
-from ae_env.scenes.procedural import Drawing
-from ae_env.scenes.scene import Scene
 from simulator.capture.layout import Layout
+from simulator.radiance.light import temperature_tint
+from simulator.radiance.procedural import (
+    Drawing,
+    LeafStyle,
+    dead_leaves,
+    fractal_noise,
+    paint_leaves,
+)
 from simulator.utils.checks import check_integer, check_word
 
 #: The lens that procedural scenes are drawn for [m], and the f-number of the stated blur.
@@ -99,25 +103,26 @@ def draw_depth(rng: np.random.Generator, size: int, focus: str = "middle") -> De
     return DepthDrawing(drawing, blur.astype(np.float32), far, surface)
 
 
-def drape(scene: Scene) -> Scene:
-    """`scene` with a `Layout`, as if it lay over procedural depth.
+def draw_layout(name: str, height: int, width: int) -> Layout:
+    """The layout of a picture without depth, as if it lay over procedural depth.
 
-    The subject is the nearest thing. Focus is on it in eight of ten scenes, in the others on
+    The subject is the nearest thing. Focus is on it in eight of ten layouts, in the others on
     something behind it.
 
     Args:
-        scene: A scene without depth, of any size. Its name decides the layout.
+        name: Decides the layout.
+        height: Of the picture [packed pixels].
+        width: Of the picture [packed pixels].
     """
-    rng = np.random.default_rng([zlib.crc32(f"layout {scene.scene_id}".encode()), 0])
-    blur, subject = _draw_layout(rng)
-    height, width = scene.light.shape[-2:]
+    rng = np.random.default_rng([zlib.crc32(f"layout {name}".encode()), 0])
+    blur, subject = _blur_and_subject(rng)
     side = max(height, width)
     maps = torch.from_numpy(np.stack([blur, subject.astype(np.float32)]))[None]
     sized = F.interpolate(maps, (side, side), mode="area")[0, :, :height, :width]
-    return replace(scene, layout=Layout(sized[0].clamp(max=1.0), sized[1] > 0.5))
+    return Layout(sized[0].clamp(max=1.0), sized[1] > 0.5)
 
 
-def _draw_layout(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _blur_and_subject(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Relative circle of confusion (S, S) float32, and where the nearest thing is, bool."""
     focus = str(rng.choice(_LAYOUT_FOCUSES, p=_LAYOUT_SHARES))
     while True:

@@ -118,7 +118,7 @@ class EpisodeBatch:
 
 
 @dataclass(frozen=True)
-class Episodes:
+class RolloutPlan:
     """Episodes that are run one batch after the other.
 
     The seed alone decides an episode's motion, defocus, noise and start, so that an episode is the
@@ -139,7 +139,7 @@ class Episodes:
     @classmethod
     def of_each_scene(
         cls, scenes: Sequence[Scene], *, count: int, seed: int, most: int | None = None
-    ) -> Episodes:
+    ) -> RolloutPlan:
         """All scenes, `count` times in a row; episode i has the seed ``seed + i``.
 
         Args:

@@ -1,8 +1,6 @@
-"""Radiance maps (.hdr, .exr) as scenes: views cut from panoramas, light of unknown scale.
+"""Radiance maps (.hdr, .exr): reading them, views into panoramas, and their assumed light.
 
-A radiance map is linear but relative: nothing in it says how many lux it shows. The views of one
-map are therefore put at an EV100 between 3 and 14 drawn by a stable hash of the source group (an
-assumption, stated in each scene's `source`), and their `illuminance` is None unless given.
+A radiance map is linear but relative: nothing in it says how many lux it shows.
 """
 
 from __future__ import annotations
@@ -11,17 +9,13 @@ import hashlib
 import logging
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from ae_env.scenes.colour import camera_from_srgb
-from ae_env.scenes.procedural import NATIVE_SIZE
-from ae_env.scenes.scene import Scene, SceneRequest, mean_anchor
-from simulator.camera import CameraProfile
+from simulator.radiance.procedural import NATIVE_SIZE
 from simulator.utils.files import MAX_RADIANCE_PIXELS_PER_BYTE, as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
@@ -71,94 +65,13 @@ def read_radiance(path: str | Path) -> np.ndarray:
     return _clean(image.astype(np.float32, copy=False), path)
 
 
-def radiance_scenes(
-    path: str | Path,
-    request: SceneRequest,
-    *,
-    name: str,
-    group: str,
-    ev100: float | None = None,
-    **fields: Any,
-) -> Iterator[Scene]:
-    """The scenes of one radiance map, all in one source group.
-
-    A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
-    with a field of view of 60 degrees; any other gives its central square. Both have about 256
-    packed pixels a side, as the bundled scenes have, before `Scene.resized`. A map with at least as
-    many pixels there as photosites (512 x 512) is sampled through the colour filter array, so is a
-    coarser one with ``crop="native"`` if it has those of the crop; of others the planes share their
-    places, and the log says so (`Scene.sampled`).
-
-    Args:
-        path: The file.
-        request: Camera and size; without a resolution the views have 256 packed pixels a side.
-        name: Prefix of the scene ids.
-        group: Source group.
-        ev100: The EV100 at which the views' mean is 0.12 (on average over the views, which keep
-            their relative brightness), if known; see `assumed_ev100`.
-        **fields: Further arguments of `Scene.from_radiance`.
-    """
-    image = read_radiance(path)
-    if "illuminance" not in fields:
-        image = _near_one(image)
-    height, width = image.shape[1:]
-    if "illuminance" not in fields and ev100 is None:
-        ev100 = assumed_ev100(group)
-        fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
-    fields.setdefault("source", Path(path).name)
-    if abs(width / height - 2.0) <= 0.01:
-        available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
-        size, sampled = _view_size(request, native_size(request.resolution), available)
-        views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
-    else:
-        available = min(height, width)
-        size = native_size(request.resolution, available)
-        size, sampled = _view_size(request, size, available)
-        views = [(name, _central_square(image, size, Path(path).name))]
-    if not sampled:
-        logger.info(
-            "radiance map %s: %d pixels a view, fewer than photosites: planes share their places",
-            *(Path(path).name, available),
-        )
-    try:
-        levels = [_log2_level(view, request.camera) for _, view in views]
-    except ValueError as error:
-        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
-    for (scene_id, view), level in zip(views, levels, strict=True):
-        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
-            fields["ev100"] = ev100 + level - float(np.mean(levels))
-        try:
-            scene = Scene.from_radiance(
-                view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
-            )
-        except ValueError as error:
-            raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
-        yield request.sized(scene)
-
-
-def _view_size(request: SceneRequest, size: int, available: int) -> tuple[int, bool]:
-    """Pixels a side of a view of `size` packed pixels, and whether they are photosites."""
-    if available >= 2 * size:
-        return 2 * size, True
-    if request.crop == "native" and request.resolution and available >= 2 * request.resolution:
-        return available // 2 * 2, True
-    return size, False
-
-
-def _near_one(image: np.ndarray) -> np.ndarray:
+def near_one(image: np.ndarray) -> np.ndarray:
     """A map of unknown scale whose median is far from 1, divided by a power of two near to it."""
     _, exponent = math.frexp(float(np.quantile(image[image > 0], 0.5, method="lower")))
     if abs(exponent) <= _USUAL_EXPONENT:
         return image
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100)))
-
-
-def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
-    """log2 of the mean of a view's green, clipped at white, relative to 0.12."""
-    matrix, _ = camera_from_srgb(camera)
-    green = torch.from_numpy(np.tensordot(matrix[1], view, axes=1))
-    return -math.log2(mean_anchor(green))
 
 
 def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
@@ -241,7 +154,7 @@ def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     return values[0].numpy()
 
 
-def _central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
+def central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
     """The middle of `image`, box-averaged by the largest integer that leaves `size` pixels."""
     height, width = image.shape[1:]
     k = min(height, width) // size

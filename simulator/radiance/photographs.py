@@ -14,10 +14,8 @@ from importlib import resources
 import numpy as np
 from PIL import Image
 
-from ae_env.scenes.colour import temperature_tint
-from ae_env.scenes.procedural import NATIVE_SIZE
-from ae_env.scenes.scene import Scene
-from simulator.camera import CameraProfile
+from simulator.radiance.light import temperature_tint
+from simulator.radiance.procedural import NATIVE_SIZE, Drawing
 
 #: Scenes made of each photograph: crops, mirrored or not, under lights of their own.
 SCENES_PER_PHOTOGRAPH = 3
@@ -45,6 +43,11 @@ class Photograph:
     tint: tuple[float, float]
     credit: str
 
+    @property
+    def scene_ids(self) -> list[str]:
+        """Names of the scenes made of it."""
+        return [f"{self.name}-{index}" for index in range(SCENES_PER_PHOTOGRAPH)]
+
 
 PHOTOGRAPHS = (
     Photograph(
@@ -64,16 +67,16 @@ PHOTOGRAPHS = (
 )
 
 
-def photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator[Scene]:
-    """The scenes made of one photograph, 256 x 256 packed, all in one source group.
+def photograph_drawings(photograph: Photograph) -> Iterator[Drawing]:
+    """The scenes made of one photograph, 256 x 256 pixels each, and the light assumed for them.
 
-    A pixel of the photograph becomes one packed pixel. The first scene is the middle of the
-    picture, the others are cut and mirrored at random (by a seed that depends on the name alone).
+    The first is the middle of the picture, the others are cut and mirrored at random (by a seed
+    that depends on the name alone).
     """
     rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
     light = unprocess(read_photograph(photograph.file), rng)
     height, width = light.shape[1:]
-    for index, scene_id in enumerate(scene_ids(photograph)):
+    for index in range(SCENES_PER_PHOTOGRAPH):
         top, left = (height - NATIVE_SIZE) // 2, (width - NATIVE_SIZE) // 2
         if index:
             top = int(rng.integers(0, height - NATIVE_SIZE + 1))
@@ -82,21 +85,9 @@ def photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator
         if index and rng.random() < 0.5:
             crop = crop[:, :, ::-1]
         low, high = (math.log(v) for v in photograph.illuminance)
-        yield Scene.from_radiance(
-            np.ascontiguousarray(crop),
-            camera,
-            scene_id=scene_id,
-            group=photograph.name,
-            illuminance=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
-            illuminant=temperature_tint(rng.uniform(*photograph.tint)),
-            kind="photograph",
-            source=f"scikit-image {photograph.file}: {photograph.credit}",
-        )
-
-
-def scene_ids(photograph: Photograph) -> list[str]:
-    """Names of its scenes."""
-    return [f"{photograph.name}-{index}" for index in range(SCENES_PER_PHOTOGRAPH)]
+        illuminance = float(f"{math.exp(rng.uniform(low, high)):.4g}")
+        tint = temperature_tint(rng.uniform(*photograph.tint))
+        yield Drawing(np.ascontiguousarray(crop), illuminance, tint)
 
 
 def unprocess(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,5 +1,10 @@
 """The paper's two baselines (section 4.3): networks that know the settings, but no physics.
 
+They are presets of `simulator.networks.weights.build_modules` once this module is imported. In a
+clone of the repository they are trained by
+
+    python -m benchmarks.paper_baselines train-simulator configs/simulator/pc.yaml
+
 Both take ``parameters``: log2(ISO / 100), log2(exposure time / s) and log2(f-number) of the
 source, then of the target. Both predict the target raw itself, not a residual.
 """
@@ -14,6 +19,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from simulator.networks.unet import LEAK, instance_norm
+from simulator.networks.weights import BUILDERS
+from simulator.utils.checks import check_integer
 
 #: Camera parameters of a pair: three of the source, three of the target.
 NUM_PARAMETERS = 6
@@ -34,10 +41,9 @@ def scaled_parameters(parameters: Tensor, image: Tensor) -> Tensor:
 
 
 def _check(width: int, dilations: Sequence[int]) -> None:
-    if width < 1:
-        raise ValueError(f"`width` (={width!r}) must be >= 1")
-    if not dilations or min(dilations) < 1:
-        raise ValueError(f"`dilations` (={dilations!r}) must be one or more integers >= 1")
+    for name, values in (("width", [width]), ("dilations", dilations)):
+        for value in values:
+            check_integer(name, value, 1)
 
 
 class AdaptiveNorm(nn.Module):
@@ -284,3 +290,12 @@ class DecoupledNet(nn.Module):
             x = F.relu(layer(x, scaled)[..., :height, :width])  # an odd size came out one larger
         result: Tensor = self.tail(x, scaled)
         return result
+
+
+BUILDERS["pc"] = lambda: nn.ModuleDict({"baseline": ParameterConcatenation()})
+BUILDERS["dl"] = lambda: nn.ModuleDict({"baseline": DecoupledNet()})
+
+if __name__ == "__main__":
+    from agents.cli.main import main
+
+    main()

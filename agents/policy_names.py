@@ -1,0 +1,317 @@
+"""Names of policies: how ``matrix:P?compensation=-1`` or ``my.py:Mine`` becomes a policy."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+import yaml
+
+from ae_env.utils.user_code import find_attribute, load_from_file
+from agents.policy import Policy, PolicyContext
+from simulator.utils.checks import did_you_mean
+
+#: Light meters that weigh pixels or zones.
+CLASSIC_METERS = ("average", "centre_weighted", "matrix", "spot")
+#: All light meters; those after the classic ones look at the histogram or at gradients.
+METERS = (*CLASSIC_METERS, "highlight_weighted", "skewness", "entropy", "shim", "zhang")
+#: The programs that nothing has to be learnt for, and all.
+MANUAL_PROGRAMS = ("P", "A", "S", "M")
+PROGRAMS = (*MANUAL_PROGRAMS, "tuned", "tuned_blind")
+#: Agents that come with the package: the training seeds of ``ae-env bench agents``.
+PRETRAINED = Path(__file__).parent / "pretrained"
+PRETRAINED_SEEDS = (0, 1, 2)
+#: Forecasters of light that come with the package, and the word that asks for them.
+FORECASTERS, LEARNT = str(PRETRAINED / "forecaster-*"), "learnt"
+
+_METERING = "agents.metering.metering_policy:MeteringPolicy"
+#: Classes whose names take a file after the colon, and the argument that it is.
+_WITH_FILE = {
+    "ppo": ("agents.learning.ppo:PPOPolicy", "weights"),
+    "regression": ("agents.learning.regression:RegressionPolicy", "weights"),
+    "recorded": ("agents.baselines:Recorded", "path"),
+}
+#: Files of the agents that come with the package, without ``-SEED``.
+_SHIPPED = {
+    **{agent: str(PRETRAINED / agent) for agent in ("ppo", "regression")},
+    **{f"{agent}:video": str(PRETRAINED / f"video-{agent}") for agent in ("ppo", "regression")},
+}
+#: The built-in policies: class, imported when a policy is made, and arguments that the name gives.
+_POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
+    "random": ("agents.baselines:Random", {}),
+    "best_fixed": ("agents.baselines:BestFixed", {}),
+    "oracle:last_frame": ("agents.baselines:Oracle", {"knows": "last_frame"}),
+    "oracle:clairvoyant": ("agents.baselines:Oracle", {"knows": "clairvoyant"}),
+    **{f"{m}:{p}": (_METERING, {"meter": m, "program": p}) for m in METERS for p in PROGRAMS},
+    **{f"rpi_agc:{p}": ("agents.metering.rpi_agc:RpiAgc", {"program": p}) for p in MANUAL_PROGRAMS},
+    **{
+        name: (_WITH_FILE[name.partition(":")[0]][0], {"weights": f"{file}-{PRETRAINED_SEEDS[0]}"})
+        for name, file in _SHIPPED.items()
+    },
+}
+#: Likewise of `ExposureBracket-v0`.
+_BRACKETS: dict[str, tuple[str, dict[str, Any]]] = {
+    "bracket": ("agents.bracketing.policies:Planner", {"blur": True}),
+    "bracket:planned": ("agents.bracketing.policies:Planner", {"blur": False}),
+    "bracket:fixed": ("agents.bracketing.policies:FixedBracket", {}),
+    "bracket:hasinoff": ("agents.bracketing.policies:Hasinoff", {}),
+}
+#: What shorter names stand for.
+_SHORT = {"oracle": "oracle:last_frame", "rpi_agc": "rpi_agc:P", **{m: f"{m}:P" for m in METERS}}
+#: Where options begin: a question mark before a slash of a path is a part of the path.
+_OPTIONS = re.compile(r"\?(?![^=]*/)")
+
+
+def list_policies() -> list[str]:
+    """Names of the built-in policies of single frames that need no file."""
+    return sorted(_POLICIES)
+
+
+def is_metering(name: str) -> bool:
+    """Whether `name`, with or without a program and options, is that of a metering policy.
+
+    >>> is_metering("spot?compensation=1"), is_metering("rpi_agc:A"), is_metering("random")
+    (True, True, False)
+    """
+    return split_options(name)[0].partition(":")[0] in (*METERS, "rpi_agc")
+
+
+def training_seeds(name: str) -> list[str]:
+    """The names under which `make_policy` knows the training seeds of a learnt agent.
+
+    Args:
+        name: ``"ppo"`` or ``"regression"`` for all seeds that come with the package;
+            ``"ppo:video"`` or ``"regression:video"`` for those of `AutoExposureVideo-v0`;
+            ``"ppo:runs/ppo-*"`` for the files that match; anything else stands for itself. Options
+            of the name are those of each.
+
+    Raises:
+        ValueError: If no file matches a pattern.
+
+    >>> [name.rpartition("-")[2] for name in training_seeds("ppo")], training_seeds("spot:P")
+    (['0', '1', '2'], ['spot:P'])
+    """
+    base, _ = split_options(name)
+    head, _, tail = base.partition(":")
+    if base in _SHIPPED:
+        files = [f"{_SHIPPED[base]}-{seed}" for seed in PRETRAINED_SEEDS]
+    elif head in ("ppo", "regression") and "*" in tail:
+        files = weight_files(tail)
+        if not files:
+            raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {tail!r}")
+    else:
+        return [name]
+    return [f"{head}:{file}{name[len(base) :]}" for file in files]
+
+
+def weight_files(pattern: str) -> list[str]:
+    """Names, without suffix, of the .safetensors files that fit `pattern`, sorted."""
+    path = Path(pattern).expanduser()
+    found = sorted(path.parent.glob(f"{path.name.removesuffix('.safetensors')}.safetensors"))
+    return [str(file.with_suffix("")) for file in found]
+
+
+def split_class(base: str) -> tuple[str, str]:
+    """Head and tail of a policy's name without options: around the colon before a class.
+
+    >>> split_class("matrix:P"), split_class("C:/my.py:Mine"), split_class("random")
+    (('matrix', 'P'), ('C:/my.py', 'Mine'), ('random', ''))
+    """
+    head, _, tail = base.rpartition(":") if ".py:" in base else base.partition(":")
+    return head, tail
+
+
+def split_options(name: str) -> tuple[str, dict[str, Any]]:
+    """A policy's name without its options, and the options.
+
+    Args:
+        name: A name, or a name, ``?`` and options ``key=value`` with ``&`` between them, as in a
+            URL. Values are YAML scalars; a fraction such as ``1/60`` is a number too.
+
+    Raises:
+        ValueError: If `name` is not a text, an option has no value or a value that is no scalar, or
+            one is given twice.
+
+    >>> split_options("centre_weighted:P?compensation=-1&shutter_cap=1/50")
+    ('centre_weighted:P', {'compensation': -1, 'shutter_cap': 0.02})
+    >>> split_options("ppo:runs/mine")
+    ('ppo:runs/mine', {})
+    """
+    if not isinstance(name, str):
+        raise ValueError(f"`policy` (={name!r}) must be a name, such as 'matrix:P'")
+    # A folder may have a question mark in its name, a class may not.
+    mark = _OPTIONS.search(name, max(name.find(".py:"), 0))
+    if mark is None:
+        return name, {}
+    query = name[mark.end() :].replace("+", "%2B")  # a plus is a sign here, not a space
+    options: dict[str, Any] = {}
+    try:
+        pairs = parse_qsl(query or "&", keep_blank_values=True, strict_parsing=True)
+    except ValueError as error:
+        raise ValueError(
+            f"`policy` (={name!r}): options are written name?key=value&key=value: {error}"
+        ) from None
+    for key, text in pairs:
+        if key.strip() in options:
+            raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
+        options[key.strip()] = _scalar(name, key, text)
+    return name[: mark.start()], options
+
+
+def _scalar(name: str, key: str, text: str) -> Any:
+    try:
+        value = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        value = {}
+    if isinstance(value, str):
+        try:  # YAML 1.1 takes 1/60 and 1e-3 for texts
+            return float(Fraction(value))
+        except (ValueError, ZeroDivisionError):
+            return value
+    if not (value is None or isinstance(value, bool | int | float)):
+        raise ValueError(f"`policy` (={name!r}): option {key!r} (={text!r}) must be a YAML scalar")
+    return value
+
+
+def make_policy(
+    name: str, context: PolicyContext, *, device: str = "cpu", **options: Any
+) -> Policy:
+    """The policy called `name`.
+
+    Args:
+        name: ``"random"``, ``"best_fixed"``; ``"oracle"``, alone or with what it knows, such as
+            ``"oracle:clairvoyant"``; a meter and a program such as
+            ``"centre_weighted:P"`` (the program defaults to P); ``"rpi_agc"``, alone or with a
+            program; ``"recorded:FOLDER"``; ``"regression"`` and ``"ppo"``, the
+            agents that come with the package, ``"regression:video"`` and ``"ppo:video"``, those for
+            `AutoExposureVideo-v0`, or ``"regression:PATH"`` and ``"ppo:PATH"`` with weights of
+            one's own; for `ExposureBracket-v0` ``"bracket:fixed"``, ``"bracket:hasinoff"``,
+            ``"bracket:planned"`` and ``"bracket"``, which also allows for blur;
+            ``"package.module:Class"`` or ``"path/to/file.py:Class"`` for a policy of one's own.
+            Options may follow: ``"centre_weighted:P?compensation=-1&damping=0.5"``.
+        context: The camera.
+        device: Torch device of a learnt agent's network.
+        options: Passed to the class, with those of the name.
+
+    Raises:
+        ValueError: If there is no such policy, its file cannot be loaded (the cause is chained),
+            the class found is not a policy or does not take an option.
+    """
+    base, named = split_options(name)
+    for key in set(options) & set(named):
+        raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
+    cls, fixed = _find(name, base)
+    options = {**options, **named}
+    if "weights" in fixed:
+        fixed = {} if "network" in options else {**fixed, "device": device}
+    policy = _construct(cls, name, context, options, fixed)
+    if named:
+        policy.name = name
+    return policy
+
+
+def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
+    """The class of a policy, and the arguments that the name `base` gives."""
+    found = (_POLICIES | _BRACKETS).get(_SHORT.get(base, base))
+    head, tail = split_class(base)
+    if found is None and head in _WITH_FILE:
+        path, argument = _WITH_FILE[head]
+        if "*" in tail and argument == "weights":
+            raise ValueError(
+                f"`policy` (={name!r}) is a pattern, so several agents: it is for evaluations; "
+                "`training_seeds` lists the names of the single ones"
+            )
+        found = path, {argument: tail}
+    if found is not None:
+        module, _, cls = found[0].partition(":")
+        return getattr(importlib.import_module(module), cls), found[1]
+    if head.endswith(".py"):
+        return load_from_file(head, tail, f"`policy` (={name!r})", example="MyPolicy"), {}
+    if not tail or head in {known.partition(":")[0] for known in (*_POLICIES, *_BRACKETS)}:
+        raise ValueError(_unknown(base))
+    return _class_in_module(head, tail, name), {}
+
+
+def _class_in_module(module: str, name: str, policy: str) -> Any:
+    if not all(part.isidentifier() for part in module.split(".")):
+        raise ValueError(_unknown(policy))
+    try:
+        loaded = importlib.import_module(module)
+    except Exception as error:  # the user's module runs, and may raise anything
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing is not None and (module == missing or module.startswith(f"{missing}.")):
+            raise ValueError(f"{_unknown(policy)} (there is no module {missing!r})") from None
+        raise ValueError(_broken(policy, f"{module} cannot be imported", error)) from error
+    return find_attribute(loaded, name, f"`policy` (={policy!r})")
+
+
+def _construct(
+    cls: Any, name: str, context: PolicyContext, options: dict[str, Any], fixed: dict[str, Any]
+) -> Policy:
+    """A `cls` with `options` of the caller's and the arguments that the name has `fixed`."""
+    if not inspect.isclass(cls):
+        raise ValueError(f"`policy` (={name!r}) must name a class")
+    missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
+    if not missing and issubclass(cls, Policy) and cls.act is Policy.act:
+        missing = ["act"]
+    if missing:
+        methods = " and ".join(f"`{m}`" for m in missing)
+        raise ValueError(
+            f"`policy` (={name!r}): {cls.__name__} is not a policy, it has no {methods}; "
+            "derive it from agents.Policy"
+        )
+    ours = cls.__module__.startswith("agents.")
+    for_brackets = cls.__module__.startswith("agents.bracketing.") or cls.__name__ == "Random"
+    if context.bracket is not None and ours and not for_brackets:
+        raise ValueError(
+            f"`policy` (={name!r}) is not for ae_env/ExposureBracket-v0: take random, "
+            f"{', '.join(_BRACKETS)} or one of your own"
+        )
+    _check_options(cls, name, options, fixed)
+    try:
+        policy: Policy = cls(context, **fixed, **options)
+    except Exception as error:  # a user's constructor may raise anything
+        if not ours:
+            message = _broken(name, f"{cls.__name__} cannot be made", error)
+            raise ValueError(message) from error
+        if not isinstance(error, ValueError | FileNotFoundError):
+            raise
+        kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
+        raise kind(f"`policy` (={name!r}): {error}") from error
+    return policy
+
+
+def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str, Any]) -> None:
+    """Raises a `ValueError` if `cls` does not take one of the `options`."""
+    parameters = list(inspect.signature(cls).parameters.values())[1:]  # the first is the context
+    if any(p.kind is p.VAR_KEYWORD for p in parameters):
+        return
+    known = [p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and p.name not in fixed]
+    for option in set(options) - set(known):
+        takes = f"it takes {', '.join(known)}" if known else "it takes none"
+        raise ValueError(
+            f"`policy` (={name!r}): {cls.__name__} does not take the option {option!r}; "
+            f"{takes}{did_you_mean(option, known)}"
+        )
+
+
+def _unknown(name: str) -> str:
+    files = [f"{head}:{'FOLDER' if head == 'recorded' else 'PATH'}" for head in _WITH_FILE]
+    known = [*_SHORT, *_POLICIES, *files, *_BRACKETS]
+    single = [n for n in (*_POLICIES, *files, *_BRACKETS) if n.partition(":")[0] not in _SHORT]
+    return (
+        f"`policy` (={name!r}) must be one of {', '.join(single)}; oracle, alone or with "
+        f":last_frame or :clairvoyant; a meter ({', '.join(METERS)}), alone or with a program "
+        f"({', '.join(f':{p}' for p in PROGRAMS)}); rpi_agc, alone or with "
+        f"{', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
+        f"package.module:Class or path.py:Class{did_you_mean(name, known, cutoff=0.5)}"
+    )
+
+
+def _broken(policy: str, what: str, error: BaseException) -> str:
+    return f"`policy` (={policy!r}): {what}: {type(error).__name__}: {error}"

@@ -1,0 +1,571 @@
+"""The paper's dataset in the form that its authors released, and training on it.
+
+A table ``camera_params.csv`` has one row per capture, and for each capture there is a file
+``SEQUENCE/NAME.npy``: float32 (4, H, W), planes **R, G1, B, G2**, black-subtracted, 1.0 at white,
+not clipped. Rows name the developed picture beside it, ``.../SEQUENCE/NAME.jpg``.
+
+The stages of the training, their order and their losses are the paper's: exposure, then noise and
+aperture on the output of the stages before. The target is the capture itself, with its noise.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import io
+import logging
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor, nn
+
+from simulator.camera import CameraProfile, get_camera
+from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
+from simulator.networks.noise_module import NoiseModule
+from simulator.networks.weights import build_modules, save_modules
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.raw.image import RawImage
+from simulator.reference.sequences import Pair, any_pairs, opening_pairs
+from simulator.settings import CameraSettings, exposure_ratio
+from simulator.training.config import SimulatorConfig
+from simulator.training.data import Batch, settings_parameters
+from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, expose
+from simulator.training.train import TrainingProgress, load_start, make_accelerator, train_stage
+from simulator.utils.cache import LruCache
+from simulator.utils.checks import check_word
+from simulator.utils.files import sibling, write_atomically
+from simulator.utils.results import result_meta
+
+logger = logging.getLogger(__name__)
+
+#: The table, and the one beside it with what developing the raws needs.
+PARAMETERS, DEVELOPING = "camera_params.csv", "camera_isp_params.csv"
+#: Columns that the table must have. ``wb`` and ``noiseprofile`` are optional.
+COLUMNS = ("path", "time", "iso", "aperture")
+#: Black and white level that the authors' preprocessing takes, per camera.
+LEVELS = {"nikon_z6": (1008.0, 15520.0), "canon_70d": (2048.0, 15000.0)}
+#: From R, G1, B, G2 of the ``.npy`` files to R, G1, G2, B, and back: it inverts itself.
+_PLANES = [0, 1, 3, 2]
+#: Stages in the order of the paper.
+STAGES = ("exposure", "noise", "aperture", "baseline")
+#: Share of the sequences that is held out (paper, section 4.2).
+TEST_SHARE = 0.1
+#: Highest ISO of a target of the noise stage (section 4.2: 100, 200 and 400), and its noise
+#: variance at mid grey relative to the source's at the same exposure, at most.
+_LOW_ISO, _LOW_NOISE, _GREY = 400.0, 0.25, 0.119
+#: Most bytes of captures in memory; one of 4 x 512 x 768 takes 6 million.
+_CACHED = 2**31
+
+Balance = tuple[float, float, float]
+
+
+# -- reading --------------------------------------------------------------------------------------
+
+
+def packed_camera(name: str) -> CameraProfile:
+    """The built-in camera `name` with the levels of the dataset, and its noise on that scale.
+
+    Args:
+        name: ``"nikon_z6"`` or ``"canon_70d"``.
+
+    Raises:
+        ValueError: If the dataset does not have the camera.
+
+    >>> packed_camera("canon_70d").black_level
+    (2048.0, 2048.0, 2048.0, 2048.0)
+    """
+    check_word("camera", name, tuple(LEVELS))
+    camera = get_camera(name)
+    black, white = LEVELS[name]
+    return camera.with_levels((black,) * 4, white, camera.bit_depth)
+
+
+@dataclass(frozen=True)
+class PackedCapture:
+    """One capture: a row of the table.
+
+    Args:
+        file: Its ``.npy`` file.
+        camera: The body.
+        settings: The exposure settings.
+        white_balance: Gains of R, G, B, green 1; None if not stated.
+        nlf: Noise as the row states it; None if it does not.
+    """
+
+    file: Path
+    camera: CameraProfile
+    settings: CameraSettings
+    white_balance: Balance | None
+    nlf: NoiseLevelFunction | None
+
+    @property
+    def noise(self) -> NoiseLevelFunction:
+        """Noise as the row states it, or the camera's calibration."""
+        return self.nlf or self.camera.nlf(self.settings.iso)
+
+    def read(self) -> RawImage:
+        """Read the capture from its file.
+
+        Raises:
+            ValueError: If the file is not a finite (4, H, W) array of floating-point numbers;
+                pickled objects are refused.
+        """
+        try:
+            array = np.load(self.file, allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise ValueError(
+                f"`{self.file}` must be a whole .npy file of numbers: {error}"
+            ) from None
+        if not isinstance(array, np.ndarray) or array.ndim != 3 or array.shape[0] != 4:
+            shape = getattr(array, "shape", type(array).__name__)
+            raise ValueError(f"`{self.file}` (shape {shape}) must be (4, H, W): R, G1, B, G2")
+        stated = self.nlf is not None
+        return RawImage(
+            torch.from_numpy(array[_PLANES]),
+            self.settings,
+            self.camera,
+            self.nlf,
+            self.white_balance or (1.0, 1.0, 1.0),
+            metadata={
+                "path": self.file.name,
+                "make": self.camera.make,
+                "model": self.camera.model,
+                "nlf_source": PARAMETERS if stated else f"camera calibration ({self.camera.name})",
+                "white_balance_source": "camera" if self.white_balance else "none",
+            },
+        )
+
+
+@dataclass(frozen=True)
+class CapturedSequence:
+    """Captures of one static scene with different settings.
+
+    Args:
+        name: Folder of the sequence.
+        captures: The captures in the order of the table, read when they are asked for.
+    """
+
+    name: str
+    captures: tuple[PackedCapture, ...]
+
+    @property
+    def settings(self) -> tuple[CameraSettings, ...]:
+        """The settings of each capture."""
+        return tuple(capture.settings for capture in self.captures)
+
+
+def read_dataset(
+    root: str | os.PathLike[str], *, camera: CameraProfile | str | None = None
+) -> list[CapturedSequence]:
+    """Every sequence that a ``camera_params.csv`` in `root` or below lists, sorted by name.
+
+    Rows whose ``.npy`` file is not there are left out, with a warning in the log: a copy of the
+    dataset may be partial.
+
+    Args:
+        root: A folder. The paths in its tables begin where the preprocessing ran: only their last
+            two parts count, and the last alone if the files lie beside the table.
+        camera: The body: a profile, or a name that `packed_camera` knows. Without it, a table with
+            a column ``wb`` is the Nikon Z6's and one without the Canon 70D's, as the authors'
+            scripts write them.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        ValueError: If there is no table, a column is missing, a cell is no number, or no file is
+            there.
+    """
+    found = (s for table in _tables("root", root) for s in _read_table(table, camera))
+    return sorted(found, key=lambda sequence: sequence.name)
+
+
+def _tables(name: str, folder: str | os.PathLike[str]) -> list[Path]:
+    path = Path(folder).expanduser()
+    if not path.is_dir():
+        raise FileNotFoundError(f"`{name}` (={str(path)!r}) must be an existing folder")
+    tables = sorted(path.rglob(PARAMETERS))
+    if not tables:
+        raise ValueError(f"`{name}` (={str(path)!r}) must hold a {PARAMETERS}, in it or below")
+    return tables
+
+
+def _read_table(table: Path, camera: CameraProfile | str | None = None) -> list[CapturedSequence]:
+    rows = _cells(table)
+    if not set(COLUMNS) <= set(rows.columns):
+        raise ValueError(
+            f"`{table}` (columns: {', '.join(rows.columns) or 'none'}) must have the columns "
+            f"{', '.join(COLUMNS)}, and may have wb and noiseprofile"
+        )
+    if camera is None:
+        camera = "nikon_z6" if "wb" in rows.columns else "canon_70d"
+    profile = packed_camera(camera) if isinstance(camera, str) else camera
+    balances = _white_balances(table.with_name(DEVELOPING))
+    captures: dict[str, list[PackedCapture]] = {}
+    lost = []
+    for number, row in enumerate(rows.to_dict("records"), start=2):
+        path = _path(row["path"])
+        try:
+            capture = _capture(table, path, row, profile, balances.get(path))
+        except ValueError as error:
+            raise ValueError(f"`{table}`, row {number}: {error}") from None
+        if capture.file.is_file():
+            name = path.parts[-2] if len(path.parts) > 1 else table.parent.name
+            captures.setdefault(name, []).append(capture)
+        else:
+            lost.append(path)
+    if lost:
+        logger.warning("%s: %d of %d files are not there, %s", table, len(lost), len(rows), lost[0])
+    if not captures:
+        raise ValueError(
+            f"`{table}` ({len(rows)} rows) must list .npy files that are there, as "
+            "SEQUENCE/NAME.npy or NAME.npy beside the table"
+        )
+    return [CapturedSequence(name, tuple(own)) for name, own in captures.items()]
+
+
+def _cells(table: Path) -> pd.DataFrame:
+    """The cells of a table as text; no rows and no columns for an empty file."""
+    try:
+        frame = pd.read_csv(table, dtype=str, keep_default_na=False, encoding="utf-8-sig")
+    except pd.errors.EmptyDataError:
+        return pd.DataFrame()
+    return frame.rename(columns=str.strip)
+
+
+def _path(text: str) -> PurePosixPath:
+    return PurePosixPath(text.strip().replace("\\", "/"))
+
+
+def _capture(
+    table: Path,
+    path: PurePosixPath,
+    row: Mapping[Any, str],
+    camera: CameraProfile,
+    developing: Balance | None,
+) -> PackedCapture:
+    values = {}
+    for name in ("iso", "time", "aperture"):
+        try:
+            values[name] = float(row[name])
+        except ValueError:
+            raise ValueError(f"`{name}` (={row[name]!r}) must be a number") from None
+    settings = CameraSettings.from_exif(values["iso"], values["time"], values["aperture"])
+    gains, noise = _numbers(row.get("wb", "")), _numbers(row.get("noiseprofile", ""))
+    balance = (gains[0] / gains[1], 1.0, gains[2] / gains[1]) if _positive(gains) else developing
+    stem = f"{path.stem}.npy"
+    nested = table.parent.joinpath(*path.parts[-2:-1], stem)
+    file = nested if nested.is_file() else table.with_name(stem)
+    return PackedCapture(file, camera, settings, balance, _noise_profile(noise) if noise else None)
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Numbers separated by blanks, or a list as Python prints it."""
+    return tuple(float(v) for v in text.strip(" []()\r\n").replace(",", " ").split())
+
+
+def _positive(values: tuple[float, ...]) -> bool:
+    return len(values) >= 3 and min(values[:3]) > 0
+
+
+def _noise_profile(numbers: tuple[float, ...]) -> NoiseLevelFunction:
+    """Pairs (shot, read) of a DNG NoiseProfile: one for all colours, or one each for R, G, B."""
+    if len(numbers) not in (2, 6):
+        raise ValueError(f"`noiseprofile` (={numbers}) must be 2 or 6 numbers")
+    pairs = [numbers[i : i + 2] for i in range(0, len(numbers), 2)] * (6 // len(numbers))
+    shot, read = zip(*(pairs[colour] for colour in (0, 1, 1, 2)), strict=True)
+    return NoiseLevelFunction(shot, read, source=f"DNG NoiseProfile, from {PARAMETERS}")
+
+
+def _white_balances(table: Path) -> dict[PurePosixPath, Balance]:
+    """Gains by path, from AsShotNeutral, if there is such a table."""
+    rows = _cells(table) if table.is_file() else pd.DataFrame()
+    if not {"path", "AsShotNeutral"} <= set(rows.columns):
+        return {}
+    values = {_path(row["path"]): _numbers(row["AsShotNeutral"]) for row in rows.to_dict("records")}
+    return {p: (v[1] / v[0], 1.0, v[1] / v[2]) for p, v in values.items() if _positive(v)}
+
+
+# -- writing --------------------------------------------------------------------------------------
+
+
+def write_packed_sequence(folder: str | os.PathLike[str], raws: Sequence[RawImage]) -> None:
+    """Write `raws` as ``capture_000.npy`` and on, beside ``camera_params.csv``.
+
+    The table has the columns that the authors' script for the camera writes. It records an exposure
+    time as a camera does: one within 3 % of a nominal stop is read back as that stop.
+
+    Args:
+        folder: Where to; new or empty.
+        raws: At least one capture, all of one `packed_camera`: the files do not state levels.
+
+    Raises:
+        ValueError: If `folder` holds something already, there is no capture, or a camera is not
+            one that the dataset has.
+    """
+    folder = Path(folder).expanduser()
+    if folder.exists() and any(folder.iterdir()):
+        raise ValueError(f"`folder` (={str(folder)!r}) must be new or empty")
+    if not raws:
+        raise ValueError("`raws` (=[]) must hold at least one capture")
+    name = raws[0].camera.name
+    known, nikon = _layout_of(packed_camera(name)), name == "nikon_z6"
+    for camera in (raw.camera for raw in raws):
+        if _layout_of(camera) != known:
+            raise ValueError(
+                f"`raws` (one of {_layout_of(camera)}) must all be of packed_camera({name!r})"
+            )
+    rows: list[list[object]] = [[*COLUMNS, *(["wb"] if nikon else []), "noiseprofile"]]
+    for index, raw in enumerate(raws):
+        stem = f"capture_{index:03d}"
+        content = io.BytesIO()
+        np.save(content, raw.data.detach().cpu().numpy()[_PLANES], allow_pickle=False)
+        write_atomically(folder / f"{stem}.npy", content.getvalue())
+        settings, noise = raw.settings, _profile_text(raw.noise, colours=nikon)
+        row = [f"{folder.name}/{stem}.jpg", settings.exposure_time, settings.iso, settings.f_number]
+        rows.append([*row, *([[*raw.white_balance, 0.0]] if nikon else []), noise])
+    text = io.StringIO()
+    csv.writer(text).writerows(rows)
+    write_atomically(folder / PARAMETERS, text.getvalue())
+
+
+def _layout_of(camera: CameraProfile) -> tuple[Any, ...]:
+    return camera.name, camera.cfa.value, camera.black_level, camera.white_level
+
+
+def _profile_text(nlf: NoiseLevelFunction, *, colours: bool) -> str:
+    """A DNG NoiseProfile of `nlf`: greens averaged, or without `colours` all averaged."""
+    groups: list[tuple[int, ...]] = [(0,), (1, 2), (3,)] if colours else [(0, 1, 2, 3)]
+    return " ".join(
+        repr(sum(values[i] for i in planes) / len(planes))
+        for planes in groups
+        for values in (nlf.shot, nlf.read)
+    )
+
+
+# -- training -------------------------------------------------------------------------------------
+
+
+def split_dataset(
+    folder: Path, *, seed: int = 0
+) -> tuple[list[CapturedSequence], list[CapturedSequence]]:
+    """The sequences below `folder` to train on, and those held out.
+
+    Where some of several tables lie in a folder with "test" in its name, as in the authors' data,
+    theirs are held out; otherwise a tenth of all sequences, drawn by `seed`, as in the paper.
+
+    Raises:
+        FileNotFoundError: If there is no such folder.
+        ValueError: If there is no table, or fewer than two sequences of two captures or more.
+    """
+    named: dict[bool, list[CapturedSequence]] = {False: [], True: []}
+    for table in _tables("folder", folder):
+        is_test = any("test" in part.lower() for part in table.relative_to(folder).parts[:-1])
+        named[is_test] += [s for s in _read_table(table) if len(s.captures) > 1]
+    if all(named.values()):
+        return named[False], named[True]
+    every = sorted(named[False] + named[True], key=lambda sequence: sequence.name)
+    if len(every) < 2:
+        raise ValueError(
+            f"`folder` (={str(folder)!r}) must hold two sequences or more, of two captures or "
+            f"more each, to train on one and measure on another; it holds {len(every)}"
+        )
+    count = max(1, round(TEST_SHARE * len(every)))
+    held_out = set(np.random.default_rng(seed).permutation(len(every))[:count].tolist())
+    train = [sequence for index, sequence in enumerate(every) if index not in held_out]
+    return train, [every[index] for index in sorted(held_out)]
+
+
+def captured_pairs(sequences: Sequence[CapturedSequence], stage: str) -> list[Pair]:
+    """The pairs that a stage is trained on (paper, section 4.2).
+
+    Args:
+        sequences: The sequences to choose from.
+        stage: ``"exposure"`` or ``"baseline"``: any two captures of a sequence. ``"noise"``: the
+            same f-number, a target at ISO 400 or less with at most a quarter of the source's noise
+            variance at mid grey. ``"aperture"``: a target that is more open, and for a tenth of
+            the pairs one that is as open.
+
+    Raises:
+        ValueError: If there is no such pair.
+    """
+    pairs = opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)
+    if stage == "noise":
+        pairs = [p for p in pairs if _is_cleaner(*_captures(sequences, p))]
+    if not pairs:
+        raise ValueError(f"`sequences` ({len(sequences)}) must hold a pair for stage {stage!r}")
+    return pairs
+
+
+def _captures(
+    sequences: Sequence[CapturedSequence], pair: Pair
+) -> tuple[PackedCapture, PackedCapture]:
+    captures = sequences[pair.sequence].captures
+    return captures[pair.source], captures[pair.target]
+
+
+def _is_cleaner(source: PackedCapture, target: PackedCapture) -> bool:
+    if source.settings.aperture_stop != target.settings.aperture_stop:
+        return False
+    exposed = source.noise.exposed(exposure_ratio(source.settings, target.settings))
+    wanted, present = (
+        sum(read + shot * _GREY for shot, read in zip(nlf.shot, nlf.read, strict=True))
+        for nlf in (target.noise, exposed)
+    )
+    return target.settings.iso <= _LOW_ISO and wanted <= _LOW_NOISE * present
+
+
+class CapturedPairs:
+    """Pairs of one stage; the same step gives the same batch.
+
+    Args:
+        sequences: Real captures.
+        stage: See `captured_pairs`.
+        seed: Seed of pairs and crops.
+    """
+
+    def __init__(self, sequences: Sequence[CapturedSequence], stage: str, *, seed: int = 0) -> None:
+        self.sequences, self.stage, self.seed = sequences, stage, seed
+        self.pairs = captured_pairs(sequences, stage)
+        self._data: LruCache[Tensor] = LruCache(_CACHED)
+
+    def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> Batch:
+        """The pairs of one step; see `simulator.training.data.ReferencePairs.batch`.
+
+        Pictures smaller than `crop` are taken whole.
+        """
+        rng = np.random.default_rng([self.seed, STAGES.index(self.stage), step, process])
+        chosen = rng.integers(len(self.pairs), size=size)
+        items = [self._pair(self.pairs[i], crop, rng) for i in chosen]
+        smallest = [min(item["source"].shape[i] for item in items) for i in (1, 2)]
+        for item in items:  # pictures of several sizes: what they have in common
+            for name in ("source", "target", "sample", "defocus"):
+                item[name] = item[name][..., : smallest[0], : smallest[1]]
+        return Batch(*(torch.stack([item[name] for item in items]) for name in Batch._fields))
+
+    def _pair(self, pair: Pair, crop: int, rng: np.random.Generator) -> dict[str, Tensor]:
+        source, target = _captures(self.sequences, pair)
+        light, sample = self._read(source), self._read(target)
+        top, left = (int(rng.integers(max(n - crop, 0) + 1)) for n in light.shape[1:])
+        light, sample = (
+            t[:, top : top + crop, left : left + crop].clamp(max=1.0) for t in (light, sample)
+        )
+        if light.shape != sample.shape:
+            raise ValueError(
+                f"`{target.file}` must be as large as the other captures of its sequence"
+            )
+        settings, nlf = (source.settings, target.settings), source.noise
+        return {
+            "source": light,
+            "target": sample,
+            "sample": sample,
+            "ratio": torch.tensor(exposure_ratio(*settings), dtype=torch.float32),
+            "shot": torch.tensor(nlf.shot),
+            "read": torch.tensor(nlf.read),
+            "f_source": torch.tensor(settings[0].effective_f_number),
+            "f_target": torch.tensor(settings[1].effective_f_number),
+            "parameters": torch.tensor([v for s in settings for v in settings_parameters(s)]),
+            "defocus": torch.zeros(light.shape[1:]),  # not known, and not used
+        }
+
+    def _read(self, capture: PackedCapture) -> Tensor:
+        data = self._data.get(capture.file)
+        if data is None:
+            data = capture.read().data
+            self._data.put(capture.file, data, data.nbytes)
+        return data
+
+
+class CapturedNoiseLoss(nn.Module):
+    """L1 of the exposed and denoised source against the target, as in the paper.
+
+    Source pixels above 0.99 are left out.
+    """
+
+    def __init__(self, exposure: ExposureModule, noise: NoiseModule) -> None:
+        super().__init__()
+        self.exposure, self.noise = exposure, noise
+
+    def forward(self, batch: Batch) -> Mapping[str, Tensor]:
+        """The loss on `batch`, and the error relative to not denoising."""
+        exposed, shot, read = expose(self.exposure, batch)
+        exposed = exposed.clamp(0.0, 1.0)
+        used = batch.source <= OVER_EXPOSED
+        error = (self.noise(exposed, shot, read) - batch.sample).abs() * used
+        before = ((exposed - batch.sample).abs() * used).sum()
+        relative = error.detach().sum() / before.clamp(min=1e-9)
+        return {"loss": error.sum() / used.sum().clamp(min=1), "relative": relative}
+
+
+def train_on_captures(
+    config: SimulatorConfig,
+    sequences: Sequence[CapturedSequence],
+    path: Path,
+    *,
+    command: str,
+    device: str = "cpu",
+    progress: TrainingProgress | None = None,
+) -> Path:
+    """Trains the stages of `config` on real captures and writes the weights with their card.
+
+    A stage that is done or half done resumes from its checkpoint.
+
+    Args:
+        config: A training of preset ``"paper"``, ``"pc"`` or ``"dl"``; its camera, body and scenes
+            do not matter.
+        sequences: To train on.
+        path: File name of the weights; checkpoints go into its folder.
+        command: The command line that does it again, for the card.
+        device: ``"cpu"`` or ``"cuda"``.
+        progress: Called every few steps.
+
+    Returns:
+        The file of the weights.
+
+    Raises:
+        ValueError: If the preset needs what captures do not tell, or a stage has no pairs.
+    """
+    check_word("preset", config.preset, ("paper", "pc", "dl"))
+    accelerator = make_accelerator(config, device, None)
+    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
+        torch.default_generator.manual_seed(config.seed)
+        modules: Any = build_modules(config.preset)
+    start = None if config.start is None else load_start(config, modules)
+    losses: dict[str, Callable[[], nn.Module]] = {
+        "exposure": lambda: ExposureLoss(modules["exposure"]),
+        "noise": lambda: CapturedNoiseLoss(modules["exposure"], modules["noise"]),
+        "aperture": lambda: ApertureLoss(*(modules[name] for name in STAGES[:3])),
+        "baseline": lambda: BaselineLoss(modules["baseline"]),
+    }
+    names = [name for name in STAGES if name in config.stages()]
+    stages: dict[str, dict[str, Any]] = {}
+    for number, name in enumerate(names, start=1):
+        pairs = CapturedPairs(sequences, name, seed=config.seed)
+        values = config.card()
+        clock = train_stage(
+            name,
+            losses[name](),
+            modules[name],
+            pairs,
+            config.stages()[name],
+            accelerator,
+            checkpoint=path.parent / f"{name}.checkpoint",
+            identity=[
+                {key: values[key] for key in ("preset", "seed", "precision", *names[:number])},
+                start,
+                [sequence.name for sequence in sequences],
+            ],
+            progress=None if progress is None else functools.partial(progress, name),
+        )
+        seconds = round(clock.seconds, 1)
+        stages[name] = {"pairs": len(pairs.pairs), "steps": clock.step, "seconds": seconds}
+    modules.to("cpu").eval()
+    meta = result_meta(command, config.seed)
+    origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
+    done = {"start": start, "sequences": len(sequences), "stages": stages}
+    save_modules(path, modules, config.preset, {"training": config.card(), **done, **origin})
+    return sibling(path, ".safetensors")
