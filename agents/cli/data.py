@@ -87,10 +87,10 @@ def record(
     import gymnasium as gym
 
     from ae_env.utils.presets import load_preset
-    from agents.episodes import fitting_arguments
     from agents.evaluation.running import fit_policies
     from agents.policy import PolicyContext, make_policy
     from agents.recording import check_dataset_id, record_dataset
+    from agents.rollouts import fitting_arguments
     from simulator.utils.checks import check_word
 
     check_word("task", task, ("AutoExposure-v0", "AutoExposureVideo-v0"))
@@ -260,13 +260,13 @@ def _use_rest() -> None:
     import numpy as np
     import torch
 
-    from ae_env.scenes.procedural import draw
     from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.library import find_scenes
     from agents.viewer.viewed_scene import View, ViewedScene
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
     from simulator.optics.blur import disc_blur, motion_blur
     from simulator.optics.blur_kernels import Blur, blur_many
+    from simulator.radiance.procedural import draw
 
     library = find_scenes(DEFAULT_SCENES)
     viewed = ViewedScene(library.open(library.first), CameraSimulator(device="cpu"))

@@ -28,6 +28,7 @@ def import_weights(
     Example: `ae-env import-weights ncs exp/demo -o ncs.safetensors`
     """
     from simulator.networks.authors_weights import read_authors_weights
+
     from simulator.networks.weights import save_modules
     from simulator.utils.checks import check_word
 

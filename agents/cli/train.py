@@ -195,7 +195,7 @@ def export(
     """
     import gymnasium as gym
 
-    from agents.learning.agent_weights import load_agent, trained_grid
+    from agents.learning.weights import load_agent, trained_grid
     from agents.onboard.controller import Controller
     from agents.onboard.export import export_agent
     from agents.policy import PolicyContext, make_policy, training_seeds

@@ -59,7 +59,7 @@ def _use_rest() -> None:
     import numpy as np
     import torch
 
-    from agents.cli.view import DEFAULT_SCENES
+    from agents.cli.show import DEFAULT_SCENES
     from agents.viewer.library import find_scenes
     from agents.viewer.viewed_scene import View, ViewedScene
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
