@@ -88,7 +88,8 @@ def record(
 
     from ae_env.utils.presets import load_preset
     from agents.evaluation.running import fit_policies
-    from agents.policy import PolicyContext, make_policy
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy
     from agents.recording import check_dataset_id, record_dataset
     from agents.rollouts import fitting_arguments
     from simulator.utils.checks import check_word

@@ -23,8 +23,6 @@ from agents.cli.bench import bench
 from agents.cli.console import print_line
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
-from agents.cli.export import export
-from agents.cli.film import film
 from agents.cli.quickstart import quickstart
 from agents.cli.show import convert_nima, film, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep

@@ -110,7 +110,8 @@ def film(
     import ae_env  # noqa: F401  (registers the environment)
     from ae_env.lighting.moving import KIND_SETS, MOVES
     from agents.evaluation.running import fit_policies
-    from agents.policy import PolicyContext, make_policy
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy
     from agents.report.film import film as write
     from simulator.utils.checks import check_word
 

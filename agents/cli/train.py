@@ -198,7 +198,8 @@ def export(
     from agents.learning.weights import load_agent, trained_grid
     from agents.onboard.controller import Controller
     from agents.onboard.export import export_agent
-    from agents.policy import PolicyContext, make_policy, training_seeds
+    from agents.policy import PolicyContext
+    from agents.policy_names import make_policy, training_seeds
 
     kind = policy.partition(":")[0].partition("?")[0]
     if kind not in ("regression", "ppo") or "*" in policy or "?" in policy:
