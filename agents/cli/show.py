@@ -68,8 +68,8 @@ def view(
             "`ae-env view` needs the extra view: pip install 'ae-env[view]'"
         ) from None
     from ae_env.scorers import make_scorer
-    from agents.viewer.library import find_scenes
     from agents.viewer.page import Options
+    from agents.viewer.viewed_scene import find_scenes
     from simulator.capture.plan import check_tolerance
 
     check_depth(depth, weights)
