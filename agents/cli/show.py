@@ -81,10 +81,10 @@ def view(
         library = find_scenes(what)
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
-    serve(options, port, open_browser, _tell)
+    serve(options, port, open_browser, _announce)
 
 
-def _tell(address: str) -> None:
+def _announce(address: str) -> None:
     print_line(f"open {address}")
     print_line("Ctrl-C stops")
     console.file.flush()

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from simulator.training.config import SimulatorConfig
     from simulator.training.crops import DetailPicture
 
-#: Evaluations of the tasks; that of still light is the command's own default.
-_PRESETS = {"ae_env/AutoExposureVideo-v0": "video", "ae_env/ExposureBracket-v0": "bracket"}
 #: Procedural scenes that a training validates on.
 _VALIDATION_SCENES = 24
 
@@ -81,10 +79,9 @@ def _evaluation(agent: AgentConfig, out: Path) -> list[str]:
     if agent.agent == "forecaster":
         return ["--preset", "video", "--policy", f"regression:video?foresight={out}"]
     words = ["--policy", f"{agent.agent}:{out}"]
-    preset = _PRESETS.get(agent.task)
-    if preset is not None:
-        words = ["--preset", preset, *words]
-    if preset is None and isinstance(agent.environment.get("grid"), str):
+    if agent.task == "ae_env/AutoExposureVideo-v0":
+        words = ["--preset", "video", *words]
+    elif isinstance(agent.environment.get("grid"), str):
         words += ["--grid", agent.environment["grid"]]
     for name in ("observation", "resolution"):
         if name in agent.environment:

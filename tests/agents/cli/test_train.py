@@ -1,3 +1,8 @@
+"""Trainings from YAML files: agents, and the networks of the simulator."""
+
+import json
+import re
+import shlex
 from collections import Counter
 from functools import partialmethod
 from pathlib import Path
@@ -14,6 +19,7 @@ from simulator.training import calibration
 from simulator.training.config import SimulatorConfig
 from simulator.training.crops import DetailCrops
 from simulator.training.data import ReferencePairs
+from simulator.utils.files import sibling
 
 TINY = """\
 preset: compact
@@ -79,3 +85,29 @@ def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
     for scene in (scene for scenes in splits.values() for scene in scenes):
         assert (scene.size, scene.sampled) == ((32, 32), True)
         assert scene.illuminance is not None
+
+
+def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(
+        "agent: regression\nnum_envs: 4\nenvironment: {scenes: 'bundled:small', resolution: 36}\n"
+        "training: {frames: 24, width: 8}\n"
+    )
+    out = Path("runs/a-0.5")
+    code, text, _ = ae_env("train", "tiny.yaml", "--out", out, "--seed", 2)
+    assert code == 0
+    (following,) = re.findall("next: ae-env (.*)", text)
+    card = json.loads(sibling(tmp_path / out, ".json").read_text())
+    assert card["training"]["training"]["seed"] == 2
+    few = ("--scenes", "bundled:small", "--frames", 2, "--episodes", 1)
+    code, text, _ = ae_env(*shlex.split(following), *few)
+    assert code == 0
+    assert f"regression:{out}" in text
+
+
+def test_a_forecaster_is_evaluated_on_video(ae_env, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(
+        "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n"
+    )
+    code, text, _ = ae_env("train", "tiny.yaml", "--out", "a")
+    assert code == 0
+    assert "next: ae-env evaluate --preset video --policy 'regression:video?foresight=a'" in text
