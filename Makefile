@@ -1,6 +1,7 @@
 # make demo   sets up .venv and runs the quickstart
-# make test   sets up .venv and runs the test suite
-# make check  lint, format and types
+# make test   sets up .venv and runs the test suite; T=tests/ae_env/test_env.py runs one file or folder
+# make test-fast  the tests that take no more than a few seconds each, without doctests
+# make check  lint, format, types, spelling and the budget of lines
 # make docs   the site, in build/site
 # make dist   the wheel and the source distribution, in dist/
 # make check-dist  installs the wheel in a new environment and runs every command there
@@ -12,18 +13,23 @@ BASE := $(VENV)/.base
 STAMP := $(VENV)/.installed
 BIN := $(VENV)/bin
 
-.PHONY: demo test check format docs dist check-dist bench clean $(VENV)
+.PHONY: demo test test-fast check format docs dist check-dist bench clean $(VENV)
 
 demo: $(BASE)
 	$(BIN)/ae-env quickstart
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal $(T)
+
+test-fast: $(STAMP)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow" -o addopts="--strict-markers" tests
 
 check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
+	$(BIN)/python .ci/budget.py
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from simulator.capture.exposure import PEDESTAL
-from simulator.utils.jit import kernel
+from simulator.utils.compute import kernel
 
 if TYPE_CHECKING:
     import torch

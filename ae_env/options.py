@@ -30,7 +30,7 @@ from simulator.camera import CameraProfile, get_camera
 from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.plan import check_tolerance
 from simulator.capture.prepared_scene import MAX_DISC_PX, MAX_IMAGE_SPEED
-from simulator.networks.denoiser import SIZES
+from simulator.networks.noise_module import SIZES
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 

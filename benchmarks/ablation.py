@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from agents.learning.learning_curve import LearningCurve, load_curve
+from agents.learning.training import LearningCurve, load_curve
 from agents.report.plots import learning_figure
 from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, table
 from benchmarks.isolated import ROOT
@@ -43,10 +43,10 @@ def measure(variant: str, frames: int, seed: int, scenes: int) -> Row:
     """Trains a variant, unless its file is there, and judges it."""
     import time
 
-    from agents.evaluation.evaluation_plan import load_plan
-    from agents.evaluation.plan_run import run_plan
+    from agents.evaluation.jobs import run_plan
+    from agents.evaluation.plan import load_plan
+    from agents.evaluation.result import overall_ranking
     from agents.learning.training import AgentConfig, load_config, train_agent
-    from agents.report.result_table import overall_ranking
 
     training, environment = VARIANTS.get(variant, ({}, {}))
     name = "".join(c if c.isalnum() else "-" for c in variant)

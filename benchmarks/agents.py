@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from agents.cli.console import print_files, progress_bars
-from agents.evaluation.engine import evaluate
-from agents.evaluation.running import fit_policies
+from agents.evaluation.engine import evaluate, fit_policies
 from agents.learning.training import TrainingJob, load_config, train_in_parallel
 from agents.policy import PolicyContext
 from agents.policy_names import CLASSIC_METERS, PROGRAMS, make_policy
-from agents.report.evaluation_report import write_report
+from agents.report.evaluation import write_report
 from agents.rollouts import make_envs
 from benchmarks.isolated import ROOT
 

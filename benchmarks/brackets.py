@@ -37,7 +37,7 @@ from simulator import (
     estimate_nlf,
     exposure_ratio,
 )
-from simulator.networks.denoiser import SIZES
+from simulator.networks.noise_module import SIZES
 from simulator.raw.image import PLANES
 
 SCENES = {"left_c0": "static", "left_c5": "moving"}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from simulator import CameraProfile
-from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.camera import ReferenceScene
 
 #: PSNR of two images that are the same, or nearer than this [dB].
 LARGEST_PSNR = 80.0

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from agents import PolicyContext, evaluate, make_policy
 from agents.evaluation.metrics import THIRD_EV
 from agents.evaluation.result import EvaluationResult
-from agents.metering.libcamera_agc import ExposureFilter
+from agents.metering.rpi_agc import ExposureFilter
 from agents.policy_names import METERS
 from agents.rollouts import make_envs
 from benchmarks.harness import Benchmark, Part, Report, Row, table

@@ -18,7 +18,7 @@ from scipy.stats import spearmanr
 
 from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
-from ae_env.scorers.luma import luma_of
+from ae_env.scorers.measures import luma_of
 from agents.cli.console import console
 from benchmarks.harness import Benchmark, Part, Report, Row, bullets, cell, pivot, table
 from simulator import develop, exposure_ratio, get_camera

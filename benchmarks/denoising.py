@@ -2,7 +2,7 @@
 
     ae-env bench denoising
 
-One crop of every source of the test split of `ae_env.scenes.pictures`: views into radiance maps,
+One crop of every source of the test split of `simulator.training.scenes`: views into radiance maps,
 photographs and recorded mosaics, photographed by the reference camera. Every case is denoised by
 every method; the gain is that of the PSNR over the noisy input. One thread.
 """
@@ -20,16 +20,15 @@ import torch
 from skimage.restoration import denoise_nl_means
 from torch import Tensor
 
-from ae_env.scenes.pictures import detail_pictures
 from benchmarks.fidelity.models import checksums, trained_noise_modules
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, pivot, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, get_camera
 from simulator.noise.generator import noise_generator
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.reference_camera import ReferenceCamera
-from simulator.reference.sampling import lens_blur, sample_mosaic
-from simulator.training.crops import DetailPicture
+from simulator.reference.camera import ReferenceCamera, lens_blur, sample_mosaic
+from simulator.training.data import DetailPicture
+from simulator.training.scenes import detail_pictures
 
 #: Sources are photographed by both cameras in turn.
 CAMERAS = ("nikon_z6", "canon_70d")

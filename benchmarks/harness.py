@@ -26,8 +26,7 @@ from agents.cli.console import print_files, progress_bars
 from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator.utils.files import data_folder as data_root
-from simulator.utils.files import write_atomically
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
 #: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function.
@@ -223,12 +222,15 @@ def rounded(value: Any) -> Any:
 
 
 def write_picture(path: Path, figure: Figure) -> Path:
-    """Writes a figure as a PNG with a palette: a third of the bytes."""
+    """Writes a figure: photographs as WebP, plots as PNG with a palette, a third of the bytes."""
     from PIL import Image
 
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".webp":
+        Image.open(stream).convert("RGB").save(path, quality=80, method=6)
+        return path
     return write_palette_png(path, Image.open(stream))
 
 

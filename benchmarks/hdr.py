@@ -13,14 +13,19 @@ from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from ae_env.scenes.reference_scenes import reference_scenes
-from agents.applications.hdr import bracket_exposures, expose_and_develop, fuse, hdr_picture
+from agents.applications.hdr import (
+    bracket_exposures,
+    expose_and_develop,
+    fuse,
+    hdr_picture,
+)
 from benchmarks.captures import psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
 from simulator import CameraSimulator, RawImage, get_camera
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import reference_scenes
 
 CAMERA, F_NUMBER = "nikon_z6", 8.0
 ISOS = (100, 1600, 6400)
@@ -227,9 +232,9 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         f"2^{np.log2(DARKEST):.0f} of the raw's white:",
         table([m for m in means if any(m[f"{k} radiance_ev"] is not None for k in keys)], errors),
     ]
-    page.insert(2, "![a raw, fused with its noise, by ae-env hdr, and its light fused](hdr.png)")
+    page.insert(2, "![a raw, fused with its noise, by ae-env hdr, and its light fused](hdr.webp)")
     figure = picture(meta["seed"], meta["quick"])
-    return Report([*rows, *means], page, figures={"hdr.png": figure})
+    return Report([*rows, *means], page, figures={"hdr.webp": figure})
 
 
 def _cell(key: str, *names: str) -> Any:

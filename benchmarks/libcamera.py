@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from agents.metering.libcamera_agc import LADDERS, LibcameraAgc, signal_histogram
+from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram
 from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, table
 
 #: Where the recordings lie in the folder of real data.
@@ -161,7 +161,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     }
     page = [
         f"{len(rows)} recordings of libcamera's own code for the Raspberry Pi (imx477) on a "
-        "simulated sensor, and `agents.metering.libcamera_agc` on the same sensor and light, 160 "
+        "simulated sensor, and `agents.metering.rpi_agc` on the same sensor and light, 160 "
         "frames each, compared frame by frame. What `rpi_agc` adds to it is the choice of the "
         "nearest state of a grid.",
         f"Largest deviation of all frames of all recordings: {worst['exposure_deviation']:.2%} of "

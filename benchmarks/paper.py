@@ -32,7 +32,6 @@ from simulator import CameraSimulator, RawImage, exposure_ratio
 from simulator.networks.weights import load_modules
 from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.sequences import any_pairs
-from simulator.training.config import SimulatorConfig, load_config
 from simulator.training.data import settings_parameters
 from simulator.training.paper_dataset import (
     PARAMETERS,
@@ -40,6 +39,7 @@ from simulator.training.paper_dataset import (
     split_dataset,
     train_on_captures,
 )
+from simulator.training.train import SimulatorConfig, load_config
 
 #: What is trained: the paper's networks, parameter concatenation and decoupled learning.
 TRAINED = ("paper", "pc", "dl")

@@ -26,7 +26,6 @@ from ae_env.scenes import load_scenes
 from ae_env.scenes.loading import DEFAULT_SIMULATOR, SceneNetworks
 from ae_env.scenes.recorded import RecordedOptions, merged_scene
 from ae_env.scenes.recorded_files import PREFIX
-from ae_env.scenes.reference_scenes import reference_scenes
 from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
@@ -45,7 +44,8 @@ from benchmarks.harness import (
 )
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
 from simulator.radiance.light import MEAN_SIGNAL
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import reference_scenes
 
 CAMERA = "nikon_z6"
 #: Side of a frame [packed pixel].

@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ae_env.scenes.reference_scenes import depth_photographs
 from agents.applications.refocus import refocus
 from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
@@ -22,7 +21,8 @@ from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.disc_bank import DiscBank, added_blur
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import depth_photographs
 
 CAMERA, F_SOURCE = "nikon_z6", 11.0
 ISOS, F_NUMBERS = (100, 1600), (4.0, 2.8, 2.0, 1.4)
@@ -196,8 +196,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "The paper's module is trained by `configs/simulator/paper.yaml` (on f/11 to f/4); it "
         "stands here where `runs/simulator/paper` holds its weights.",
     ]
-    page.insert(2, "![a scene at f/11, and opened to f/1.4](refocus.png)")
-    return Report([*rows, *means], page, figures={"refocus.png": picture(meta["seed"])})
+    page.insert(2, "![a scene at f/11, and opened to f/1.4](refocus.webp)")
+    return Report([*rows, *means], page, figures={"refocus.webp": picture(meta["seed"])})
 
 
 def _cell(f_number: float) -> Callable[[Row], str]:

@@ -16,41 +16,17 @@ if TYPE_CHECKING:
     from simulator.noise.noise_level_function import NoiseLevelFunction as NoiseLevelFunction
     from simulator.optics.thin_lens import Lens as Lens
     from simulator.optics.thin_lens import defocus as defocus
-    from simulator.raw.decoding import RawFileError as RawFileError
     from simulator.raw.develop import develop as develop
     from simulator.raw.develop import render_srgb as render_srgb
     from simulator.raw.dng import write_dng as write_dng
     from simulator.raw.image import RawImage as RawImage
     from simulator.raw.noise_estimation import estimate_nlf as estimate_nlf
+    from simulator.raw.read import RawFileError as RawFileError
     from simulator.raw.read import read_raw as read_raw
     from simulator.settings import CameraSettings as CameraSettings
     from simulator.settings import exposure_ratio as exposure_ratio
     from simulator.settings import incident_ev100 as incident_ev100
     from simulator.settings import sensor_signal as sensor_signal
-
-__all__ = [
-    "BayerPattern",
-    "CameraProfile",
-    "CameraSettings",
-    "CameraSimulator",
-    "Lens",
-    "NoiseLevelFunction",
-    "PreparedScene",
-    "RawFileError",
-    "RawImage",
-    "SimulationPlan",
-    "defocus",
-    "develop",
-    "estimate_nlf",
-    "exposure_ratio",
-    "get_camera",
-    "incident_ev100",
-    "list_cameras",
-    "read_raw",
-    "render_srgb",
-    "sensor_signal",
-    "write_dng",
-]
 
 #: Module of each public name; loaded when the name is first used, so that importing is fast.
 _MODULES = {
@@ -60,14 +36,15 @@ _MODULES = {
     "capture.prepared_scene": ["PreparedScene"],
     "noise.noise_level_function": ["NoiseLevelFunction"],
     "optics.thin_lens": ["Lens", "defocus"],
-    "raw.decoding": ["RawFileError"],
     "raw.develop": ["develop", "render_srgb"],
     "raw.dng": ["write_dng"],
     "raw.image": ["RawImage"],
     "raw.noise_estimation": ["estimate_nlf"],
-    "raw.read": ["read_raw"],
+    "raw.read": ["RawFileError", "read_raw"],
     "settings": ["CameraSettings", "exposure_ratio", "incident_ev100", "sensor_signal"],
 }
+
+__all__ = sorted(name for names in _MODULES.values() for name in names)
 
 
 def __getattr__(name: str) -> Any:

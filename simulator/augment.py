@@ -7,6 +7,7 @@ drawn for a picture is a function of its seed alone, whatever the batch or the w
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
@@ -26,6 +27,7 @@ from simulator.optics.motion_path import Movement
 from simulator.raw.develop import develop, develop_inverse
 from simulator.raw.image import check_packed
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_integer
 
 #: Parts of the augmentation, in the order in which they act.
 MODULES = ("exposure", "blur", "noise")
@@ -110,9 +112,9 @@ class ExposureAugmentation:
             ("highlights", 0.0, 20.0),
         ):
             object.__setattr__(self, name, _check_range(name, getattr(self, name), low, high))
-        modules = () if isinstance(self.modules, str) else self.modules
-        modules = tuple(modules) if isinstance(modules, Iterable) else (modules,)
-        if isinstance(self.modules, str) or any(name not in MODULES for name in modules):
+        named = isinstance(self.modules, Iterable) and not isinstance(self.modules, str)
+        modules = tuple(self.modules) if named else (None,)
+        if any(name not in MODULES for name in modules):
             raise ValueError(f"`modules` (={self.modules!r}) must be some of {list(MODULES)}")
         object.__setattr__(self, "modules", modules)
 
@@ -123,7 +125,7 @@ class ExposureAugmentation:
         return self.camera
 
     def draw(self, seed: int) -> DrawnSettings:
-        """What a picture with this seed is given; what `modules` leaves out is drawn, too."""
+        """The settings of a picture with this seed, those that `modules` leaves out included."""
         rng = np.random.default_rng([int(seed), 0xA06])
         low, high = (math.log2(iso) for iso in self.isos)
         return DrawnSettings(
@@ -246,8 +248,11 @@ def sample_seeds(seed: int, epoch: int, indices: Sequence[int] | torch.Tensor) -
         raise ValueError(f"`indices` (={indices!r}) must be integers, one for each sample")
     found = []
     for index in given:
-        words = [_check_integer("seed", seed), _check_integer("epoch", epoch)]
-        sequence = np.random.SeedSequence([*words, _check_integer("indices", index)])
+        words = [
+            _check_seed("seed", seed),
+            _check_seed("epoch", epoch),
+        ]
+        sequence = np.random.SeedSequence([*words, _check_seed("indices", index)])
         found.append(int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1)))
     return found
 
@@ -274,7 +279,7 @@ class AugmentedDataset(Dataset[Any]):
         if not isinstance(augmentation, ExposureAugmentation):
             raise ValueError(f"`augmentation` (={augmentation!r}) must be an ExposureAugmentation")
         self.dataset, self.augmentation = dataset, augmentation
-        self.seed = _check_integer("seed", seed)
+        self.seed = _check_seed("seed", seed)
         # Shared memory: workers that persist see it change.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
@@ -285,7 +290,7 @@ class AugmentedDataset(Dataset[Any]):
 
     def set_epoch(self, epoch: int) -> None:
         """Begins an epoch; call it before the loader is iterated, as that of a sampler."""
-        self._epoch.fill_(_check_integer("epoch", epoch))
+        self._epoch.fill_(_check_seed("epoch", epoch))
 
     def __len__(self) -> int:
         return len(self.dataset)  # type: ignore[arg-type]
@@ -314,6 +319,8 @@ class AugmentedDataset(Dataset[Any]):
 
 # -- checks ---------------------------------------------------------------------------------------
 
+_check_seed = functools.partial(check_integer, low=0, high=2**63 - 1)
+
 
 def _check_range(name: str, given: Any, low: float, high: float) -> tuple[float, float]:
     try:
@@ -325,12 +332,6 @@ def _check_range(name: str, given: Any, low: float, high: float) -> tuple[float,
             f"`{name}` (={given!r}) must be two numbers in [{low:g}, {high:g}], the lower one first"
         )
     return first, last
-
-
-def _check_integer(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value < 2**63:
-        raise ValueError(f"`{name}` (={value!r}) must be an integer >= 0, below 2**63")
-    return int(value)
 
 
 def _check_images(images: Any) -> torch.Tensor:
@@ -365,4 +366,4 @@ def _check_seeds(seeds: Any, count: int) -> list[int]:
     given = seeds.tolist() if isinstance(seeds, torch.Tensor | np.ndarray) else seeds
     if isinstance(given, str | Real) or not isinstance(given, Sequence) or len(given) != count:
         raise ValueError(f"`seeds` (={seeds!r}) must be {count} integers, one for each picture")
-    return [_check_integer("seeds", value) for value in given]
+    return [_check_seed("seeds", value) for value in given]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import json
 import math
@@ -10,13 +9,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from importlib import resources
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.noise.read_noise import ReadNoise
+from simulator.utils.checks import check_integer, check_word
 
 
 class BayerPattern(StrEnum):
@@ -80,26 +80,20 @@ class CameraProfile:
     source: str = ""
 
     def __post_init__(self) -> None:
-        try:
-            object.__setattr__(self, "cfa", BayerPattern(self.cfa))
-        except ValueError:
-            known = ", ".join(p.value for p in BayerPattern)
-            raise ValueError(f"`cfa` (={self.cfa!r}) must be one of {known}") from None
-        given = self.black_level
-        black = (float(given),) * 4 if isinstance(given, Real) else tuple(map(float, given))
+        check_word("cfa", self.cfa, tuple(p.value for p in BayerPattern))
+        object.__setattr__(self, "cfa", BayerPattern(self.cfa))
+        level = self.black_level
+        black = (float(level),) * 4 if isinstance(level, Real) else tuple(map(float, level))
         if len(black) != 4:
             raise ValueError(f"`black_level` (={black}) must be one number or 4 (R, G1, G2, B)")
         object.__setattr__(self, "black_level", black)
-        if not isinstance(self.bit_depth, Integral) or not 1 <= self.bit_depth <= 16:
-            raise ValueError(f"`bit_depth` (={self.bit_depth!r}) must be an integer in [1, 16]")
-        if not all(0 <= b < self.white_level for b in black):
+        check_integer("bit_depth", self.bit_depth, 1, 16)
+        white, largest = self.white_level, 2**16 - 1
+        if not (all(0 <= b < white for b in black) and white <= largest and white == round(white)):
             raise ValueError(
-                f"`white_level` (={self.white_level}) must be above every black level (={black})"
+                f"`white_level` (={white}) must be a whole number above every black level "
+                f"(={black}), at most {largest}"
             )
-        if self.white_level > 2**16 - 1:
-            raise ValueError(f"`white_level` (={self.white_level}) must fit in 16 bits")
-        if self.white_level != round(self.white_level):
-            raise ValueError(f"`white_level` (={self.white_level}) must be a whole number")
 
     @property
     def span(self) -> tuple[float, float, float, float]:
@@ -268,10 +262,5 @@ def get_camera(name: str) -> CameraProfile:
     Raises:
         ValueError: If there is none; the message proposes the nearest name.
     """
-    try:
-        return _built_in()[name]
-    except (KeyError, TypeError):  # a list cannot be looked up
-        known = list_cameras()
-        near = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"`camera` (={name!r}) must be one of {known}{hint}") from None
+    check_word("camera", name, tuple(list_cameras()))
+    return _built_in()[name]

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, TypedDict, Unpack, cast, get_args
 
 import torch
 from torch import nn
@@ -22,17 +22,26 @@ from simulator.capture.blurred_light import ApertureBlur
 from simulator.capture.denoised import Denoised
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
+from simulator.capture.scene_blur import scene_light
+from simulator.capture.sensor import Transitions, record
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
-from simulator.networks.denoiser import SIZES, Denoiser
 from simulator.networks.exposure_module import ExposureModule
-from simulator.networks.full_run import FullRun, Stages
 from simulator.networks.network_cache import NetworkCache, Where
-from simulator.networks.noise_module import NoiseModule, Preset, smoothed, variance_map
-from simulator.noise.generator import Noise, check_noise
-from simulator.raw.highlights import neutral_highlights
+from simulator.networks.noise_module import (
+    SIZES,
+    Denoiser,
+    NoiseModule,
+    Preset,
+    smoothed,
+    variance_map,
+)
+from simulator.noise.generator import Noise, check_noise, sweep_keys
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage
 from simulator.settings import CameraSettings
-from simulator.utils.processor import check_bfloat16
+from simulator.utils.checks import check_word
+from simulator.utils.compute import check_bfloat16
 from simulator.utils.tiles import in_tiles, varying
 
 #: Depth of a scene: it is far or in focus throughout, or it is not known.
@@ -47,10 +56,31 @@ _TIMED = 128
 _DISC_REACH = 16
 
 
-def check_depth(depth: str) -> None:
-    """Raises a `ValueError` unless `depth` says what is known of the scene's."""
-    if depth not in get_args(Depth):
-        raise ValueError(f"`depth` (={depth!r}) must be one of {list(get_args(Depth))}")
+class SceneArguments(TypedDict, total=False):
+    """What may be said of the scene of a source; see `CameraSimulator.prepare`."""
+
+    image_speed: float | None
+    defocus: float | None
+    depth: Depth
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """Every intermediate result of the full pipeline (paper, figure 2), each (4, H, W).
+
+    Args:
+        exposed: After the exposure module (EXP).
+        denoised: After the noise module (NS).
+        opened: After the aperture module (Full).
+        light: With the blur of a known disc and of motion, before the output's noise.
+        capture: With the output settings' noise, clipped and quantised.
+    """
+
+    exposed: torch.Tensor
+    denoised: torch.Tensor
+    opened: torch.Tensor
+    light: torch.Tensor
+    capture: torch.Tensor
 
 
 def prepared_of(source: Source, device: torch.device) -> PreparedScene:
@@ -94,8 +124,8 @@ def _recorded(raw: RawImage, device: torch.device) -> PreparedScene:
 def _for_the_map(prepared: PreparedScene) -> torch.Tensor | None:
     """The light with little noise that defocus is estimated on; None if there is none.
 
-    The smallest network will do, whatever the tolerance: with it, the blur of 24 validation scenes
-    at ISO 6400 erred by 2 % more than with the largest, at ISO 100 by nothing.
+    The smallest network is enough, whatever the tolerance: with it, the error of the blur of 24
+    validation scenes was 2 % larger than with the largest at ISO 6400, and the same at ISO 100.
     """
     return prepared.denoised[0].light if prepared.denoised else None
 
@@ -138,8 +168,7 @@ class CameraSimulator:
             raise ValueError(f"`device` (={device!r}) is not a torch device: {error}") from None
         if self.device.type == "cuda" and not torch.cuda.is_available():
             raise ValueError(f"`device` (={str(device)!r}) must be 'cpu': there is no CUDA here")
-        if precision not in ("float32", "bfloat16"):
-            raise ValueError(f"`precision` (={precision!r}) must be 'float32' or 'bfloat16'")
+        check_word("precision", precision, ("float32", "bfloat16"))
         if precision == "bfloat16":
             check_bfloat16(self.device)
         self.precision = precision
@@ -238,7 +267,7 @@ class CameraSimulator:
                 "`tolerance` (=None) must be a number here: what is prepared is shared between "
                 "transitions; ask `simulate` for the full run of one"
             )
-        check_depth(depth)
+        check_word("depth", depth, get_args(Depth))
         if depth == "unknown" and self.aperture is None:
             raise ValueError(
                 "`depth` (='unknown') needs an aperture module: use CameraSimulator.from_pretrained"
@@ -267,7 +296,7 @@ class CameraSimulator:
     def _seen(
         self, source: Source, image_speed: float | None, defocus: float | None
     ) -> PreparedScene:
-        """The source's light, with its motion and blur where they are given."""
+        """The source's light, with its motion and blur unless they are None."""
         prepared = prepared_of(source, self.device)
         if image_speed is not None:
             prepared = replace(prepared, image_speed=image_speed)
@@ -414,10 +443,8 @@ class CameraSimulator:
         settings: CameraSettings,
         *,
         noise: bool = True,
-        image_speed: float | None = None,
-        defocus: float | None = None,
-        depth: Depth = "far",
         tolerance: float | Literal["source"] = "source",
+        **scene: Unpack[SceneArguments],
     ) -> SimulationPlan:
         """Which steps the change to `settings` takes, why others are left out, error and cost.
 
@@ -425,15 +452,10 @@ class CameraSimulator:
             source: A raw, a prepared scene, or a scene.
             settings: Target settings.
             noise: False plans the light on the sensor alone (`PreparedScene.expected`).
-            image_speed: See `prepare`.
-            defocus: See `prepare`.
-            depth: See `prepare`.
             tolerance: See `prepare`.
+            scene: `image_speed`, `defocus` and `depth`, see `prepare`.
         """
-        prepared = self.prepare(
-            source, image_speed=image_speed, defocus=defocus, depth=depth, tolerance=tolerance
-        )
-        return prepared.plan(settings, noise=noise)
+        return self.prepare(source, tolerance=tolerance, **scene).plan(settings, noise=noise)
 
     def stages(
         self,
@@ -441,9 +463,7 @@ class CameraSimulator:
         settings: CameraSettings,
         *,
         seed: int = 0,
-        image_speed: float | None = None,
-        defocus: float | None = None,
-        depth: Depth = "unknown",
+        **scene: Unpack[SceneArguments],
     ) -> Stages:
         """Runs the whole pipeline on one source, every module for this very transition.
 
@@ -455,24 +475,59 @@ class CameraSimulator:
             settings: Target settings. The aperture module only opens: a smaller aperture than the
                 source's leaves its blur.
             seed: Seed of the output's noise.
-            image_speed: See `prepare`.
-            defocus: See `prepare`.
-            depth: See `prepare`; unknown to a prepared scene that was prepared as such.
+            scene: `image_speed`, `defocus` and `depth`, see `prepare`; by default the depth is
+                unknown.
 
         Raises:
             ValueError: If this simulator has no networks, or an argument is out of range.
         """
         if self.noise is None or self.aperture is None:
             raise ValueError("there are no modules to run: use CameraSimulator.from_pretrained")
-        check_depth(depth)
-        prepared = self._seen(source, image_speed, defocus)
+        depth = scene.get("depth", "unknown")
+        check_word("depth", depth, get_args(Depth))
+        prepared = self._seen(source, scene.get("image_speed"), scene.get("defocus"))
         opens = depth == "unknown" or prepared.aperture_blur is not None
         # A prepared scene may be corrected already; a scene is no recording of this body.
         exposure = self.exposure
         if not isinstance(source, RawImage):
             exposure = ExposureModule().requires_grad_(False).to(self.device)
-        aperture, half = self.aperture if opens else None, self.precision == "bfloat16"
-        return FullRun(exposure, self.noise, aperture, half).run(prepared, settings, seed=seed)
+        return self._full_run(prepared, settings, exposure, opens, seed)
+
+    @torch.no_grad()
+    def _full_run(
+        self,
+        prepared: PreparedScene,
+        settings: CameraSettings,
+        module: ExposureModule,
+        opens: bool,
+        seed: int,
+    ) -> Stages:
+        """The paper's pipeline; `opens` says whether the aperture module runs."""
+        assert self.noise is not None
+        assert self.aperture is not None
+        keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
+        # What networks found out about the scene is not used.
+        bare = replace(prepared, denoised=(), aperture_blur=None, tolerance=0.0)
+        exposure = bare.exposure(settings)
+        exposed = module(prepared.light[None], exposure.ratio)
+        if not self.noise.commutes:
+            exposed = exposed.clamp(0.0, 1.0)
+        nlf = prepared.nlf.exposed(float(module.w) * exposure.ratio)
+        shot, read = (torch.tensor([v]).to(exposed) for v in (nlf.shot, nlf.read))
+        with self._autocast():
+            denoised = opened = self.noise(exposed, shot, read)
+            if opens:
+                deviation = variance_map(smoothed(exposed), shot, read).sqrt()
+                f_numbers = (
+                    torch.tensor([s.effective_f_number], device=exposed.device)
+                    for s in (prepared.reference, settings)
+                )
+                opened = self.aperture(denoised, deviation, *f_numbers)
+        at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
+        light = scene_light(opened[0], at_target)
+        capture = torch.empty_like(light)[None]
+        record(Transitions.of([light], [at_target]), prepared.camera, keys=keys, signals=capture)
+        return Stages(exposed[0], denoised[0], opened[0], light, capture[0])
 
     def simulate(
         self,
@@ -481,10 +536,8 @@ class CameraSimulator:
         *,
         seed: int = 0,
         noise: Noise = "exact",
-        image_speed: float | None = None,
-        defocus: float | None = None,
-        depth: Depth = "far",
         tolerance: float | Literal["source"] | None = "source",
+        **scene: Unpack[SceneArguments],
     ) -> RawImage:
         """The raw that the camera would have recorded at `settings`.
 
@@ -494,11 +547,9 @@ class CameraSimulator:
             seed: Seed of the noise, >= 0; the same seed gives the same frame.
             noise: ``"exact"`` draws it, ``"bank"`` looks it up, faster, ``"sensor"`` draws it with
                 row noise and tails (see `PreparedScene.capture`); the full run knows ``"exact"``.
-            image_speed: See `prepare`.
-            defocus: See `prepare`.
-            depth: See `prepare`.
             tolerance: See `prepare`; None runs every module for this very transition (`stages`),
                 and shares and leaves out nothing.
+            scene: `image_speed`, `defocus` and `depth`, see `prepare`.
 
         Returns:
             A raw with the camera's noise at `settings`; ``metadata["excess_noise"]`` and
@@ -508,21 +559,15 @@ class CameraSimulator:
         if tolerance is None and self.noise is not None:
             if noise == "sensor":
                 raise ValueError("`noise` (='sensor') needs a `tolerance`: not in the full run")
-            stages = self.stages(
-                source, settings, seed=seed, image_speed=image_speed, defocus=defocus, depth=depth
-            )
+            scene.setdefault("depth", "far")
+            stages = self.stages(source, settings, seed=seed, **scene)
             data, excess_noise = stages.capture, 0.0
             prepared = prepared_of(source, self.device)
             clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=(), aperture_blur=None)
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
-            prepared = self.prepare(
-                source,
-                image_speed=image_speed,
-                defocus=defocus,
-                depth=depth,
-                tolerance=0.0 if tolerance is None else tolerance,
-            )
+            exact = 0.0 if tolerance is None else tolerance
+            prepared = self.prepare(source, tolerance=exact, **scene)
             data, excess_noise = prepared.capture(settings, seed, noise=noise)
             output_noise = prepared.output_noise(settings)
         metadata = dict(source.metadata) if isinstance(source, RawImage) else {}

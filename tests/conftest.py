@@ -66,7 +66,7 @@ def forkserver() -> Any:
         pytest.skip("needs POSIX processes")
     context = multiprocessing.get_context("forkserver")
     used = ("agents.cli.main", "agents.learning.ppo", "agents.learning.training", "torch._dynamo")
-    context.set_forkserver_preload([*used, "ae_env.vector_env", "agents.evaluation.plan_run"])
+    context.set_forkserver_preload([*used, "ae_env.vector_env", "agents.evaluation.jobs"])
     multiprocessing.forkserver.ensure_running()
     return context
 

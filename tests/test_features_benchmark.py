@@ -8,10 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
-from ae_env.scenes.pictures import detail_split
 from benchmarks.features import judging, pairs, training
 from benchmarks.features.detector import CELL, Detector, Features, mutual_matches, sample
 from benchmarks.features.judging import SIZE, area_under, measures
+from simulator.training.scenes import detail_split
 
 cv2 = pytest.importorskip("cv2")
 
@@ -176,7 +176,7 @@ def test_train_judge_report(ae_env, here: Path) -> None:
     }
     page = (here / "results" / "features.md").read_text()
     assert "| **ours, in full** |" in page
-    with Image.open(here / "results" / "features.png") as picture:
+    with Image.open(here / "results" / "features.webp") as picture:
         assert picture.width > 300
     # Weights of a training are kept: the next one finds them.
     model, seconds = training.train("full", 0, 2, 4)

@@ -9,8 +9,7 @@ from typing import Any, overload
 
 from ae_env.scenes.scene import Scene
 from ae_env.scenes.stored import rounded, store_scenes
-from simulator.utils.progress import Progress
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import parallel_ranges, progress_bar
 
 logger = logging.getLogger(__name__)
 #: So many at once are said to be drawn; fewer take no time to speak of.
@@ -93,15 +92,15 @@ class DrawnScenes(Sequence[Scene]):
         many = len(missing) >= _MANY
         if many:
             logger.warning("drawing %s, once for this camera and resolution", self._name)
-        with Progress("drawing scenes", len(missing) if many else 0) as progress:
+        with progress_bar("drawing scenes", len(missing) if many else 0) as advance:
 
             def draw_some(first: int, last: int) -> None:
                 for number in missing[first:last]:
                     scenes = [rounded(scene) for scene in self._sources[number].make()]
                     self._drawn.setdefault(number, scenes)
-                    progress.advance()
+                    advance()
 
-            in_shares(draw_some, len(missing))
+            parallel_ranges(draw_some, len(missing))
         if len(self._drawn) == len(self._sources) and not self._stored:
             self._stored = True
             store_scenes(self._key, list(self))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from ae_env.scenes.reference_scenes import depth_photographs
 from ae_env.scenes.scene import Scene
 from simulator.camera import CameraProfile
 from simulator.capture.layout import Layout
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.reference_camera import ReferenceScene
-from simulator.reference.sampling import lens_blur, sample_mosaic
+from simulator.reference.camera import ReferenceScene, lens_blur, sample_mosaic
+from simulator.training.scenes import depth_photographs
 from simulator.utils.files import data_folder
 
 #: Largest circle of confusion of a subject, relative to the largest of the scene.

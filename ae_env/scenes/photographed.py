@@ -16,7 +16,7 @@ from ae_env.scenes.scene import Scene
 from simulator.noise.generator import noise_generator
 from simulator.radiance.light import mean_anchor
 from simulator.raw.image import RawImage
-from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.camera import ReferenceCamera
 from simulator.settings import CameraSettings
 from simulator.utils.checks import check_number
 

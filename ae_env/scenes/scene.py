@@ -21,7 +21,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.residual import Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
-from simulator.raw.highlights import neutral_highlights
+from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
 from simulator.settings import CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
@@ -58,7 +58,7 @@ class Scene:
         box_factor: Sensor pixels averaged per side into one pixel of `light`.
         source: Provenance and licence in one line.
         saturated: (H, W) bool, pixels whose light is a guess because the source raw was saturated
-            there (`simulator.raw.highlights`); None if there are none.
+            there (`simulator.raw.develop`); None if there are none.
         denoised: (4, H, W) `light` with its noise removed by a noise module; None where there is
             no noise, or no such module.
         residual: What the network that made `denoised` gets wrong; None where that is not known.
@@ -317,7 +317,7 @@ class Scene:
     ) -> Scene:
         """A scene from a raw photograph: its light, its noise, its saturated pixels.
 
-        Saturated pixels are neutral (`simulator.raw.highlights`), so that they stay so when they
+        Saturated pixels are neutral (`simulator.raw.develop`), so that they stay so when they
         are darkened.
 
         Args:

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from ae_env.scenes.scene import Scene
-from ae_env.scorers.pixel_blur import PixelBlur, layout_blur, stacked
-from ae_env.scorers.protocol import Captures
+from ae_env.scorers.protocol import Captures, PixelBlur, layout_blur, stacked
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.optics.motion_path import ALONG_ROWS, Movement

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from ae_env.observation import PEDESTAL
-from simulator.utils.jit import as_pointer, kernel
+from simulator.utils.compute import as_pointer, kernel
 
 #: Expectations are tabulated at this many values between two codes.
 FINE = 8

@@ -34,8 +34,7 @@ from simulator.camera import CameraProfile
 from simulator.capture.sensor import Transitions, record
 from simulator.settings import CameraSettings
 from simulator.utils.cache import LruCache
-from simulator.utils.jit import addresses
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import addresses, parallel_ranges
 
 #: Memory for tabulated expectations [byte].
 _BYTES = 2**25
@@ -136,7 +135,7 @@ class CodeScores:
         means = np.empty((len(codes), 3))
         least = max(1, _WORTH_A_THREAD // flat[0].size)
         fixed = (flat, shares, which, self._dark, means)
-        in_shares(lambda a, b: measure_codes(a, b, *fixed), len(codes), least=least)
+        parallel_ranges(lambda a, b: measure_codes(a, b, *fixed), len(codes), least=least)
         return means
 
     def expected(
@@ -183,7 +182,7 @@ class CodeScores:
         )
         means = np.empty((len(table), 3))
         least = max(1, _WORTH_A_THREAD // (4 * height * width))
-        in_shares(lambda a, b: expect_means(a, b, *fixed, means), len(table), least=least)
+        parallel_ranges(lambda a, b: expect_means(a, b, *fixed, means), len(table), least=least)
         return means
 
     def _tabulated(self, key: bytes, missing: np.ndarray, shares: np.ndarray) -> np.ndarray:

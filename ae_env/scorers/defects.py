@@ -16,8 +16,7 @@ import torch
 from torch.nn.functional import avg_pool2d, pad
 
 from ae_env.scorers.composite import CompositeScorer
-from ae_env.scorers.detail import immerkaer_sigma
-from ae_env.scorers.luma import by_parts, luma_of, luminance_of, srgb_decode
+from ae_env.scorers.measures import by_parts, immerkaer_sigma, luma_of, luminance_of, srgb_decode
 from ae_env.scorers.protocol import Captures, Domain
 
 # -- signs: one number of the picture for each defect ---------------------------------------------

@@ -1,21 +1,16 @@
-"""Scorers by OpenCV: BRISQUE, ORB keypoints, and the matches of keypoints for tracking."""
+"""Scorers by OpenCV: ORB keypoints, and the matches of keypoints for tracking."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from ae_env.scorers.fidelity import distinct_references, reference_pictures
-from ae_env.scorers.luma import luma_of
+from ae_env.scorers.measures import luma_of
 from ae_env.scorers.protocol import Captures, DependsOn, Domain
-from ae_env.utils.model_files import find_model_file
 
 
 def opencv() -> Any:
@@ -24,7 +19,7 @@ def opencv() -> Any:
         import cv2
     except ImportError:
         raise ImportError(
-            "the scorers keypoints, matches and brisque need OpenCV: pip install 'ae-env[cv]'"
+            "the scorers keypoints and matches need OpenCV: pip install 'ae-env[cv]'"
         ) from None
     return cv2
 
@@ -33,8 +28,6 @@ def luma_bytes(images: torch.Tensor) -> np.ndarray:
     """Luma (B, H, W) uint8 of sRGB pictures (B, 3, H, W) in [0, 1]."""
     return luma_of(images).clamp(0.0, 1.0).mul(255.0).round().to("cpu", torch.uint8).numpy()
 
-
-# -- keypoints ------------------------------------------------------------------------------------
 
 #: Keypoints that ORB returns at most, per 1000 pixels inside its border.
 MOST_PER_1000 = 60.0
@@ -140,99 +133,3 @@ class Matches:
             )
             scores.append(inliers / len(known))
         return torch.tensor(scores, dtype=torch.float64)
-
-
-# -- BRISQUE --------------------------------------------------------------------------------------
-
-#: Environment variable that names the model file.
-BRISQUE_VARIABLE = "AE_ENV_BRISQUE"
-MODEL, RANGE = "brisque_model_live.yml", "brisque_range_live.yml"
-#: Numbers that describe a picture.
-FEATURES = 36
-#: Value of the worst picture, and of one without statistics.
-WORST = 100.0
-#: Smaller pictures have no statistics [pixel].
-_LEAST_SIDE = 8
-
-
-class Brisque:
-    """Naturalness by BRISQUE: 1 - value / 100, the value in [0, 100], 0 for a pristine picture.
-
-    Mittal, Moorthy and Bovik, No-Reference Image Quality Assessment in the Spatial Domain, IEEE
-    Transactions on Image Processing 21(12), 2012, computed by OpenCV (`cv2.quality`) from the luma.
-    A constant picture is 100. Its two files come with opencv_contrib
-    (``modules/quality/samples``), not with this package.
-
-    Args:
-        file: ``brisque_model_live.yml``; ``brisque_range_live.yml`` must lie beside it.
-
-    Raises:
-        ImportError: If OpenCV with its contributed modules is not installed.
-        ValueError: If a file is not there or is not OpenCV's.
-    """
-
-    domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
-    needs = f"extra cv; model: {BRISQUE_VARIABLE}"
-    version = 1
-
-    def __init__(self, file: str | os.PathLike[str] | None = None) -> None:
-        cv2 = opencv()
-        if not (hasattr(cv2, "quality") and hasattr(cv2, "ml")):
-            raise ImportError(
-                "the scorer brisque needs OpenCV's contributed modules: pip uninstall "
-                "opencv-python-headless, then pip install 'ae-env[cv]'"
-            )
-        how = f"{MODEL} and, beside it, {RANGE} are in opencv_contrib's modules/quality/samples"
-        model = find_model_file("brisque", file, BRISQUE_VARIABLE, (MODEL,), how=how).resolve()
-        ranges = model.with_name(model.name.replace("model", "range"))
-        if ranges == model or not ranges.is_file():
-            raise ValueError(f"scorer 'brisque' needs {RANGE} beside {str(model)!r}; {how}")
-        self.model, self.range = str(model), str(ranges)
-        self.content = f"{_digest(model)} {_digest(ranges)}"
-        _brisque_model(self.model, self.range, self.content)
-
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
-        machine, low, high = _brisque_model(self.model, self.range, self.content)
-        values = np.full(len(images), WORST)
-        if min(images.shape[2:]) >= _LEAST_SIDE:
-            compute = opencv().quality.QualityBRISQUE_computeFeatures
-            features = np.concatenate([compute(picture) for picture in luma_bytes(images)])
-            # A constant picture has no statistics, which OpenCV's own `compute` rates as pristine.
-            known = np.isfinite(features).all(axis=1)
-            scaled = -1.0 + 2.0 / (high - low) * (features[known] - low)
-            if known.any():
-                values[known] = machine.predict(scaled.astype(np.float32))[1][:, 0]
-        return torch.from_numpy(1.0 - np.clip(values / WORST, 0.0, 1.0))
-
-
-@lru_cache(maxsize=2)
-def _brisque_model(model: str, ranges: str, content: str) -> tuple[Any, np.ndarray, np.ndarray]:
-    """OpenCV's support vector machine, and the ranges (1, 36) of its training's features.
-
-    `content` is part of the cache's key: the files are read once per content.
-    """
-    cv2 = opencv()
-    level = cv2.utils.logging.setLogLevel(0)  # the errors below say it all
-    try:
-        machine = cv2.ml.SVM_load(model)
-        storage = cv2.FileStorage(ranges, cv2.FILE_STORAGE_READ)
-        bounds = storage.getNode("range").mat()
-    except (cv2.error, SystemError) as error:
-        raise ValueError(f"`file` (={model!r}) must be OpenCV's BRISQUE model: {error}") from error
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    if machine.getVarCount() != FEATURES or bounds is None or bounds.shape != (2, FEATURES):
-        raise ValueError(
-            f"`file` (={model!r}) and {Path(ranges).name} must be OpenCV's BRISQUE model, of "
-            f"{FEATURES} numbers"
-        )
-    if not bool((bounds[1] > bounds[0]).all()):  # False for NaN, too
-        raise ValueError(f"{ranges!r} must hold ranges: a least and a larger largest value each")
-    return machine, bounds[:1], bounds[1:]
-
-
-def _digest(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]

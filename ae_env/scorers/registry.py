@@ -4,14 +4,12 @@
 |---|---|
 | `composite.py` | `balanced`, weighted means |
 | `terms.py` | `brightness`, `highlights`, `shadows`, `noise`, `sharpness`, `banding` |
-| `exposure_measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy` |
-| `detail.py` | `shim`, `zhang`, `shin`, `snr`, `blind_noise` |
+| `measures.py` | `mid_grey`, `clipping`, `dynamic_range`, `well_exposedness`, `entropy`; `shim`, |
+| | `zhang`, `shin`, `snr`, `blind_noise` |
 | `defects.py` | `defects`, `analytic_*` |
 | `fidelity.py` | `fidelity` |
-| `nima.py`, `niqe.py` | `nima_aesthetic`, `nima_technical`; `niqe` |
-| `classifier.py` | `classifier` |
-| `opencv.py` | `brisque`, `keypoints`, `matches` |
-| `registry.py` | ``pyiqa:METRIC`` |
+| `learnt.py` | `nima_aesthetic`, `nima_technical`, `classifier`, ``pyiqa:METRIC`` |
+| `opencv.py` | `keypoints`, `matches` |
 """
 
 from __future__ import annotations
@@ -19,16 +17,12 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-import torch
-
-from ae_env.scorers.classifier import Classifier
 from ae_env.scorers.composite import Balanced, CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
@@ -39,19 +33,22 @@ from ae_env.scorers.defects import (
     AnalyticWhiteBalance,
     Defects,
 )
-from ae_env.scorers.detail import BlindNoise, Shim, Shin, SignalToNoise, Zhang
-from ae_env.scorers.exposure_measures import (
+from ae_env.scorers.fidelity import Fidelity
+from ae_env.scorers.learnt import Classifier, NimaAesthetic, NimaTechnical, PyiqaMetric
+from ae_env.scorers.measures import (
+    BlindNoise,
     Clipping,
     DynamicRange,
     Entropy,
     MidGrey,
+    Shim,
+    Shin,
+    SignalToNoise,
     WellExposedness,
+    Zhang,
 )
-from ae_env.scorers.fidelity import Fidelity
-from ae_env.scorers.nima import NimaAesthetic, NimaTechnical
-from ae_env.scorers.niqe import Niqe
-from ae_env.scorers.opencv import Brisque, Keypoints, Matches
-from ae_env.scorers.protocol import Captures, DependsOn, Domain, Scorer
+from ae_env.scorers.opencv import Keypoints, Matches
+from ae_env.scorers.protocol import Scorer
 from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
 from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
@@ -69,13 +66,11 @@ _REGISTRY: dict[str, Callable[[], Any]] = {
     "noise": Noise,
     "sharpness": Sharpness,
     "banding": Banding,
-    "brisque": Brisque,
     "classifier": Classifier,
     "keypoints": Keypoints,
     "matches": Matches,
     "nima_aesthetic": NimaAesthetic,
     "nima_technical": NimaTechnical,
-    "niqe": Niqe,
     "mid_grey": MidGrey,
     "clipping": Clipping,
     "dynamic_range": DynamicRange,
@@ -269,72 +264,6 @@ def _nested(scorer: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str
     if isinstance(parts, Mapping):
         for name, part in parts.items():
             yield from _nested(part, (*path, name))
-
-
-# -- metrics of the package pyiqa, named ``pyiqa:musiq`` ------------------------------------------
-# It has a non-commercial licence and is large, so it is no dependency of this package and imported
-# only where one of its metrics is asked for.
-
-_NUMBER = re.compile(r"[-+]?(?:inf|\d+\.?\d*(?:e[-+]?\d+)?)", re.IGNORECASE)
-
-
-class PyiqaMetric:
-    """A no-reference metric of pyiqa, its stated range mapped to [0, 1], higher better.
-
-    Score = (value - low) / (high - low), clipped, or 1 minus that where lower is better. The range
-    is the metric's own ``score_range``, which pyiqa calls a rough estimate.
-
-    Args:
-        metric: Its name, as ``pyiqa.create_metric`` takes it.
-
-    Raises:
-        ImportError: If pyiqa is not installed.
-        ValueError: If pyiqa has no such metric, it needs a reference picture, or it states no
-            finite range.
-    """
-
-    domain: Domain = "srgb"
-    depends_on: DependsOn = "image"
-    needs = "pip install pyiqa"
-
-    def __init__(self, metric: str) -> None:
-        rule = f"`scorer` (='pyiqa:{metric}')"
-        try:
-            import pyiqa
-        except ImportError as error:
-            raise ImportError(
-                f"{rule} needs pyiqa, which is non-commercial and no extra of this package: "
-                f"pip install pyiqa ({error})"
-            ) from error
-        try:
-            self._metric: Any = pyiqa.create_metric(metric, device=torch.device("cpu"))
-        except Exception as error:
-            what = f"{type(error).__name__}: {error}"
-            raise ValueError(f"{rule} cannot be made by pyiqa.create_metric: {what}") from error
-        if getattr(self._metric, "metric_mode", "NR") != "NR":
-            raise ValueError(f"{rule} must be a metric that needs no reference picture")
-        self.metric = metric
-        self.low, self.high = _range(getattr(self._metric, "score_range", None), rule)
-        self.lower_better = bool(getattr(self._metric, "lower_better", False))
-
-    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
-        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
-        assert images is not None
-        with torch.no_grad():
-            values = torch.as_tensor(self._metric(images)).double().reshape(len(images))
-        share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
-        return 1.0 - share if self.lower_better else share
-
-
-def _range(stated: Any, rule: str) -> tuple[float, float]:
-    """Two finite numbers from such as ``"~0, ~100"``."""
-    numbers = [float(n) for n in _NUMBER.findall(str(stated))]
-    if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or numbers[0] >= numbers[1]:
-        raise ValueError(
-            f"{rule} states the score range {stated!r}, which must be two finite numbers to be "
-            "mapped to [0, 1]: wrap the metric in a scorer of your own"
-        )
-    return numbers[0], numbers[1]
 
 
 # -- the rows of ``ae-env scorers`` ---------------------------------------------------------------

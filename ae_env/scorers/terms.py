@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from ae_env.observation import decode_observation, encode_observation
-from ae_env.scorers.pixel_blur import PixelBlur
-from ae_env.scorers.protocol import Captures, DependsOn, Domain
+from ae_env.scorers.protocol import Captures, DependsOn, Domain, PixelBlur
 
 
 class Brightness:

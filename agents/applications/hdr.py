@@ -64,7 +64,7 @@ def hdr_picture(
     """Simulates a bracket of `raw`, each picture with little noise, and fuses it.
 
     Saturated parts of the raw are taken as neutral highlights, brighter than white where every
-    plane is clipped (`simulator.raw.highlights`): halos would surround them if they stayed white
+    plane is clipped (`simulator.raw.develop`): halos would surround them if they stayed white
     in the darkest pictures.
 
     Args:

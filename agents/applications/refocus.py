@@ -17,10 +17,10 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from ae_env.scenes.reference_scenes import fill_from_nearest
 from agents.applications.hdr import import_openexr
 from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage, defocus
 from simulator.optics.thin_lens import SHARP
+from simulator.training.scenes import fill_from_nearest
 from simulator.utils.checks import check_word
 
 #: The numbers of a depth map: distances, or inverse distances.

@@ -87,7 +87,7 @@ def record(
     import gymnasium as gym
 
     from ae_env.utils.presets import load_preset
-    from agents.evaluation.running import fit_policies
+    from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
     from agents.recording import check_dataset_id, record_dataset
@@ -232,7 +232,7 @@ def warm_up() -> None:
 
     Example: `ae-env warm-up`
     """
-    logging.getLogger("simulator.utils.jit").setLevel(logging.ERROR)  # it proposes this command
+    logging.getLogger("simulator.utils.compute").setLevel(logging.ERROR)  # it proposes this command
     with progress_bars() as progress, progress("warming up") as task:
         for done, (name, arguments) in enumerate(_CASES):
             task(done, len(_CASES) + 1, ", ".join([name, *map(str, arguments.values())]))

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,16 +25,12 @@ from agents.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from agents.evaluation.bracket_plan import BracketPlan
-    from agents.evaluation.evaluation_plan import EvaluationPlan
     from agents.evaluation.intervals import Rank
+    from agents.evaluation.plan import EvaluationPlan
     from agents.evaluation.result import EvaluationResult
 
 logger = logging.getLogger(__name__)
-Plan = TypeVar("Plan", "EvaluationPlan", "BracketPlan")
 
-#: Source groups in one table on the terminal.
-_GROUPS_ABREAST = 4
 #: Options that are arguments of the environment, and those of the condition; the only one that a
 #: benchmark takes; and those that an evaluation of brackets takes.
 _ENVIRONMENT = ("scenes", "split", "grid", "observation", "sensors", "resolution", "scorer")
@@ -134,8 +130,6 @@ def evaluate(
         raise ValueError(
             f"`on-error` (={on_error!r}) is about the files of --scenes: give that, too"
         )
-    from agents.evaluation.bracket_plan import BracketPlan
-
     device = torch_device(device)
     plan = _plan(preset, env, list(policy or ()), given)
     if append is not None and plan.hash is None:
@@ -149,10 +143,7 @@ def evaluate(
         if not append.parent.is_dir():
             raise ValueError(f"`append` (={str(append)!r}): there is no folder {append.parent}")
         make_folder(append.parent, name="append", file=append)
-    if isinstance(plan, BracketPlan):
-        _run_brackets(plan, out, append, author)
-    else:
-        _run(plan, out, append, author, workers, device)
+    _run(plan, out, append, author, workers, device)
 
 
 def _run(
@@ -163,15 +154,15 @@ def _run(
     workers: int | None,
     device: str,
 ) -> None:
-    from agents.evaluation.evaluation_plan import plan_scenes
-    from agents.evaluation.plan_run import StoredRun
-    from agents.report.ae_bench import append_rows, check_append, check_hash, result_rows
-    from agents.report.evaluation_report import write_report
-    from agents.report.result_table import overall_ranking
+    from agents.evaluation.jobs import Jobs
+    from agents.evaluation.plan import plan_scenes
+    from agents.evaluation.result import overall_ranking
+    from agents.report.ae_bench import append_rows, bench_rows, check_append, check_hash
+    from agents.report.evaluation import write_report
 
     scenes = plan_scenes(plan)
     check_hash(plan, scenes)
-    with StoredRun(plan, out / "parts", scenes, device=device) as run:
+    with Jobs(plan, out / "parts", scenes, device=device) as run:
         ranked = run.ranked_policies  # raises before any work where a policy is unknown
         if append is not None and plan.policies:
             check_append(append, plan, ranked, author=author)
@@ -185,54 +176,20 @@ def _run(
     files = write_report(results, out, command=command_line())
     ranking = overall_ranking(results)
     if append is not None:
-        rows = result_rows(plan, results, ranking)
-        files |= append_rows(append, plan, rows, author=author)
-    _print_ranking(ranking, results, plan.static_condition)
-    print_files(files)
-
-
-def _run_brackets(plan: BracketPlan, out: Path, append: Path | None, author: str) -> None:
-    from agents.evaluation.bracket_plan import check_bracket_policies, run_bracket_plan
-    from agents.evaluation.evaluation_plan import plan_scenes
-    from agents.report.ae_bench import append_rows, bracket_rows, check_append, check_hash
-    from agents.report.bracket_report import rows_by_budget, write_bracket_report
-
-    scenes = plan_scenes(plan.of_conditions())
-    check_hash(plan, scenes)
-    if append is not None and plan.policies:
-        check_append(append, plan, plan.policies, author=author)
-    check_bracket_policies(plan, scenes)
-    make_folder(out)
-    with progress_bars() as progress, progress("evaluation") as task:
-        results = run_bracket_plan(plan, scenes, progress=task)
-        task(1, 1)
-    files = write_bracket_report(plan, results, out, command=command_line())
-    if append is not None:
-        files |= append_rows(append, plan, bracket_rows(results), author=author)
-    head, body = rows_by_budget(plan, results)
-    _print_table("quality of the merged picture, by time of all frames", head, body)
+        files |= append_rows(append, plan, bench_rows(results, ranking), author=author)
+    print_scores(results, ranking)
     print_files(files)
 
 
 def _plan(
     preset: str | None, env: str | None, policies: list[str], given: Mapping[str, Any]
-) -> EvaluationPlan | BracketPlan:
+) -> EvaluationPlan:
     """The plan that the options describe."""
-    from agents.evaluation.bracket_plan import BracketPlan, load_bench_plan
-    from agents.evaluation.evaluation_plan import EvaluationPlan
+    from agents.evaluation.plan import EvaluationPlan, load_plan
 
-    base = None if preset is None else load_bench_plan(preset)
-    changed = [*given, *(["env"] if env is not None else [])]
-    allowed: tuple[str, ...] = tuple(changed)
-    if base is not None and base.hash is not None:
-        allowed, what = _OF_BENCHMARKS, "is a fixed benchmark"
-    elif isinstance(base, BracketPlan):
-        allowed, what = _OF_BRACKETS, "is of ExposureBracket-v0"
-    refused = [f"--{name}" for name in changed if name not in allowed]
-    if base is not None and refused:
-        raise ValueError(f"`preset` (={base.name!r}) {what}: it does not take {', '.join(refused)}")
-    if isinstance(base, BracketPlan):
-        return _bracket_plan(base, policies, given)
+    base = None if preset is None else load_plan(preset)
+    if base is not None:
+        _check_changes(base, [*given, *(["env"] if env is not None else [])])
     environment: dict[str, Any] = {} if base is None else dict(base.environment)
     condition: dict[str, Any] = {}
     if env is not None:
@@ -264,6 +221,19 @@ def _plan(
     return _changed(base, entries)
 
 
+def _check_changes(base: EvaluationPlan, changed: list[str]) -> None:
+    """Raises a `ValueError` if a preset does not take one of the options `changed`."""
+    if base.hash is not None:
+        allowed, what = _OF_BENCHMARKS, "is a fixed benchmark"
+    elif base.budgets:
+        allowed, what = _OF_BRACKETS, "is of ExposureBracket-v0"
+    else:
+        return
+    refused = [f"--{name}" for name in changed if name not in allowed]
+    if refused:
+        raise ValueError(f"`preset` (={base.name!r}) {what}: it does not take {', '.join(refused)}")
+
+
 @contextmanager
 def _errors_of(env: str) -> Iterator[None]:
     """Errors about an argument name the file that it is in."""
@@ -271,17 +241,6 @@ def _errors_of(env: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"`env` (={env!r}): {error}") from error
-
-
-def _bracket_plan(base: BracketPlan, policies: list[str], given: Mapping[str, Any]) -> BracketPlan:
-    environment = dict(base.environment) | {k: given[k] for k in _ENVIRONMENT if k in given}
-    entries: dict[str, Any] = {"environment": environment}
-    entries |= {"seeds": _seeds(base.seeds, given)}
-    if policies:
-        entries["policies"] = list(dict.fromkeys(policies))
-    if "scenes" in given or "split" in given:
-        entries["scene_ids"] = []  # those are of the preset's own scenes
-    return _changed(base, entries)
 
 
 def _seeds(known: Sequence[int], given: Mapping[str, Any]) -> list[int]:
@@ -312,12 +271,12 @@ def _plain(
 
 def _one_condition(entries: Mapping[str, Any]) -> dict[str, Any]:
     """A condition by the kind of its light."""
-    from agents.evaluation.evaluation_plan import light_name
+    from agents.evaluation.plan import light_name
 
     return {light_name(entries.get("lighting", "static")): entries}
 
 
-def _changed(plan: Plan, entries: Mapping[str, Any]) -> Plan:
+def _changed(plan: EvaluationPlan, entries: Mapping[str, Any]) -> EvaluationPlan:
     """`plan` with other entries; an error about them has one line."""
     from pydantic import ValidationError
 
@@ -334,56 +293,14 @@ def _changed(plan: Plan, entries: Mapping[str, Any]) -> Plan:
 # -- results on the terminal ----------------------------------------------------------------------
 
 
-def print_scores(result: EvaluationResult) -> None:
-    """Prints the scores of one condition, and every source group's where there are few."""
-    from agents.report.result_table import result_rows
-
-    rows = result_rows(result, resamples=2000)
-    parts = result.conditions
-    by_policy: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        by_policy.setdefault(row["policy"], {})[row["condition"]] = row
-    body = []
-    for policy, own in by_policy.items():
-        scores = [f"{own[part]['normalised_score']:.3f}" for part in parts]
-        body.append([policy, *scores, _interval(own["all"]["ci95"])])
-    title = "normalised score: 0 is random, 1 the best state of every frame"
-    _print_table(title, ["policy", *parts, "95 % interval (all)"], body)
-    _print_groups(result, rows[0]["num_groups"])
-
-
-def _print_ranking(
-    ranking: list[Rank], results: Mapping[str, EvaluationResult], static: str
+def print_scores(
+    results: EvaluationResult | Mapping[str, EvaluationResult], ranking: list[Rank] | None = None
 ) -> None:
-    if len(results) == 1:
-        print_scores(results[static])
-        return
-    body = []
-    for one in ranking:
-        gains, span = results[static].group_gains(one.policy)
-        tier, score = "-" if one.tier is None else str(one.tier), f"{one.score.value:.3f}"
-        in_static = f"{gains.mean(axis=0).sum() / span.sum():.3f}"
-        body.append([tier, one.policy, score, _interval(one.score.pair), in_static])
-    title = f"normalised score over {len(results)} conditions, and in {static!r}"
-    _print_table(title, ["tier", "policy", "all conditions", "95 % interval", static], body)
-    _print_groups(results[static], ranking[0].score.num_groups if ranking else 0)
+    """Prints the scores of an evaluation, and every source group's where there are few."""
+    from agents.report.evaluation import summary
 
-
-def _print_groups(result: EvaluationResult, groups: int) -> None:
-    from agents.evaluation.intervals import MIN_GROUPS
-    from agents.report.result_table import group_values
-
-    if groups >= MIN_GROUPS:
-        return
-    head, body = group_values(result)
-    for first in range(0, len(body), _GROUPS_ABREAST):
-        names, *rows = zip(head, *body[first : first + _GROUPS_ABREAST], strict=True)
-        title = "mean score of every source group"
-        _print_table(title, ["policy", *names[1:]], [list(row) for row in rows])
-
-
-def _interval(pair: list[float] | None) -> str:
-    return "too few groups" if pair is None else f"{pair[0]:.3f} to {pair[1]:.3f}"
+    for title, frame in summary(results, ranking):
+        _print_table(title, list(frame.columns), frame.to_numpy().tolist())
 
 
 def _print_table(title: str, head: list[str], body: list[list[str]]) -> None:

@@ -24,7 +24,7 @@ from agents.cli.console import print_line
 from agents.cli.data import cache, record, scenes, score_tables, warm_up
 from agents.cli.evaluate import evaluate
 from agents.cli.quickstart import quickstart
-from agents.cli.show import convert_nima, film, scorers, view
+from agents.cli.show import film, scorers, view
 from agents.cli.simulate import hdr, refocus, simulate, sweep
 from agents.cli.train import export, train, train_simulator
 
@@ -36,7 +36,7 @@ app = typer.Typer(
     epilog="Exit status: 2 for a mistake in an option or a file, 1 for a failure while running.",
 )
 for command in (
-    *(quickstart, simulate, sweep, train_simulator, scorers, convert_nima, train, evaluate),
+    *(quickstart, simulate, sweep, train_simulator, scorers, train, evaluate),
     *(view, refocus, hdr, film, record, export, score_tables, cache, warm_up),
 ):
     app.command()(command)

@@ -120,10 +120,9 @@ def run_quickstart(
         device: Torch device of the agents' networks.
         on_error: See `ae_env.scenes.folder.FolderOptions`.
     """
-    from agents.evaluation.engine import evaluate
-    from agents.evaluation.evaluation_plan import MAX_SEED
-    from agents.evaluation.running import fit_policies
-    from agents.report.evaluation_report import write_report
+    from agents.evaluation.engine import evaluate, fit_policies
+    from agents.evaluation.plan import MAX_SEED
+    from agents.report.evaluation import write_report
     from agents.rollouts import make_envs, training_arguments
     from simulator.utils.checks import check_integer
 

@@ -1,4 +1,4 @@
-"""What there is to look at: ``ae-env view``, ``film``, ``scorers`` (and ``convert-nima``)."""
+"""What there is to look at: ``ae-env view``, ``film``, ``scorers``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from agents.cli.console import (
     Weights,
     check_outputs,
     console,
-    make_folder,
     print_files,
     print_line,
     progress_bars,
@@ -109,10 +108,10 @@ def film(
 
     import ae_env  # noqa: F401  (registers the environment)
     from ae_env.lighting.moving import KIND_SETS, MOVES
-    from agents.evaluation.running import fit_policies
+    from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
-    from agents.report.film import film as write
+    from agents.report.plots import film as write
     from simulator.utils.checks import check_word
 
     check_outputs(out=(out, ".gif"))
@@ -175,40 +174,3 @@ def scorers() -> None:
         table.add_row(Text(row.name), row.domain, row.depends_on, what)
     console.print(table)
     print_line("and by name: my_file.py:MyScore, package.module:MyScore, pyiqa:METRIC")
-
-
-def convert_nima(
-    file: Annotated[Path, typer.Argument(help="The published Keras weights, .h5 or .hdf5.")],
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="The .safetensors; by default in the cache folder."),
-    ] = None,
-) -> None:
-    """Convert NIMA's published Keras weights for the scorers nima_aesthetic and nima_technical.
-
-    Example: `ae-env convert-nima weights_mobilenet_aesthetic_0.07.hdf5`
-
-    Needs h5py: `pip install 'ae-env[nima]'`.
-    """
-    from ae_env.scorers.nima import PUBLISHED, convert_nima, published_as
-    from simulator.utils.cache import cache_dir
-    from simulator.utils.files import as_path
-
-    if not as_path(file).is_file():
-        raise ValueError(f"`file` (={str(file)!r}) must be the file of Keras weights")
-    kind = published_as(file.read_bytes())
-    if out is None and kind is None:
-        raise ValueError(
-            f"`file` (={str(file)!r}) is not one of the published files (git blob ids "
-            f"{', '.join(PUBLISHED.values())}): say what it becomes with --out, such as "
-            "--out nima_aesthetic.safetensors"
-        )
-    target = cache_dir() / f"{kind}.safetensors" if out is None else out
-    make_folder(target.parent, file=target)
-    convert_nima(file, target)
-    text = f"the published weights of {kind}" if kind else "not one of the published files"
-    print_line(f"{file.name}: {text}")
-    print_files({"weights": target})
-    name = kind or "nima_aesthetic"
-    if out is not None:
-        print_line(f"next: export AE_ENV_{name.upper()}={target.resolve()}")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,12 +24,6 @@ from agents.cli.console import (
 
 if TYPE_CHECKING:
     from agents.learning.training import AgentConfig
-    from simulator.reference.reference_camera import ReferenceScene
-    from simulator.training.config import SimulatorConfig
-    from simulator.training.crops import DetailPicture
-
-#: Procedural scenes that a training validates on.
-_VALIDATION_SCENES = 24
 
 
 def train(
@@ -48,8 +40,7 @@ def train(
     Example: `ae-env train configs/ppo.yaml --out runs/ppo`
     """
     from ae_env.utils.presets import find_config
-    from agents.learning.learning_curve import load_curve
-    from agents.learning.training import load_config, train_agent
+    from agents.learning.training import load_config, load_curve, train_agent
     from agents.report.plots import plot_learning
     from simulator.utils.files import sibling
 
@@ -106,8 +97,7 @@ def train_simulator(
     """
     from ae_env.utils.presets import find_config
     from simulator.networks.weights import build_modules
-    from simulator.training.config import load_config
-    from simulator.training.train import load_start, train_and_save
+    from simulator.training.train import load_config, load_start, train_and_save
 
     training = load_config(find_config(config))
     if seed is not None:
@@ -128,8 +118,6 @@ def train_simulator(
 
             weights = train_and_save(
                 training,
-                reference_scenes_of,
-                detail_pictures_of,
                 folder / training.preset,
                 command=command_line(),
                 device=device,
@@ -140,42 +128,6 @@ def train_simulator(
     if training.preset in ("compact", "paper"):
         command = shlex.join(["ae-env", "simulate", "RAW", "--weights", str(weights)])
         print_line(f"next: {command} ...")
-
-
-def reference_scenes_of(config: SimulatorConfig, split: str) -> Sequence[ReferenceScene]:
-    """The scenes of a split that a training's configuration names."""
-    from ae_env.scenes.reference_scenes import draped_scenes, mosaic_scenes, reference_scenes
-    from simulator import get_camera
-    from simulator.utils.files import DATA_VARIABLE, data_folder
-
-    radiance, folder = config.scenes.radiance or "", data_folder()
-    if folder is not None:
-        radiance = radiance.replace(f"${DATA_VARIABLE}", str(folder))
-    radiance = os.path.expandvars(radiance)
-    if config.scenes.radiance and ("$" in radiance or not radiance):  # unset, or empty
-        console.print(f"{config.scenes.radiance} is not set: training without radiance maps")
-        radiance = ""
-    data = Path(radiance) if radiance else None
-    camera = get_camera(config.camera)
-    scenes = reference_scenes(
-        split,  # type: ignore[arg-type]
-        camera,
-        number=config.scenes.procedural if split == "train" else _VALIDATION_SCENES,
-        size=config.scenes.size,
-        data=data,
-        seed=config.seed,
-    )
-    if data is not None:
-        scenes += mosaic_scenes(split, camera, data, size=config.scenes.size)  # type: ignore[arg-type]
-    return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
-
-
-def detail_pictures_of(config: SimulatorConfig, split: str) -> Sequence[DetailPicture]:
-    """The pictures of a split that the noise stage is trained on."""
-    from ae_env.scenes.pictures import detail_pictures
-    from simulator.utils.files import data_folder
-
-    return detail_pictures(split, data=data_folder(), seed=config.seed)  # type: ignore[arg-type]
 
 
 def export(

@@ -1,57 +1,66 @@
 """The evaluation engine: score tables once per light, every policy on the same episodes.
 
-An evaluation is a plan with one or many conditions. `evaluate` runs a plan of one condition on
-policies that the caller has made; `agents.evaluation.plan_run` makes the policies by their names,
-keeps every finished part in a file, and shares the work between processes.
+`evaluate` runs policies that the caller has made; `agents.evaluation.jobs` makes the policies of a
+plan by their names, stores every finished part, and shares the work between processes.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import astuple, dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.scorers import make_scorer
-from ae_env.scorers.score_table import TIE
-from agents.evaluation.evaluation_plan import (
+from ae_env.scorers.score_table import TIE, ScoreTables
+from agents.bracketing.policies import run_brackets
+from agents.evaluation.plan import (
     CONDITION_ARGUMENTS,
     MAX_SEED,
+    SEED_STRIDE,
     Condition,
     EvaluationPlan,
+    groups_in_turn,
     light_name,
     plan_episodes,
     plan_scenes,
 )
-from agents.evaluation.other_scorers import other_scores
-from agents.evaluation.result import EvaluationResult, Track
-from agents.evaluation.running import (
-    TIMED_FRAMES,
-    Progress,
-    VectorEnv,
-    check_captures,
-    fit_policies,
-    milliseconds_alone,
-    run_batch,
-    training_envs,
-)
+from agents.evaluation.result import BRACKET_METRICS, EvaluationResult, Track
+from agents.metering.reading import linear_signal, signal_codes
 from agents.policy import Policy, PolicyContext
 from agents.policy_names import make_policy, training_seeds
-from agents.rollouts import RolloutPlan, action_masks, expected_scores, fitting_arguments, make_envs
-from simulator.utils.checks import check_integer
+from agents.rollouts import (
+    EpisodeBatch,
+    RolloutPlan,
+    action_masks,
+    checked_states,
+    errors_of,
+    expected_scores,
+    fitting_arguments,
+    make_envs,
+)
+from simulator.utils.checks import check_integer, check_number
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
 
+VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 Ints = NDArray[np.int64]
 Arrays = dict[str, NDArray[Any]]
+#: Called with work done, work in all, and what is being done.
+Progress = Callable[[int, int, str], None]
+#: Called with frames done since the last call.
+Report = Callable[[float], None]
 
-#: Arrays of a `Track`.
-TRACK_ARRAYS = ("states", "image_mean", "code_mean", "clipped_high", "clipped_low")
-#: Episodes at a time, at most.
-BATCH = 64
+#: Episodes at a time, at most; of brackets.
+BATCH, BRACKET_BATCH = 64, 32
+#: Frames in which the time of one camera's decision is measured, the first ones to warm up.
+TIMED_FRAMES, _WARM_UP = 28, 4
 #: The scorer of the environments that policies see: it costs next to nothing, and is not used.
 _CHEAP = "sharpness"
 
@@ -94,25 +103,25 @@ def evaluate(
     check_integer("frames", frames, 1)
     check_integer("batch", batch, 1)
     check_integer("seed", seed, 0, MAX_SEED + 1 - episodes_per_scene)
-    members = [
-        (Member(name, name, k), policy)
+    trained = [
+        (TrainedPolicy(name, name, k), policy)
         for name, entry in policies.items()
         for k, policy in enumerate(entry if isinstance(entry, Sequence) else [entry])
     ]
-    if not members:
+    if not trained:
         raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
-    for member, policy in members:
-        check_captures(member.name, policy)
+    for one, policy in trained:
+        check_captures(one.name, policy)
     for name in other_scorers:
         make_scorer(name)  # raises before any work
     plan = _plan_of(env_options, frames, range(seed, seed + episodes_per_scene))
     plan = plan.model_copy(update={"other_scorers": tuple(other_scorers)})
     run = EvaluationRun(plan, batch=batch)
-    (condition,) = run.plan.all_conditions.values()
-    total = run.plan.frames * (run.num_tables + len(members) * len(run.episodes))
+    (condition,) = plan.all_conditions.values()
+    total = frames * (run.num_tables + len(trained) * len(run.episodes))
     done = 0.0
 
-    def reporter(name: str) -> Callable[[float], None]:
+    def reporter(name: str) -> Report:
         def report(count: float) -> None:
             nonlocal done
             done += count
@@ -122,14 +131,13 @@ def evaluate(
         return report
 
     with run:
-        light = run.judge(condition, reporter("score tables"))
-        tracks: dict[Member, Track] = {}
-        start_states = np.zeros(0, np.int64)
-        for member, policy in members:
-            follow = run.follow(member.name, policy, condition, light, reporter(member.name))
-            start_states, tracks[member] = follow
-    result = run.result(condition, light, start_states, tracks)
-    return replace(result, other_scores=other_scores(result, plan))
+        light = run.score_light(condition, reporter("score tables"))
+        tracks = {
+            one: run.run_policy(one.name, policy, condition, light, reporter(one.name))
+            for one, policy in trained
+        }
+    result = run.result(condition, light, tracks)
+    return replace(result, other_scores=other_scores(result))
 
 
 def _plan_of(env_options: Mapping[str, Any], frames: int, seeds: Sequence[int]) -> EvaluationPlan:
@@ -152,7 +160,7 @@ def _plan_of(env_options: Mapping[str, Any], frames: int, seeds: Sequence[int]) 
 
 
 @dataclass(frozen=True)
-class Member:
+class TrainedPolicy:
     """One policy of a plan, or one training seed of an agent.
 
     Args:
@@ -173,7 +181,7 @@ class EvaluationRun:
         plan: The plan.
         scenes: Those of the plan; loaded by default.
         device: Torch device of a learnt agent's network.
-        batch: Episodes at a time, at most.
+        batch: Episodes of frames at a time, at most.
     """
 
     def __init__(
@@ -194,14 +202,17 @@ class EvaluationRun:
 
     @property
     def num_tables(self) -> int:
-        """Number of episodes that differ in more than their start."""
-        return len(self.episodes) // len(self.plan.starts)
+        """Number of episodes that differ in more than their start; 0 where none are scored."""
+        return 0 if self.plan.budgets else len(self.episodes) // len(self.plan.starts)
 
     @property
-    def members(self) -> list[Member]:
+    def trained(self) -> list[TrainedPolicy]:
         """Every training seed of every policy of the plan."""
-        names = self.plan.policies
-        return [Member(p, name, k) for p in names for k, name in enumerate(training_seeds(p))]
+        return [
+            TrainedPolicy(policy, name, k)
+            for policy in self.plan.policies
+            for k, name in enumerate(training_seeds(policy))
+        ]
 
     def __enter__(self) -> Self:
         return self
@@ -218,30 +229,45 @@ class EvaluationRun:
         self._envs.clear()
 
     def _make_envs(
-        self, condition: Condition, num_envs: int, frames: int, *, judged: bool = False
+        self, condition: Condition, num_envs: int, frames: int, *, scored: bool = False
     ) -> VectorEnv:
-        """Environments of a condition, which stay open until those of another are asked for.
+        """Environments of a condition, which stay open until those of another are needed.
 
         Args:
-            condition: Light and delay.
+            condition: Light and delay, or budget.
             num_envs: Episodes at a time.
             frames: Actions that an episode must allow.
-            judged: Whether they have the plan's scorer: policies see environments without.
+            scored: Whether they have the plan's scorer: policies see environments without.
         """
         if condition != self._open_for:
             self._close()
             self._open_for = condition
-        key = num_envs, frames, judged
-        if key not in self._envs:
-            unused = ("costs",) if judged else ("costs", "reward")
-            options = {k: v for k, v in self.plan.arguments(condition).items() if k not in unused}
-            options |= {"delay": 0} if judged else {"scorer": _CHEAP}
-            if not self.plan.options().in_sequences:  # those must know that they are sequences
-                options["scenes"] = self.scenes
-            self._envs[key] = make_envs(options, num_envs=num_envs, frames=frames)
+        key = num_envs, frames, scored
+        if key in self._envs:
+            return self._envs[key]
+        if condition.budget is not None:
+            options = {**self.plan.environment, "scenes": self.scenes, "split": "all"}
+            self._envs[key] = self._make_bracket_envs(condition, options)
+            return self._envs[key]
+        unused = ("costs",) if scored else ("costs", "reward")
+        options = {k: v for k, v in self.plan.arguments(condition).items() if k not in unused}
+        options |= {"delay": 0} if scored else {"scorer": _CHEAP}
+        if not self.plan.options().in_sequences:  # those must know that they are sequences
+            options["scenes"] = self.scenes
+        self._envs[key] = make_envs(options, num_envs=num_envs, frames=frames)
         return self._envs[key]
 
-    def judge(self, condition: Condition, report: Callable[[float], None]) -> Arrays:
+    def _make_bracket_envs(self, condition: Condition, options: Mapping[str, Any]) -> VectorEnv:
+        return gym.make_vec(
+            self.plan.env_id,
+            num_envs=BRACKET_BATCH,
+            autoreset_mode="DISABLED",
+            budget=condition.budget,
+            max_frames=self.plan.max_frames,
+            **options,
+        )
+
+    def score_light(self, condition: Condition, report: Report) -> Arrays:
         """q of every state in every frame of the light of `condition`, whatever the start.
 
         Returns:
@@ -250,7 +276,7 @@ class EvaluationRun:
         """
         count, frames, own = self.num_tables, self.plan.frames, self.episodes
         episodes = RolloutPlan(self.scenes, own.seeds[:count], own.scene[:count], [0] * count)
-        envs = self._make_envs(condition, batch_size(count, self.batch), frames, judged=True)
+        envs = self._make_envs(condition, batch_size(count, self.batch), frames, scored=True)
         base: Any = envs.unwrapped
         scores, allowed, drawn = [], [], []
         for batch in episodes.batches(envs):
@@ -271,45 +297,54 @@ class EvaluationRun:
             "movement": np.array([astuple(episode.movement) for episode in drawn]),
         }
 
-    def make(self, member: Member, condition: Condition) -> Policy:
-        """The policy of `member`, for the camera of `condition`; not fitted."""
+    def make(self, trained: TrainedPolicy, condition: Condition) -> Policy:
+        """The policy `trained`, for the camera of `condition`; not fitted."""
         context = PolicyContext.from_envs(self._make_envs(condition, 1, TIMED_FRAMES))
-        policy = make_policy(member.name, context, device=self.device)
-        check_captures(member.name, policy)
+        policy = make_policy(trained.name, context, device=self.device)
+        check_captures(trained.name, policy)
         return policy
 
-    def fitted(self, member: Member, condition: Condition) -> Policy:
-        """The policy of `member`, fitted on training scenes in static light."""
-        policy = self.make(member, condition)
+    def fitted(self, trained: TrainedPolicy, condition: Condition) -> Policy:
+        """The policy `trained`, fitted on training scenes: in static light, or to the budget."""
+        policy = self.make(trained, condition)
         if getattr(type(policy), "fit", Policy.fit) is Policy.fit:
+            return policy
+        own, seed = {trained.name: policy}, self.plan.seeds[0]
+        if condition.budget is not None:
+            options = {**self.plan.environment, "split": "train"}
+            with closing(self._make_bracket_envs(condition, options)) as envs:
+                fit_policies(own, options, seed=seed, training=envs)
             return policy
         base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
         base = fitting_arguments(base, self.plan.options().resolution)
         if self._training is None:
             self._training = training_envs(base)
-        fit_policies({member.name: policy}, base, seed=self.plan.seeds[0], training=self._training)
+        fit_policies(own, base, seed=seed, training=self._training)
         return policy
 
-    def follow(
+    def run_policy(
         self,
         name: str,
         policy: Policy,
         condition: Condition,
         light: Arrays | None,
-        report: Callable[[float], None],
-    ) -> tuple[Ints, Track]:
+        report: Report,
+    ) -> Track:
         """Runs `policy` through all episodes of `condition`.
 
         Args:
             name: The policy's name in errors.
             policy: The policy, fitted.
-            condition: Light and delay.
-            light: What `judge` returns; only a privileged policy needs it.
+            condition: Light and delay, or budget.
+            light: What `score_light` returns; only a privileged policy needs it.
             report: Called with the frames done since the last call.
 
         Returns:
-            The state of each episode's reset frame, ``(E,)``; and the track.
+            The track, which has the state of each episode's reset frame too, ``start_states``
+            ``(1, E)``.
         """
+        if condition.budget is not None:
+            return self._run_brackets(name, policy, condition, report)
         oracle: Ints | None = None
         if getattr(policy, "privileged", False):
             if light is None:
@@ -328,53 +363,261 @@ class EvaluationRun:
             single = self._make_envs(condition, 1, TIMED_FRAMES)
             best = None if oracle is None else oracle[:1]
             alone = milliseconds_alone(name, policy, single, first, best)
-        arrays = {k: np.concatenate([part[k] for part in parts])[None] for k in TRACK_ARRAYS}
-        seconds = sum(float(part["seconds"].sum()) for part in parts)
-        track = Track(
-            **arrays,
+        seconds = sum(float(part.pop("seconds").sum()) for part in parts)
+        return Track(
+            {key: np.concatenate([part[key] for part in parts])[None] for key in parts[0]},
             ms_per_decision=1000.0 * seconds / (frames * len(episodes)),
             captures_per_decision=float(getattr(policy, "captures_per_decision", 1.0)),
             privileged=oracle is not None,
             ms_alone=alone,
         )
-        return np.concatenate([part["start_states"] for part in parts]), track
+
+    def _run_brackets(
+        self, name: str, policy: Policy, condition: Condition, report: Report
+    ) -> Track:
+        envs = self._make_envs(condition, BRACKET_BATCH, self.plan.max_frames)
+        runs = []
+        for seed in self.plan.seeds:
+            runs.append(run_brackets(policy, envs, seed=seed * SEED_STRIDE, name=name))
+            report(float(len(self.scenes) * self.plan.frames))
+        arrays = {key: np.concatenate([run[key] for run in runs])[None] for key in BRACKET_METRICS}
+        return Track(
+            arrays | {"start_states": np.zeros(arrays["frames"].shape, np.int64)},
+            ms_per_decision=1000.0 * float(arrays["seconds"].mean()),
+            captures_per_decision=1.0,
+            privileged=False,
+        )
 
     def result(
-        self,
-        condition: Condition,
-        light: Arrays,
-        start_states: Ints,
-        tracks: Mapping[Member, Track],
+        self, condition: Condition, light: Arrays, tracks: Mapping[TrainedPolicy, Track]
     ) -> EvaluationResult:
-        """Everything measured in `condition`, from what `judge` and `follow` return."""
+        """Everything measured in `condition`.
+
+        Args:
+            condition: Light and delay, or budget.
+            light: What `score_light` returns; empty for brackets.
+            tracks: What `run_policy` returns.
+        """
         scenes = [self.scenes[i] for i in self.episodes.scene]
-        table = np.arange(len(scenes)) % self.num_tables
-        policies = dict.fromkeys(member.policy for member in tracks)
+        table = np.arange(len(scenes)) % max(self.num_tables, 1)
+        of_policy: dict[str, list[Track]] = {}
+        for trained, track in tracks.items():
+            of_policy.setdefault(trained.policy, []).append(track)
         return EvaluationResult(
             grid=self.grid,
             scene_ids=np.array([s.scene_id for s in scenes]),
             groups=np.array([s.group for s in scenes]),
             kinds=np.array([s.kind for s in scenes]),
             hard=np.array([bool(s.hard) for s in scenes]),
-            start_states=start_states,
-            scores=light["scores"][table, 1:],
-            allowed=light["allowed"][table, 1:],
-            tracks={
-                name: Track.of_seeds([t for m, t in tracks.items() if m.policy == name])
-                for name in policies
-            },
+            start_states=next(iter(tracks.values())).arrays["start_states"][0],
+            scores=light["scores"][table, 1:] if light else np.zeros((len(scenes), 0, 0)),
+            allowed=light["allowed"][table, 1:] if light else np.zeros((len(scenes), 0, 0), bool),
+            tracks={name: Track.of_seeds(own) for name, own in of_policy.items()},
             seed=self.plan.seeds[0],
             delays=self.plan.options(condition).delays,
             plan=self.plan,
             scenes=scenes,
-            speed=light["speed"][table],
-            defocus=light["defocus"][table],
-            movement=light["movement"][table],
+            **{key: light[key][table] for key in ("speed", "defocus", "movement") if light},
         )
 
 
+# -- one policy ----------------------------------------------------------------------------------
+
+
+def fit_policies(
+    policies: Mapping[str, Policy],
+    env_options: Mapping[str, Any],
+    *,
+    seed: int = 0,
+    batch: int = 64,
+    progress: Progress | None = None,
+    training: VectorEnv | None = None,
+) -> None:
+    """Call `fit` of every policy that has one, on the training split.
+
+    Args:
+        policies: By name; changed in place.
+        env_options: Arguments of the environment; `split` is set to ``"train"``.
+        seed: Decides the training episodes.
+        batch: Episodes at a time.
+        progress: Called before and after each fit.
+        training: Environments to use, see `training_envs`, which stay open; by default new ones.
+    """
+    learners = {n: p for n, p in policies.items() if getattr(type(p), "fit", None)}
+    learners = {n: p for n, p in learners.items() if type(p).fit is not Policy.fit}
+    if not learners:
+        return
+    envs = training_envs(env_options, batch) if training is None else training
+    try:
+        for i, (name, policy) in enumerate(learners.items()):
+            if progress is not None:
+                progress(i, len(learners), name)
+            with errors_of(name, "fit"):
+                policy.fit(envs, seed)
+        if progress is not None:
+            progress(len(learners), len(learners), "")
+    finally:
+        if training is None:
+            envs.close()
+
+
+def training_envs(env_options: Mapping[str, Any], batch: int = 64) -> VectorEnv:
+    """Environments to fit policies on; fits that follow each other share their score tables.
+
+    Args:
+        env_options: As of `fit_policies`.
+        batch: As of `fit_policies`.
+    """
+    return make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
+
+
+def run_batch(
+    name: str,
+    policy: Policy,
+    envs: VectorEnv,
+    batch: EpisodeBatch,
+    frames: int,
+    *,
+    oracle: Ints | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Run one policy over one batch of episodes.
+
+    Args:
+        name: The policy's name in errors.
+        policy: The policy.
+        envs: Freshly reset to `batch`.
+        batch: The episodes.
+        frames: Actions.
+        oracle: (N, frames + 1) best state of every frame, the reset frame first, which a privileged
+            policy's ``info`` gets.
+
+    Returns:
+        The arrays of a `Track` without their leading axis, of the valid episodes, and their
+        ``start_states`` (n,); ``seconds`` (frames,) that `act` took for the batch.
+
+    Raises:
+        UserCodeError: If the policy raises, or returns something else than allowed states.
+    """
+    base: Any = envs.unwrapped
+    with errors_of(name, "reset"):
+        policy.reset(envs.num_envs, seed=batch.seed)
+    observations, info, masks = batch.observations, batch.info, batch.action_masks
+    start = np.array(info["state"], dtype=np.int64)
+    seen: dict[str, list[NDArray[Any]]] = {}
+    seconds = []
+    for frame in range(frames):
+        extra: dict[str, Any] = {}
+        if getattr(policy, "privileged", False):
+            known = {} if oracle is None else _oracle_info(base, oracle, frame)
+            extra = {"info": {**info, **known}}
+        begin = time.perf_counter()
+        with errors_of(name, "act"):
+            actions = policy.act(observations, masks, **extra)
+        seconds.append(time.perf_counter() - begin)
+        observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
+        masks = action_masks(envs)  # the next frame of a sequence is another scene
+        shown = {
+            "states": np.array(info["state"], dtype=np.int64),  # with a delay, an older choice
+            "image_mean": linear_signal(observations["raw"], base.camera).mean(axis=(1, 2, 3)),
+            "code_mean": signal_codes(observations["raw"], base.camera).mean(
+                axis=(1, 2, 3), dtype=np.float64
+            )
+            / 255.0,
+            "clipped_high": np.array(info["clipped_high"], dtype=np.float64),
+            "clipped_low": np.array(info["clipped_low"], dtype=np.float64),
+        }
+        for key, value in shown.items():
+            seen.setdefault(key, []).append(value)
+    return {
+        **{key: np.stack(values, axis=1)[batch.valid] for key, values in seen.items()},
+        "start_states": start[batch.valid],
+        "seconds": np.array(seconds),
+    }
+
+
+def _oracle_info(base: Any, oracle: Ints, frame: int) -> dict[str, Ints]:
+    """Entries of `info` for oracles: best states of `frame`, and of the one they decide on."""
+    last = oracle.shape[1] - 1
+    decided = (oracle[:, min(frame + 1 + delay, last)] for delay in base.delays)
+    return {"oracle_state": oracle[:, frame], "clairvoyant_state": base.grid.mixed(*decided)}
+
+
+def milliseconds_alone(
+    name: str,
+    policy: Policy,
+    envs: VectorEnv,
+    episodes: RolloutPlan,
+    oracle: Ints | None = None,
+) -> float:
+    """Median time in `act` for one camera alone [ms].
+
+    Args:
+        name: The policy's name in errors.
+        policy: The policy.
+        envs: One environment, of `TIMED_FRAMES` or more.
+        episodes: The episode.
+        oracle: (1, T) best state of every frame, for a privileged policy; the last one stays.
+    """
+    if oracle is not None:
+        last = np.repeat(oracle[:, -1:], TIMED_FRAMES, axis=1)
+        oracle = np.concatenate([oracle, last], axis=1)
+    batch = next(episodes.batches(envs))
+    found = run_batch(name, policy, envs, batch, TIMED_FRAMES, oracle=oracle)
+    return 1000.0 * float(np.median(found["seconds"][_WARM_UP:]))
+
+
+def check_captures(name: str, policy: Policy) -> float:
+    """`captures_per_decision` of a policy.
+
+    Raises:
+        ValueError: Unless it is a number.
+    """
+    captures = getattr(policy, "captures_per_decision", 1.0)
+    return check_number(f"captures_per_decision` of policy `{name}", captures, 0.0, 1e9)
+
+
+def other_scores(result: EvaluationResult) -> dict[str, dict[str, float]]:
+    """Mean expected score of the states that each policy chose, by scorer and policy.
+
+    Of some scenes of the first seed, all starts and frames; averaged over frames, then training
+    seeds, episodes of a source group, and source groups.
+
+    Args:
+        result: The results in unchanging light, with their plan, which names the scorers.
+    """
+    plan = result.plan
+    assert plan is not None
+    pairs = len(result.scene_ids) // len(plan.starts)  # of scenes and seeds
+    count = pairs // len(plan.seeds)
+    scenes = list(result.scenes[:count])  # scenes change fastest, the first seed comes first
+    chosen = groups_in_turn(scenes, plan.other_scorer_scenes)
+    options = plan.options()
+    found: dict[str, dict[str, float]] = {}
+    for name in plan.other_scorers:
+        tables = ScoreTables(
+            options.make_grid(),
+            options.make_camera(),
+            make_scorer(name),
+            noise=bool(options.noise),
+            tolerance=options.tolerance,
+        )
+        means: dict[str, dict[str, list[float]]] = {policy: {} for policy in result.tracks}
+        for scene in chosen:
+            j = scenes.index(scene)
+            episodes = np.flatnonzero(np.arange(len(result.scene_ids)) % pairs == j)
+            scores = tables.table(scene, **result.moves(j)).mean
+            for policy, track in result.tracks.items():
+                mean = float(scores[track.states[:, episodes]].mean())
+                means[policy].setdefault(scene.group, []).append(mean)
+        found[name] = {
+            policy: float(np.mean([np.mean(values) for values in groups.values()]))
+            for policy, groups in means.items()
+        }
+    return found
+
+
 def best_states(scores: NDArray[np.float64], allowed: NDArray[np.bool_]) -> Ints:
-    """The oracle's states: the best allowed one, ties to the lower ISO, ````(...)````.
+    """The oracle's states: the best allowed one, ties to the lower ISO, ``(...)``.
 
     >>> int(best_states(np.array([0.5, 0.9, 0.9]), np.array([True, False, True])))
     2

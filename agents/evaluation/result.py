@@ -1,4 +1,4 @@
-"""Everything that an evaluation measured in one condition, per episode and frame."""
+"""Everything that an evaluation measured in one condition, and the rows of its tables."""
 
 from __future__ import annotations
 
@@ -11,58 +11,93 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.evaluation import metrics
+from agents.evaluation.intervals import (
+    RESAMPLES,
+    Rank,
+    difference_interval,
+    rank,
+    score_interval,
+)
+from agents.policy_names import is_metering
 from simulator.optics.motion_path import Movement
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from ae_env.grid import ExposureGrid
     from ae_env.scenes import Scene
-    from agents.evaluation.evaluation_plan import EvaluationPlan
+    from agents.evaluation.plan import EvaluationPlan
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+#: By condition.
+Results = Mapping[str, "EvaluationResult"]
 
+#: Parts of the static condition.
 CONDITIONS = ("all", "hard", "rest")
+#: Columns of `results.json`, in its order, and those that `metrics.csv` has besides.
+ROW_COLUMNS = (
+    *("policy", "condition", "source", "split", "num_groups", "seed", "mean_score"),
+    *("normalised_score", "regret", "ci95", "ev_error_median", "ev_error_p95"),
+    *("ev_within_third", "frames_to_converge", "overshoot", "reversals", "flicker", "jump"),
+    *("clipped_high", "clipped_low", "captures_per_decision", "ms_per_decision"),
+)
+MORE_COLUMNS = ("regret_given_ev", "regret_delayed", "converged", "ms_alone", "training_seeds")
+SCENE_COLUMNS = (
+    *("policy", "scene_id", "group", "kind", "hard", "episodes", "score", "oracle", "random"),
+    *("regret", "regret_delayed", "regret_given_ev", "ev_error_median", "ev_error_p95"),
+    *("ev_within_third", "frames_to_converge", "converged", "overshoot", "reversals", "flicker"),
+    *("jump", "frames_to_settle", "clipped_high", "clipped_low", "final_state", "oracle_state"),
+)
+#: What an episode of a bracket is measured by.
+BRACKET_METRICS = ("quality", "log_error", "unseen", "frames", "seconds")
+#: Metrics of a row that are means over episodes of a source group, then over source groups.
+_MEANS = (
+    *("regret", "frames_to_converge", "overshoot", "reversals", "flicker", "jump"),
+    *("clipped_high", "clipped_low", "regret_given_ev", "regret_delayed", "converged"),
+)
 
 
 @dataclass(frozen=True)
 class Track:
-    """The states that one policy chose, and the frames that they gave.
+    """What one policy did in all episodes.
 
     Leading axis K: training seeds (1 where there is nothing to train).
 
     Args:
-        states: States of the frames after each action, ``(K, E, T)``; with a delay those that
-            were chosen earlier.
-        image_mean: Mean linear signal of each frame after an action, ``(K, E, T)``.
-        code_mean: Mean of the companded frame, in [0, 1], ``(K, E, T)``.
-        clipped_high: Share of saturated pixels, ``(K, E, T)``.
-        clipped_low: Share of black pixels, ``(K, E, T)``.
+        arrays: By name. Of frames, ``(K, E, T)``: ``states`` of the frames after each action (with
+            a delay those that were chosen earlier); ``image_mean``, their mean linear signal;
+            ``code_mean``, the mean of the companded frame in [0, 1]; ``clipped_high`` and
+            ``clipped_low``, shares of saturated and of black pixels. Of brackets, ``(K, E)``:
+            `BRACKET_METRICS`.
         ms_per_decision: Time in `act` per camera and frame [ms], in batches.
         captures_per_decision: Frames taken for one decision.
         privileged: Whether the policy was told the best states.
         ms_alone: Time in `act` for one camera alone [ms]; None where it was not measured.
     """
 
-    states: Ints
-    image_mean: Floats
-    code_mean: Floats
-    clipped_high: Floats
-    clipped_low: Floats
+    arrays: Mapping[str, NDArray[Any]]
     ms_per_decision: float
     captures_per_decision: float
     privileged: bool
     ms_alone: float | None = None
+
+    @property
+    def states(self) -> Ints:
+        """States of the frames after each action, ``(K, E, T)``."""
+        return self.arrays["states"]
+
+    @property
+    def num_seeds(self) -> int:
+        """Number of training seeds, K."""
+        return len(next(iter(self.arrays.values())))
 
     @classmethod
     def of_seeds(cls, tracks: Sequence[Track]) -> Track:
         """The tracks of several training seeds as one."""
         alone = [track.ms_alone for track in tracks if track.ms_alone is not None]
         return cls(
-            states=np.concatenate([t.states for t in tracks]),
-            image_mean=np.concatenate([t.image_mean for t in tracks]),
-            code_mean=np.concatenate([t.code_mean for t in tracks]),
-            clipped_high=np.concatenate([t.clipped_high for t in tracks]),
-            clipped_low=np.concatenate([t.clipped_low for t in tracks]),
+            {name: np.concatenate([t.arrays[name] for t in tracks]) for name in tracks[0].arrays},
             ms_per_decision=float(np.mean([t.ms_per_decision for t in tracks])),
             captures_per_decision=tracks[0].captures_per_decision,
             privileged=tracks[0].privileged,
@@ -80,7 +115,7 @@ class EvaluationResult:
         groups: Source group of each episode.
         kinds: Kind of scene of each episode.
         hard: Whether the episode's scene is in the hard part.
-        start_states: State of the reset frame.
+        start_states: State of the reset frame; empty for brackets, as `scores` and `allowed`.
         scores: q of every state, ``(E, T, S)``.
         allowed: Action masks of every frame, ``(E, T, S)``.
         tracks: By policy.
@@ -115,6 +150,11 @@ class EvaluationResult:
     movement: Floats | None = None
     other_scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
+    @property
+    def measure(self) -> str:
+        """``"score"`` of frames, or ``"quality"`` of brackets: the metric that decides."""
+        return "score" if self.plan is None else self.plan.measure
+
     def moves(self, episode: int) -> dict[str, Any]:
         """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
         known = {"speed": self.speed, "defocus": self.defocus}
@@ -126,7 +166,9 @@ class EvaluationResult:
 
     @cached_property
     def oracle(self) -> Floats:
-        """Mean q of the oracle over the frames, ``(E,)``."""
+        """Mean q of the oracle over the frames, ``(E,)``; a bracket's quality is at most 1."""
+        if self.measure == "quality":
+            return np.ones(len(self.groups))
         mean: Floats = metrics.oracle_score(self.scores, self.allowed).mean(axis=-1)
         return mean
 
@@ -141,7 +183,9 @@ class EvaluationResult:
 
     @cached_property
     def random(self) -> Floats:
-        """Exact mean q of a random policy over the frames, ``(E,)``."""
+        """Exact mean q of a random policy over the frames, ``(E,)``; 0 for brackets."""
+        if self.measure == "quality":
+            return np.zeros(len(self.groups))
         mean: Floats = metrics.random_score(self.scores, self.allowed).mean(axis=-1)
         return mean
 
@@ -163,7 +207,7 @@ class EvaluationResult:
 
     @cached_property
     def _metrics(self) -> dict[str, dict[str, NDArray[Any]]]:
-        """Metrics that were asked for, by policy."""
+        """Metrics that were computed, by policy."""
         return {}
 
     @cached_property
@@ -172,20 +216,22 @@ class EvaluationResult:
         return metrics.settling(self.scores)
 
     def _measured(self, policy: str) -> dict[str, NDArray[Any]]:
-        track = self.tracks[policy]
-        ev100, allowed = self.grid.ev100, self.allowed
-        score = metrics.score_of(self.scores, track.states).mean(axis=-1)
-        errors = metrics.ev_error(self.scores, track.states, ev100, allowed)
+        arrays = self.tracks[policy].arrays
+        if self.measure == "quality":
+            return dict(arrays)
+        states, ev100, allowed = self.tracks[policy].states, self.grid.ev100, self.allowed
+        score = metrics.score_of(self.scores, states).mean(axis=-1)
+        errors = metrics.ev_error(self.scores, states, ev100, allowed)
         frames, converged = metrics.frames_to_converge(errors, since=self.settling)
-        start = np.broadcast_to(self.start_states[:, None], (*track.states.shape[:-1], 1))
-        evs = ev100[np.concatenate([start, track.states], axis=-1)]
+        start = np.broadcast_to(self.start_states[:, None], (*states.shape[:-1], 1))
+        evs = ev100[np.concatenate([start, states], axis=-1)]
         static = np.all(self.scores[:, 1:] == self.scores[:, :-1], axis=-1)  # (E, T - 1)
-        given = metrics.regret_given_ev(self.scores, track.states, ev100, allowed)
+        of_split = metrics.regret_given_ev(self.scores, states, ev100, allowed)
         return {
             "score": score,
             "regret": self.oracle - score,
             "regret_delayed": self.delayed_oracle - score,
-            "regret_given_ev": given.mean(axis=-1),
+            "regret_given_ev": of_split.mean(axis=-1),
             "ev_error": errors,
             "frames_to_converge": frames,
             "converged": converged,
@@ -193,15 +239,15 @@ class EvaluationResult:
             "overshoot": metrics.overshoot(evs, since=self.settling),
             "ev_within_third": (errors <= metrics.THIRD_EV).mean(axis=-1),
             "reversals": metrics.reversals(evs),
-            "flicker": metrics.flicker(track.image_mean, static),
-            "jump": metrics.jump(track.code_mean),
-            "clipped_high": track.clipped_high.mean(axis=-1),
-            "clipped_low": track.clipped_low.mean(axis=-1),
+            "flicker": metrics.flicker(arrays["image_mean"], static),
+            "jump": metrics.jump(arrays["code_mean"]),
+            "clipped_high": arrays["clipped_high"].mean(axis=-1),
+            "clipped_low": arrays["clipped_low"].mean(axis=-1),
         }
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """``("all", "hard", "rest")``, or ``("all",)`` where one of the two parts has no scenes."""
+        """Parts that have scenes: always ``"all"``, and both others or neither."""
         return CONDITIONS if self.hard.any() and not self.hard.all() else CONDITIONS[:1]
 
     def condition(self, name: str) -> NDArray[np.bool_]:
@@ -211,13 +257,343 @@ class EvaluationResult:
             raise ValueError(f"`condition` (={name!r}) must be one of {', '.join(masks)}")
         return masks[name]
 
-    def group_gains(self, policy: str, condition: str = "all") -> tuple[Floats, Floats]:
+    def mean(self, policy: str, key: str, episodes: NDArray[np.bool_] | None = None) -> float:
+        """Mean of a metric: over a source group's episodes, then over groups and seeds.
+
+        Args:
+            policy: Name of the policy.
+            key: Name of the metric, see `episode_metrics`.
+            episodes: Which of the episodes, ``(E,)``; all by default.
+        """
+        members = self.condition("all") if episodes is None else episodes
+        values = self.episode_metrics(policy)[key][:, members]
+        return float(metrics.group_means(values, self.groups[members])[0].mean())
+
+    def group_gains(
+        self, policy: str, condition: str | NDArray[np.bool_] = "all"
+    ) -> tuple[Floats, Floats]:
         """Gains over random and the span to the oracle per source group: ``(K, G)``, ``(G,)``.
 
         These are the arguments of `agents.evaluation.intervals`.
+
+        Args:
+            policy: Name of the policy.
+            condition: As of `condition`, or which of the episodes, ``(E,)``.
         """
-        members = self.condition(condition)
-        gains = (self.episode_metrics(policy)["score"] - self.random)[:, members]
+        members = self.condition(condition) if isinstance(condition, str) else condition
+        gains = (self.episode_metrics(policy)[self.measure] - self.random)[:, members]
         span = (self.oracle - self.random)[members]
         groups = self.groups[members]
         return metrics.group_means(gains, groups)[0], metrics.group_means(span, groups)[0]
+
+
+# -- rows -----------------------------------------------------------------------------------------
+
+
+def as_results(results: EvaluationResult | Results) -> Results:
+    """Results by condition, of one result as well."""
+    if not isinstance(results, EvaluationResult):
+        return results
+    plan = results.plan
+    return {"static" if plan is None else plan.static_condition: results}
+
+
+def static_condition(results: Results) -> str:
+    """Name of the condition of unchanging light without delay; of the first where there is none."""
+    first = next(iter(results))
+    plan = results[first].plan
+    return first if plan is None else plan.static_condition
+
+
+def result_rows(
+    results: EvaluationResult | Results,
+    *,
+    source: str | None = None,
+    split: str | None = None,
+    resamples: int = RESAMPLES,
+) -> pd.DataFrame:
+    """A row per policy and condition: `ROW_COLUMNS` and `MORE_COLUMNS`.
+
+    The static condition gives rows ``"all"``, ``"hard"`` and ``"rest"`` (see
+    `EvaluationResult.conditions`), every other one a row with its own name.
+
+    Args:
+        results: The result of one condition, or results by condition.
+        source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
+        split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
+        resamples: Bootstrap resamples of the interval.
+
+    Returns:
+        `ci95` is the 95 % interval of `normalised_score`, None below 15 source groups;
+        `ms_per_decision` is amortised over a batch of cameras.
+    """
+    import pandas as pd
+
+    results = as_results(results)
+    static, rows = static_condition(results), []
+    for name, result in results.items():
+        environment = {} if result.plan is None else result.plan.environment
+        scenes = environment.get("scenes", "bundled")
+        if not isinstance(scenes, str):  # those that have no name
+            scenes = str(scenes) if isinstance(scenes, Mapping) else f"{len(scenes)} scenes"
+        for part in result.conditions if name == static else CONDITIONS[:1]:
+            for policy in result.tracks:
+                row = {
+                    "policy": policy,
+                    "condition": part if name == static else name,
+                    "source": source or scenes,
+                    "split": split or str(environment.get("split", "test")),
+                }
+                rows.append(row | _row(result, policy, part, resamples))
+    return pd.DataFrame(rows, columns=[*ROW_COLUMNS, *MORE_COLUMNS])
+
+
+def _row(result: EvaluationResult, policy: str, part: str, resamples: int) -> dict[str, Any]:
+    members, track = result.condition(part), result.tracks[policy]
+    gains, span = result.group_gains(policy, part)
+    interval = score_interval(gains, span, resamples=resamples)
+    errors = result.episode_metrics(policy)["ev_error"][:, members]
+    weights = _frame_weights(errors.shape, result.groups[members])
+    return {
+        "num_groups": interval.num_groups,
+        "seed": result.seed,
+        "mean_score": result.mean(policy, "score", members),
+        "normalised_score": interval.value,
+        "ci95": interval.pair,
+        "ev_error_median": weighted_quantile(errors, weights, 0.5),
+        "ev_error_p95": weighted_quantile(errors, weights, 0.95),
+        "ev_within_third": float(np.sum(weights * (errors <= metrics.THIRD_EV))),
+        **{key: result.mean(policy, key, members) for key in _MEANS},
+        "captures_per_decision": track.captures_per_decision,
+        "ms_per_decision": track.ms_per_decision,
+        "ms_alone": track.ms_alone,
+        "training_seeds": track.num_seeds,
+    }
+
+
+def bracket_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+    """A row per budget and policy of an evaluation of brackets, the best policy first.
+
+    Args:
+        results: By budget.
+        ranking: Of `overall_ranking`.
+
+    Returns:
+        `quality` with its 95 % interval `ci95`, `to_best` with `to_best_ci95`, its paired
+        difference to the best policy over all budgets, and the means of `BRACKET_METRICS`.
+    """
+    import pandas as pd
+
+    rows = []
+    for result in results.values():
+        assert result.plan is not None
+        assert result.plan.budgets is not None
+        names = [one.policy for one in ranking]
+        best = result.group_gains(names[0])[0]
+        for policy in names:
+            gains, span = result.group_gains(policy)
+            change = difference_interval(gains, best, span)
+            rows.append(
+                {
+                    "policy": policy,
+                    "budget": result.plan.budgets[len(rows) // len(names)],
+                    "ci95": score_interval(gains, span).pair,
+                    "to_best": change.value,
+                    "to_best_ci95": change.pair,
+                    "num_groups": len(span),
+                    "training_seeds": len(gains),
+                    **{key: result.mean(policy, key) for key in BRACKET_METRICS},
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], quantile: float) -> float:
+    """Least value at which the cumulated weight reaches `quantile` of the whole.
+
+    >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([0.2, 0.2, 0.6]), 0.5)
+    2.0
+    """
+    order = np.argsort(values, axis=None)
+    cumulated = np.cumsum(weights.ravel()[order])
+    index = int(np.searchsorted(cumulated, quantile * cumulated[-1] * (1 - 1e-12)))
+    return float(values.ravel()[order][index])
+
+
+def _frame_weights(shape: tuple[int, ...], groups: NDArray[Any]) -> Floats:
+    """Weights ``(K, E, T)`` that sum to 1 and give every source group the same share."""
+    _, index, counts = np.unique(groups, return_inverse=True, return_counts=True)
+    episode = 1.0 / (len(counts) * counts[index])
+    return np.broadcast_to(episode[None, :, None], shape) / (shape[0] * shape[2])
+
+
+def scene_rows(result: EvaluationResult) -> pd.DataFrame:
+    """A row per policy and scene: means over the scene's episodes and the training seeds."""
+    import pandas as pd
+
+    rows = []
+    for policy, track in result.tracks.items():
+        values = result.episode_metrics(policy)
+        for scene in dict.fromkeys(result.scene_ids):
+            own = np.flatnonzero(result.scene_ids == scene)
+            errors = values["ev_error"][:, own]
+            rows.append(
+                {
+                    **{k: float(v[:, own].mean()) for k, v in values.items()},
+                    "policy": policy,
+                    "scene_id": str(scene),
+                    "group": str(result.groups[own[0]]),
+                    "kind": str(result.kinds[own[0]]),
+                    "hard": int(result.hard[own[0]]),
+                    "episodes": len(own),
+                    "oracle": float(result.oracle[own].mean()),
+                    "random": float(result.random[own].mean()),
+                    "ev_error_median": float(np.median(errors)),
+                    "ev_error_p95": float(np.percentile(errors, 95)),
+                    # Of the first episode: a mean of indices would mean nothing.
+                    "final_state": int(track.states[0, own[0], -1]),
+                    "oracle_state": int(result.oracle_states[own[0]]),
+                }
+            )
+    return pd.DataFrame(rows, columns=list(SCENE_COLUMNS))
+
+
+def group_rows(result: EvaluationResult) -> pd.DataFrame:
+    """Mean score of every source group: a row per group, a column per policy."""
+    import pandas as pd
+
+    values = {"oracle q": result.oracle, "random q": result.random}
+    for name in result.tracks:
+        values[name] = result.episode_metrics(name)["score"].mean(axis=0)
+    frame = pd.DataFrame(values)
+    return frame.groupby(pd.Series(result.groups, name="source group").astype(str)).mean()
+
+
+# -- comparisons ----------------------------------------------------------------------------------
+
+
+def best_meter(result: EvaluationResult) -> str | None:
+    """The metering policy with the best score over all scenes evaluated; None if there is none."""
+    meters = [name for name in result.tracks if is_metering(name)]
+    return max(meters, key=lambda name: result.group_gains(name)[0].sum(1).mean(), default=None)
+
+
+def difference_rows(
+    result: EvaluationResult, minus: str, *, resamples: int = RESAMPLES
+) -> pd.DataFrame:
+    """Paired differences of every other policy's normalised score to that of `minus`.
+
+    Args:
+        result: The results of one condition.
+        minus: The policy that is subtracted.
+        resamples: Bootstrap resamples.
+
+    Returns:
+        One for each policy and part that has scenes.
+    """
+    import pandas as pd
+
+    rows = []
+    for part in result.conditions:
+        other, span = result.group_gains(minus, part)
+        for policy in (name for name in result.tracks if name != minus):
+            gains = result.group_gains(policy, part)[0]
+            interval = difference_interval(gains, other, span, resamples=resamples)
+            rows.append(
+                {
+                    "policy": policy,
+                    "minus": minus,
+                    "condition": part,
+                    "difference": interval.value,
+                    "ci95": interval.pair,
+                    "num_groups": interval.num_groups,
+                    "num_training_seeds": interval.num_seeds,
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> list[Rank]:
+    """Policies by their score over all conditions, each condition with the same weight.
+
+    Privileged policies have no rank.
+
+    Args:
+        results: By condition.
+        resamples: Bootstrap resamples.
+    """
+    first = next(iter(results.values()))
+    names = [name for name, track in first.tracks.items() if not track.privileged]
+    gains = {
+        name: np.mean([r.group_gains(name)[0] for r in results.values()], axis=0) for name in names
+    }
+    if not gains:
+        return []
+    spans = [result.group_gains(names[0])[1] for result in results.values()]
+    return rank(gains, np.mean(spans, axis=0), resamples=resamples)
+
+
+def ranking_rows(ranking: Sequence[Rank]) -> list[dict[str, Any]]:
+    """A ranking as JSON values."""
+    names = [one.policy for one in ranking]
+    rows = []
+    for i, one in enumerate(ranking):
+        row: dict[str, Any] = {
+            "place": i + 1,
+            "policy": one.policy,
+            "tier": one.tier,
+            "normalised_score": one.score.value,
+            "ci95": one.score.pair,
+        }
+        for key, change, other in (("to_best", one.to_best, 0), ("to_next", one.to_next, i + 1)):
+            row[key] = None
+            if change is not None:
+                row[key] = {
+                    "other": names[other],
+                    "difference": change.value,
+                    "simultaneous_ci95": change.pair,
+                    "significant": change.significant,
+                }
+        rows.append(row)
+    return rows
+
+
+def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
+    """Normalised score per policy, training seed and part, for those with several seeds."""
+    rows = []
+    for part in result.conditions:
+        for policy in (name for name, track in result.tracks.items() if track.num_seeds > 1):
+            gains, span = result.group_gains(policy, part)
+            for k, value in enumerate(np.sum(gains, axis=1) / np.sum(span)):
+                score = {"training_run": k, "normalised_score": float(value)}
+                rows.append({"policy": policy, "condition": part, **score})
+    return rows
+
+
+def oracle_histogram(result: EvaluationResult) -> dict[str, dict[str, float]]:
+    """Share of the episodes in which each value of each control is the oracle's.
+
+    Returns:
+        ``{"iso": {"100": 0.4, ...}, "exposure_time": {...}, "f_number": {...}}``.
+    """
+    controls = result.grid.controls(result.oracle_states)  # (E, 3)
+    axes = {
+        "iso": result.grid.isos,
+        "exposure_time": result.grid.exposure_times,
+        "f_number": result.grid.f_numbers,
+    }
+    return {
+        name: {f"{v:g}": float((controls[:, i] == j).mean()) for j, v in enumerate(values)}
+        for i, (name, values) in enumerate(axes.items())
+    }
+
+
+def scores_by_kind(result: EvaluationResult) -> dict[str, dict[str, float]]:
+    """Normalised score by kind of scene and policy; of a kind, ``groups`` counts source groups."""
+    found: dict[str, dict[str, float]] = {}
+    for kind in dict.fromkeys(result.kinds.tolist()):
+        for name in result.tracks:
+            gains, span = result.group_gains(name, result.kinds == kind)
+            scores = found.setdefault(kind, {"groups": len(span)})
+            scores[name] = float(gains.mean(axis=0).sum() / span.sum())
+    return found

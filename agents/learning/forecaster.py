@@ -7,7 +7,7 @@ they are too bright, noisy where they are dark. No picture is needed, so it trai
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,14 @@ from pydantic import Field
 from torch import nn
 
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
-from agents.learning.optimisation import Optimisation
+from agents.learning.networks import Optimisation, Progress
 from agents.learning.weights import MAX_WIDTH, load_agent, load_into
-from agents.metering.matching import ZoneMatcher
 from agents.metering.reading import (
     BLACK_SIGNAL,
     TARGET_SIGNAL,
     WHITE_SIGNAL,
     Reading,
+    ZoneMatcher,
     mean_reading,
 )
 from simulator.utils.config_file import Configuration
@@ -180,7 +180,7 @@ def train_forecaster(
     training: ForecasterTraining,
     *,
     checkpoint: Path | None = None,
-    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    progress: Progress | None = None,
     device: str = "cpu",
     identity: Any = None,
 ) -> LightForecaster:

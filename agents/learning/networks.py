@@ -1,14 +1,27 @@
-"""Networks that the learnt agents share: features of a frame, and values of every state."""
+"""What the learnt agents share: features of a frame, values of every state, optimiser steps."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES
+from ae_env.observation import PEDESTAL, SENSOR_RANGES, SETTINGS_RANGES, encode_settings
+from agents.metering.meters import make_meter
+from agents.metering.reading import frame_ev100
+from agents.policy import Observations, PolicyContext
+from simulator.utils.checkpoint import Checkpoint
+
+#: Takes frames done, frames in all, and the latest losses of a training.
+Progress = Callable[[int, int, dict[str, float]], None]
 
 #: Range of log2 luminance that the absolute plane maps to about [-1, 1].
 _LUMINANCE_CENTRE, _LUMINANCE_SCALE = 3.0, 8.0
@@ -34,6 +47,13 @@ _LEVELS = torch.tensor([1.0, 0.0, -1.0, -2.0, -3.0, -4.5, -6.0, -7.5, -9.0])
 _SOFTNESS = 0.25
 #: Numbers that describe the light of a frame to a `StateHead`.
 LIGHT_NUMBERS = _HISTOGRAMS * len(_BINS)
+#: Numbers of a frame: metered EV against the newest frame's, exposure, clipping, what was asked for
+#: after the frame before it (Av, Tv, Sv).
+NUMBERS = 6
+#: A history's numbers are within this.
+_LARGEST = 4.0
+#: Frames are shifted by up to this part of their size.
+_LARGEST_SHIFT = 1 / 8
 
 
 class ExposureFeatures(nn.Module):
@@ -260,3 +280,148 @@ class StateHead(nn.Module):
         squared = motion_px.square() + defocus_px.square()
         loss = torch.log1p(squared)
         return torch.stack([squared.log2() / 8.0, loss / 2.0], dim=2)
+
+
+# -- what networks see beside a frame, and frames that look different each time --------------------
+
+
+class MeterHistory:
+    """What a light meter read in the last frames of each camera, and what was asked for.
+
+    Args:
+        context: The camera and the grid.
+        num_envs: Cameras.
+        frames: Frames that are kept, the one in hand among them.
+    """
+
+    def __init__(self, context: PolicyContext, num_envs: int, frames: int) -> None:
+        self._meter = make_meter("average", context.camera)
+        states = context.grid.states
+        apex = np.array([[s.aperture_value, s.time_value, s.speed_value] for s in states])
+        self._apex = encode_settings(apex)
+        self._frames = np.full((num_envs, frames, NUMBERS), np.nan)
+        self._action = np.full((num_envs, 3), np.nan)
+
+    def observe(
+        self, observations: Observations, rows: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.float32]:
+        """Takes in a frame of each camera; returns the history (N, frames * NUMBERS), newest first.
+
+        Args:
+            observations: Of all cameras.
+            rows: Which of them have a new frame; by default all.
+        """
+        reading, exposed = self._meter(observations), frame_ev100(observations)
+        action = np.where(np.isnan(self._action), observations["settings"], self._action)
+        numbers = [reading.ev100, (reading.ev100 - exposed) / 4.0, reading.saturated, *action.T]
+        new = np.stack(numbers, axis=1)
+        shifted = np.concatenate([new[:, None], self._frames[:, :-1]], axis=1)
+        # Before the first frame there was the same.
+        shifted = np.where(np.isnan(shifted), new[:, None], shifted)
+        which = np.ones(len(new), bool) if rows is None else rows
+        self._frames[which] = shifted[which]
+        shown = self._frames.copy()
+        shown[:, :, 0] = (shown[:, :, 0] - shown[:, :1, 0]) / 2.0
+        flat = np.clip(shown, -_LARGEST, _LARGEST).reshape(len(shown), -1)
+        return flat.astype(np.float32)
+
+    def record_action(self, states: NDArray[np.int64]) -> None:
+        """Remembers the states that were asked for after the frame in hand, ``(N,)``."""
+        self._action = self._apex[states].astype(np.float64)
+
+    def forget(self, rows: NDArray[np.bool_]) -> None:
+        """Forgets the frames of the cameras that `rows` marks."""
+        self._frames[rows], self._action[rows] = np.nan, np.nan
+
+
+def with_history(space: gym.spaces.Dict, frames: int) -> gym.spaces.Dict:
+    """The observation `space` of a single environment with the history of so many frames."""
+    box = gym.spaces.Box(-_LARGEST, _LARGEST, (frames * NUMBERS,), np.float32)
+    return gym.spaces.Dict({**space.spaces, "history": box})
+
+
+def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Frames shifted by up to an eighth, all alike, and mirrored half of the time.
+
+    Their light, and so the scores of all states, stay nearly what they were.
+
+    Args:
+        raw: (N, 4, H, W) uint8. Shifted frames continue their border.
+        rng: Draws the shift.
+    """
+    for axis in (2, 3):
+        size = raw.shape[axis]
+        most = int(size * _LARGEST_SHIFT)
+        places = np.arange(size) + rng.integers(-most, most + 1)
+        raw = np.take(raw, np.clip(places, 0, size - 1), axis=axis)
+    return np.ascontiguousarray(raw[..., ::-1]) if rng.random() < 0.5 else raw
+
+
+# -- optimiser steps -------------------------------------------------------------------------------
+
+
+class Optimisation:
+    """AdamW with a one-cycle schedule; a training that was interrupted goes on where it was.
+
+    Args:
+        network: What is trained.
+        steps: Optimiser steps in all.
+        learning_rate: Peak of the schedule.
+        weight_decay: Of AdamW.
+        checkpoint: File for the state of the training; None for none.
+        identity: JSON value; the checkpoint of a training with another one is not resumed.
+        warm_up: Share of the steps in which the learning rate rises.
+
+    Attributes:
+        done: Steps so far.
+        store: The checkpoint, a context manager.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        steps: int,
+        learning_rate: float,
+        weight_decay: float,
+        checkpoint: Path | None,
+        identity: Any,
+        warm_up: float = 0.3,
+    ) -> None:
+        self.network, self.done = network, 0
+        self.optimizer = torch.optim.AdamW(
+            network.parameters(), lr=learning_rate, weight_decay=weight_decay
+        )
+        self.schedule = torch.optim.lr_scheduler.OneCycleLR(
+            self.optimizer, max_lr=learning_rate, total_steps=steps + 1, pct_start=warm_up
+        )
+        self._parts: dict[str, Any] = {
+            "network": network,
+            "optimizer": self.optimizer,
+            "schedule": self.schedule,
+        }
+        self.store = Checkpoint(checkpoint, identity, self._state)
+        past = self.store.load()
+        if past is not None:
+            self.done = int(past["step"])
+            for name, part in self._parts.items():
+                part.load_state_dict(past[name])
+
+    def _state(self) -> dict[str, Any]:
+        states = {name: part.state_dict() for name, part in self._parts.items()}
+        return {"step": self.done, **states}
+
+    def step(self, loss: torch.Tensor) -> None:
+        """One step down `loss`.
+
+        Raises:
+            ValueError: If it is not finite.
+        """
+        if not math.isfinite(loss.item()):
+            raise ValueError(f"the loss (={loss.item()}) must be finite; lower `learning_rate`")
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimizer.step()
+        self.schedule.step()
+        self.done += 1

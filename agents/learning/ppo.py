@@ -24,9 +24,16 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from ae_env.grid import ExposureGrid
-from agents.learning.history import NUMBERS, MeterHistory, WithHistory, with_history
-from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead
-from agents.learning.sb3_adapter import MovedFrames, SB3VectorAdapter
+from agents.learning.networks import (
+    LIGHT_NUMBERS,
+    NUMBERS,
+    ExposureFeatures,
+    MeterHistory,
+    Progress,
+    StateHead,
+    with_history,
+)
+from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
 from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.policy import Observations, PolicyContext, masked_argmax
 from simulator.utils.checkpoint import Checkpoint
@@ -205,7 +212,7 @@ class PPOPolicy(NetworkPolicy):
         self.check_reset(observations)
         shown = {**observations, "history": self._history.observe(observations)}
         states = self._chosen(shown, action_masks)
-        self._history.asked(states)
+        self._history.record_action(states)
         return states
 
     def _chosen(
@@ -222,7 +229,7 @@ def train_ppo(
     training: PPOTraining,
     *,
     checkpoint: Path | None = None,
-    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    progress: Progress | None = None,
     device: str = "cpu",
     identity: Any = None,
 ) -> ExposureActorCritic:
@@ -243,7 +250,8 @@ def train_ppo(
     """
     training.check_batch(envs.num_envs)
     context = PolicyContext.from_envs(envs)
-    store = Checkpoint(checkpoint, identity or training.model_dump(), lambda: callback.state())
+    callback = _TrainingCallback(training, progress)
+    store = Checkpoint(checkpoint, identity or training.model_dump(), callback.state)
     past = store.load()
     done = 0 if past is None else int(past["timesteps"])
     seen: VecEnv = SB3VectorAdapter(envs)
@@ -251,7 +259,7 @@ def train_ppo(
         seen = WithHistory(seen, context, training.history)
     model = PPO(
         ExposureActorCritic,
-        MovedFrames(seen, np.random.default_rng([training.seed, done])),
+        ShiftedFrames(seen, np.random.default_rng([training.seed, done])),
         learning_rate=lambda remaining: training.learning_rate * (0.1 + 0.9 * remaining),
         n_steps=training.n_steps,
         batch_size=training.batch_size,
@@ -270,8 +278,7 @@ def train_ppo(
         model.policy.load_state_dict(past["policy"])
         model.policy.optimizer.load_state_dict(past["optimizer"])
         model.num_timesteps = done
-    callback = _TrainingCallback(training, store, done, progress)
-    callback.model = model
+    callback.start(model, store)
     remaining = training.total_timesteps - done
     if remaining > 0:
         with store:
@@ -284,17 +291,15 @@ def train_ppo(
 class _TrainingCallback(BaseCallback):
     """Progress, falling entropy, and checkpoints between the updates."""
 
-    def __init__(
-        self,
-        training: PPOTraining,
-        checkpoint: Checkpoint,
-        done: int,
-        progress: Callable[[int, int, dict[str, float]], None] | None,
-    ) -> None:
+    def __init__(self, training: PPOTraining, progress: Progress | None) -> None:
         super().__init__()
-        self.training, self.checkpoint, self.progress = training, checkpoint, progress
-        self.learnt = done  # frames of complete updates
+        self.training, self.progress = training, progress
         self._rewards: deque[float] = deque(maxlen=50)
+
+    def start(self, model: PPO, checkpoint: Checkpoint) -> None:
+        """Takes the model that is trained, and where its checkpoints go."""
+        self.model, self.checkpoint = model, checkpoint
+        self.learnt = model.num_timesteps  # frames of complete updates
 
     def state(self) -> dict[str, Any]:
         """State of the training for its checkpoint. A half-done rollout is taken again."""

@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from agents.learning.augmentation import moved
+from agents.learning.networks import MeterHistory, random_shift, with_history
+from agents.policy import PolicyContext
 
 
 class SB3VectorAdapter(VecEnv):
@@ -118,8 +119,8 @@ class SB3VectorAdapter(VecEnv):
         return [int(i) for i in np.atleast_1d(indices)]
 
 
-class MovedFrames(VecEnvWrapper):
-    """Shows `moved` frames, those of each step otherwise.
+class ShiftedFrames(VecEnvWrapper):
+    """Shows frames shifted by `random_shift`, those of each step otherwise.
 
     Args:
         venv: SB3's view of the environments.
@@ -140,7 +141,51 @@ class MovedFrames(VecEnvWrapper):
         return self._shown(observations), *rest
 
     def _shown(self, observations: Any) -> dict[str, np.ndarray]:
-        return {**observations, "raw": moved(observations["raw"], self.rng)}
+        return {**observations, "raw": random_shift(observations["raw"], self.rng)}
+
+
+class WithHistory(VecEnvWrapper):
+    """Adds ``history`` to the observations, see `MeterHistory`.
+
+    Args:
+        venv: SB3's view of the environments.
+        context: The camera and the grid.
+        frames: Frames that are kept.
+    """
+
+    def __init__(self, venv: VecEnv, context: PolicyContext, frames: int) -> None:
+        assert isinstance(venv.observation_space, gym.spaces.Dict)
+        super().__init__(venv, with_history(venv.observation_space, frames))
+        self._history = MeterHistory(context, venv.num_envs, frames)
+
+    def reset(self) -> Any:
+        """Begins an episode in every environment."""
+        self._history.forget(np.ones(self.num_envs, bool))
+        observations: Any = self.venv.reset()
+        return {**observations, "history": self._history.observe(observations)}
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Remembers the actions, and takes the step."""
+        self._history.record_action(actions)
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Takes the step."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(observations, dict)
+        if not dones.any():
+            history = self._history.observe(observations)
+            return {**observations, "history": history}, rewards, dones, infos
+        last = {name: values.copy() for name, values in observations.items()}
+        for i in np.flatnonzero(dones):
+            for name, value in infos[i]["terminal_observation"].items():
+                last[name][i] = value
+        history = self._history.observe(last)
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"]["history"] = history[i]
+        self._history.forget(dones)
+        history = np.where(dones[:, None], self._history.observe(observations, dones), history)
+        return {**observations, "history": history}, rewards, dones, infos
 
 
 def _columns(infos: dict[str, Any]) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -9,24 +11,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
-from agents.learning.learning_curve import LearningCurve
-from agents.learning.regression_training import RegressionTraining, train_regression
+from agents.learning.networks import Progress
+from agents.learning.regression import RegressionTraining, train_regression
 from agents.learning.weights import describe_agent, load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
 from agents.policy import PolicyContext
 from simulator.utils.config_file import Configuration, load_yaml, one_line
-from simulator.utils.files import sibling
+from simulator.utils.files import sibling, write_atomically
 
 if TYPE_CHECKING:
     from agents.learning.ppo import PPOTraining
 
     Hyperparameters = RegressionTraining | PPOTraining | ForecasterTraining
 
-#: Called with frames done, frames in all, and the latest losses.
-Progress = Callable[[int, int, dict[str, float]], None]
+#: Rows of a whole training.
+ROWS = 200
 
 
 class AgentConfig(Configuration):
@@ -229,6 +232,68 @@ def _logged(
     with SummaryWriter(str(folder)) as writer:
         takers.insert(0, log)
         yield report
+
+
+class LearningCurve:
+    """Writes the mean of each reported value over every 200th part of a training.
+
+    A training that was interrupted goes on in its file.
+
+    Args:
+        path: File to write, such as ``agent.csv``.
+
+    Raises:
+        ValueError: If there is a file that is no learning curve.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        known = load_curve(path) if path.is_file() else {}
+        self._rows = [
+            dict(zip(known, row, strict=True)) for row in zip(*known.values(), strict=True)
+        ]
+        self._recent: list[dict[str, float]] = []
+
+    def __call__(self, done: int, total: int, values: dict[str, float]) -> None:
+        """Take in what the training reports after `done` of `total` frames."""
+        # What another training left here, or this one after its checkpoint.
+        while self._rows and not self._goes_on(done, values):
+            self._rows.pop()
+        self._recent.append(values)
+        last = self._rows[-1]["frames"] if self._rows else 0
+        if done != total and done - last < total / ROWS:
+            return
+        means = {name: float(np.mean([v[name] for v in self._recent])) for name in values}
+        self._rows.append({"frames": done, **means})
+        self._recent = []
+        text = io.StringIO()
+        writer = csv.DictWriter(text, self._rows[-1], lineterminator="\n")
+        writer.writeheader()
+        for row in self._rows:
+            shown = {name: f"{value:.6g}" for name, value in row.items()}
+            writer.writerow({**shown, "frames": int(row["frames"])})
+        write_atomically(self.path, text.getvalue())
+
+    def _goes_on(self, done: int, values: dict[str, float]) -> bool:
+        """Whether the last row is of this training, from before `done` frames."""
+        last = self._rows[-1]
+        return last["frames"] < done and last.keys() == {"frames", *values}
+
+
+def load_curve(path: Path) -> dict[str, list[float]]:
+    """Columns of a file that `LearningCurve` wrote: ``frames`` and the reported values.
+
+    Raises:
+        ValueError: If it is no such file.
+    """
+    try:
+        rows = list(csv.DictReader(path.read_text().splitlines()))
+        curve = {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ())}
+    except (TypeError, ValueError, KeyError) as error:
+        raise ValueError(f"{path} is not a learning curve of `ae-env train`") from error
+    if "frames" not in curve:
+        raise ValueError(f"{path} is not a learning curve of `ae-env train`")
+    return curve
 
 
 @dataclass(frozen=True)

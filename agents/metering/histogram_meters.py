@@ -159,7 +159,7 @@ def _edges(evs: tuple[float, ...], gain: float) -> tuple[NDArray[np.intp], Float
     """
     import torch
 
-    from ae_env.scorers.luma import srgb_decode
+    from ae_env.scorers.measures import srgb_decode
 
     # What the edge is of the exposed picture.
     linear = srgb_decode(torch.arange(1, BINS, dtype=torch.float64) / BINS).numpy()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -9,25 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.observation import SENSOR_RANGES, decode_sensors
-from agents.foresight import Foresight
+from agents.foresight import Foresight, TrendTracker
 from agents.metering.meters import make_meter
 from agents.metering.programs import (
     ProgramOptions,
     StateChooser,
-    check_program,
     check_used,
     program_cost,
 )
-from agents.metering.reading import (
-    CODE_SIGNALS,
-    GREEN,
-    SATURATED_STEP_EV,
-    WHITE_SIGNAL,
-    Reading,
-    frame_ev100,
-    signal_codes,
-)
-from agents.metering.trend import TrendTracker
+from agents.metering.reading import EVTracker, Floats, ReferenceFrames
 from agents.metering.tuned import ScoreRegression
 from agents.policy import Observations, Policy, PolicyContext, masked_argmax
 from agents.policy_names import PROGRAMS
@@ -37,9 +28,6 @@ from simulator.utils.checks import check_word
 if TYPE_CHECKING:
     import gymnasium as gym
 
-    from simulator.camera import CameraProfile
-
-Floats = NDArray[np.float64]
 
 #: Meters whose reading is the most exposure that may be given: no state above it is chosen.
 CEILING_METERS = ("highlight_weighted",)
@@ -57,16 +45,6 @@ FIT_PER_SCENE = 4
 SECOND_PASS = 1_000_000
 #: What a meter may foresee.
 FORESIGHTS = ("none", "trend", "model")
-#: Metered weight from which a frame is all white.
-ALL_SATURATED = 0.999
-#: Quantiles in which frames are compared.
-_QUANTILES = np.linspace(0.05, 0.95, 19)
-#: The light is another one where the frames differ by more than these, in the square root of the
-#: signal (mean of the quantiles), and in stops (median of those that both frames show well).
-_TOLERANCE, _TOLERANCE_EV = 0.04, 0.3
-_SHOWN = (0.004, 0.9)
-#: Saturated share from which a frame hides something.
-_SATURATED = 0.01
 
 
 class MeteringPolicy(Policy):
@@ -109,7 +87,8 @@ class MeteringPolicy(Policy):
         foresight: str = "none",
     ) -> None:
         super().__init__(context)
-        self.program = check_program(program, PROGRAMS)
+        check_word("program", program, PROGRAMS)
+        self.program = program
         check_word("foresight", foresight, FORESIGHTS)
         if foresight == "model" and program not in ("tuned", "tuned_blind"):
             raise ValueError(
@@ -167,7 +146,7 @@ class MeteringPolicy(Policy):
             foresight.record_action(self._previous)
         return self._previous.copy()
 
-    def observe(self, observations: Observations) -> NDArray[np.float64]:
+    def observe(self, observations: Observations) -> Floats:
         """Take in one frame; returns metered EV100, log2 speed, log2 defocus, ``(N, 1 or 3)``.
 
         The sensors are averaged, in stops, over the frames of the episode.
@@ -187,7 +166,7 @@ class MeteringPolicy(Policy):
         self._sensor_sum += np.log2(values)
         return np.concatenate([ev[:, None], self._sensor_sum / self._frames], axis=1)
 
-    def _program_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _program_utility(self, readings: Floats) -> Floats:
         """Minus the cost of each state, by the program's priorities."""
         chooser = self._chooser
         target = readings[:, 0] - self.options.compensation
@@ -199,7 +178,7 @@ class MeteringPolicy(Policy):
             cost[np.arange(len(cost)), self._previous] -= HYSTERESIS_COST
         return chooser.utility(chooser.with_hysteresis(target, self._previous), cost)
 
-    def _tuned_utility(self, readings: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _tuned_utility(self, readings: Floats) -> Floats:
         if self.regression is None:
             raise ValueError(
                 f"policy {self.name!r} learns from scenes first: call fit(envs), or give `weights`"
@@ -227,17 +206,15 @@ class MeteringPolicy(Policy):
         """
         if self.program not in ("tuned", "tuned_blind"):
             return
-        tuned, self.program = self.program, "P"
-        foresight, self.foresight = self.foresight, "none"  # the light of these episodes stays
+        leader = copy.copy(self)
+        leader.program, leader.foresight = "P", "none"  # the light of these episodes stays
         per_scene = FIT_EPISODES // (2 * len(scenes_of(envs)))
         per_scene = min(max(per_scene, 1), FIT_PER_SCENE)
-        first = self._gather(envs, seed, per_scene)
-        self.program = tuned
-        self.regression = ScoreRegression.fit(*first)
-        second = self._gather(envs, seed + SECOND_PASS, per_scene)
+        first = leader._gather(envs, seed, per_scene)
+        leader.program, leader.regression = self.program, ScoreRegression.fit(*first)
+        second = leader._gather(envs, seed + SECOND_PASS, per_scene)
         both: Any = [np.concatenate(pair) for pair in zip(first, second, strict=True)]
         self.regression = ScoreRegression.fit(*both)
-        self.foresight = foresight
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a tuned program; ``weights=path`` restores it.
@@ -251,7 +228,7 @@ class MeteringPolicy(Policy):
 
     def _gather(
         self, envs: gym.vector.VectorEnv[Any, Any, Any], seed: int, per_scene: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[Any]]:
+    ) -> tuple[Floats, Floats, NDArray[Any]]:
         """Readings after the meter has settled, scores of all states, source groups."""
         features, scores, groups = [], [], []
         drawn = RolloutPlan.of_each_scene(
@@ -267,118 +244,4 @@ class MeteringPolicy(Policy):
             features.append(readings[batch.valid])
             scores.append(expected_scores(envs)[batch.valid])
             groups.append(batch.groups[batch.valid])
-        self.reset(0)
         return np.concatenate(features), np.concatenate(scores), np.concatenate(groups)
-
-
-class EVTracker:
-    """Continuous metered EV of each camera over the frames of an episode.
-
-    A reading far from the estimate replaces it; within a stop the two are averaged, which settles
-    what would otherwise flip between neighbouring states. A mostly saturated frame only says that
-    the light is not below a bound, a black one that it is not above: an estimate that agrees with
-    the bound stays. A frame that is all white or all black moves any other estimate half of the
-    way to the end of the range.
-
-    With damping the EV that is handed out follows that estimate, keeping `damping` of its distance
-    to it at every frame. It is a number of its own and never read back from the settings: a grid of
-    whole stops does not hold it up. Its past never counts as lying beyond the range: light that
-    comes back after a long night is followed at once.
-
-    Args:
-        num_envs: Cameras.
-        ev_range: Lowest and highest EV100 of the camera's exposure states.
-        damping: Share of the distance to the estimate [EV] that remains after a frame, in [0, 1).
-        compensation: Exposure compensation [EV] that is taken off what is handed out: the range of
-            that is so much higher.
-    """
-
-    def __init__(
-        self,
-        num_envs: int,
-        ev_range: tuple[float, float],
-        damping: float = 0.0,
-        compensation: float = 0.0,
-    ) -> None:
-        self.ev100 = np.full(num_envs, np.nan)
-        self.damped = np.full(num_envs, np.nan)
-        self.ev_range = ev_range
-        self.damping = damping
-        self.compensation = compensation
-
-    def update(self, reading: Reading) -> NDArray[np.float64]:
-        """Take in one frame's reading; returns the estimates, ``(N,)``, damped."""
-        old, new = self.ev100, reading.ev100
-        low, high = self.ev_range
-        bound = new - SATURATED_STEP_EV * reading.saturated
-        agrees = (reading.saturated > 0.5) & (old >= bound) | reading.black & (old <= new)
-        white = reading.saturated >= ALL_SATURATED
-        new = np.where(reading.black, np.minimum(new, 0.5 * (new + low)), new)
-        new = np.where(white, np.maximum(new, 0.5 * (bound + high)), new)
-        blended = np.where(np.abs(new - old) > 1.0, new, 0.5 * (new + old))
-        self.ev100 = np.where(np.isnan(old), new, np.where(agrees, old, blended))
-        before = np.clip(self.damped, low + self.compensation, high + self.compensation)
-        distance = self.damping * (before - self.ev100)
-        self.damped = self.ev100 + np.where(np.isnan(distance), 0.0, distance)
-        return self.damped.copy()
-
-
-class ReferenceFrames:
-    """Keeps, for each camera, the best frame of the present light.
-
-    What a search finds on a saturated frame and on a dark one of the same scene differs, because
-    neither shows what the other does: a controller that follows the frame in hand may go to and fro
-    between the two for ever. So it continues to search on the better one for as long as new frames
-    look as that one predicts. Of two frames the less saturated is better; of two that are not
-    saturated, the brighter.
-
-    Args:
-        camera: The camera, for its black and white level.
-    """
-
-    def __init__(self, camera: CameraProfile) -> None:
-        self.camera = camera
-        self._raw: NDArray[np.uint8] | None = None  # (N, 4, h, w) codes
-        self._settings: NDArray[np.floating] | None = None
-        self._quantiles = np.empty((0, 0))
-        self._saturated = np.empty(0)
-        self._ev = np.empty(0)
-
-    def update(self, observations: Observations) -> Observations:
-        """Take in the frames in hand; returns the best ones, raw and settings."""
-        raw = signal_codes(observations["raw"], self.camera)
-        settings = np.asarray(observations["settings"])
-        ev = frame_ev100(observations)
-        green = raw[:, GREEN].reshape(len(raw), -1)
-        ordered = np.sort(green, axis=1)
-        ranks = np.rint(_QUANTILES * (green.shape[1] - 1)).astype(np.intp)
-        quantiles = CODE_SIGNALS[ordered[:, ranks]]
-        white = np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)
-        saturated = (green >= white).mean(axis=1)
-        if self._raw is None or self._settings is None:
-            self._raw, self._settings = raw.copy(), settings.copy()
-            self._quantiles, self._saturated, self._ev = quantiles, saturated, ev
-            return {"raw": self._raw, "settings": self._settings}
-        hides, hid = saturated >= _SATURATED, self._saturated >= _SATURATED
-        better = np.where(
-            hides | hid, saturated < self._saturated, ev <= self._ev
-        )  # the same state again is a newer look at the same light
-        replaced = better | self._changed(quantiles, ev)
-        self._raw[replaced], self._settings[replaced] = raw[replaced], settings[replaced]
-        self._quantiles[replaced], self._ev[replaced] = quantiles[replaced], ev[replaced]
-        self._saturated[replaced] = saturated[replaced]
-        return {"raw": self._raw, "settings": self._settings}
-
-    def _changed(
-        self, quantiles: NDArray[np.float64], ev: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
-        """Whether the frames in hand look other than predicted, ``(N,)``."""
-        predicted = self._quantiles * np.exp2(self._ev - ev)[:, None]
-        both = np.stack([predicted, quantiles]).clip(0.0, 1.0)
-        apart = np.abs(np.diff(np.sqrt(both), axis=0)[0]).mean(axis=1) > _TOLERANCE
-        shown = (both.min(axis=0) > _SHOWN[0]) & (both.max(axis=0) < _SHOWN[1])
-        stops = np.abs(np.diff(np.log2(np.maximum(both, 1e-6)), axis=0)[0])
-        known = shown.any(axis=1)
-        middle = np.nanmedian(np.where(known[:, None] & ~shown, np.nan, stops), axis=1)
-        changed: NDArray[np.bool_] = apart | known & (middle > _TOLERANCE_EV)
-        return changed

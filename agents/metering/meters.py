@@ -3,7 +3,7 @@
 Every meter undoes the observation's companding, measures the linear green signal against the
 calibration of the exposure scale (an 18 % card is recorded at 0.12 of sensor white when the state's
 EV equals that of the incident light) and adds the EV100 at which the frame was taken. The meters
-here weigh pixels or zones; those of `histogram_meters` and `gradient_meters` look for an exposure.
+here weigh pixels or zones; those of `search_meters` look for an exposure.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from agents.metering.reading import (
     BLACK_SIGNAL,
     GREEN,
     WHITE_SIGNAL,
+    Floats,
     Meter,
     Reading,
     frame_ev100,
@@ -27,7 +28,7 @@ from agents.metering.reading import (
 from agents.policy import Observations
 from agents.policy_names import METERS
 from simulator.camera import CameraProfile
-from simulator.utils.checks import did_you_mean
+from simulator.utils.checks import check_word
 
 #: Share of a centre-weighted meter's reading that comes from the central circle, and the circle's
 #: diameter in frame heights (12 mm of 24 mm).
@@ -50,17 +51,14 @@ def make_meter(name: str, camera: CameraProfile) -> Meter:
     Raises:
         ValueError: If there is none; the message proposes the nearest name.
     """
-    if name not in METERS:
-        hint = did_you_mean(name, METERS)
-        raise ValueError(f"`meter` (={name!r}) must be one of {', '.join(METERS)}{hint}")
+    check_word("meter", name, METERS)
     if name in ("average", "centre_weighted", "spot"):
         return functools.partial(weighted_reading, camera=camera, name=name)
     if name == "matrix":
         return functools.partial(matrix_reading, camera=camera)
-    from agents.metering import gradient_meters, histogram_meters
+    from agents.metering import search_meters  # not all processes need torch
 
-    module: Any = gradient_meters if name in ("shim", "zhang") else histogram_meters
-    return functools.partial(getattr(module, f"{name}_reading"), camera=camera)
+    return functools.partial(getattr(search_meters, f"{name}_reading"), camera=camera)
 
 
 def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
@@ -95,7 +93,7 @@ def weight_map(name: str, height: int, width: int) -> NDArray[np.float32]:
 
 def weighted_reading(
     observations: Observations,
-    estimate: NDArray[np.float64] | None = None,
+    estimate: Floats | None = None,
     *,
     camera: CameraProfile,
     name: str,
@@ -111,7 +109,7 @@ def weighted_reading(
 
 def matrix_reading(
     observations: Observations,
-    estimate: NDArray[np.float64] | None = None,
+    estimate: Floats | None = None,
     *,
     camera: CameraProfile,
 ) -> Reading:
@@ -140,7 +138,7 @@ def matrix_reading(
     return Reading(reading.ev100 + correction, reading.saturated, reading.black)
 
 
-def _zone_means(images: NDArray[Any]) -> NDArray[np.float64]:
+def _zone_means(images: NDArray[Any]) -> Floats:
     """Means over the zones, ``(N, zones)``, row by row."""
     for axis in (1, 2):
         size = images.shape[axis]
@@ -152,10 +150,10 @@ def _zone_means(images: NDArray[Any]) -> NDArray[np.float64]:
     return images.reshape(len(images), -1)
 
 
-def _zone_weights() -> NDArray[np.float64]:
+def _zone_weights() -> Floats:
     """Centre weighting of the zones, summing to 1."""
     offset = np.arange(MATRIX_ZONES) - (MATRIX_ZONES - 1) / 2
     profile = np.exp(-0.5 * (offset / MATRIX_SIGMA) ** 2)
-    weights: NDArray[np.float64] = np.outer(profile, profile).ravel()
+    weights: Floats = np.outer(profile, profile).ravel()
     weights /= weights.sum()
     return weights

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ae_env.grid import ExposureGrid
-from agents.policy_names import MANUAL_PROGRAMS
-from simulator.utils.checks import check_number, check_word
+from simulator.utils.checks import check_number
 
 Floats = NDArray[np.float64]
 
@@ -40,8 +39,15 @@ USED_BY = {
     "flicker_period": ("P", "A"),
     "weights": ("tuned", "tuned_blind"),
 }
-#: Largest exposure compensation [EV].
-MAX_COMPENSATION = 32.0
+#: Ranges of the numbers among the options.
+_RANGES = {
+    "compensation": (-32.0, 32.0),
+    "damping": (0.0, 1.0),
+    "f_number": (0.1, 1000.0),
+    "exposure_time": (1e-7, 1e5),
+    "shutter_cap": (1e-7, 1e5),
+    "iso": (1.0, 1e7),
+}
 #: Weights of what comes first, second and third in the choice of a state.
 _CAPPED, _BY_HAND, _DISTANCE = 1e9, 1e6, 1e3
 #: A state above the ceiling is so much farther than it is [EV]: any below it is nearer.
@@ -73,19 +79,12 @@ class ProgramOptions:
     iso: float | None = None
 
     def __post_init__(self) -> None:
-        limit = MAX_COMPENSATION
-        values = {
-            "compensation": check_number("compensation", self.compensation, -limit, limit),
-            "damping": check_damping(self.damping),
-            "f_number": check_number("f_number", self.f_number, 0.1, 1000.0),
-            "exposure_time": check_number("exposure_time", self.exposure_time, 1e-7, 1e5),
-        }
-        if self.shutter_cap is not None:
-            values["shutter_cap"] = check_number("shutter_cap", self.shutter_cap, 1e-7, 1e5)
-        if self.iso is not None:
-            values["iso"] = check_number("iso", self.iso, 1.0, 1e7)
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name)
+            if value is not None or name not in ("shutter_cap", "iso"):
+                object.__setattr__(self, name, check_number(name, value, low, high))
+        if self.damping == 1.0:
+            raise ValueError("`damping` (=1) must be below 1: nothing would ever move")
 
 
 class StateChooser:
@@ -169,28 +168,6 @@ class StateChooser:
         distance = np.maximum(distance - self._least_distance(distance) - SAME_EV, 0.0)
         first = _CAPPED * self.over_cap + _BY_HAND * self._fixed
         return -(first + _DISTANCE * distance + preference)
-
-
-def check_damping(damping: float) -> float:
-    """`damping` as a float.
-
-    Raises:
-        ValueError: Unless it is a number in [0, 1).
-    """
-    value = check_number("damping", damping, 0.0, 1.0)
-    if value == 1.0:
-        raise ValueError(f"`damping` (={damping!r}) must be below 1: nothing would ever move")
-    return value
-
-
-def check_program(program: str, programs: tuple[str, ...] = MANUAL_PROGRAMS) -> str:
-    """`program` as it is.
-
-    Raises:
-        ValueError: Unless it is one of `programs`.
-    """
-    check_word("program", program, programs)
-    return program
 
 
 def check_used(program: str, **options: object) -> None:

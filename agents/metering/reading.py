@@ -1,4 +1,4 @@
-"""The reading of a light meter, and the light that a frame shows."""
+"""Readings of light meters: of one frame, and what those of several frames say together."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from ae_env.observation import PEDESTAL, decode_observation, decode_settings
 from agents.policy import Observations
 from simulator.camera import CameraProfile
+
+Floats = NDArray[np.float64]
 
 #: The planes that carry luminance.
 GREEN = slice(1, 3)
@@ -27,6 +29,23 @@ SATURATED_STEP_EV = 3.0
 #: Codes of the 8-bit observation, and the signal of each.
 CODES = 256
 CODE_SIGNALS = (1.0 + PEDESTAL) * (np.arange(CODES) / (CODES - 1.0)) ** 2 - PEDESTAL
+#: Zones a side, at most.
+ZONES = 32
+#: A meter's own reading stands up to this share of saturated weight.
+TRUSTED_SATURATED = 0.02
+#: Share of the zones that two frames must show unclipped to be compared, and the mean signal of
+#: those in each.
+LEAST_SHARE, LEAST_SIGNAL = 0.01, 0.004
+#: Metered weight from which a frame is all white.
+ALL_SATURATED = 0.999
+#: Quantiles in which frames are compared.
+_QUANTILES = np.linspace(0.05, 0.95, 19)
+#: The light is another one where the frames differ by more than these, in the square root of the
+#: signal (mean of the quantiles), and in stops (median of those that both frames show well).
+_TOLERANCE, _TOLERANCE_EV = 0.04, 0.3
+_SHOWN = (0.004, 0.9)
+#: Saturated share from which a frame hides something.
+_SATURATED = 0.01
 
 
 @dataclass(frozen=True)
@@ -40,17 +59,15 @@ class Reading:
         black: Whether nothing was recorded, ``(N,)``: the reading is an upper bound.
     """
 
-    ev100: NDArray[np.float64]
-    saturated: NDArray[np.float64]
+    ev100: Floats
+    saturated: Floats
     black: NDArray[np.bool_]
 
 
 class Meter(Protocol):
     """A light meter for a batch of cameras."""
 
-    def __call__(
-        self, observations: Observations, estimate: NDArray[np.float64] | None = None
-    ) -> Reading:
+    def __call__(self, observations: Observations, estimate: Floats | None = None) -> Reading:
         """Meter the frames in hand.
 
         Args:
@@ -60,7 +77,7 @@ class Meter(Protocol):
         """
 
 
-def frame_ev100(observations: Observations) -> NDArray[np.float64]:
+def frame_ev100(observations: Observations) -> Floats:
     """EV100 at which each frame in hand was taken, ``(N,)``: Av + Tv - (Sv - 5).
 
     Av is rounded to the third of a stop that a marked f-number stands for.
@@ -110,10 +127,199 @@ def signal_codes(
     return codes
 
 
-def mean_reading(
-    mean: NDArray[np.float64], saturated: NDArray[np.float64], ev: NDArray[np.float64]
-) -> Reading:
+def mean_reading(mean: Floats, saturated: Floats, ev: Floats) -> Reading:
     """The reading of frames with this mean signal, taken at `ev`, all ``(N,)``."""
     level = np.log2(np.maximum(mean, BLACK_SIGNAL) / TARGET_SIGNAL)
     black = mean <= BLACK_SIGNAL * 1.001
     return Reading(ev + level + SATURATED_STEP_EV * saturated, saturated, black)
+
+
+# -- over the frames of an episode -----------------------------------------------------------------
+
+
+class EVTracker:
+    """Continuous metered EV of each camera over the frames of an episode.
+
+    A reading far from the estimate replaces it; within a stop the two are averaged, which settles
+    what would otherwise flip between neighbouring states. A mostly saturated frame only says that
+    the light is not below a bound, a black one that it is not above: an estimate that agrees with
+    the bound stays. A frame that is all white or all black moves any other estimate half of the
+    way to the end of the range.
+
+    With damping the EV that is handed out follows that estimate, keeping `damping` of its distance
+    to it at every frame. It is a number of its own and never read back from the settings: a grid of
+    whole stops does not hold it up. Its past never counts as lying beyond the range: light that
+    comes back after a long night is followed at once.
+
+    Args:
+        num_envs: Cameras.
+        ev_range: Lowest and highest EV100 of the camera's exposure states.
+        damping: Share of the distance to the estimate [EV] that remains after a frame, in [0, 1).
+        compensation: Exposure compensation [EV] that is taken off what is handed out: the range of
+            that is so much higher.
+    """
+
+    def __init__(
+        self,
+        num_envs: int,
+        ev_range: tuple[float, float],
+        damping: float = 0.0,
+        compensation: float = 0.0,
+    ) -> None:
+        self.ev100 = np.full(num_envs, np.nan)
+        self.damped = np.full(num_envs, np.nan)
+        self.ev_range = ev_range
+        self.damping = damping
+        self.compensation = compensation
+
+    def update(self, reading: Reading) -> Floats:
+        """Take in one frame's reading; returns the estimates, ``(N,)``, damped."""
+        old, new = self.ev100, reading.ev100
+        low, high = self.ev_range
+        bound = new - SATURATED_STEP_EV * reading.saturated
+        agrees = (reading.saturated > 0.5) & (old >= bound) | reading.black & (old <= new)
+        white = reading.saturated >= ALL_SATURATED
+        new = np.where(reading.black, np.minimum(new, 0.5 * (new + low)), new)
+        new = np.where(white, np.maximum(new, 0.5 * (bound + high)), new)
+        blended = np.where(np.abs(new - old) > 1.0, new, 0.5 * (new + old))
+        self.ev100 = np.where(np.isnan(old), new, np.where(agrees, old, blended))
+        before = np.clip(self.damped, low + self.compensation, high + self.compensation)
+        distance = self.damping * (before - self.ev100)
+        self.damped = self.ev100 + np.where(np.isnan(distance), 0.0, distance)
+        return self.damped.copy()
+
+
+class ReferenceFrames:
+    """Keeps, for each camera, the best frame of the present light.
+
+    What a search finds on a saturated frame and on a dark one of the same scene differs, because
+    neither shows what the other does: a controller that follows the frame in hand may go to and fro
+    between the two for ever. So it continues to search on the better one for as long as new frames
+    look as that one predicts. Of two frames the less saturated is better; of two that are not
+    saturated, the brighter.
+
+    Args:
+        camera: The camera, for its black and white level.
+    """
+
+    def __init__(self, camera: CameraProfile) -> None:
+        self.camera = camera
+        self._raw: NDArray[np.uint8] | None = None  # (N, 4, h, w) codes
+        self._settings: NDArray[np.floating] | None = None
+        self._quantiles = np.empty((0, 0))
+        self._saturated = np.empty(0)
+        self._ev = np.empty(0)
+
+    def update(self, observations: Observations) -> Observations:
+        """Take in the frames in hand; returns the best ones, raw and settings."""
+        raw = signal_codes(observations["raw"], self.camera)
+        settings = np.asarray(observations["settings"])
+        ev = frame_ev100(observations)
+        green = raw[:, GREEN].reshape(len(raw), -1)
+        ordered = np.sort(green, axis=1)
+        ranks = np.rint(_QUANTILES * (green.shape[1] - 1)).astype(np.intp)
+        quantiles = CODE_SIGNALS[ordered[:, ranks]]
+        white = np.searchsorted(CODE_SIGNALS, WHITE_SIGNAL)
+        saturated = (green >= white).mean(axis=1)
+        if self._raw is None or self._settings is None:
+            self._raw, self._settings = raw.copy(), settings.copy()
+            self._quantiles, self._saturated, self._ev = quantiles, saturated, ev
+            return {"raw": self._raw, "settings": self._settings}
+        hides, hid = saturated >= _SATURATED, self._saturated >= _SATURATED
+        better = np.where(
+            hides | hid, saturated < self._saturated, ev <= self._ev
+        )  # the same state again is a newer look at the same light
+        replaced = better | self._changed(quantiles, ev)
+        self._raw[replaced], self._settings[replaced] = raw[replaced], settings[replaced]
+        self._quantiles[replaced], self._ev[replaced] = quantiles[replaced], ev[replaced]
+        self._saturated[replaced] = saturated[replaced]
+        return {"raw": self._raw, "settings": self._settings}
+
+    def _changed(self, quantiles: Floats, ev: Floats) -> NDArray[np.bool_]:
+        """Whether the frames in hand look other than predicted, ``(N,)``."""
+        predicted = self._quantiles * np.exp2(self._ev - ev)[:, None]
+        both = np.stack([predicted, quantiles]).clip(0.0, 1.0)
+        apart = np.abs(np.diff(np.sqrt(both), axis=0)[0]).mean(axis=1) > _TOLERANCE
+        shown = (both.min(axis=0) > _SHOWN[0]) & (both.max(axis=0) < _SHOWN[1])
+        stops = np.abs(np.diff(np.log2(np.maximum(both, 1e-6)), axis=0)[0])
+        known = shown.any(axis=1)
+        middle = np.nanmedian(np.where(known[:, None] & ~shown, np.nan, stops), axis=1)
+        changed: NDArray[np.bool_] = apart | known & (middle > _TOLERANCE_EV)
+        return changed
+
+
+class ZoneMatcher:
+    """Replaces what a meter reads in frames that clip by how much brighter they are than the last.
+
+    A frame that is exposed four stops too long is mostly white, and its mean is only a lower bound
+    of the light. But its shadows are recorded: over the zones that clip nowhere, neither in this
+    frame nor in the one before, the ratio of the signals is that of the exposures times that of the
+    light (the comparametric principle of Mann 2000, on a linear sensor). Where too little is left
+    to compare, the meter's reading stands, with its share of white as a warning.
+    """
+
+    def __init__(self) -> None:
+        self._zones: Floats | None = None
+        self._light, self._exposed_at = np.empty(0), np.empty(0)
+
+    def match(self, reading: Reading, zones: Floats, exposed_at: Floats) -> Reading:
+        """Take in one frame of each camera; what it reads, unsaturated where it was matched.
+
+        Args:
+            reading: What a meter reads in the frames, ``(N,)``.
+            zones: Mean signals of their zones, ``(N, zones)``, NaN where a pixel clips.
+            exposed_at: EV100 that they were taken at, ``(N,)``.
+        """
+        light, saturated = reading.ev100, reading.saturated
+        if self._zones is not None:
+            change, comparable = light_change(self._zones, zones)
+            matched = comparable & (saturated > TRUSTED_SATURATED)
+            change += exposed_at - self._exposed_at
+            light = np.where(matched, self._light + change, light)
+            saturated = np.where(matched, 0.0, saturated)
+        self._zones, self._light, self._exposed_at = zones, light, exposed_at
+        return Reading(light, saturated, reading.black)
+
+
+class MatchedReadings(ZoneMatcher):
+    """`ZoneMatcher` on the zones of observed frames.
+
+    Args:
+        camera: The camera, for its black and white level.
+    """
+
+    def __init__(self, camera: CameraProfile) -> None:
+        super().__init__()
+        self.camera = camera
+
+    def update(self, reading: Reading, observations: Observations) -> Reading:
+        """Take in one frame of each camera; what it reads, unsaturated where it was matched."""
+        signal = linear_signal(observations["raw"], self.camera, GREEN)
+        return self.match(reading, _zones(signal), frame_ev100(observations))
+
+
+def light_change(before: Floats, now: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """How many stops more signal `now` has than `before`, over what both show.
+
+    Args:
+        before: Mean signals of zones, (..., zones), NaN where one clips.
+        now: Likewise, of the same zones.
+
+    Returns:
+        Stops (...), and whether there was enough to compare; 0 where not.
+    """
+    both = ~np.isnan(before) & ~np.isnan(now)
+    count = np.maximum(both.sum(axis=-1), 1)
+    means = [np.where(both, zones, 0.0).sum(axis=-1) / count for zones in (before, now)]
+    enough = (both.mean(axis=-1) >= LEAST_SHARE) & (np.minimum(*means) >= LEAST_SIGNAL)
+    stops = np.diff(np.log2(np.maximum(means, LEAST_SIGNAL)), axis=0)[0]
+    return np.where(enough, stops, 0.0), enough
+
+
+def _zones(signal: NDArray[np.float32]) -> Floats:
+    """Means over zones (N, zones) of the greens (N, 2, h, w); NaN where a pixel clips."""
+    pixels = np.where(signal >= WHITE_SIGNAL, np.nan, signal).mean(axis=1)  # NaN if either does
+    high, wide = (max(1, size // ZONES) for size in pixels.shape[1:])
+    rows, columns = pixels.shape[1] // high, pixels.shape[2] // wide
+    blocks = pixels[:, : rows * high, : columns * wide].reshape(-1, rows, high, columns, wide)
+    return blocks.mean(axis=(2, 4), dtype=np.float64).reshape(len(signal), -1)

@@ -1,4 +1,4 @@
-"""Which state was best on the training scenes, given what the meter and the sensors read?"""
+"""The regression of tuned programs: from readings to the expected scores of all states."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.metering.reading import Floats
 from simulator.utils.files import write_atomically
 
 #: Bandwidths tried for EV and, in the same units (stops), for speed and defocus.
@@ -39,14 +40,12 @@ class ScoreRegression:
         bandwidths: Standard deviation of the kernel per reading [stops], ``(d,)``.
     """
 
-    features: NDArray[np.float64]
-    scores: NDArray[np.float64]
-    bandwidths: NDArray[np.float64]
+    features: Floats
+    scores: Floats
+    bandwidths: Floats
 
     @classmethod
-    def fit(
-        cls, features: NDArray[np.float64], scores: NDArray[np.float64], groups: NDArray[Any]
-    ) -> ScoreRegression:
+    def fit(cls, features: Floats, scores: Floats, groups: NDArray[Any]) -> ScoreRegression:
         """Choose the bandwidths by cross-validation over source groups.
 
         The criterion is the mean score of the state that the regression picks for the groups left
@@ -62,10 +61,10 @@ class ScoreRegression:
         dimensions = features.shape[1]
         folds = np.unique(groups, return_inverse=True)[1] % FOLDS
 
-        def bandwidths(ev: float, sensors: float) -> NDArray[np.float64]:
+        def bandwidths(ev: float, sensors: float) -> Floats:
             return np.array([ev, *[sensors] * (dimensions - 1)])
 
-        def criterion(candidate: NDArray[np.float64]) -> float:
+        def criterion(candidate: Floats) -> float:
             return _left_out_score(features, scores, folds, candidate)
 
         sensors = SENSOR_BANDWIDTHS[1]
@@ -75,7 +74,7 @@ class ScoreRegression:
             sensors = _widest_good(SENSOR_BANDWIDTHS, found)
         return cls(features, scores, bandwidths(ev, sensors))
 
-    def predict(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+    def predict(self, features: Floats) -> Floats:
         """Expected scores of all states at these readings, ``(N, S)``.
 
         Readings outside the range of the training ones (an overexposed frame may read any EV) are
@@ -90,10 +89,10 @@ class ScoreRegression:
 
     def _local_fit(
         self,
-        features: NDArray[np.float64],
-        bandwidths: NDArray[np.float64],
-        prior: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+        features: Floats,
+        bandwidths: Floats,
+        prior: Floats,
+    ) -> Floats:
         """Ridge-regularised local linear fit around each query, shrunk to `prior`."""
         known, query = self.features / bandwidths, features / bandwidths
         # Squared distances through the inner product: no (N, n, d) array.
@@ -114,7 +113,7 @@ class ScoreRegression:
         moment[:, 0] += SHRINKAGE * prior
         diagonal = np.arange(1, d + 1)
         gram[:, diagonal, diagonal] += RIDGE * gram[:, :1, 0] + 1e-9
-        solution: NDArray[np.float64] = np.linalg.solve(gram, moment)[:, 0]
+        solution: Floats = np.linalg.solve(gram, moment)[:, 0]
         return solution
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -157,10 +156,10 @@ def _widest_good(bandwidths: Sequence[float], criteria: Sequence[float]) -> floa
 
 
 def _left_out_score(
-    features: NDArray[np.float64],
-    scores: NDArray[np.float64],
+    features: Floats,
+    scores: Floats,
     folds: NDArray[np.intp],
-    bandwidths: NDArray[np.float64],
+    bandwidths: Floats,
 ) -> float:
     """Mean score of the states picked for each fold by the regression on the others."""
     total = 0.0

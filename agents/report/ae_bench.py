@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import io
 import logging
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from ae_env.scenes.polyhaven import list_assets
-from agents.evaluation import metrics
-from agents.evaluation.bracket_plan import BracketPlan, BracketResult, load_bench_plan
-from agents.evaluation.evaluation_plan import EvaluationPlan, digest
 from agents.evaluation.intervals import Rank
+from agents.evaluation.plan import EvaluationPlan, digest, load_plan
+from agents.evaluation.result import Results, static_condition
 from agents.policy_names import split_class, split_options
-from agents.report.markdown import escape, markdown_table
-from agents.report.result_table import Results
-from simulator.utils.files import write_atomically
-from simulator.utils.results import machine, versions
+from agents.report.evaluation import Cell, to_markdown
+from simulator.utils.files import machine, versions, write_atomically
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,8 +27,6 @@ if TYPE_CHECKING:
     from ae_env.scenes import Scene
 
 logger = logging.getLogger(__name__)
-#: The plan of a task of a benchmark.
-BenchPlan = EvaluationPlan | BracketPlan
 
 #: The scenes' light is hashed as means of so many blocks a side, to so many EV: a scene that was
 #: made otherwise is noticed, the last bit of another processor's arithmetic is not.
@@ -51,52 +45,63 @@ COLUMNS = (
 #: Columns that hold no numbers.
 _TEXT = ("task", "policy", "observation", "author", "date", "cpu", "version", "hash")
 #: What identifies a row.
-_KEY = ("task", "policy", "observation", "author")
-#: Metrics of a row that are means over all conditions.
-_MEANS = (
-    *("regret", "ev_within_third", "frames_to_converge", "converged", "reversals", "jump"),
-    *("clipped_high", "clipped_low"),
-)
+_KEY = ["task", "policy", "observation", "author"]
+#: Metrics of a row that are means over all conditions, by the measure of the plan.
+_MEANS = {
+    "score": (
+        *("regret", "ev_within_third", "frames_to_converge", "converged", "reversals", "jump"),
+        *("clipped_high", "clipped_low"),
+    ),
+    "quality": ("log_error", "unseen", "frames"),
+}
 #: The tables of a page: their tasks, what is said of each, and its columns by heading.
-_COMMON = {"policy": "policy", "sees": "observation", "score": "score", "95 % interval": "ci95"}
-_SCENES = {"procedural": "procedural", "real": "real"}
-_LAST = {"ms alone": "ms_alone", "seeds": "training_seeds", "author": "author", "date": "date"}
-_FRAMES = {
-    "regret": "regret",
-    "within 1/3 EV": "ev_within_third",
-    "frames to converge": "frames_to_converge",
-    "converged": "converged",
-    "reversals": "reversals",
-    "jump": "jump",
-    "white": "clipped_high",
+_COMMON: dict[str, Cell] = {
+    "policy": "{policy}",
+    "sees": "{observation}",
+    "score": "{score:.4f}",
+    "95 % interval": "{ci95_low:.4f} to {ci95_high:.4f}",
+    "procedural": "{procedural:.4f}",
+    "real": "{real:.4f}",
+}
+_FRAMES: dict[str, Cell] = {
+    "regret": "{regret:.4f}",
+    "within 1/3 EV": "{ev_within_third:.2%}",
+    "frames to converge": "{frames_to_converge:.4f}",
+    "converged": "{converged:.2%}",
+    "reversals": "{reversals:.4f}",
+    "jump": "{jump:.4f}",
+    "white": "{clipped_high:.2%}",
+}
+_BRACKETS: dict[str, Cell] = {
+    "error [EV]": "{log_error:.4f}",
+    "unseen": "{unseen:.2%}",
+    "frames": "{frames:.4f}",
+}
+_LAST: dict[str, Cell] = {
+    "ms alone": "{ms_alone:.4f}",
+    "seeds": "{training_seeds:.0f}",
+    "author": "{author}",
+    "date": "{date}",
 }
 _TABLES = {
     "still": (
         "Still: `AutoExposure-v0`",
         "Score: normalised over all conditions, each with the same weight; 0 is a random policy, "
         "1 the best state of every frame in that frame's own light.",
-        {**_COMMON, **_SCENES, **_FRAMES, **_LAST},
+        {**_COMMON, **_FRAMES, **_LAST},
     ),
     "video": (
         "Video: `AutoExposureVideo-v0`",
         "Score: as above. Nobody reaches 1, as the light to come must be guessed: "
         "`oracle:last_frame`, which is not ranked, knows that of the frame in hand.",
-        {**_COMMON, **_SCENES, **_FRAMES, **_LAST},
+        {**_COMMON, **_FRAMES, **_LAST},
     ),
     "bracket": (
         "Bracket: `ExposureBracket-v0`",
         "Score: quality of the merged picture, 1 - mean error / 2 EV, over all time budgets.",
-        {
-            **_COMMON,
-            **_SCENES,
-            "error [EV]": "log_error",
-            "unseen": "unseen",
-            "frames": "frames",
-            **_LAST,
-        },
+        {**_COMMON, **_BRACKETS, **_LAST},
     ),
 }
-_PERCENT = ("ev_within_third", "converged", "clipped_high", "unseen")
 #: What tells a page that this module wrote.
 _MARK = "<!-- written by `ae-env evaluate --append`"
 _PAGE = """\
@@ -152,22 +157,22 @@ def _blocks(planes: Tensor) -> NDArray[Any]:
     return means
 
 
-def bench_hash(plan: BenchPlan, scenes: Sequence[Scene]) -> str:
+def bench_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> str:
     """sha256 of the plan, or of all plans of its suite, of its scenes, and of `RULES`."""
     protocols: Any = plan.protocol()
     if plan.suite:
-        protocols = [_shared(load_bench_plan(name)) for name in plan.suite]
+        protocols = [_shared(load_plan(name)) for name in plan.suite]
     return digest(RULES, protocols, [scene_signature(scene) for scene in scenes])
 
 
-def _shared(plan: BenchPlan) -> dict[str, Any]:
+def _shared(plan: EvaluationPlan) -> dict[str, Any]:
     """What decides the episodes of a plan of a suite: a policy may choose what it is shown."""
     protocol = plan.protocol()
     shown = {k: v for k, v in protocol["environment"].items() if k != "observation"}
     return {**protocol, "environment": shown}
 
 
-def check_hash(plan: BenchPlan, scenes: Sequence[Scene]) -> None:
+def check_hash(plan: EvaluationPlan, scenes: Sequence[Scene]) -> None:
     """Checks that a benchmark is still the one that its hash was written down for.
 
     Raises:
@@ -200,7 +205,9 @@ def row_name(policy: str) -> str:
     return policy
 
 
-def check_append(table: Path, plan: BenchPlan, policies: Sequence[str], *, author: str) -> None:
+def check_append(
+    table: Path, plan: EvaluationPlan, policies: Sequence[str], *, author: str
+) -> None:
     """Checks that rows of `policies` can be added to a table, before they are measured.
 
     Args:
@@ -219,7 +226,7 @@ def check_append(table: Path, plan: BenchPlan, policies: Sequence[str], *, autho
             f"`append` (={str(table)!r}): {plan.name} takes no rows any more, AE-Bench v2 has "
             "superseded it: --preset ae_bench_v2_still"
         )
-    rows = _rows_of_hash(table, plan)
+    known = _read_own(table, plan)[_KEY].apply(tuple, axis=1).tolist()
     if page_of(table) == table:
         raise ValueError(f"`append` (={str(table)!r}) must be a CSV file, such as mine.csv")
     page = page_of(table)
@@ -242,7 +249,7 @@ def check_append(table: Path, plan: BenchPlan, policies: Sequence[str], *, autho
                 f"{table}: rename a file"
             )
         seen[name] = policy
-        if not author.strip() and (plan.task, name, plan.observation, "") in rows:
+        if not author.strip() and (plan.task, name, plan.observation, "") in known:
             raise ValueError(
                 f"`author` (={author!r}) must be given: {table} has a row of {name!r} without an "
                 "author, which may be another's"
@@ -250,7 +257,7 @@ def check_append(table: Path, plan: BenchPlan, policies: Sequence[str], *, autho
 
 
 def append_rows(
-    table: Path, plan: BenchPlan, found: Sequence[Mapping[str, Any]], *, author: str
+    table: Path, plan: EvaluationPlan, rows: pd.DataFrame, *, author: str
 ) -> dict[str, Path]:
     """Adds rows to a benchmark's table, and writes its page again.
 
@@ -260,7 +267,7 @@ def append_rows(
     Args:
         table: CSV with `COLUMNS`; made where missing.
         plan: The plan of the task.
-        found: ``policy`` and the numbers of each row, see `result_rows` and `COLUMNS`.
+        rows: ``policy`` and the numbers of each row, see `bench_rows` and `COLUMNS`.
         author: Who made the policies.
 
     Returns:
@@ -269,87 +276,73 @@ def append_rows(
     Raises:
         ValueError: If the table has other columns, or rows of another hash.
     """
-    rows = _rows_of_hash(table, plan)
-    for one in found:
-        row = _written(one) | {
-            "task": plan.task,
-            "policy": row_name(one["policy"]),
-            "observation": plan.observation,
-            "author": author.strip(),
-            "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-            "cpu": str(machine()["cpu"]),
-            "version": versions().get("ae-env", ""),
-            "hash": plan.hash or "",
-        }
-        key = tuple(row[name] for name in _KEY)
-        if key in rows:
-            logger.warning("%s: replaced the row of %r by %r", table, row["policy"], row["author"])
-        rows[key] = row
-    tasks = list(_TABLES)
-    ordered = sorted(rows.values(), key=lambda r: (tasks.index(r["task"]), -float(r["score"])))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(ordered)
+    known = _read_own(table, plan)
+    found = rows.assign(
+        task=plan.task,
+        policy=rows.policy.map(row_name),
+        observation=plan.observation,
+        author=author.strip(),
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        cpu=str(machine()["cpu"]),
+        version=versions().get("ae-env", ""),
+        hash=plan.hash or "",
+    )
+    # Through text, so that a table says the same whether its rows are new or read from the file.
+    text = found.reindex(columns=COLUMNS).to_csv(index=False, float_format="%.4f")
+    both = pd.concat([known, _parse(text)])
+    replaced = known.merge(found[_KEY].astype(str), on=_KEY)
+    for row in replaced.itertuples():
+        logger.warning("%s: replaced the row of %r by %r", table, row.policy, row.author)
+    both = both.drop_duplicates(_KEY, keep="last")
+    order = both.task.map(list(_TABLES).index)
+    both = both.assign(order=order, value=-both.score.astype(float))
+    both = both.sort_values(["order", "value"], kind="stable")[list(COLUMNS)]
     page = page_of(table)
+    content = both.to_csv(index=False, lineterminator="\n")
     return {
-        table.name: write_atomically(table, text.getvalue()),
-        page.name: write_atomically(page, table_page(plan, ordered, table)),
+        table.name: write_atomically(table, content),
+        page.name: write_atomically(page, table_page(plan, both, table)),
     }
 
 
-def _written(row: Mapping[str, Any]) -> dict[str, str]:
-    """A row's numbers as the table has them; what there is none of stays empty."""
-    numbers = {key: row.get(key) for key in COLUMNS}
-    return {
-        key: "" if value is None else str(value) if isinstance(value, int) else f"{value:.4f}"
-        for key, value in numbers.items()
-        if not isinstance(value, str)
-    }
-
-
-def _rows_of_hash(table: Path, plan: BenchPlan) -> dict[tuple[str, ...], dict[str, str]]:
-    """Rows of a table by `_KEY`; an error where one has another hash."""
-    rows = {tuple(row[name] for name in _KEY): row for row in read_table(table)}
-    for key, row in rows.items():
-        if row["hash"] != plan.hash:
-            raise ValueError(
-                f"{table}: policy {key[1]!r} was measured under the hash {row['hash']}, this run "
-                f"under {plan.hash}: they do not compare"
-            )
+def _read_own(table: Path, plan: EvaluationPlan) -> pd.DataFrame:
+    """Rows of a table; an error where one has another hash."""
+    rows = read_table(table)
+    for row in rows[rows.hash != plan.hash].itertuples():
+        raise ValueError(
+            f"{table}: policy {row.policy!r} was measured under the hash {row.hash}, this run "
+            f"under {plan.hash}: they do not compare"
+        )
     return rows
 
 
-def read_table(table: Path) -> list[dict[str, str]]:
-    """Rows of a benchmark's table; none where there is no file.
+def _parse(text: str) -> pd.DataFrame:
+    """Cells of a table as the texts that they are: those of other rows stay to the last digit."""
+    return pd.read_csv(io.StringIO(text), dtype=str, keep_default_na=False)
+
+
+def read_table(table: Path) -> pd.DataFrame:
+    """Rows of a benchmark's table, all cells as texts; none where there is no file.
 
     Raises:
         ValueError: If it cannot be read, its columns are not `COLUMNS`, or a cell is no number.
     """
     if not table.is_file():
-        return []
+        return pd.DataFrame(columns=COLUMNS, dtype=str)
     try:
-        text = table.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        rows = _parse(table.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:  # pandas' errors of parsing are ValueErrors
         raise ValueError(f"{table} cannot be read as a table: {error}") from error
-    reader = csv.DictReader(io.StringIO(text, newline=""))
-    if tuple(reader.fieldnames or ()) != COLUMNS:
+    if tuple(rows.columns) != COLUMNS:
         raise ValueError(f"{table}: its columns must be {', '.join(COLUMNS)}")
-    rows = list(reader)
-    for line, row in enumerate(rows, start=2):
-        for name in COLUMNS:
-            value = row[name]
-            if value is None or (name not in _TEXT and not _is_number(value, name == "score")):
-                raise ValueError(f"{table}, line {line}: `{name}` (={value!r}) must be a number")
+    for name in (name for name in COLUMNS if name not in _TEXT):
+        numbers = pd.to_numeric(rows[name], errors="coerce")
+        wrong = ~np.isfinite(numbers) & ((rows[name] != "") | (name == "score"))
+        for line in np.flatnonzero(wrong):
+            raise ValueError(
+                f"{table}, line {line + 2}: `{name}` (={rows[name][line]!r}) must be a number"
+            )
     return rows
-
-
-def _is_number(text: str, required: bool) -> bool:
-    """Whether a cell holds a finite number, or nothing where nothing is required."""
-    try:
-        return math.isfinite(float(text)) if text or required else True
-    except ValueError:
-        return False
 
 
 def page_of(table: Path) -> Path:
@@ -362,30 +355,23 @@ def page_of(table: Path) -> Path:
     return (folder if folder.name == "ae-bench" else table).with_suffix(".md")
 
 
-def result_rows(
-    plan: EvaluationPlan, results: Results, ranking: Sequence[Rank]
-) -> list[dict[str, Any]]:
-    """The rows of policies of a plan of conditions: means over all of them.
+def bench_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+    """The rows of the policies that are ranked: means over all conditions or budgets.
 
     Args:
-        plan: The plan.
         results: By condition.
         ranking: Over all conditions.
     """
-    return [_row(plan, results, one) for one in ranking]
+    return pd.DataFrame([_row(results, one) for one in ranking])
 
 
-def _row(plan: EvaluationPlan, results: Results, one: Rank) -> dict[str, Any]:
-    name = one.policy
-    track = results[plan.static_condition].tracks[name]
+def _row(results: Results, one: Rank) -> dict[str, Any]:
+    first = results[static_condition(results)]
+    track = first.tracks[one.policy]
 
     def mean(key: str) -> float:
         """Over all conditions, source groups with the same weight."""
-        values = [
-            metrics.group_means(r.episode_metrics(name)[key], r.groups)[0].mean()
-            for r in results.values()
-        ]
-        return float(np.mean(values))
+        return float(np.mean([result.mean(one.policy, key) for result in results.values()]))
 
     def score(real: bool) -> float | None:
         """Over the groups that are real places, or over the others."""
@@ -394,46 +380,23 @@ def _row(plan: EvaluationPlan, results: Results, one: Rank) -> dict[str, Any]:
             chosen = is_real(result.groups) == real
             if not chosen.any():
                 return None
-            gains = (result.episode_metrics(name)["score"] - result.random)[:, chosen]
-            span, groups = (result.oracle - result.random)[chosen], result.groups[chosen]
-            gained = metrics.group_means(gains, groups)[0].mean(axis=0).sum()
-            found.append(gained / metrics.group_means(span, groups)[0].sum())
+            gains, span = result.group_gains(one.policy, chosen)
+            found.append(gains.mean(axis=0).sum() / span.sum())
         return float(np.mean(found))
 
     low, high = one.score.pair or (None, None)
+    brackets = first.measure == "quality"
     return {
-        "policy": name,
+        "policy": one.policy,
         "score": one.score.value,
         "ci95_low": low,
         "ci95_high": high,
         "procedural": score(real=False),
         "real": score(real=True),
-        **{key: mean(key) for key in _MEANS},
-        "ms_alone": track.ms_alone,
-        "training_seeds": len(track.states),
+        **{key: mean(key) for key in _MEANS[first.measure]},
+        "ms_alone": 1000.0 * mean("seconds") if brackets else track.ms_alone,
+        "training_seeds": track.num_seeds,
     }
-
-
-def bracket_rows(results: Sequence[BracketResult]) -> list[dict[str, Any]]:
-    """The rows of policies of a plan of brackets: means over all budgets."""
-    rows = []
-    for result in results:
-        real, interval = is_real(result.groups), result.score()
-        low, high = interval.pair or (None, None)
-        rows.append(
-            {
-                "policy": result.policy,
-                "score": interval.value,
-                "ci95_low": low,
-                "ci95_high": high,
-                "procedural": None if real.all() else result.mean("quality", ~real),
-                "real": result.mean("quality", real) if real.any() else None,
-                **{key: result.mean(key) for key in ("log_error", "unseen", "frames")},
-                "ms_alone": 1000.0 * result.mean("seconds"),
-                "training_seeds": len(result.values["quality"]),
-            }
-        )
-    return rows
 
 
 def is_real(groups: NDArray[Any]) -> NDArray[np.bool_]:
@@ -441,26 +404,20 @@ def is_real(groups: NDArray[Any]) -> NDArray[np.bool_]:
     return np.isin(groups, [asset.place for asset in list_assets()])
 
 
-def table_page(plan: BenchPlan, rows: Sequence[Mapping[str, str]], table: Path) -> str:
+def table_page(plan: EvaluationPlan, rows: pd.DataFrame, table: Path) -> str:
     """The page of a benchmark's table as Markdown."""
 
     def shown(path: Path) -> str:  # a full path is of one machine only
         return path.name if path.is_absolute() else path.as_posix()
 
-    blocks = []
-    for task, (title, text, columns) in _TABLES.items():
-        own = [row for row in rows if row["task"] == task]
-        if own:
-            body = [[_cell(row, key) for key in columns.values()] for row in own]
-            blocks.append(f"## {title}\n\n{text}\n\n{markdown_table(list(columns), body)}")
+    numbers = rows.assign(
+        **{name: pd.to_numeric(rows[name]) for name in COLUMNS if name not in _TEXT}
+    )
+    blocks = [
+        f"## {title}\n\n{text}\n\n{to_markdown(numbers[rows.task == task], columns)}"
+        for task, (title, text, columns) in _TABLES.items()
+        if (rows.task == task).any()
+    ]
     return _PAGE.format(
         table=shown(table), page=shown(page_of(table)), hash=plan.hash, tables="\n\n".join(blocks)
     )
-
-
-def _cell(row: Mapping[str, str], key: str) -> str:
-    if key == "ci95":
-        return f"{row['ci95_low']} to {row['ci95_high']}" if row["ci95_low"] else "-"
-    if not row[key]:
-        return "-"
-    return f"{float(row[key]):.2%}" if key in _PERCENT else escape(row[key])

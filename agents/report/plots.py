@@ -1,21 +1,29 @@
-"""The figures of an evaluation: scores, EV error over time, cost, and paths on contact sheets."""
+"""The pictures of a report: figures of an evaluation, contact sheets, and films of an episode."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
 
 from agents.evaluation import metrics
 from agents.evaluation.result import EvaluationResult
+from agents.policy import Policy
+from agents.rollouts import errors_of
+from simulator import RawImage
+from simulator.raw.develop import quarter_turns
 from simulator.utils.files import write_atomically
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.figure import Figure
-    from PIL import Image
 
 #: Okabe and Ito's colour-blind-safe palette, each with a dash pattern for the second round.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#B8A800")
@@ -37,36 +45,36 @@ _SHEETS, _QUALITY = 2, 75
 _KINDS = ("photograph", "backlit")
 
 
-def plot_scores(path: Path, rows: Sequence[Mapping[str, Any]], title: str = "") -> Path:
+def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
     """Draw the normalised score of each policy, a mark per part, and write it as PNG.
 
     Args:
         path: File to write.
-        rows: As `result_rows` returns them; those of other conditions are left out.
+        rows: As `result_rows` returns them, and those of ``"all conditions"``, where there are
+            several; those of a single other condition are left out.
         title: Text above the figure.
     """
-    overall = {r["policy"]: r["normalised_score"] for r in rows if r["condition"] == "all"}
-    names = sorted((n for n in overall if n != "oracle"), key=lambda n: overall[n])
+    parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
+    names = parts["all"].sort_values("normalised_score", kind="stable").policy
+    names = [name for name in names if name != "oracle"]
     figure = _figure(7.5, 1.6 + 0.42 * len(names))
     axes = figure.add_subplot()
-    shown = [part for part in _PARTS if any(r["condition"] == part for r in rows)]
+    shown = [part for part in _PARTS if part in parts]
     for part in shown:
         colour, marker, offset = _PARTS[part]
-        own = {r["policy"]: r for r in rows if r["condition"] == part}
-        heights = {n: i + (offset if len(shown) > 1 else 0.0) for i, n in enumerate(names)}
-        groups = next(iter(own.values()))["num_groups"]
-        for name in names:
-            if name in own and own[name]["ci95"] is not None:
-                interval = own[name]["ci95"]
-                axes.plot(interval, [heights[name]] * 2, color=colour, lw=1.6, alpha=0.6)
+        own = parts[part][parts[part].policy.isin(names)]
+        heights = [names.index(name) + offset * (len(shown) > 1) for name in own.policy]
+        for interval, height in zip(own.ci95, heights, strict=True):
+            if interval is not None:
+                axes.plot(interval, [height] * 2, color=colour, lw=1.6, alpha=0.6)
         axes.plot(
-            [own[name]["normalised_score"] for name in names if name in own],
-            [heights[name] for name in names if name in own],
+            own.normalised_score,
+            heights,
             color=colour,
             marker=marker,
             linestyle="none",
             markersize=6,
-            label=f"{part} ({groups} groups)",
+            label=f"{part} ({parts[part].num_groups.iloc[0]} groups)",
         )
     axes.axvline(1.0, color="0.35", lw=1.0)
     axes.text(1.01, 0.02, "oracle", rotation=90, transform=axes.get_xaxis_transform())
@@ -261,11 +269,9 @@ def _text(name: str) -> str:
 
 
 def _write(path: Path, figure: Figure) -> Path:
-    from PIL.Image import open as opened
-
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
-    return write_palette_png(path, opened(stream))
+    return write_palette_png(path, Image.open(stream))
 
 
 def write_palette_png(path: Path, picture: Image.Image) -> Path:
@@ -278,9 +284,160 @@ def write_palette_png(path: Path, picture: Image.Image) -> Path:
     Returns:
         `path`.
     """
-    from PIL.Image import Dither
-
     stream = io.BytesIO()
-    indexed = picture.convert("RGB").quantize(256, dither=Dither.NONE)
+    indexed = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     indexed.save(stream, format="PNG", optimize=True)
     return write_atomically(path, stream.getvalue())
+
+
+def upright_picture(raw: RawImage, srgb: torch.Tensor) -> Image.Image:
+    """`srgb` (3, H, W) uint8, a picture of `raw`, turned as its camera was held.
+
+    Where the sensor's pixels are not square, it grows along their longer side: none is left out.
+    """
+    picture = Image.fromarray(srgb.permute(1, 2, 0).cpu().numpy())
+    aspect = raw.metadata.get("pixel_aspect", 1.0)
+    if aspect != 1.0:
+        size = round(picture.width * max(aspect, 1)), round(picture.height / min(aspect, 1))
+        picture = picture.resize(size, Image.Resampling.BICUBIC)
+    upright = np.rot90(np.asarray(picture), quarter_turns(raw))
+    return Image.fromarray(np.ascontiguousarray(upright))
+
+
+#: Size of a picture, height of the chart below it and of the title above [pixel].
+PICTURE, CHART, TITLE, GAP = 192, 64, 34, 8
+#: Pictures per second; half of the camera's, so that one can follow.
+FRAME_RATE = 15
+#: Colours of the picture file.
+COLOURS = 64
+_INK, _PAPER, _ORACLE, _CHOSEN = "#202020", "#ffffff", "#b0b0b0", "#c0392b"
+
+
+@dataclass
+class Recording:
+    """One policy's episode.
+
+    Args:
+        name: Of the policy.
+        pictures: (H, W, 3) uint8 of every frame.
+        ev100: EV100 of the settings of every frame.
+        best: EV100 of the best state of every frame.
+        scores: Score of every frame.
+        states: Index of the state of every frame.
+        regrets: Best state's expected score less that of the frame's state, of every frame.
+    """
+
+    name: str
+    pictures: list[np.ndarray] = field(default_factory=list)
+    ev100: list[float] = field(default_factory=list)
+    best: list[float] = field(default_factory=list)
+    scores: list[float] = field(default_factory=list)
+    states: list[int] = field(default_factory=list)
+    regrets: list[float] = field(default_factory=list)
+
+
+def record(
+    name: str,
+    policy: Policy,
+    envs: gym.vector.VectorEnv[Any, Any, Any],
+    frames: int,
+    seed: int,
+    scene: str | None = None,
+) -> Recording:
+    """Runs `policy` through one episode.
+
+    Args:
+        name: Of the policy, in the film.
+        policy: Fitted.
+        envs: One environment, made with ``with_oracle=True`` and ``render_mode="rgb_array"``.
+        frames: Actions.
+        seed: Decides the scene, its light and the start.
+        scene: Id of the scene; drawn by default.
+    """
+    base: Any = envs.unwrapped
+    options = None if scene is None else {"scene": scene}
+    observations, info = envs.reset(seed=seed, options=options)
+    with errors_of(name, "reset"):
+        policy.reset(1, seed=seed)
+    found = Recording(name)
+    for frame in range(frames + 1):
+        if frame:
+            with errors_of(name, "act"):
+                extra = {"info": info} if policy.privileged else {}
+                actions = policy.act(observations, base.action_masks(), **extra)
+            observations, _, _, _, info = envs.step(actions)
+        pictures: Any = envs.render()
+        found.pictures.append(pictures[0])
+        found.ev100.append(float(info["ev100"][0]))
+        found.best.append(float(base.grid.ev100[info["oracle_state"][0]]))
+        found.scores.append(float(info["rewards"]["score"][0]))
+        found.states.append(int(info["state"][0]))
+        found.regrets.append(float(info["regret"][0]))
+    return found
+
+
+def write_film(
+    path: Path,
+    recordings: Sequence[Recording],
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Writes the recordings side by side as an animated GIF, each over a chart of its exposure.
+
+    The chart has the EV100 of the best state in grey, that of the policy in colour up to now.
+    """
+    images = []
+    total = len(recordings[0].pictures)
+    for frame in range(total):
+        panels = [_panel(recording, frame) for recording in recordings]
+        width = sum(panel.width for panel in panels) + GAP * (len(panels) - 1)
+        image = Image.new("RGB", (width, panels[0].height), _PAPER)
+        for i, panel in enumerate(panels):
+            image.paste(panel, (i * (PICTURE + GAP), 0))
+        images.append(image.quantize(COLOURS, dither=Image.Dither.NONE))
+        if progress is not None:
+            progress(frame + 1, total)
+    content = io.BytesIO()
+    more: dict[str, Any] = {"append_images": images[1:], "duration": 1000 // FRAME_RATE}
+    images[0].save(content, format="GIF", save_all=True, loop=0, optimize=True, **more)
+    return write_atomically(path, content.getvalue())
+
+
+def _panel(recording: Recording, frame: int) -> Image.Image:
+    panel = Image.new("RGB", (PICTURE, TITLE + PICTURE + CHART), _PAPER)
+    draw = ImageDraw.Draw(panel)
+    score = float(np.mean(recording.scores[1 : frame + 1])) if frame else recording.scores[0]
+    for i, text in enumerate((recording.name, f"mean score so far {score:.2f}")):
+        font: Any = ImageFont.load_default(12)
+        while draw.textlength(text, font) > PICTURE and font.size > 7:
+            font = ImageFont.load_default(int(font.size) - 1)
+        draw.text((0, 2 + 15 * i), text, _INK, font)
+    picture = Image.fromarray(recording.pictures[frame]).resize((PICTURE, PICTURE))
+    panel.paste(picture, (0, TITLE))
+    top, bottom = TITLE + PICTURE + 4, TITLE + PICTURE + CHART - 4
+    low, high = min(recording.best + recording.ev100), max(recording.best + recording.ev100)
+
+    def points(values: Sequence[float]) -> list[tuple[float, float]]:
+        step, scale = PICTURE / max(len(recording.best) - 1, 1), max(high - low, 1.0)
+        return [
+            (i * step, bottom - (v - low) / scale * (bottom - top)) for i, v in enumerate(values)
+        ]
+
+    draw.line(points(recording.best), fill=_ORACLE, width=3)
+    if frame:
+        draw.line(points(recording.ev100[: frame + 1]), fill=_CHOSEN, width=2)
+    return panel
+
+
+def film(
+    policies: Mapping[str, Policy],
+    envs: gym.vector.VectorEnv[Any, Any, Any],
+    path: Path,
+    *,
+    frames: int,
+    seed: int = 0,
+    scene: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Films one episode by each of `policies`; see `record` and `write_film`."""
+    found = [record(name, p, envs, frames, seed, scene) for name, p in policies.items()]
+    return write_film(path, found, progress)

@@ -16,7 +16,7 @@ from PIL import Image
 
 from agents.applications.hdr import hdr_picture, linear_rgb, write_exr
 from agents.applications.refocus import refocus
-from agents.report.upright import upright_picture
+from agents.report.plots import upright_picture
 from agents.viewer.tab import Stage, Tab, complain
 from agents.viewer.viewed_scene import ViewedScene, encoded
 from simulator import CameraSimulator, RawImage, render_srgb, write_dng

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ae_env.scenes.pictures import Split
 from benchmarks.features.detector import Features, mutual_matches
 from benchmarks.features.pairs import (
     Source,
@@ -27,7 +26,8 @@ from benchmarks.features.pairs import (
 from benchmarks.features.training import CAMERA
 from simulator import CameraSettings, develop, get_camera
 from simulator.noise.generator import noise_generator
-from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.training.scenes import Split
 
 #: Gaps [EV] and ISOs at which every pair is taken.
 GAPS, ISOS = (0.0, 2.0, 4.0, 6.0), (100.0, 1600.0, 12800.0)

@@ -11,16 +11,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ae_env.scenes.pictures import (
+from benchmarks.harness import data_root
+from simulator import develop
+from simulator.radiance.maps import read_radiance
+from simulator.raw.develop import GREY_CARD_SIGNAL
+from simulator.training.scenes import (
     Split,
     photograph_pictures,
     radiance_files,
     recorded_mosaics,
 )
-from benchmarks.harness import data_root
-from simulator import develop
-from simulator.radiance.maps import read_radiance
-from simulator.raw.develop import GREY_CARD_SIGNAL
 
 #: Brightest light of a map, in its medians.
 _BRIGHTEST = 64.0

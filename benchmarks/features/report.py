@@ -84,7 +84,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "Milliseconds for one picture on one thread, and seconds of the second stage of the "
         "training on one thread, on a machine that others used meanwhile.",
         "## Across the exposure gap",
-        "![accuracy against the gap, and matches of one pair](features.png)",
+        "![accuracy against the gap, and matches of one pair](features.webp)",
         *_by_gap(means),
         "## By ISO, gaps of 4 EV and more",
         *_by_iso(by_iso),
@@ -95,7 +95,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         *_differences(differences),
     ]
     rows = [*costs, *means, *by_iso, *differences]
-    return Report(rows, page, figures={"features.png": picture(means, runs, meta)})
+    return Report(rows, page, figures={"features.webp": picture(means, runs, meta)})
 
 
 def _large(gaps: Iterable[float]) -> tuple[float, ...]:

@@ -49,7 +49,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     cards = load_models().cards
     page = [
         "One thread, float32. Ground truth is the reference camera "
-        "(`simulator/reference/reference_camera.py`); every scene is from the test split, whose "
+        "(`simulator/reference/camera.py`); every scene is from the test split, whose "
         "source groups no training saw. A millisecond is that of one 4 x 128 x 128 raw unless "
         "stated otherwise.",
         table([{"name": name, **card} for name, card in cards.items()], _CARD_COLUMNS),

@@ -16,7 +16,6 @@ import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from ae_env.scenes.reference_scenes import depth_photographs, reference_scenes
 from benchmarks.captures import clipped
 from benchmarks.fidelity.models import load_models
 from benchmarks.harness import Row, data_root, pivot, sections
@@ -24,7 +23,8 @@ from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
 from simulator.optics.disc_bank import DiscBank, added_blur
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import depth_photographs, reference_scenes
 
 CAMERA = "nikon_z6"
 #: Procedural groups, of which three quarters have depth, and their height and width [pixel].

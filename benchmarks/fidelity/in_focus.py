@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ae_env.scenes.reference_scenes import mosaic_scenes, reference_scenes
 from benchmarks.captures import cropped
 from benchmarks.fidelity.defocus import CAMERA, equal_exposure
 from benchmarks.harness import Row, data_root, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import mosaic_scenes, reference_scenes
 
 ISO, F_SOURCE, F_TARGET = 100, 8.0, 4.0
 #: Height and width [packed pixel], at most.

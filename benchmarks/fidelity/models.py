@@ -9,15 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.harness import data_root
 from benchmarks.isolated import ROOT
 from benchmarks.paper_baselines import DecoupledNet, ParameterConcatenation
 from simulator import CameraSimulator, get_camera
-from simulator.networks.denoiser import SIZES
-from simulator.networks.noise_module import NoiseModule
+from simulator.networks.noise_module import SIZES, NoiseModule
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.camera import ReferenceScene
+from simulator.training.scenes import reference_scenes
 
 #: Where trained networks lie that do not come with the package: ``NAME/NAME.safetensors``.
 FOLDER, CONFIGS = ROOT / "runs" / "simulator", ROOT / "configs" / "simulator"

@@ -24,7 +24,7 @@ from benchmarks.fidelity.models import FULL, QUICK, Models, held_out_scenes, loa
 from benchmarks.harness import Row, cell, pivot, sections
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
-from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceCapture
+from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceCapture
 from simulator.reference.sequences import Pair, select_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.training.data import draw_sequences, settings_parameters

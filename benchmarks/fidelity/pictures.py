@@ -13,19 +13,19 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ae_env.scenes.reference_scenes import depth_photographs, reference_scenes
 from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import load_models
 from benchmarks.harness import RUNS, Row, data_root, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import depth_photographs, reference_scenes
 
 CAMERA = "nikon_z6"
 #: The published picture; a quick run leaves it alone.
-IMAGE = ROOT / "docs" / "images" / "simulator_stages.png"
-QUICK_IMAGE = RUNS / "simulator" / "simulator_stages.png"
+IMAGE = ROOT / "docs" / "images" / "simulator_stages.webp"
+QUICK_IMAGE = RUNS / "simulator" / "simulator_stages.webp"
 #: Height and width of the crops [packed pixel].
 CROP = 72
 COLUMNS = ("whole picture", "input", "EXP", "NS", "Full", "ground truth")

@@ -24,7 +24,7 @@ from benchmarks.transfer.agents import agent_rows
 from benchmarks.transfer.report import FILES, write_page
 from benchmarks.transfer.tables import table_rows
 from benchmarks.transfer.worlds import QUICK, TransferPlan, has_weights, training_set
-from simulator.utils.results import result_meta, write_results
+from simulator.utils.files import result_meta, write_results
 
 PARTS = tuple(FILES)
 #: What the score tables depend on.

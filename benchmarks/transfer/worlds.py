@@ -13,7 +13,7 @@ from ae_env.scenes.bundled import Split
 from ae_env.scenes.photographed import photographed
 from ae_env.scenes.polyhaven import list_assets
 from ae_env.scenes.scene import Crop
-from agents.evaluation.evaluation_plan import groups_in_turn
+from agents.evaluation.plan import groups_in_turn
 from benchmarks.fidelity.models import weights
 from simulator import CameraProfile
 

@@ -26,7 +26,7 @@ from simulator import (
 )
 from simulator.capture.plan import DEFAULT_TOLERANCE
 from simulator.training.data import settings_parameters
-from simulator.utils.processor import computes_bfloat16
+from simulator.utils.compute import computes_bfloat16
 
 Dtype = Literal["float32", "bfloat16"]
 

@@ -21,7 +21,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ae_env.scenes.pictures import Split
 from benchmarks.harness import Row
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import DEFAULT, TOLERANCES, simulator
@@ -37,6 +36,7 @@ from simulator import CameraSettings, CameraSimulator, NoiseLevelFunction, Prepa
 from simulator.capture.sensor import exposed_light
 from simulator.noise.noise_level_function import noise_variance
 from simulator.noise.top_up import top_up_variance
+from simulator.training.scenes import Split
 
 #: Photographs of each scene, and fair states of it; a third as many are any others of the grid.
 DRAWS, FAIR = 8, 12

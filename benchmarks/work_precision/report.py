@@ -54,7 +54,7 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     scenes = len({row["scene"] for row in tests})
     page = [
         f"{CORES} threads. The truth is the reference camera "
-        "(`simulator/reference/reference_camera.py`), here without hidden errors of its body. "
+        "(`simulator/reference/camera.py`), here without hidden errors of its body. "
         "Scenes are of the test split: procedural ones with and without depth, photographs and "
         "views into radiance maps; the simulator is not told their depth. Sources are at f/8, "
         "ISO 100 to 6400 and up to 2 EV less than incident light asks for, and exposed at the 64 "

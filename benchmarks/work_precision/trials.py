@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from ae_env import ExposureGrid
-from ae_env.scenes.pictures import Split
-from ae_env.scenes.reference_scenes import reference_scenes
 from benchmarks.captures import cropped
 from benchmarks.harness import data_root
 from simulator import CameraSettings, RawImage, get_camera, incident_ev100
 from simulator.camera_simulator import Depth
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.training.scenes import Split, reference_scenes
 
 #: Height and width [packed pixel].
 Size = tuple[int, int]

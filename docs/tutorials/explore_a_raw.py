@@ -69,10 +69,10 @@ for state, frame, above, below in zip(states, frames, *axes, strict=True):
     for plane, colour in zip(frame, ("tab:red", "tab:green", "limegreen", "tab:blue"), strict=True):
         below.plot(torch.linspace(0, 1, 64), torch.histc(plane, 64, 0, 1).sqrt(), color=colour)
     below.set(xlabel="share of sensor white", yticks=[])
-figure.savefig("explore_a_raw.png", dpi=80)
+figure.savefig("explore_a_raw.webp", dpi=80)
 
 # %% [markdown]
-# ![four exposures of a scene and the histograms of their raw planes](explore_a_raw.png)
+# ![four exposures of a scene and the histograms of their raw planes](explore_a_raw.webp)
 #
 # Write any of them as a DNG that a raw developer opens, with noise, levels and settings in its tags:
 

@@ -45,10 +45,10 @@ class NumberPlate:
 # %%
 scene = load_scenes("bundled:back_light", "test", camera=get_camera("nikon_z6"))[0]
 scorer = {"number_plate": 0.8, "noise": 0.2}
-contact_sheet(scene, scorer=scorer, speed=0.5, seed=0).save("plug_in_a_scorer.png")
+contact_sheet(scene, scorer=scorer, speed=0.5, seed=0).save("plug_in_a_scorer.webp")
 
 # %% [markdown]
-# ![all 64 states, framed in the colour of their score](plug_in_a_scorer.png)
+# ![all 64 states, framed in the colour of their score](plug_in_a_scorer.webp)
 #
 # The same scorer in an environment whose light falls by four stops in the third frame. Its terms are
 # in `info["rewards"]`.

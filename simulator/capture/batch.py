@@ -25,7 +25,7 @@ from simulator.capture.sensor import Transitions, noise_balance, record
 from simulator.noise.generator import Noise, noise_keys, single_normals
 from simulator.optics.blur_kernels import Blur, blur_many
 from simulator.settings import CameraSettings
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import parallel_ranges
 
 #: The steps of a capture that a scene may not need, in order; the exposure always runs.
 _STEPS = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
@@ -281,7 +281,7 @@ class CaptureBatch:
             begun = [self._begin_blur(index, row) for index, row in planned]
             blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
             tasks = [task for task in begun if callable(task)]
-            in_shares(lambda first, last: [task() for task in tasks[first:last]], len(tasks))
+            parallel_ranges(lambda first, last: [task() for task in tasks[first:last]], len(tasks))
             _in_shares(self._balance, planned)
         except BaseException:  # some of the light is not made
             self.forget(indices)
@@ -320,7 +320,7 @@ def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, in
         for index, row in planned[first:last]:
             task(index, row)
 
-    in_shares(run, len(planned))
+    parallel_ranges(run, len(planned))
 
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:

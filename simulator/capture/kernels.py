@@ -3,7 +3,7 @@
 The steps are those of `simulator.capture.sensor`, which stays the reference and the path on other
 devices: multiply by the exposure ratio, add noise of the variance that is missing, round to digital
 numbers and clip. They run in blocks of 256 samples that stay in the first-level cache, vectorised
-by the compiler, on as many threads as `simulator.utils.threads` allows.
+by the compiler, on as many threads as `simulator.utils.compute` allows.
 
 This module imports numba.
 """
@@ -29,8 +29,7 @@ from simulator.noise.generator import (
     mixed_word,
     noise_bank,
 )
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: A sample at or below this signal counts as clipped low: ten stops below white.
 LOW_CLIP = 2.0**-10
@@ -294,5 +293,7 @@ def record_frames(
         counts,
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
-    in_shares(lambda first, last: _record(first, last, *fixed), units, least=least, threads=threads)
+    parallel_ranges(
+        lambda first, last: _record(first, last, *fixed), units, least=least, threads=threads
+    )
     return counts.reshape(frames, 4 * pieces if count else 0, 2).sum(axis=1)

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: Bins of about equal population per plane, and pixels of a plane that are looked at, at most.
 BINS = 64
@@ -323,7 +322,7 @@ class LightStatistics:
         levels[0] = np.inf
         least = 1 + _WORTH_A_THREAD // samples
         fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
-        in_shares(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
+        parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
         counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
         return _Bins(
             share=sums[0] / (4.0 * samples),

@@ -24,7 +24,7 @@ from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.residual import ResidualStatistics
 from simulator.capture.sensor import NoiseBalance, Transitions, record
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.raw.highlights import ABOVE_WHITE
+from simulator.raw.develop import ABOVE_WHITE
 from simulator.settings import CameraSettings
 
 #: Error that a capture may have, in units of the target's noise: by default the distribution of a

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 
 from simulator.capture.light_statistics import SUMS, SURE, noise_numbers
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.utils.jit import kernel
+from simulator.utils.compute import kernel
 
 #: Side of a block, over which light is averaged, and of a window, over which detail is [packed
 #: pixel]; blocks that are looked at, at most about this many.

@@ -26,7 +26,7 @@ from simulator.noise.noise_level_function import VARIANCE_LIMIT, plane_tensor
 from simulator.noise.read_noise import ReadNoise
 from simulator.noise.top_up import missing_variance, top_up_table
 from simulator.optics.blur import disc_blur, motion_blur
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import parallel_ranges
 
 _TINY = torch.finfo(torch.float32).tiny
 #: Samples whose noise is balanced at a time: they stay in the cache, and on one thread.
@@ -318,7 +318,7 @@ def noise_balance(light: torch.Tensor, exposure: Exposure) -> NoiseBalance:
                 excess[plane] -= float(missing.sum())
                 relative[plane] -= float((missing / wanted.clamp_(min=_TINY)).sum())
 
-    in_shares(balance, 4, threads=None if len(parts) > 4 else 1)
+    parallel_ranges(balance, 4, threads=None if len(parts) > 4 else 1)
     count = light.numel()
     share = min(abs(float(relative.sum())) / count, VARIANCE_LIMIT)  # finite over no noise, too
     return NoiseBalance(share, abs(float(excess.sum())) / count, bool(lacks.any()))

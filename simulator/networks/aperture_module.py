@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from simulator.networks.denoiser import ResidualBlock
+from simulator.networks.noise_module import ResidualBlock
 from simulator.networks.unet import AttentionUNet
 from simulator.optics.blur import box_mean, disc_blur
 from simulator.optics.disc_bank import DiscBank, added_blur

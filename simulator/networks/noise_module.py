@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 import functools
-from typing import Literal, get_args
+import itertools
+from typing import Literal, NamedTuple, get_args
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from simulator.capture.residual import Residual
-from simulator.networks.denoiser import SIZES, Denoiser
 from simulator.networks.unet import UNet
 from simulator.noise.generator import frame_normals, noise_keys
 from simulator.optics.blur import box_mean
@@ -20,19 +21,245 @@ from simulator.utils.checks import check_word
 Preset = Literal["nano", "compact", "large", "paper", "ncs"]
 #: Side of the window that smooths the signal which the noise level is read from.
 _SMOOTHING = 5
-#: Seed of the sample of noise that the authors' network is shown.
+#: Seed of the sample of noise that is an input of the authors' network.
 _SAMPLE_SEED = 1234
+#: Windows of the local means [packed pixel]: the near one divides detail from surroundings, the far
+#: one shows the network the noise that the near mean still has.
+_NEAR, _FAR = 17, 65
+#: Side of the cells on which the far mean and the correction of the mean are worked out.
+_CELL = 8
+#: Window of the correction of the mean [cells].
+_MEAN_CELLS = 17
+#: Largest change of a pixel, in standard deviations of its noise.
+_LARGEST = 5.0
+#: The network's inputs, detail and level, are compressed beyond this many standard deviations.
+_LEVEL = 8.0
+
+
+class Size(NamedTuple):
+    """Channels of each level, the finest first, and residual blocks on the coarsest."""
+
+    widths: tuple[int, ...]
+    blocks: int
+
+
+#: The family; each level has half the resolution of the one before.
+SIZES = {
+    "nano": Size((16, 24, 32), 2),
+    "compact": Size((32, 48, 80, 96), 2),
+    "large": Size((48, 96, 176, 256), 2),
+}
+
+
+class Stabiliser(NamedTuple):
+    """Transform of a raw into a picture whose noise has a standard deviation of about 1.
+
+    ``z = 2 y / (sqrt(shot y + c) + sqrt(c))`` with ``c = read + 3/8 shot^2``: the generalised
+    Anscombe transform less its value at 0, in a form that stays exact as shot goes to 0, where it
+    becomes ``y / sigma``. Below 0 it goes on as a straight line.
+
+    Args:
+        shot: (B, 4, 1, 1) slope of the noise variance.
+        root: (B, 4, 1, 1) ``sqrt(c)``, above 0.
+    """
+
+    shot: Tensor
+    root: Tensor
+
+    @classmethod
+    def of(cls, shot: Tensor, read: Tensor) -> Stabiliser:
+        """For noise of (B, 4) `shot` and `read`, in float32."""
+        shot, read = (v.float()[:, :, None, None] for v in (shot, read))
+        return cls(shot, (read + 0.375 * shot.square()).sqrt().clamp(min=1e-18))
+
+    def forward(self, y: Tensor) -> Tensor:
+        """Stabilised picture of a raw (B, 4, H, W)."""
+        positive = y.clamp(min=0.0)
+        bent = 2.0 * positive / ((self.shot * positive + self.root.square()).sqrt() + self.root)
+        return bent + (y - positive) / self.root
+
+    def inverse(self, z: Tensor) -> Tensor:
+        """Raw (B, 4, H, W) of a stabilised picture.
+
+        Algebraically, ``sqrt(c) z + shot z^2 / 4``. That the mean of a square is more than the
+        square of the mean is left to the network, whose error is measured after this step.
+        """
+        positive = z.clamp(min=0.0)
+        return self.root * z + 0.25 * self.shot * positive.square()
+
+    @property
+    def linearity(self) -> Tensor:
+        """In [0, 1]: 1 where read noise rules, 0 where photons do."""
+        return self.root / (self.root + self.shot)
+
+
+class Denoiser(nn.Module):
+    """Estimates the noise of a raw in units of its standard deviation, at most 5 of them.
+
+    The network sees the stabilised picture less its mean over 17 x 17 pixels, how that mean
+    differs from the one over 65 x 65, the level itself, and how linear the stabilisation is.
+    What it takes away is corrected such that the mean over about 136 x 136 pixels stays: noise has
+    a mean of zero, so nothing else may be taken on average.
+
+    Args:
+        size: Name in `SIZES`.
+    """
+
+    def __init__(self, size: str = "compact") -> None:
+        super().__init__()
+        widths, blocks = SIZES[size]
+        self.stride = 2 ** (len(widths) - 1)
+        self.head = nn.Conv2d(16, widths[0], 3, padding=1)
+        self.encode = nn.ModuleList(ResidualBlock(w, bias=True) for w in widths[:-1])
+        self.down = nn.ModuleList(
+            nn.Conv2d(fine, coarse, 2, stride=2) for fine, coarse in itertools.pairwise(widths)
+        )
+        self.coarsest = nn.Sequential(
+            *(ResidualBlock(widths[-1], bias=True) for _ in range(blocks))
+        )
+        self.up = nn.ModuleList(
+            nn.ConvTranspose2d(coarse, fine, 2, stride=2)
+            for fine, coarse in itertools.pairwise(widths)
+        )
+        self.decode = nn.ModuleList(ResidualBlock(w, bias=True) for w in widths[:-1])
+        self.tail = nn.Conv2d(widths[0], 4, 3, padding=1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="linear")
+                assert module.bias is not None
+                nn.init.zeros_(module.bias)
+            if isinstance(module, ResidualBlock):  # starts near the identity: no warm-up needed
+                with torch.no_grad():
+                    module.second.weight.mul_(0.1)
+        nn.init.zeros_(self.tail.weight)  # it starts by changing nothing
+
+    def forward(self, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """Noise-reduced image.
+
+        Args:
+            image: (B, 4, H, W) noisy raw, any exposure; H, W >= 1.
+            shot: (B, 4) slope of the noise variance, on the same scale.
+            read: (B, 4) noise variance at zero signal.
+
+        Returns:
+            (B, 4, H, W) float32.
+        """
+        clean = self.uncorrected(image, self.surroundings(image, shot, read), shot, read)
+        # In training a residual that is the same everywhere must cost something.
+        return clean if self.training else self.corrected(clean, image, shot, read)
+
+    def surroundings(self, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """The stabilised picture's mean over 65 x 65 pixels, (B, 4, H, W), of the whole frame."""
+        height, width = image.shape[-2:]
+        far = _coarse_mean(Stabiliser.of(shot, read).forward(_padded(image)), _FAR // _CELL | 1)
+        return far[..., :height, :width]
+
+    def uncorrected(self, image: Tensor, far: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """The network alone; a pixel depends on those within 80 pixels, and on place modulo 8.
+
+        Args:
+            image: See `forward`; may be a part of a frame.
+            far: `surroundings` there.
+            shot: See `forward`.
+            read: See `forward`.
+        """
+        height, width = image.shape[-2:]
+        stabiliser = Stabiliser.of(shot, read)
+        z, far = stabiliser.forward(_padded(image)), _padded(far)
+        near = box_mean(z, _NEAR)
+        features = (
+            _LEVEL * _asinh((z - near) / _LEVEL),
+            _asinh(4.0 * (near - far)),
+            _asinh(near / _LEVEL),
+            stabiliser.linearity.expand_as(z),
+        )
+        residual = self._residual(torch.cat(features, dim=1)).float()
+        # Bounded by a function whose slope never vanishes: a saturated network must still learn.
+        clean = stabiliser.inverse(z + residual * (1.0 + (residual / _LARGEST).square()).rsqrt())
+        return clean[..., :height, :width]
+
+    def corrected(self, clean: Tensor, image: Tensor, shot: Tensor, read: Tensor) -> Tensor:
+        """`clean` of a whole frame with the local mean of `image`, in units of the noise."""
+        height, width = image.shape[-2:]
+        root = Stabiliser.of(shot, read).root
+        sigma = (shot.float()[:, :, None, None] * clean.clamp(min=0.0)).add_(root.square()).sqrt_()
+        taken = ((image.float() - clean) / sigma).clamp_(-2.0 * _LARGEST, 2.0 * _LARGEST)
+        mean = _coarse_mean(_padded(taken), _MEAN_CELLS)[..., :height, :width]
+        # Windows are smaller at the borders, so these count more than their share: made up for.
+        rest = (sigma * (taken - mean)).mean(dim=(2, 3), keepdim=True)
+        return clean + sigma * (mean + rest / sigma.mean(dim=(2, 3), keepdim=True))
+
+    def _residual(self, x: Tensor) -> Tensor:
+        x = self.head(x)
+        skips = []
+        for block, down in zip(self.encode, self.down, strict=True):
+            x = block(x)
+            skips.append(x)
+            x = down(x)
+        x = self.coarsest(x)
+        for block, up, skip in zip(
+            reversed(self.decode), reversed(self.up), reversed(skips), strict=True
+        ):
+            x = block(up(x).add_(skip))
+        residual: Tensor = self.tail(x)
+        return residual
+
+
+def _asinh(x: Tensor) -> Tensor:
+    """Inverse hyperbolic sine, of vectorised functions: torch's own takes three times as long."""
+    size = x.abs().clamp(max=1e18)  # whose square is finite
+    square = size.square()
+    return torch.log1p(size + square / (1.0 + (1.0 + square).sqrt())).copysign(x)
+
+
+def _padded(image: Tensor) -> Tensor:
+    """`image` with borders repeated to a multiple of 8 pixels, float32."""
+    height, width = image.shape[-2:]
+    return F.pad(image.float(), (0, -width % _CELL, 0, -height % _CELL), mode="replicate")
+
+
+def _coarse_mean(x: Tensor, cells: int) -> Tensor:
+    """Local mean over `cells` x `cells` cells of 8 x 8 pixels, between cells interpolated.
+
+    Only cells of the frame count: at its borders the window is smaller.
+    """
+    pooled = F.avg_pool2d(x, _CELL)
+    for window in ((cells, 1), (1, cells)):
+        padding = (window[0] // 2, window[1] // 2)
+        pooled = F.avg_pool2d(pooled, window, 1, padding, count_include_pad=False)
+    return F.interpolate(pooled, x.shape[-2:], mode="bilinear", align_corners=False)
+
+
+class ResidualBlock(nn.Module):
+    """``x + conv(relu(conv(x)))``, 3 x 3.
+
+    Args:
+        width: Channels.
+        dilation: Of the first convolution.
+        bias: Whether the convolutions have biases.
+    """
+
+    def __init__(self, width: int, *, dilation: int = 1, bias: bool = False) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=dilation, dilation=dilation, bias=bias)
+        self.second = nn.Conv2d(width, width, 3, padding=1, bias=bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) to the same shape."""
+        # In place where autograd allows it: on large frames fresh memory costs as much as the sums.
+        inner: Tensor = self.second(F.relu_(self.first(x)))
+        return inner.add_(x)
 
 
 class NoiseModule(nn.Module):
     """Denoises an exposed raw of known noise level function.
 
     Args:
-        preset: ``"nano"``, ``"compact"`` or ``"large"``: one of the family of
-            `simulator.networks.denoiser`, which commute with exposure; ``"paper"``: the U-Net of
-            Brooks et al. 2019 with a noise-level map, as the paper uses it (section 3.2);
-            ``"ncs"``: the U-Net of the authors' released code, which is shown a sample of the
-            noise in place of its level. The sample is the same whenever it is asked for.
+        preset: ``"nano"``, ``"compact"`` or ``"large"``: a `Denoiser` of that size, which commutes
+            with exposure; ``"paper"``: the U-Net of Brooks et al. 2019 with a noise-level map, as
+            the paper uses it (section 3.2); ``"ncs"``: the U-Net of the authors' released code,
+            whose second input is a sample of the noise in place of its level. The sample is
+            always the same, so that results can be shared between captures.
     """
 
     def __init__(self, preset: Preset = "compact") -> None:
@@ -75,8 +302,8 @@ class NoiseModule(nn.Module):
             result = self.network(exposed, shot, read)
         else:
             level = variance_map(exposed, shot, read).sqrt()
-            shown = level if self.preset == "paper" else exposed + level * _sample(exposed)
-            result = exposed + self.network(torch.cat([exposed, shown], dim=1)).float()
+            second = level if self.preset == "paper" else exposed + level * _sample(exposed)
+            result = exposed + self.network(torch.cat([exposed, second], dim=1)).float()
         noisy = ((shot > 0) | (read > 0)).any(dim=1)
         return torch.where(noisy[:, None, None, None], result, exposed.float())
 

@@ -21,8 +21,7 @@ import torch
 from scipy.special import ndtri
 
 from simulator.settings import CameraSettings
-from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
 #: and tails of the camera's read noise (`simulator.noise.read_noise`).
@@ -310,7 +309,7 @@ def drawn_normals(key: int, shape: tuple[int, int, int]) -> np.ndarray:
     planes, samples = shape[0], shape[1] * shape[2]
     blocks = -(-samples // BLOCK)
     out = np.empty((planes, samples), np.float32)
-    in_shares(
+    parallel_ranges(
         lambda first, last: _draw(first, last, np.uint64(key), blocks, out),
         planes * blocks,
         least=1024,

@@ -20,8 +20,7 @@ import numpy as np
 import torch
 
 from simulator.optics.shapes import coverage, disc_kernel, disc_radius, streak_share
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import in_shares, thread_count
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges, thread_count
 
 #: Samples from which another thread is worth waking.
 _WORTH_A_THREAD = 2**16
@@ -261,7 +260,7 @@ def blur_many(
         if moved.any():
             _move_some(first, last, *images, *streaks, most)
 
-    in_shares(run, len(blurs), threads=threads)
+    parallel_ranges(run, len(blurs), threads=threads)
 
 
 def _without_wide_discs(blurs: Sequence[Blur], limit: float, threads: int | None) -> Sequence[Blur]:
@@ -274,7 +273,7 @@ def _without_wide_discs(blurs: Sequence[Blur], limit: float, threads: int | None
         for blur in wide[first:last]:
             _wide_disc(blur, limit)
 
-    in_shares(run, len(wide), threads=threads)
+    parallel_ranges(run, len(wide), threads=threads)
     left = [b for b in blurs if b.defocused is None or b.diameter_px <= _WIDE_PX]
     moved = [b for b in wide if b.moved is not None]
     return left + [Blur(b.defocused, extent_px=b.extent_px, moved=b.moved) for b in moved]  # type: ignore[arg-type]
@@ -315,7 +314,7 @@ def streak(
         return _unchanged(light, out)
     out = torch.empty(light.shape) if out is None else out
     rows, result = _rows(light), _rows(out)
-    in_shares(
+    parallel_ranges(
         lambda first, last: _moved(first, last, rows, n, end, np.float32(limit), result),
         len(rows),
         least=1 + _WORTH_A_THREAD // rows.shape[1],
@@ -348,7 +347,7 @@ def disc(
     rows, result = _rows(light), _rows(out)
     weights, reach = _quadrant(radius)
     height, most = light.shape[-2], np.float32(limit)
-    in_shares(
+    parallel_ranges(
         lambda first, last: _disc(first, last, height, rows, weights, reach, most, result),
         len(rows),
         least=1 + _WORTH_A_THREAD // (len(weights) ** 2 * rows.shape[1]),

@@ -22,8 +22,7 @@ from simulator.optics.blur import disc_blur
 from simulator.optics.motion_path import Taps
 from simulator.optics.shapes import disc_kernel
 from simulator.raw.image import new_frame
-from simulator.utils.jit import addresses, as_pointer, kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
 #: Diameters of the bank [pixel]: each doubles the blurred area, the step at which a blend of two
 #: discs is within 2 % of the disc between them.
@@ -352,7 +351,7 @@ def blend(
     out = new_frame(anything) if out is None else out
     fixed = (diameter.contiguous().numpy(), knots.astype(np.float32), table, out.numel())
     result = out.numpy().reshape(-1, *out.shape[-2:])
-    in_shares(
+    parallel_ranges(
         lambda first, last: _blend(first, last, *fixed, result),
         out.shape[-2],
         least=1 + _WORTH_A_THREAD // out.shape[-1],
@@ -374,7 +373,7 @@ def piecewise(diameter: torch.Tensor, knots: np.ndarray, products: np.ndarray) -
     ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
     out = torch.empty(diameter.shape)
     fixed = (diameter.contiguous().numpy(), knots.astype(np.float32), ends.astype(np.float32))
-    in_shares(
+    parallel_ranges(
         lambda first, last: _evaluate(first, last, *fixed, out.numpy()),
         len(diameter),
         least=1 + _WORTH_A_THREAD // diameter.shape[1],

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 
 from simulator.optics.shapes import streak_share
-from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import kernel, parallel_ranges
 
 #: Points of a path, per pixel of its length and at most: longer ones are sampled more coarsely.
 _POINTS_PER_PIXEL, _MOST_POINTS = 2.0, 1024
@@ -319,7 +318,7 @@ def path_blur(
         return _shifted_sum(light.clamp(-limit, limit), taps)
     out = torch.empty(light.shape) if out is None else out
     planes, result = light.contiguous().numpy(), out.numpy()
-    in_shares(
+    parallel_ranges(
         lambda first, last: _blur_rows(
             planes[first:last], *taps, np.float32(limit), result[first:last]
         ),
@@ -361,7 +360,7 @@ def path_blur_apart(
     out = torch.empty(light.shape) if out is None else out
     planes, result = light.contiguous().numpy(), out.numpy()
     fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
-    in_shares(
+    parallel_ranges(
         lambda first, last: _blur_apart(planes[first:last], *fixed, result[first:last]),
         len(planes),
         least=1 + _WORTH_A_THREAD // planes[0].size,

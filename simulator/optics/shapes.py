@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from simulator.utils.jit import kernel
+from simulator.utils.compute import kernel
 
 #: Rows per pixel in the numerical integration of a disc's coverage.
 _SUBROWS = 32

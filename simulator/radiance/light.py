@@ -11,7 +11,7 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.raw.develop import XYZ_FROM_SRGB
-from simulator.reference.sampling import lens_blur, sample_mosaic
+from simulator.reference.camera import lens_blur, sample_mosaic
 from simulator.settings import LUX_AT_EV0, SATURATION_CONSTANT, CameraSettings, incident_ev100
 
 #: Signal of a perfectly white diffuse surface at the incident-light exposure, ``x = 0.663 * R``.
@@ -156,7 +156,8 @@ def camera_light(
     else:
         reference = reference_settings(ev100)
         light *= mean_anchor(light[1:3] if sampled else light[1])
-    return CameraLight(light, reference, (white[1] / white[0], 1.0, white[1] / white[2]))
+    red, green, blue = white.tolist()
+    return CameraLight(light, reference, (green / red, 1.0, green / blue))
 
 
 def _check_rgb(rgb: torch.Tensor | np.ndarray) -> torch.Tensor:

@@ -20,7 +20,7 @@ import numpy as np
 
 from simulator.radiance.light import temperature_tint
 from simulator.utils.checks import did_you_mean
-from simulator.utils.jit import kernel
+from simulator.utils.compute import kernel
 
 #: Part of every cache key: raise it with any change of the drawings.
 GENERATOR_VERSION = 1

@@ -22,8 +22,7 @@ import tifffile
 
 from simulator.raw.image import RawImage, unpack_mosaic
 from simulator.settings import CameraSettings
-from simulator.utils.files import as_path, write_atomically
-from simulator.utils.results import package_version
+from simulator.utils.files import as_path, package_version, write_atomically
 
 #: Begins the Software tag of every DNG written here.
 SOFTWARE_NAME = "ae-env"

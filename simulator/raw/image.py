@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.checks import check_integer
+from simulator.utils.compute import kernel, parallel_ranges
 
 PLANES = ("R", "G1", "G2", "B")
 #: Packed rows from which a second thread helps, and that are packed at a time.
@@ -62,8 +61,7 @@ class RawImage:
         if len(gains) != 3 or not all(np.isfinite(g) and g > 0 for g in gains):
             raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
         object.__setattr__(self, "white_balance", gains)
-        if not isinstance(self.box_factor, Integral) or self.box_factor < 1:
-            raise ValueError(f"`box_factor` (={self.box_factor!r}) must be an integer >= 1")
+        check_integer("box_factor", self.box_factor, 1)
 
     @classmethod
     def from_mosaic(
@@ -95,7 +93,7 @@ class RawImage:
 
         data = self.data.detach().contiguous().numpy()
         marks = np.empty(data.shape[1:], np.bool_)
-        in_shares(
+        parallel_ranges(
             lambda first, last: mark_saturated(data, limits, first, last, marks),
             len(marks),
             least=_SHARE,
@@ -138,7 +136,7 @@ def pack_mosaic(mosaic: np.ndarray, camera: CameraProfile) -> torch.Tensor:
             rows = mosaic[2 * top : 2 * min(top + _ROWS, last)]
             pack_rows(np.ascontiguousarray(rows, dtype), tile, black, span, top, planes)
 
-    in_shares(pack, height, least=_SHARE)
+    parallel_ranges(pack, height, least=_SHARE)
     return torch.from_numpy(planes)
 
 
@@ -165,7 +163,7 @@ def unpack_mosaic(
         part = mosaic[2 * top : 2 * bottom]
         unpack_rows(planes, tile, black, span, white, first + top, first + bottom, part)
 
-    in_shares(unpack, count, least=_SHARE)
+    parallel_ranges(unpack, count, least=_SHARE)
     return mosaic
 
 

@@ -178,54 +178,26 @@ def missing_bytes(directories: Sequence[Directory], size: int) -> int:
     return end - size
 
 
-# -- the kind of file and its camera --------------------------------------------------------------
+# -- the camera of a file -------------------------------------------------------------------------
 
-UNKNOWN_FILE, CANON_CRW = "a file of unknown type", "a Canon CRW file"
-TIFF_FILE, TEXT_FILE = "a TIFF-structured file", "a text file"
-_OTHER_SIGNATURES: tuple[tuple[bytes, str], ...] = (
-    (b"\xff\xd8\xff", "a JPEG file"),
-    (b"\x89PNG\r\n", "a PNG file"),
-    (b"GIF8", "a GIF file"),
-    (b"BM", "a BMP file"),
-    (b"RIFF", "a RIFF file (WebP or video)"),
-    (b"#?R", "a Radiance HDR file"),
-    (b"v/1\x01", "an OpenEXR file"),
-    (b"%PDF", "a PDF file"),
-    (b"PK\x03\x04", "a ZIP archive"),
-    (b"\x1f\x8b", "a gzip archive"),
-    (b"\x93NUMPY", "a NumPy array"),
+#: How raws begin: TIFF, Minolta MRW, ARRIRAW, Nokia, Fujifilm RAF, Sigma X3F, Raspberry Pi's JPEG.
+_RAW_SIGNATURES = (
+    *(b"II", b"MM", b"\0MRM", b"ARRI", b"NOKIARAW", b"FUJIFILM", b"FOVb", b"\xff\xd8\xff"),
 )
-_RAW_SIGNATURES: tuple[tuple[bytes, str], ...] = (
-    (b"\0MRM", "a Minolta MRW file"),
-    (b"ARRI", "an ARRIRAW file"),
-    (b"NOKIARAW", "a Nokia raw file"),
-    (b"FUJIFILM", "a Fujifilm RAF file"),
-    (b"FOVb", "a Sigma X3F file (Foveon: three colours at every pixel)"),
-)
-#: Kinds of files that are no raws, whole or not.
-NO_RAWS = {TEXT_FILE, *(words for _, words in _OTHER_SIGNATURES)}
+#: Where a Canon CRW has it; the camera's name is in a directory at the end of that file.
+_CIFF = slice(6, 14), b"HEAPCCDR"
 #: Record type of make and model in Canon's CIFF, and of the heaps that hold further records.
 _CIFF_MAKE_MODEL, _CIFF_HEAPS = 0x080A, (0x2800, 0x3000)
 #: A Canon CRW has less than ten heaps of less than a hundred records.
 _CIFF_MAX_HEAPS, _CIFF_MAX_RECORDS = 64, 1024
 
 
-def describe_file(head: bytes) -> str:
-    """Kind of a file in words for an error message, from its first 4096 bytes."""
-    for signature, words in (*_OTHER_SIGNATURES, *_RAW_SIGNATURES):
-        if head.startswith(signature):
-            return words
-    if not head:
-        return "an empty file"
-    if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypavif"):
-        return "a HEIF or AVIF file"
-    if head[6:14] == b"HEAPCCDR":
-        return CANON_CRW
-    if head[:2] in (b"II", b"MM"):
-        return TIFF_FILE
-    if b"\0" not in head and all(b >= 32 or b in b"\t\n\r\f" for b in head):
-        return TEXT_FILE
-    return UNKNOWN_FILE
+def is_raw_container(stream: BinaryIO) -> bool:
+    """Whether a file that names no camera may be a raw all the same."""
+    head = _read_at(stream, 0, 16)
+    if head[_CIFF[0]] == _CIFF[1]:
+        return False
+    return head.startswith(_RAW_SIGNATURES) or head[4:8] == b"ftyp"
 
 
 def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple[str, str]:
@@ -239,7 +211,7 @@ def camera_identity(stream: BinaryIO, directories: Sequence[Directory]) -> tuple
         if "Model" in tags:
             return str(tags.get("Make", ("",))[0]), str(tags["Model"][0])
     head = _read_at(stream, 0, 2**16)
-    if head[6:14] == b"HEAPCCDR":
+    if head[_CIFF[0]] == _CIFF[1]:
         return _ciff_identity(stream, struct.unpack_from("<I", head, 2)[0])
     if head[:8] == b"FUJIFILM":
         return "FUJIFILM", _text(head[28:60])

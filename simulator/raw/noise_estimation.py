@@ -16,8 +16,7 @@ import torch
 
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import check_packed
-from simulator.utils.jit import kernel
-from simulator.utils.threads import in_shares
+from simulator.utils.compute import kernel, parallel_ranges
 
 
 @kernel()
@@ -159,7 +158,7 @@ def _block_statistics(planes: np.ndarray, white: float, floor: float) -> _Blocks
             found[index] = _blocks_of(planes[index], white, floor)
 
     if min(planes.shape[1:]) >= _BLOCK + 2:
-        in_shares(look, len(planes))
+        parallel_ranges(look, len(planes))
     return _Blocks(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 

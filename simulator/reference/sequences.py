@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import math
 from collections.abc import Iterator
@@ -15,9 +14,10 @@ import numpy as np
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings, exposure_ratio, incident_ev100, sensor_signal
+from simulator.utils.checks import check_word
 
 if TYPE_CHECKING:
-    from simulator.reference.reference_camera import ReferenceScene
+    from simulator.reference.camera import ReferenceScene
 
 Stage = Literal["exposure", "noise", "aperture", "all"]
 
@@ -210,11 +210,7 @@ def select_pairs(
         ValueError: If there is no such stage, or `camera` has no noise calibration and `stage` is
             ``"noise"``.
     """
-    known = get_args(Stage)
-    if stage not in known:
-        near = difflib.get_close_matches(str(stage), known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"`stage` (={stage!r}) must be one of {', '.join(known)}{hint}")
+    check_word("stage", stage, get_args(Stage))
     if stage == "noise":
         return list(_little_noise(sequences, any_pairs(sequences), camera))
     return opening_pairs(sequences) if stage == "aperture" else any_pairs(sequences)

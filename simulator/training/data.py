@@ -1,9 +1,15 @@
-"""Pairs of captures as batches, drawn by step number: the same step gives the same batch."""
+"""Pairs of captures, and crops for the noise stage, as batches: the same step gives the same batch.
+
+A picture for the noise stage is light at the pitch of the photosites, seen through the colour
+filter array, or a recorded mosaic with little noise. Averages over k x k samples of a plane, as of
+a frame that was reduced, are among its crops.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +18,35 @@ from torch import Tensor
 
 from simulator.camera import CameraProfile
 from simulator.noise.generator import noise_generator
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.reference.camera import (
+    ReferenceCamera,
+    ReferenceScene,
+    average_planes,
+    lens_blur,
+    sample_mosaic,
+)
 from simulator.reference.sequences import Pair, Stage, draw_settings, select_pairs
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.settings import CameraSettings, exposure_ratio
 
 #: Called with the number of scenes that are rendered, and of all.
 Progress = Callable[[int, int], None]
+#: Samples averaged per side and plane, and how often.
+_AVERAGED = (1, 2, 3, 4, 6, 8)
+_AVERAGED_SHARE = (0.55, 0.2, 0.08, 0.07, 0.05, 0.05)
+#: Share of crops whose four planes coincide, as after averaging by a large k.
+_COINCIDING = 0.1
+#: Light of a crop, log2 of its mean [white].
+_LEVEL = (-11.0, -0.5)
+#: ISO, log2.
+_ISO = (math.log2(50.0), math.log2(25600.0))
+#: How often kinds are drawn, where it is not 1.
+_WEIGHTS = {"radiance": 3.0, "photograph": 3.0, "leaves": 1.5, "linear": 0.7, "chart": 0.7}
+#: A recorded mosaic serves where the noise that is added has this many times its own variance.
+_CLEAN_RATIO = 16.0
+
+_CLEAN = NoiseLevelFunction.zero()
 
 
 class Batch(NamedTuple):
@@ -205,3 +233,206 @@ def settings_parameters(settings: CameraSettings) -> tuple[float, float, float]:
         math.log2(settings.exposure_time),
         math.log2(settings.effective_f_number),
     )
+
+
+# -- crops of the noise stage ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class DetailPicture:
+    """A sharp picture with little noise.
+
+    Args:
+        name: Unique name.
+        group: Source group, the unit of splitting.
+        kind: Kind of source, which decides how often it is drawn.
+        light: (3, H, W) linear light in camera colours at the pitch of the photosites, or
+            (4, H, W) the planes of a recorded mosaic; float32, >= 0 but for noise.
+        nlf: Noise left in it, on the scale of `light`.
+    """
+
+    name: str
+    group: str
+    kind: str
+    light: Tensor
+    nlf: NoiseLevelFunction = _CLEAN
+
+    def __post_init__(self) -> None:
+        if self.light.ndim != 3 or self.light.shape[0] not in (3, 4):
+            raise ValueError(
+                f"`light` (shape {tuple(self.light.shape)}) of {self.name!r} must be (3, H, W) "
+                "or (4, H, W)"
+            )
+
+
+class NoiseBatch(NamedTuple):
+    """B crops with and without noise.
+
+    Args:
+        noisy: (B, 4, H, W) as recorded: clipped, whole digital numbers where nothing is averaged.
+        clean: (B, 4, H, W) their light, clipped at white.
+        shot: (B, 4) slope of the noise variance.
+        read: (B, 4) noise variance at zero signal.
+    """
+
+    noisy: Tensor
+    clean: Tensor
+    shot: Tensor
+    read: Tensor
+
+
+class DetailCrops:
+    """Batches of the noise stage.
+
+    Args:
+        pictures: Sources, at least one of 16 packed pixels a side or more.
+        cameras: Cameras whose noise is added, each at ISO 50 to 25,600; half of the crops have
+            read noise of 0.4 to 7 times as much, as other sensors have.
+        seed: Seed of everything drawn.
+    """
+
+    def __init__(
+        self, pictures: Sequence[DetailPicture], cameras: Sequence[CameraProfile], seed: int = 0
+    ) -> None:
+        if not pictures or not cameras:
+            raise ValueError("`pictures` and `cameras` must not be empty")
+        self.cameras, self.seed = list(cameras), seed
+        kinds: dict[str, list[DetailPicture]] = {}
+        for picture in pictures:
+            kinds.setdefault(picture.kind, []).append(picture)
+        self.kinds = [kinds[name] for name in sorted(kinds)]
+        weights = np.array([_WEIGHTS.get(name, 1.0) for name in sorted(kinds)])
+        self._shares = weights / weights.sum()
+        self.pairs = list(pictures)
+        #: Side of the largest crop that there is [packed pixel].
+        self.largest = max(min(p.light.shape[1:]) // _photosites(p) for p in self.pairs)
+
+    def batch(self, step: int, size: int, crop: int, *, process: int = 0) -> NoiseBatch:
+        """The crops of one step.
+
+        Args:
+            step: Number of the step.
+            size: Crops.
+            crop: Height and width of the crops [packed pixel].
+            process: Rank among several processes, each of which gets crops of its own.
+        """
+        rng = np.random.default_rng([self.seed, 0xDE7A, step, process])
+        generator = noise_generator(self.seed, step, process, 0xDE7A)
+        items = [_recorded(*self._draw(crop, rng), generator) for _ in range(size)]
+        return NoiseBatch(*(torch.stack(parts) for parts in zip(*items, strict=True)))
+
+    def captures(self, index: int, count: int, crop: int) -> NoiseBatch:
+        """`count` captures of one crop, which differ by their noise.
+
+        Args:
+            index: Number of the crop.
+            count: Captures.
+            crop: Height and width [packed pixel].
+        """
+        generator = noise_generator(self.seed, index, 0xCA9)
+        drawn = self._draw(crop, np.random.default_rng([self.seed, 0xCA9, index]))
+        items = [_recorded(*drawn, generator) for _ in range(count)]
+        return NoiseBatch(*(torch.stack(parts) for parts in zip(*items, strict=True)))
+
+    def _draw(
+        self, crop: int, rng: np.random.Generator
+    ) -> tuple[Tensor, Tensor, Tensor, CameraProfile, int]:
+        """Light, shot and read noise, camera and averaged samples of a crop."""
+        if crop > self.largest:
+            raise ValueError(
+                f"`crop` (={crop}) must not exceed the largest picture, {self.largest}"
+            )
+        while True:
+            kind = self.kinds[int(rng.choice(len(self.kinds), p=self._shares))]
+            picture = kind[int(rng.integers(len(kind)))]
+            k = int(rng.choice(_AVERAGED, p=_AVERAGED_SHARE))
+            made = _planes(picture, crop, k, rng)
+            if made is None:
+                continue
+            planes, nlf = made
+            camera = self.cameras[int(rng.integers(len(self.cameras)))]
+            shot, read = _noise(camera, rng)
+            shot, read = shot / k**2, read / k**2
+            level = float(np.exp2(rng.uniform(*_LEVEL)))
+            scale = level / max(float(planes.mean()), 1e-12)
+            if not nlf.is_zero:
+                own = nlf.exposed(scale)
+                quiet = _CLEAN_RATIO * np.array([own.read, own.shot]) <= np.stack([read, shot])
+                if not quiet.all():
+                    continue
+            shots, reads = (torch.from_numpy(v.astype(np.float32)) for v in (shot, read))
+            return planes * scale, shots, reads, camera, k
+
+
+def _photosites(picture: DetailPicture) -> int:
+    """Samples of a picture per packed pixel and side: a recorded mosaic is packed already."""
+    return 1 if picture.light.shape[0] == 4 else 2
+
+
+def _planes(
+    picture: DetailPicture, crop: int, k: int, rng: np.random.Generator
+) -> tuple[Tensor, NoiseLevelFunction] | None:
+    """A crop averaged by k, its mean arbitrary, and the noise in it; None if it is too small."""
+    mosaic, side = picture.light.shape[0] == 4, crop * k * _photosites(picture)
+    height, width = picture.light.shape[1:]
+    if side > min(height, width):
+        return None
+    top, left = (int(rng.integers(n - side + 1)) for n in (height, width))
+    part = picture.light[:, top : top + side, left : left + side]
+    if mosaic:  # flipping packed planes would not be flipping the mosaic
+        if rng.random() < 0.5:
+            part = part.transpose(-2, -1)[[0, 2, 1, 3]]
+        return average_planes(part, k), picture.nlf.scaled(1.0 / k**2)
+    part = part.flip([axis for axis in (-2, -1) if rng.random() < 0.5])
+    if rng.random() < 0.5:
+        part = part.transpose(-2, -1)
+    light = _other_colours(part, rng)
+    if rng.random() < _COINCIDING:
+        return average_planes(light[[0, 1, 1, 2]], 2 * k), NoiseLevelFunction.zero()
+    sigma = 0.0 if rng.random() < 0.25 else float(rng.uniform(0.3, 0.9))
+    return average_planes(sample_mosaic(lens_blur(light, sigma)), k), NoiseLevelFunction.zero()
+
+
+def _other_colours(light: Tensor, rng: np.random.Generator) -> Tensor:
+    """The picture under another light, by another sensor: mixed colours, gains, contrast."""
+    if rng.random() < 0.3:
+        light = light.clamp(min=0.0) ** float(rng.uniform(0.7, 1.4))
+    mix = np.eye(3) + rng.uniform(-0.25, 0.25, (3, 3)) * rng.random()
+    mix /= mix.sum(axis=1, keepdims=True)
+    gains = np.exp2([rng.uniform(-1.6, 0.4), 0.0, rng.uniform(-1.6, 0.4)])
+    matrix = torch.from_numpy((mix * gains[:, None]).astype(np.float32))
+    return torch.einsum("ij,jhw->ihw", matrix, light).clamp(min=0.0)
+
+
+def _noise(camera: CameraProfile, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(shot, read), each (4,) float64, of a camera at a random ISO, or of one like it."""
+    nlf = camera.nlf(float(np.exp2(rng.uniform(*_ISO))))
+    shot, read = np.array(nlf.shot), np.array(nlf.read)
+    if rng.random() < 0.5:
+        shot = shot * np.exp(rng.normal(0.0, 0.4))
+        read = read * np.exp(rng.uniform(-1.0, 2.0))
+    return shot, read
+
+
+def _recorded(
+    light: Tensor,
+    shot: Tensor,
+    read: Tensor,
+    camera: CameraProfile,
+    k: int,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`light` as it is recorded, and the other fields of a `NoiseBatch`.
+
+    Photons, read noise, rounding, clip. An average of k x k samples is rounded to 1/k^2 of a
+    digital number; rounding is part of the calibrated read noise.
+    """
+    shots, reads = shot[:, None, None], read[:, None, None]
+    step = 1.0 / (torch.tensor(camera.span, dtype=torch.float32)[:, None, None] * k**2)
+    electrons = 1.0 / shots
+    counted = torch.poisson(light.clamp(0.0, 2.0) * electrons, generator=generator) / electrons
+    normal = torch.empty_like(light).normal_(generator=generator)
+    noisy = counted + (reads - step.square() / 12.0).clamp(min=0.0).sqrt() * normal
+    pedestal = torch.tensor(camera.pedestal, dtype=torch.float32)[:, None, None]
+    rounded = torch.maximum((noisy / step).round() * step, -pedestal).clamp(max=1.0)
+    return rounded, light.clamp(max=1.0), shot, read

@@ -28,19 +28,23 @@ from torch import Tensor, nn
 from simulator.camera import CameraProfile, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule
 from simulator.networks.noise_module import NoiseModule
-from simulator.networks.weights import build_modules, save_modules
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.raw.image import RawImage
 from simulator.reference.sequences import Pair, any_pairs, opening_pairs
 from simulator.settings import CameraSettings, exposure_ratio
-from simulator.training.config import SimulatorConfig
 from simulator.training.data import Batch, settings_parameters
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, expose
-from simulator.training.train import TrainingProgress, load_start, make_accelerator, train_stage
+from simulator.training.train import (
+    SimulatorConfig,
+    TrainingProgress,
+    first_modules,
+    make_accelerator,
+    save_trained,
+    train_stage,
+)
 from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_word
 from simulator.utils.files import sibling, write_atomically
-from simulator.utils.results import result_meta
 
 logger = logging.getLogger(__name__)
 
@@ -531,10 +535,8 @@ def train_on_captures(
     """
     check_word("preset", config.preset, ("paper", "pc", "dl"))
     accelerator = make_accelerator(config, device, None)
-    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
-        torch.default_generator.manual_seed(config.seed)
-        modules: Any = build_modules(config.preset)
-    start = None if config.start is None else load_start(config, modules)
+    made, start = first_modules(config)
+    modules: Any = made
     losses: dict[str, Callable[[], nn.Module]] = {
         "exposure": lambda: ExposureLoss(modules["exposure"]),
         "noise": lambda: CapturedNoiseLoss(modules["exposure"], modules["noise"]),
@@ -563,9 +565,6 @@ def train_on_captures(
         )
         seconds = round(clock.seconds, 1)
         stages[name] = {"pairs": len(pairs.pairs), "steps": clock.step, "seconds": seconds}
-    modules.to("cpu").eval()
-    meta = result_meta(command, config.seed)
-    origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
     done = {"start": start, "sequences": len(sequences), "stages": stages}
-    save_modules(path, modules, config.preset, {"training": config.card(), **done, **origin})
+    save_trained(path, made, config, command, **done)
     return sibling(path, ".safetensors")

@@ -1,27 +1,35 @@
 """From a configuration to weights: the stages in turn, each on its own pairs of captures.
 
-Accelerate does the plumbing: devices, precision, several processes, logs.
+Accelerate does the plumbing: devices, precision, several processes, logs. In the end the error that
+a noise module leaves is measured (`calibrate`), for the plan's predictions.
 """
 
 from __future__ import annotations
 
 import functools
+import logging
 import math
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, cast
 
+import numpy as np
 import torch
+import torch.nn.functional as F
+from pydantic import Field, model_validator
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from simulator.camera import get_camera, list_cameras
-from simulator.networks.noise_module import NoiseModule
+from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, wiener_error
+from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import build_modules, load_modules, save_modules
-from simulator.reference.reference_camera import (
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.reference.camera import (
     DRAPED,
     MOSAIC,
     BodyError,
@@ -30,26 +38,35 @@ from simulator.reference.reference_camera import (
 )
 from simulator.reference.sequences import Sequence as CaptureSequence
 from simulator.reference.sequences import Stage
-from simulator.training.calibration import calibrate
-from simulator.training.config import SimulatorConfig, StageConfig
-from simulator.training.crops import DetailCrops, DetailPicture, NoiseBatch
-from simulator.training.data import Batch, ReferencePairs, draw_sequences
+from simulator.training.data import (
+    Batch,
+    DetailCrops,
+    DetailPicture,
+    NoiseBatch,
+    ReferencePairs,
+    draw_sequences,
+)
 from simulator.training.losses import ApertureLoss, BaselineLoss, ExposureLoss, NoiseLoss
+from simulator.training.scenes import (
+    Split,
+    detail_pictures,
+    draped_scenes,
+    mosaic_scenes,
+    reference_scenes,
+)
 from simulator.utils.checkpoint import Checkpoint
-from simulator.utils.files import sibling
-from simulator.utils.processor import check_bfloat16
-from simulator.utils.results import result_meta
+from simulator.utils.compute import check_bfloat16
+from simulator.utils.config_file import Configuration, load_yaml
+from simulator.utils.files import DATA_VARIABLE, data_folder, result_meta, sibling
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-#: Makes the scenes of a split, ``"train"`` or ``"validation"``, such as
-#: `ae_env.scenes.reference_scenes` does.
-SceneMaker = Callable[[SimulatorConfig, str], Sequence[ReferenceScene]]
-#: Gives the pictures of a split for the noise stage, such as `ae_env.scenes.pictures` does.
-PictureMaker = Callable[[SimulatorConfig, str], Sequence[DetailPicture]]
-#: Called with the task, the share of it that is done, and the latest values.
-TrainingProgress = Callable[[str, float, dict[str, float]], None]
+logger = logging.getLogger(__name__)
+
+#: Splits that a training uses, and the procedural scenes that it validates on.
+_SPLITS: tuple[Split, ...] = ("train", "validation")
+_VALIDATION_SCENES = 24
 #: Fixed batches that a trained stage is validated on.
 _VALIDATION_STEPS, _VALIDATION_BATCH = 8, 8
 #: Pairs that each stage is trained on, see `simulator.reference.sequences.select_pairs`.
@@ -64,6 +81,136 @@ _RISE = 0.05
 _GRADIENT_NORM = 1.0
 #: Steps between two log entries, and the memory of the running means that are logged.
 _LOG_EVERY, _SMOOTHING = 20, 0.98
+#: Values of `wiener_error` at which errors are tabulated.
+_KNOTS = np.array([0.0, 0.003, 0.006, 0.0125, 0.025, 0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0])
+#: Crops that are measured, how large they are, and captures of each.
+_CROPS, _SIDE, _CAPTURES = 192, 128, 4
+#: Stages in the order of their training.
+_STAGES = ("noise", "exposure", "aperture", "baseline")
+#: Stages of the presets that are not whole simulators.
+_STAGES_OF = {"nano": ("noise",), "large": ("noise",), "pc": ("baseline",), "dl": ("baseline",)}
+
+
+class StageConfig(Configuration):
+    """One stage of the training.
+
+    Args:
+        steps: Optimiser steps; the whole budget, unless `minutes` is given.
+        minutes: Budget in time instead of in steps: processor minutes of the training process on a
+            CPU, so that other work on the machine does not count; wall-clock minutes on a GPU.
+        batch: Pairs per step and process.
+        crop: Height and width of the crops [packed pixel].
+        learning_rate: Peak of a one-cycle schedule (rise over 5 %, cosine fall to 0).
+        average: Decay of the running average of the weights that is kept in the end; 0 keeps the
+            last ones.
+    """
+
+    steps: int | None = Field(default=None, ge=1, le=10_000_000)
+    minutes: float | None = Field(default=None, gt=0, le=100_000)
+    batch: int = Field(default=8, ge=1, le=4096)
+    crop: int = Field(default=64, ge=16, le=4096)
+    learning_rate: float = Field(default=1e-3, gt=0, le=1.0)
+    average: float = Field(default=0.0, ge=0, lt=1)
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> StageConfig:
+        if (self.steps is None) == (self.minutes is None):
+            raise ValueError("exactly one of `steps` and `minutes` must be given")
+        return self
+
+
+class SceneConfig(Configuration):
+    """Scenes that the reference camera photographs.
+
+    Args:
+        procedural: Procedural scenes in the training split; three quarters of them have depth.
+        size: Height and width of a scene [packed pixel].
+        radiance: Folder of radiance maps, searched with its subfolders; null leaves them out.
+    """
+
+    procedural: int = Field(default=240, ge=1, le=100_000)
+    size: int = Field(default=256, ge=32, le=4096)
+    radiance: str | None = None
+
+
+class SimulatorConfig(Configuration):
+    """A training of the three modules, or of a baseline.
+
+    Args:
+        preset: ``"compact"`` or ``"paper"``; ``"nano"`` and ``"large"`` are noise modules alone;
+            ``"pc"`` (parameter concatenation) and ``"dl"`` (decoupled learning) are the paper's
+            baselines, one network trained in one stage.
+        camera: Built-in camera that records the sequences. The noise stage adds the noise of every
+            built-in camera.
+        body: Seed of the hidden error of its body.
+        seed: Seed of everything that is random.
+        start: Weights of the same preset that the training goes on from: a name that comes with the
+            package or a file; by default it begins with random ones.
+        precision: Of the networks; weights, optimiser and losses stay float32.
+        scenes: Scenes of the sequences.
+        exposure, noise, aperture: The three stages of a simulator.
+        baseline: The stage of ``"pc"`` and ``"dl"``.
+    """
+
+    preset: Literal["nano", "compact", "large", "paper", "pc", "dl"]
+    camera: str = "nikon_z6"
+    body: int = Field(default=1, ge=0)
+    seed: int = Field(default=0, ge=0)
+    start: str | None = None
+    precision: Literal["float32", "bfloat16", "float16"] = "float32"
+    scenes: SceneConfig = SceneConfig()
+    exposure: StageConfig | None = None
+    noise: StageConfig | None = None
+    aperture: StageConfig | None = None
+    baseline: StageConfig | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> SimulatorConfig:
+        get_camera(self.camera)
+        stages = _STAGES_OF.get(self.preset, ("exposure", "noise", "aperture"))
+        for name in _STAGES:
+            wanted = name in stages
+            if wanted != (getattr(self, name) is not None):
+                rule = "must be given" if wanted else "must be left out"
+                raise ValueError(f"`{name}` {rule} for preset {self.preset!r}")
+        for name, stage in self.stages().items():
+            if name != "noise" and stage.crop > self.scenes.size:
+                raise ValueError(
+                    f"`{name}.crop` (={stage.crop}) must not exceed `scenes.size` "
+                    f"(={self.scenes.size})"
+                )
+        return self
+
+    def stages(self) -> dict[str, StageConfig]:
+        """The stages by name, in order."""
+        return {name: getattr(self, name) for name in _STAGES if getattr(self, name) is not None}
+
+    def card(self, last_stage: str | None = None) -> dict[str, Any]:
+        """JSON values that identify the training, without the stages after `last_stage`.
+
+        The noise stage has pictures of its own: nothing but its budget and the seed changes it.
+        """
+        values = self.model_dump(mode="json", exclude_none=True)
+        if last_stage == "noise":
+            names = ("preset", "seed", "start", "precision", "noise")
+            return {name: values[name] for name in names if name in values}
+        stages = list(self.stages())
+        later = [] if last_stage is None else stages[stages.index(last_stage) + 1 :]
+        return {name: value for name, value in values.items() if name not in later}
+
+
+def load_config(path: str | Path) -> SimulatorConfig:
+    """The configuration in a YAML file; see `simulator.utils.config_file.load_yaml`."""
+    return load_yaml(path, SimulatorConfig)
+
+
+# -- training -------------------------------------------------------------------------------------
+#: Makes the scenes of a split, ``"train"`` or ``"validation"``, of a training.
+SceneMaker = Callable[[SimulatorConfig, Split], Sequence[ReferenceScene]]
+#: Makes the pictures of a split for its noise stage.
+PictureMaker = Callable[[SimulatorConfig, Split], Sequence[DetailPicture]]
+#: Called with the task, the share of it that is done, and the latest values.
+TrainingProgress = Callable[[str, float, dict[str, float]], None]
 
 
 class Batches(Protocol):
@@ -75,13 +222,13 @@ class Batches(Protocol):
 
 def train_and_save(
     config: SimulatorConfig,
-    make_scenes: SceneMaker,
-    make_pictures: PictureMaker,
     path: Path,
     *,
     command: str,
     device: str = "cpu",
     tensorboard: bool = False,
+    make_scenes: SceneMaker | None = None,
+    make_pictures: PictureMaker | None = None,
     progress: TrainingProgress | None = None,
 ) -> Path:
     """Trains the stages of `config` and writes the weights with their model card.
@@ -90,12 +237,13 @@ def train_and_save(
 
     Args:
         config: The training.
-        make_scenes: Gives the scenes of a split; not called for a noise module alone.
-        make_pictures: Gives the pictures of a split for the noise stage.
         path: File name of the weights; checkpoints and logs go into its folder.
         command: The command line that does it again, for the card.
         device: ``"cpu"`` or ``"cuda"``; several GPUs or processes through ``accelerate launch``.
         tensorboard: Whether to log to ``tensorboard`` in that folder.
+        make_scenes: Gives the scenes of a split, `scenes_of` by default; not called for a noise
+            module alone.
+        make_pictures: Gives the pictures of a split for the noise stage, `pictures_of` by default.
         progress: Called while scenes are rendered and every few steps.
 
     Returns:
@@ -106,19 +254,16 @@ def train_and_save(
     """
     folder = path.parent
     accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
-    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
-        torch.default_generator.manual_seed(config.seed)
-        modules = build_modules(config.preset)
-    start = None if config.start is None else load_start(config, modules)
+    modules, start = first_modules(config)
     sources = {
-        split: _Source(config, make_scenes, make_pictures, split)
-        for split in ("train", "validation")
+        split: _Source(config, make_scenes or scenes_of, make_pictures or pictures_of, split)
+        for split in _SPLITS
     }
     if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
         progress = None
     stages: dict[str, dict[str, Any]] = {}
     for name, stage in config.stages().items():
-        pairs = sources["train"].pairs(name, _titled(progress, f"{name}: rendering"))
+        pairs = sources["train"].pairs(name, _with_title(progress, f"{name}: rendering"))
         loss = _loss(name, modules)
         clock = train_stage(
             name,
@@ -141,17 +286,58 @@ def train_and_save(
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
-        modules.to("cpu").eval()
         residual = None
         if "noise" in modules:
-            module = cast(NoiseModule, modules["noise"])
+            module = cast(NoiseModule, modules["noise"].cpu().eval())
             residual = calibrate(module, sources["validation"].crops).to_card()
-        meta = result_meta(command, config.seed)
         done = {"start": start, "scenes": sources["train"].kinds, "stages": stages}
-        origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
-        card = {"training": config.card(), **done, "residual": residual, **origin}
-        save_modules(path, modules, config.preset, card)
+        save_trained(path, modules, config, command, **done, residual=residual)
     return sibling(path, ".safetensors")
+
+
+def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any] | None]:
+    """The modules that a training begins with, and what the card of its start says, if any.
+
+    Raises:
+        ValueError: If `config.start` is not weights of this preset.
+    """
+    with torch.random.fork_rng(devices=[]):  # layers draw their weights from the global generator
+        torch.default_generator.manual_seed(config.seed)
+        modules = build_modules(config.preset)
+    return modules, None if config.start is None else load_start(config, modules)
+
+
+def save_trained(
+    path: Path, modules: nn.ModuleDict, config: SimulatorConfig, command: str, **entries: Any
+) -> None:
+    """Writes trained weights, and a card of the configuration, of `entries` and of their origin."""
+    meta = result_meta(command, config.seed)
+    origin = {k: meta[k] for k in ("command", "commit", "date", "machine", "versions")}
+    card = {"training": config.card(), **entries, **origin}
+    save_modules(path, modules.to("cpu").eval(), config.preset, card)
+
+
+def scenes_of(config: SimulatorConfig, split: Split) -> list[ReferenceScene]:
+    """The scenes of a split that a training's configuration names."""
+    radiance, folder = config.scenes.radiance or "", data_folder()
+    if folder is not None:
+        radiance = radiance.replace(f"${DATA_VARIABLE}", str(folder))
+    radiance = os.path.expandvars(radiance)
+    if config.scenes.radiance and ("$" in radiance or not radiance):  # unset, or empty
+        logger.warning("%s is not set: training without radiance maps", config.scenes.radiance)
+        radiance = ""
+    data, size = Path(radiance) if radiance else None, config.scenes.size
+    camera = get_camera(config.camera)
+    number = config.scenes.procedural if split == "train" else _VALIDATION_SCENES
+    scenes = reference_scenes(split, camera, number=number, size=size, data=data, seed=config.seed)
+    if data is not None:
+        scenes += mosaic_scenes(split, camera, data, size=size)
+    return [*scenes, *draped_scenes(scenes, camera, seed=config.seed)]
+
+
+def pictures_of(config: SimulatorConfig, split: Split) -> list[DetailPicture]:
+    """The pictures of a split that the noise stage is trained on."""
+    return detail_pictures(split, data=data_folder(), seed=config.seed)
 
 
 def load_start(config: SimulatorConfig, modules: nn.ModuleDict) -> dict[str, Any]:
@@ -213,7 +399,7 @@ class _Source:
         config: SimulatorConfig,
         make_scenes: SceneMaker,
         make_pictures: PictureMaker,
-        split: str,
+        split: Split,
     ) -> None:
         self.config, self.split = config, split
         self._make_scenes, self._make_pictures = make_scenes, make_pictures
@@ -245,7 +431,7 @@ class _Source:
             return self.crops
         camera, sequences = self._sequences
         return ReferencePairs(
-            [s for s in sequences if _teaches(s.scene, stage)],
+            [s for s in sequences if _is_useful_for(s.scene, stage)],
             camera,
             _PAIRS[stage],
             seed=self.config.seed,
@@ -254,7 +440,7 @@ class _Source:
         )
 
 
-def _teaches(scene: ReferenceScene, stage: str) -> bool:
+def _is_useful_for(scene: ReferenceScene, stage: str) -> bool:
     """Whether a stage is trained on `scene`.
 
     The aperture is learnt from scenes of known depth and from those in focus throughout, in which
@@ -266,7 +452,7 @@ def _teaches(scene: ReferenceScene, stage: str) -> bool:
     return scene.kind not in (DRAPED, MOSAIC)
 
 
-def _titled(progress: TrainingProgress | None, title: str) -> Callable[[int, int], None] | None:
+def _with_title(progress: TrainingProgress | None, title: str) -> Callable[[int, int], None] | None:
     if progress is None:
         return None
     return lambda done, total: progress(title, done / max(total, 1), {})
@@ -331,17 +517,8 @@ def train_stage(
     if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
         parts["scaler"] = accelerator.scaler
 
-    def now() -> dict[str, Any]:
-        states = {part: own.state_dict() for part, own in parts.items()}
-        return {"step": clock.step, "seconds": clock.seconds, **states}
-
     writes = accelerator.is_main_process
-    state = Checkpoint(checkpoint, [name, identity], now, writes=writes)
-    past = state.load()
-    if past is not None:
-        clock.step, clock.seconds = int(past["step"]), float(past["seconds"])
-        for part, own in parts.items():
-            own.load_state_dict(past[part])
+    state = _resume(checkpoint, [name, identity], clock, parts, writes=writes)
     wrapped, stepper = accelerator.prepare(loss, optimizer)
     means: dict[str, float] = {}
     process = accelerator.process_index
@@ -351,13 +528,13 @@ def train_stage(
             optimizer.param_groups[0]["lr"] = learning_rate(clock.share, stage.learning_rate)
             batch = pairs.batch(clock.step, stage.batch, stage.crop, process=process)
             values = wrapped(send_to_device(batch, device))
-            _follow(means, values, name)
+            _update_means(means, values, name)
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
             stepper.step()
             average.update_parameters(trained)
             clock.tick()
-            _agree(clock, accelerator)
+            _share_clock(clock, accelerator)
             stepper.zero_grad()
             if clock.step % _LOG_EVERY == 0 or clock.share >= 1.0:
                 accelerator.log({f"{name}/{k}": v for k, v in means.items()}, step=clock.step)
@@ -366,6 +543,24 @@ def train_stage(
             state.save_when_due()
     trained.load_state_dict(average.module.state_dict())
     return clock
+
+
+def _resume(
+    path: Path, identity: Any, clock: Clock, parts: dict[str, Any], *, writes: bool
+) -> Checkpoint:
+    """The checkpoint of a stage, whose state is loaded into `clock` and `parts` if there is one."""
+
+    def state() -> dict[str, Any]:
+        states = {name: part.state_dict() for name, part in parts.items()}
+        return {"step": clock.step, "seconds": clock.seconds, **states}
+
+    checkpoint = Checkpoint(path, identity, state, writes=writes)
+    past = checkpoint.load()
+    if past is not None:
+        clock.step, clock.seconds = int(past["step"]), float(past["seconds"])
+        for name, part in parts.items():
+            part.load_state_dict(past[name])
+    return checkpoint
 
 
 @dataclass
@@ -417,7 +612,7 @@ def learning_rate(share: float, peak: float) -> float:
     return peak * 0.5 * (1.0 + math.cos(math.pi * (share - _RISE) / (1.0 - _RISE)))
 
 
-def _agree(clock: Clock, accelerator: Accelerator) -> None:
+def _share_clock(clock: Clock, accelerator: Accelerator) -> None:
     """Sets every process's clock by the main one's.
 
     All of them must stop after the same step, as each step waits for all of them.
@@ -429,7 +624,7 @@ def _agree(clock: Clock, accelerator: Accelerator) -> None:
         clock.seconds = float(broadcast(seconds))
 
 
-def _follow(means: dict[str, float], values: dict[str, torch.Tensor], name: str) -> None:
+def _update_means(means: dict[str, float], values: dict[str, torch.Tensor], name: str) -> None:
     """Updates the running means by the values of a step.
 
     Raises:
@@ -462,3 +657,68 @@ def validate(
             means[key] = means.get(key, 0.0) + float(value) / _VALIDATION_STEPS
     loss.train()
     return {key: round(value, 5) for key, value in means.items() if math.isfinite(value)}
+
+
+# -- calibration ----------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def calibrate(noise: NoiseModule, crops: DetailCrops) -> Residual:
+    """The error that a noise module leaves on pictures that it was not trained on.
+
+    Several captures of each crop tell what is systematic from what is noise. The first half of the
+    crops fills the tables; the second half tells how far single crops are from them.
+
+    Args:
+        noise: In evaluation mode.
+        crops: Of the validation split.
+    """
+    half = _CROPS // 2
+    blocks = [_measure(noise, crops, index) for index in range(_CROPS)]
+    error, bias, left = (
+        np.concatenate([getattr(b, name) for b in blocks[:half]])
+        for name in ("wiener_error", "bias", "variance")
+    )
+    bias, left = (np.maximum(_means_at_knots(error, v), 0.0) for v in (bias, left))
+    first = Residual(_KNOTS, bias, left, 1.0)
+    ratios = []
+    for own in blocks[half:]:
+        predicted = own.statistics.error(first, 1.0, own.statistics.nlf, noise=False)
+        found = max(float((own.bias + own.variance).mean()), 0.0) ** 0.5
+        ratios.append(found / max(predicted, 1e-6))
+    return Residual(_KNOTS, bias, left, max(1.0, float(np.quantile(ratios, 0.9))))
+
+
+class _Measured(NamedTuple):
+    """Errors of a network on one crop, in blocks, in units of the noise's variance."""
+
+    wiener_error: np.ndarray
+    bias: np.ndarray
+    variance: np.ndarray
+    statistics: ResidualStatistics
+
+
+def _measure(noise: NoiseModule, crops: DetailCrops, index: int) -> _Measured:
+    batch = crops.captures(index, _CAPTURES, min(_SIDE, crops.largest))
+    error = noise(batch.noisy, batch.shot, batch.read).double() - batch.clean.double()
+    scale = variance_map(batch.clean, batch.shot, batch.read).double()[0]
+    variance = error.var(dim=0)
+    bias = error.mean(dim=0).square() - variance / _CAPTURES
+    shot, read = (v[0].tolist() for v in (batch.shot, batch.read))
+    nlf = NoiseLevelFunction(tuple(shot), tuple(read))
+    expected = wiener_error(batch.noisy[0], nlf).double().flatten().numpy()
+    squares = [
+        F.avg_pool2d((v / scale)[None], BLOCK)[0].mean(dim=0).flatten().numpy()
+        for v in (bias, variance)
+    ]
+    return _Measured(expected, squares[0], squares[1], ResidualStatistics(batch.noisy[0], nlf))
+
+
+def _means_at_knots(error: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Means of `values` around each knot, weights falling to 0 at the neighbouring ones."""
+    place = np.interp(error, _KNOTS, np.arange(len(_KNOTS)))
+    weights = np.maximum(1.0 - np.abs(place[None] - np.arange(len(_KNOTS))[:, None]), 0.0)
+    total = weights.sum(axis=1)
+    means = (weights @ values) / np.maximum(total, 1e-12)
+    known = total > 1.0
+    return np.interp(np.arange(len(_KNOTS)), np.flatnonzero(known), means[known])

@@ -24,8 +24,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from simulator.utils.checks import check_integer
-from simulator.utils.files import write_atomically
-from simulator.utils.results import package_version
+from simulator.utils.files import package_version, write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: Environment variable that names another cache folder.

@@ -13,34 +13,15 @@ from typing import Any
 
 import torch
 
-from simulator.utils.files import write_atomically
-from simulator.utils.results import package_version
+from simulator.utils.files import package_version, write_atomically
 
 _LOGGER = logging.getLogger(__name__)
 #: Least time between two checkpoints of a training [s].
 INTERVAL = 20.0
 
 
-def save_checkpoint(path: str | Path, state: Mapping[str, Any]) -> None:
-    """Writes the state of a training with `torch.save`, whole or not at all.
-
-    Where the file cannot be written, as on a full disk, a warning is logged, the previous
-    checkpoint stays, and the training goes on.
-
-    Args:
-        path: The file; its folder is made.
-        state: Tensors, numbers, text, and dicts and lists of them, such as state dicts.
-    """
-    content = io.BytesIO()
-    torch.save(dict(state), content)
-    try:
-        write_atomically(path, content.getvalue())
-    except OSError as error:
-        _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
-
-
 def load_checkpoint(path: str | Path) -> dict[str, Any] | None:
-    """What `save_checkpoint` wrote, with its tensors on the CPU.
+    """The content of the file of a `Checkpoint`, with its tensors on the CPU.
 
     Nothing but tensors and plain values is unpickled (``weights_only=True``), so a checkpoint from
     somebody else runs no code.
@@ -76,8 +57,9 @@ class Checkpoint:
     Args:
         path: The file; None writes and reads nothing.
         identity: JSON value that says what is trained and how. A checkpoint of another training, or
-            of another version of this package, is not resumed but kept under another name.
-        state: Called for the state to write; see `save_checkpoint`.
+            of another version of this package, is not resumed but replaced.
+        state: Called for the state to write: tensors, numbers, text, and dicts and lists of them,
+            such as state dicts.
         writes: False in the processes of a distributed training that only read.
     """
 
@@ -101,24 +83,27 @@ class Checkpoint:
         if stored is None:
             return None
         if stored.get("identity") != self.identity:
-            assert self.path is not None
-            other = self.path.with_name(f"{self.path.name}.other")
-            if self.writes:
-                self.path.replace(other)
             _LOGGER.warning(
-                "checkpoint %s is of a training with other settings or of another version: it is "
-                "kept as %s, and training restarts",
+                "checkpoint %s is of a training with other settings or of another version: "
+                "training restarts",
                 self.path,
-                other.name,
             )
             return None
         return dict(stored["state"])
 
     def save(self) -> None:
-        """Writes the state now."""
+        """Writes the state now, whole or not at all.
+
+        Where the file cannot be written, as on a full disk, a warning is logged, the previous
+        checkpoint stays, and the training goes on.
+        """
         if self.path is not None and self.writes:
-            state = {"identity": self.identity, "state": dict(self.state())}
-            save_checkpoint(self.path, state)
+            content = io.BytesIO()
+            torch.save({"identity": self.identity, "state": dict(self.state())}, content)
+            try:
+                write_atomically(self.path, content.getvalue())
+            except OSError as error:
+                _LOGGER.warning("checkpoint not saved, the one before stays: %s", error)
         self._saved = time.monotonic()
 
     def save_when_due(self) -> None:

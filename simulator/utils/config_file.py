@@ -1,19 +1,18 @@
-"""YAML files: read within bounds, and turned into validated configurations."""
+"""YAML files, turned into validated configurations."""
 
 from __future__ import annotations
 
-import difflib
 import reprlib
-from collections.abc import Hashable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
-#: Bounds of a YAML file: its bytes, its entries with every alias written out, their nesting.
-MAX_BYTES, MAX_ENTRIES, MAX_DEPTH = 2**20, 10_000, 50
+from simulator.utils.checks import did_you_mean
+
+#: Most bytes of a YAML file.
+MAX_BYTES = 2**20
 
 #: Words for pydantic's errors that name Python types.
 _PLAIN = {
@@ -32,7 +31,7 @@ class Configuration(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _no_truth(cls, value: Any) -> Any:
+    def _refuse_booleans(cls, value: Any) -> Any:
         if isinstance(value, bool):
             raise ValueError("Input should not be true or false")
         return value
@@ -60,7 +59,7 @@ def load_yaml(path: str | Path, model: type[Model]) -> Model:
 
 
 def read_yaml(path: str | Path, *, name: str = "config") -> Any:
-    """The values in a YAML file from anybody: no tags that run code, and bounded in size.
+    """The values in a YAML file from anybody: no tags that run code.
 
     Args:
         path: The file; ``~`` is the home folder.
@@ -70,8 +69,8 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
         Mappings, lists, numbers, text; None for an empty file.
 
     Raises:
-        ValueError: If the file is missing, unreadable or not YAML, gives an entry twice, or is
-            larger than `MAX_BYTES`, `MAX_ENTRIES` (aliases written out) or `MAX_DEPTH`.
+        ValueError: If the file is missing, unreadable, larger than `MAX_BYTES` or not YAML, or
+            gives an entry twice.
     """
     file, given = Path(path).expanduser(), f"`{name}` (={str(path)!r})"
     try:
@@ -85,7 +84,25 @@ def read_yaml(path: str | Path, *, name: str = "config") -> Any:
         raise ValueError(f"{given} is not YAML: {error}") from error
     except OSError as error:
         raise ValueError(f"{given} cannot be read: {error.strerror}") from error
-    return _parsed(text, given)
+    try:
+        return yaml.load(text, _Loader)
+    except RecursionError:
+        raise ValueError(f"{given} is not YAML: it is nested too deeply") from None
+    except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
+        raise ValueError(f"{given} is not YAML: {' '.join(str(error).split())}") from error
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, which by itself takes the last of two entries of one name."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[tuple[str, str]] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if (key.tag, key.value) in seen:
+                line = key.start_mark.line + 1
+                raise ValueError(f"the entry {key.value!r} is given twice, again in line {line}")
+            seen.add((key.tag, key.value))
+        return super().construct_mapping(node, deep)
 
 
 def one_line(error: ValidationError, prefix: str = "", model: Any = None) -> str:
@@ -117,61 +134,4 @@ def _unknown(model: Any, location: tuple[int | str, ...]) -> str:
         else:  # `key` is one of a mapping's, or an index in a list
             model = next(t for t in reversed(get_args(model)) if t is not Ellipsis)
     known = list(model.model_fields)
-    near = difflib.get_close_matches(str(location[-1]), known, n=1)
-    hint = f"; did you mean `{near[0]}`?" if near else ""
-    return f"unknown, the entries are {known}{hint}"
-
-
-def _parsed(text: str, name: str) -> Any:
-    """The values in a text of YAML; `name` stands for the file in error messages."""
-    with _yaml_errors(name):
-        loader = yaml.SafeLoader(text)
-        node = loader.get_single_node()
-    if node is None:
-        return None
-    try:
-        _check_node(node, {})
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from None
-    with _yaml_errors(name):
-        return loader.construct_document(node)
-
-
-@contextmanager
-def _yaml_errors(name: str) -> Iterator[None]:
-    try:
-        yield
-    except RecursionError:
-        raise ValueError(f"{name} is not YAML: it is nested too deeply") from None
-    except Exception as error:  # of values such as `!!int x`, whatever their conversion raises
-        raise ValueError(f"{name} is not YAML: {' '.join(str(error).split())}") from error
-
-
-def _check_node(node: yaml.Node, entries: dict[int, int], depth: int = 0) -> int:
-    """Number of entries of `node`, every alias counted as often as it is used.
-
-    Raises:
-        ValueError: If there are too many, or too deep, or an entry is given twice.
-    """
-    if depth > MAX_DEPTH:
-        raise ValueError(f"entries must not be nested deeper than {MAX_DEPTH}")
-    if id(node) not in entries:
-        children: list[yaml.Node] = []
-        if isinstance(node, yaml.SequenceNode):
-            children = node.value
-        elif isinstance(node, yaml.MappingNode):
-            children = [part for pair in node.value for part in pair]
-            _check_keys([key for key, _ in node.value])
-        entries[id(node)] = 1 + sum(_check_node(child, entries, depth + 1) for child in children)
-    if entries[id(node)] > MAX_ENTRIES:
-        raise ValueError(f"there must be at most {MAX_ENTRIES} entries, aliases expanded")
-    return entries[id(node)]
-
-
-def _check_keys(keys: list[yaml.Node]) -> None:
-    seen: set[Hashable] = set()
-    for key in keys:
-        if isinstance(key, yaml.ScalarNode) and (key.tag, key.value) in seen:
-            line = key.start_mark.line + 1
-            raise ValueError(f"the entry {key.value!r} is given twice, again in line {line}")
-        seen.add((key.tag, key.value) if isinstance(key, yaml.ScalarNode) else id(key))
+    return f"unknown, the entries are {known}{did_you_mean(location[-1], known, '`')}"

@@ -87,16 +87,7 @@ def make_tiles(
         tile: Largest side of a tile, a multiple of 4 [pixel]; a frame that is no larger than one
             tile and a halo is one tile.
         needed: (H, W) bool, the pixels to cover; by default all.
-
-    Raises:
-        ValueError: If `halo` or `tile` is no multiple of 4, or `needed` is not of the frame's size.
     """
-    if halo % 4 or tile % 4 or tile < 4:
-        raise ValueError(f"`halo` (={halo}) and `tile` (={tile}) must be multiples of 4")
-    if needed is not None and needed.shape != (height, width):
-        raise ValueError(
-            f"`needed` (shape {tuple(needed.shape)}) must be that of the frame, {(height, width)}"
-        )
     if height <= tile + halo and width <= tile + halo:
         tile = 4 * ((max(height, width) + 3) // 4)
     tiles = []
@@ -153,8 +144,6 @@ def varying(image: Tensor, margin: int = 0) -> Tensor:
     Returns:
         (H, W) bool, in cells of 16 x 16 pixels.
     """
-    if margin % _CELL:
-        raise ValueError(f"`margin` (={margin}) must be a multiple of {_CELL}")
     height, width = image.shape[-2:]
     high = F.max_pool2d(image, _CELL, ceil_mode=True)
     low = -F.max_pool2d(-image, _CELL, ceil_mode=True)
@@ -184,17 +173,11 @@ def in_tiles(
         halo: Multiple of 4 [pixel].
         tile: Side of a tile, a multiple of 4 [pixel].
         needed: (H, W) bool, the pixels that need the function; by default all.
-        fallback: Values of all other pixels, of the result's shape.
+        fallback: Values of all other pixels, of the result's shape; given with `needed`.
 
     Returns:
         The result of `function` on the whole images; `fallback` where it is not needed.
-
-    Raises:
-        ValueError: If `halo` or `tile` is no multiple of 4, or `needed` is not of the images' size
-            or comes without `fallback`.
     """
-    if needed is not None and fallback is None:
-        raise ValueError("`fallback` (=None) must give the values of pixels that are not `needed`")
     height, width = images[0].shape[-2:]
     tiles = make_tiles(height, width, halo=halo, tile=tile, needed=needed)
     if needed is not None and bool(needed.all()):

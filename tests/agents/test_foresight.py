@@ -6,9 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from agents.foresight import POINTS, Foresight
+from agents.foresight import POINTS, Foresight, TrendTracker
 from agents.metering.reading import Reading
-from agents.metering.trend import TrendTracker
 from agents.policy_names import make_policy
 
 

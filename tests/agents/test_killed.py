@@ -10,29 +10,30 @@ from typing import Any
 import pytest
 import torch
 
+from agents.learning import training
 from agents.learning.training import is_trained, load_config, train_agent
-from simulator.utils.checkpoint import Checkpoint, load_checkpoint
+from simulator.utils import checkpoint
+from simulator.utils.checkpoint import load_checkpoint
 
 STOPPED = "stopped; run the same command again to continue"
 
 
-def command(folder: Path, started: Any, saves: bool) -> None:
-    """Runs as `ae-env train` in the process that is stopped, between its steps 3 and 4."""
+def command(folder: Path, started: Any, interval: float) -> None:
+    """Runs as `ae-env train` in the process that is stopped, in its step 4."""
     from agents.cli.main import main
 
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background ignores it
-    calls: list[int] = []
+    checkpoint.INTERVAL = interval
+    curve = training.LearningCurve.__call__
 
-    def due(self: Checkpoint) -> None:  # the first checkpoint would be due after 20 seconds
-        calls.append(1)
-        if saves:
-            self.save()
-        if len(calls) == 3:
+    def wait(self: Any, done: int, *report: Any) -> None:
+        curve(self, done, *report)
+        if done == 16:  # the fourth report; with a negative interval the third step is saved
             started.set()
             for _ in range(600):  # a signal just before a single sleep would not end it
                 time.sleep(0.1)
 
-    Checkpoint.save_when_due = due  # type: ignore[method-assign]
+    training.LearningCurve.__call__ = wait  # type: ignore[method-assign]
     torch.set_num_threads(1)
     words = os.open(folder / "words", os.O_WRONLY | os.O_CREAT)
     os.dup2(words, 2)
@@ -42,22 +43,22 @@ def command(folder: Path, started: Any, saves: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "status", "words"),
+    ("number", "status", "words", "steps"),
     [
-        (signal.SIGTERM, 143, STOPPED),
-        (signal.SIGINT, 130, STOPPED),
-        (signal.SIGKILL, -signal.SIGKILL, ""),  # what was written before counts
+        (signal.SIGTERM, 143, STOPPED, 4),
+        (signal.SIGINT, 130, STOPPED, 4),
+        (signal.SIGKILL, -signal.SIGKILL, "", 3),  # what was written before counts
     ],
 )
 def test_a_stopped_command(
-    number: int, status: int, words: str, forkserver: Any, tmp_path: Path
+    number: int, status: int, words: str, steps: int, forkserver: Any, tmp_path: Path
 ) -> None:
     (tmp_path / "mine.yaml").write_text(
         "{agent: regression, num_envs: 4, environment: {scenes: 'bundled:small', resolution: 36},"
         " training: {frames: 24, width: 8}}"
     )
     started = forkserver.Event()
-    arguments = (tmp_path, started, number == signal.SIGKILL)
+    arguments = (tmp_path, started, -1.0 if number == signal.SIGKILL else 20.0)
     process = forkserver.Process(target=command, args=arguments, daemon=True)
     process.start()
     assert started.wait(120)
@@ -69,8 +70,8 @@ def test_a_stopped_command(
     assert {p.name for p in tmp_path.iterdir()} == names
     stored = load_checkpoint(tmp_path / "agent.checkpoint")
     assert stored is not None
-    assert stored["state"]["step"] == 3
+    assert stored["state"]["step"] == steps
     config, seen = load_config(tmp_path / "mine.yaml"), []
     train_agent(config, tmp_path / "agent", progress=lambda *report: seen.append(report[:2]))
-    assert seen == [(16, 24), (20, 24), (24, 24)]
+    assert seen == [(done, 24) for done in range(4 * steps + 4, 25, 4)]
     assert is_trained(config, tmp_path / "agent")

@@ -4,7 +4,7 @@ from itertools import combinations
 import pytest
 
 from agents import PolicyContext, evaluate, make_policy
-from agents.evaluation.store import policy_content
+from agents.evaluation.jobs import policy_content
 from agents.policy_names import training_seeds
 from agents.rollouts import make_envs
 

@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes.pictures import detail_pictures
-from ae_env.scenes.reference_scenes import reference_scenes
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.optics.disc_bank import added_blur
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from simulator.reference.sampling import lens_blur, sample_mosaic
+from simulator.reference.camera import (
+    ReferenceCamera,
+    ReferenceScene,
+    lens_blur,
+    sample_mosaic,
+)
+from simulator.training.scenes import detail_pictures, reference_scenes
 
 FOLDER = Path(str(resources.files("simulator").joinpath("pretrained")))
 

@@ -10,7 +10,7 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.captures import describe_captures
 from simulator.capture.sensor import clip_and_quantise
 from simulator.optics.flicker_integral import MainsLamp, PulsedLamp
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from tests.ae_env.environments import make_env, make_envs
 from tests.ae_env.scorer_images import CAMERA, make_scene
 

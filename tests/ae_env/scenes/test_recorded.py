@@ -14,7 +14,7 @@ from ae_env.scenes import load_scenes
 from ae_env.scenes.recorded import RecordedOptions
 from simulator import exposure_ratio, get_camera, read_raw
 from simulator.raw.develop import develop
-from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.camera import ReferenceCamera
 from tests.ae_env.recorded_files import (
     GRID,
     capture,

@@ -10,7 +10,7 @@ from ae_env.scenes import Scene
 from ae_env.scorers import defects as defect_signs
 from ae_env.scorers import make_scorer
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, Defects, mapped, severity
-from ae_env.scorers.luma import srgb_decode
+from ae_env.scorers.measures import srgb_decode
 from benchmarks import defects as benchmark
 from simulator.raw.develop import srgb_encode
 from tests.ae_env.scorer_images import CAMERA, random_pictures

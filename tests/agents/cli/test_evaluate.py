@@ -89,7 +89,7 @@ def test_broken_files_of_a_folder_are_skipped_when_asked(ae_env, dng, tmp_path, 
     command = ("evaluate", "--env", tmp_path / "env.yaml", "--scenes", dng.parent)
     command += ("--policy", "random", "--frames", 2, "--workers", 1)
     code, _, error = ae_env(*command)
-    assert (code, "a JPEG file; --on-error skip" in error) == (2, True)
+    assert (code, "damaged; --on-error skip" in error) == (2, True)
     code, _, error = ae_env(*command, "--on-error", "skip")
     assert code == 0, error
     assert "1 of 2 scene files skipped (IMG_2.dng: " in caplog.text

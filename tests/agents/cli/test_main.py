@@ -17,13 +17,13 @@ from simulator.capture.plan import DEFAULT_TOLERANCE
 from tests.simulator.training.captures import write_dataset
 
 COMMANDS = (
-    *("bench", "cache", "convert-nima", "evaluate", "export", "film", "hdr"),
+    *("bench", "cache", "evaluate", "export", "film", "hdr"),
     *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate", "sweep"),
     *("train", "train-simulator", "view", "warm-up"),
 )
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
-NO_SEED = (*NO_OUT, "convert-nima", "export", "hdr")
+NO_SEED = (*NO_OUT, "export", "hdr")
 #: Policies that fail when they are made, when it is their turn, and before.
 OWN = """\
 from agents import Policy

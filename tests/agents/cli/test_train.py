@@ -3,22 +3,16 @@
 import json
 import re
 import shlex
-from collections import Counter
 from functools import partialmethod
 from pathlib import Path
 
 import pytest
-import yaml
 
-from ae_env.scenes import pictures
-from agents.cli import train
-from agents.cli.train import reference_scenes_of
 from simulator import CameraSimulator
 from simulator.networks.weights import load_modules
-from simulator.training import calibration
-from simulator.training.config import SimulatorConfig
-from simulator.training.crops import DetailCrops
-from simulator.training.data import ReferencePairs
+from simulator.training import scenes as pictures
+from simulator.training import train
+from simulator.training.data import DetailCrops, ReferencePairs
 from simulator.utils.files import sibling
 
 TINY = """\
@@ -37,7 +31,7 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.delenv("AE_ENV_DATA", raising=False)
     monkeypatch.setattr(pictures, "_DRAWN", {"train": 2, "validation": 1})
     monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
-    monkeypatch.setattr(calibration, "_CROPS", 8)
+    monkeypatch.setattr(train, "_CROPS", 8)
     (tmp_path / "tiny.yaml").write_text(TINY)
     steps = []
 
@@ -71,20 +65,6 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert [stage["steps"] for stage in card["stages"].values()] == [2, 2, 2]
     assert {"leaves": 2, "chart": 2, "smooth": 2, "depth": 3}.items() <= card["scenes"].items()
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
-
-
-def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
-    config = SimulatorConfig.model_validate(yaml.safe_load(TINY))
-    splits = {s: reference_scenes_of(config, s) for s in ("train", "validation")}
-    groups = {split: {scene.group for scene in scenes} for split, scenes in splits.items()}
-    assert not groups["train"] & groups["validation"]
-    # Three of four procedural scenes have depth; the fourth is draped over two depths.
-    deep = [Counter(s.kind for s in own if s.depth is not None) for own in splits.values()]
-    assert deep == [{"depth": 3, "draped": 2}, {"depth": 2}]
-    for scene in (scene for scenes in splits.values() for scene in scenes):
-        assert (scene.size, scene.sampled) == ((32, 32), True)
-        assert scene.illuminance is not None
 
 
 def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:

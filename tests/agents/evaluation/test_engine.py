@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from agents import Policy, evaluate, fit_policies, make_policy, run_plan
-from agents.evaluation.evaluation_plan import EvaluationPlan, plan_scenes
+from agents.evaluation.plan import EvaluationPlan, plan_scenes
 from agents.policy import PolicyContext
 from agents.rollouts import make_envs
 
@@ -59,7 +59,7 @@ def test_the_batch_size_changes_nothing_and_a_plan_is_the_same(small, result, tm
             np.testing.assert_array_equal(getattr(other, name), getattr(result, name))
         for name in ("states", "image_mean", "clipped_high"):
             tracks = (one.tracks["matrix:P"] for one in (other, result))
-            np.testing.assert_array_equal(*(getattr(track, name) for track in tracks))
+            np.testing.assert_array_equal(*(track.arrays[name] for track in tracks))
 
 
 class Bad(Policy):

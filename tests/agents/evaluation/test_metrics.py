@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from agents.evaluation import metrics
-from agents.report.result_table import weighted_quantile
+from agents.evaluation.result import weighted_quantile
 
 EV = np.array([4.0, 4.05, 5.0, 6.0, 8.0])
 # One episode, two frames, five states.

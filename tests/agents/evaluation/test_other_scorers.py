@@ -3,9 +3,9 @@ import pytest
 
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTables
-from agents.evaluation.evaluation_plan import EvaluationPlan
-from agents.evaluation.other_scorers import other_scores
-from agents.evaluation.plan_run import run_plan
+from agents.evaluation.engine import other_scores
+from agents.evaluation.jobs import run_plan
+from agents.evaluation.plan import EvaluationPlan
 
 PLAN = EvaluationPlan(
     environment={"scenes": "bundled:small", "split": "test", "resolution": 36},
@@ -25,7 +25,7 @@ def result(tmp_path_factory):
 
 def test_means_are_over_frames_then_groups(result):
     table = result.other_scores
-    assert table == other_scores(result, PLAN)  # those of the run are these
+    assert table == other_scores(result)  # those of the run are these
     assert list(table) == ["brightness", "sharpness"]
     # By hand: two scenes of the three, each a group of its own.
     tables = ScoreTables(result.grid, PLAN.options().make_camera(), make_scorer("brightness"))

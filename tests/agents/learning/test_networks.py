@@ -6,7 +6,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_sensors
-from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead
+from agents.learning.networks import LIGHT_NUMBERS, ExposureFeatures, StateHead, random_shift
 from agents.learning.regression import observation_tensors
 
 
@@ -126,3 +126,26 @@ def test_statistics_tell_the_light_as_pixels_do(make_tiny_envs) -> None:
         found.append((every * torch.arange(LIGHT_NUMBERS // 2)).sum(dim=1) / 2.0)  # [EV]
     # Two codes share a bin: near black they are a stop and more apart.
     assert float((found[0] - found[1]).abs().max()) < 0.35
+
+
+def _shifted(raw: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """By NumPy's padding: `rows` down and `columns` to the right, borders continued."""
+    height, width = raw.shape[2:]
+    padded = np.pad(raw, ((0, 0), (0, 0), (2, 2), (2, 2)), mode="edge")
+    return padded[:, :, 2 - rows : 2 - rows + height, 2 - columns : 2 - columns + width]
+
+
+def test_frames_are_shifted_by_up_to_an_eighth_and_mirrored() -> None:
+    rng = np.random.default_rng(0)
+    raw = rng.integers(0, 256, (3, 4, 16, 16), dtype=np.uint8)
+    known = {
+        (r, c, m): _shifted(raw, r, c)[..., :: -1 if m else 1]
+        for r in range(-2, 3)
+        for c in range(-2, 3)
+        for m in (False, True)
+    }
+    seen = set()
+    for _ in range(600):
+        found = random_shift(raw, rng)
+        seen.add(next(key for key, frames in known.items() if np.array_equal(frames, found)))
+    assert seen == set(known)

@@ -1,11 +1,14 @@
-"""The native vector environment in SB3's shape: the same rollouts as SB3's own wrapper."""
+"""The native vector environment in SB3's shape, and what wraps it in training."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from agents.learning.sb3_adapter import MovedFrames, SB3VectorAdapter
+from ae_env.observation import encode_settings
+from agents.learning.networks import NUMBERS, MeterHistory, with_history
+from agents.learning.sb3_adapter import SB3VectorAdapter, ShiftedFrames, WithHistory
+from agents.policy import PolicyContext
 from tests.ae_env.environments import assert_equal, make_env
 
 STEPS = 3  # of an episode
@@ -90,14 +93,14 @@ def test_wrappers_of_the_batch_and_pictures(make_tiny_envs) -> None:
     assert list(silent.get_images()) == [None, None]
 
 
-def test_moved_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
+def test_shifted_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
     plain = SB3VectorAdapter(make_tiny_envs(num_envs=2))
-    moving = MovedFrames(SB3VectorAdapter(make_tiny_envs(num_envs=2)), np.random.default_rng(0))
-    for envs in (plain, moving):
+    shifted = ShiftedFrames(SB3VectorAdapter(make_tiny_envs(num_envs=2)), np.random.default_rng(0))
+    for envs in (plain, shifted):
         envs.seed(3)
-    pairs, rewards = [(plain.reset(), moving.reset())], []
+    pairs, rewards = [(plain.reset(), shifted.reset())], []
     for action in (5, 17, 40):
-        stepped = [envs.step(np.full(2, action)) for envs in (plain, moving)]
+        stepped = [envs.step(np.full(2, action)) for envs in (plain, shifted)]
         pairs.append((stepped[0][0], stepped[1][0]))
         rewards.append([step[1] for step in stepped])
     for one, other in pairs:
@@ -106,3 +109,44 @@ def test_moved_frames_differ_in_the_raw_alone(make_tiny_envs) -> None:
         for name in ("settings", "sensors"):
             np.testing.assert_array_equal(one[name], other[name])
     np.testing.assert_array_equal(*zip(*rewards, strict=True))
+
+
+def test_it_holds_readings_exposures_and_what_was_asked_for(context, photograph):
+    history = MeterHistory(context, 1, 3)
+    grey, grid = np.ones((64, 64)), context.grid
+    state = grid.nearest(9.0)
+    first = history.observe(photograph(grey, 9.0, state)).reshape(3, NUMBERS)
+    shown = photograph(grey, 9.0, state)["settings"][0]
+    exposed = (9.0 - grid.ev100[state]) / 4.0
+    for row in first:  # before the first frame there was the same
+        np.testing.assert_allclose(row, [0.0, exposed / 4.0, 0.0, *shown], atol=0.02)
+    history.record_action(np.array([40]))
+    second = history.observe(photograph(grey, 8.0, state)).reshape(3, NUMBERS)
+    s = grid[40]
+    asked = encode_settings(np.array([s.aperture_value, s.time_value, s.speed_value]))
+    np.testing.assert_allclose(second[0, 3:], asked)
+    np.testing.assert_allclose(second[:, 0], [0.0, 0.5, 0.5], atol=0.02)  # one stop brighter before
+    history.forget(np.array([True]))
+    assert history.observe(photograph(grey, 5.0, state))[0, 0] == 0.0
+
+
+def test_wrapped_episodes_end_with_their_own_history(make_tiny_envs):
+    envs = make_tiny_envs(num_envs=3, max_episode_steps=2)
+    context = PolicyContext.from_envs(envs)
+    seen = WithHistory(SB3VectorAdapter(envs), context, 4)
+    assert seen.observation_space == with_history(envs.single_observation_space, 4)
+    seen.seed(3)
+    observations = seen.reset()
+    alone = MeterHistory(context, 3, 4)
+    np.testing.assert_array_equal(observations["history"], alone.observe(observations))
+    for step, action in enumerate((5, 30, 41)):
+        alone.record_action(np.full(3, action))
+        observations, _, dones, infos = seen.step(np.full(3, action))
+        assert dones.all() == (step == 1)
+        if dones.all():
+            last = {
+                k: np.stack([i["terminal_observation"][k] for i in infos]) for k in observations
+            }
+            np.testing.assert_array_equal(last.pop("history"), alone.observe(last))
+            alone.forget(dones)
+        np.testing.assert_array_equal(observations["history"], alone.observe(observations))

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ae_env.grid import ExposureGrid
-from agents.metering.metering_policy import EVTracker, MeteringPolicy, ReferenceFrames
-from agents.metering.reading import Reading, frame_ev100
+from agents.metering.metering_policy import MeteringPolicy
 from agents.metering.tuned import ScoreRegression
 from agents.policy import PolicyContext
 from agents.policy_names import MANUAL_PROGRAMS, METERS, make_policy
@@ -20,53 +19,6 @@ SMALL = {"scenes": "bundled:small", "split": "all", "resolution": 36}
 #: Scenes of the loops: each third of the small ones, so some of every kind.
 COUNT = 14
 GREY = np.ones((64, 64))
-RAMP = np.geomspace(0.1, 6.0, 64)[None] * np.ones((64, 1))
-
-
-def _reading(ev, saturated=0.0, black=False):
-    return Reading(np.array([ev]), np.array([saturated]), np.array([black]))
-
-
-def test_tracker_jumps_far_averages_near_and_respects_bounds():
-    tracker = EVTracker(1, (-1.0, 17.0))
-    assert tracker.update(_reading(8.0))[0] == 8.0
-    assert tracker.update(_reading(8.5))[0] == 8.25
-    assert tracker.update(_reading(12.0))[0] == 12.0
-    assert tracker.update(_reading(9.0, saturated=0.8))[0] == 12.0  # 12 is above the bound
-    assert tracker.update(_reading(13.0, black=True))[0] == 12.0  # and below this one
-    assert tracker.update(_reading(16.0, saturated=0.8))[0] == 16.0  # 12 is below 16 - 2.4
-    assert tracker.update(_reading(5.0, black=True))[0] == 2.0  # half of the way to -1
-    white = EVTracker(1, (-1.0, 17.0)).update(_reading(9.0, saturated=1.0))
-    assert white[0] == 0.5 * (9.0 - 3.0 + 17.0)
-
-
-def test_damping_keeps_its_share_of_the_distance_in_ev():
-    tracker = EVTracker(1, (-1.0, 17.0), damping=0.75)
-    assert tracker.update(_reading(4.0))[0] == 4.0  # nothing to keep yet
-    found = [tracker.update(_reading(12.0))[0] for _ in range(6)]
-    np.testing.assert_allclose(found, [12.0 - 8.0 * 0.75**n for n in range(1, 7)])
-
-
-def _kept(reference, observations):
-    return frame_ev100(reference.update(observations))[0]
-
-
-def test_the_brightest_frame_that_hides_nothing_is_kept(context, photograph):
-    grid = context.grid
-    dark, fair, bright = (grid.nearest(ev) for ev in (13.0, 10.0, 6.0))
-    reference = ReferenceFrames(context.camera)
-    for state, best in ((dark, dark), (fair, fair), (bright, fair), (dark, fair), (fair, fair)):
-        found = _kept(reference, photograph(RAMP, 9.0, state))
-        assert abs(found - grid.ev100[best]) < 0.05
-
-
-def test_another_light_is_noticed_at_once(context, photograph):
-    grid = context.grid
-    for change in (-6.0, -4.0, -1.0, 1.0, 4.0):
-        reference = ReferenceFrames(context.camera)
-        _kept(reference, photograph(RAMP, 9.0, grid.nearest(9.0)))
-        later = photograph(RAMP, 9.0 + change, grid.nearest(11.0))
-        assert abs(_kept(reference, later) - grid.ev100[grid.nearest(11.0)]) < 0.05
 
 
 def _run(policy, photograph, scene_ev, *, start=0, **blur):
@@ -119,6 +71,15 @@ def test_tuned_needs_a_fit_and_the_same_readings(context, photograph, tmp_path):
     blind = make_policy("average:tuned_blind", context, weights=tmp_path / "three.safetensors")
     with pytest.raises(ValueError, match="agree on `sensors`"):
         _run(blind, photograph, 8.0)
+
+
+def test_a_fit_that_fails_leaves_the_policy_as_it_was(make_tiny_envs, monkeypatch):
+    envs = make_tiny_envs(mode="DISABLED")
+    policy = make_policy("average:tuned?foresight=model", PolicyContext.from_envs(envs))
+    monkeypatch.setattr(envs, "step", lambda actions: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        policy.fit(envs)
+    assert (policy.program, policy.foresight, policy.regression) == ("tuned", "model", None)
 
 
 def test_sensors_are_averaged_over_the_frames(context, photograph):

@@ -8,7 +8,6 @@ from agents.metering.programs import (
     ProgramOptions,
     StateChooser,
     aperture_limit,
-    check_program,
     check_used,
     ev_step,
     program_cost,
@@ -183,6 +182,3 @@ def test_options_belong_to_programs():
         check_used("A", iso=100)
     with pytest.raises(ValueError, match=r"option of programs A and M only, not of P"):
         check_used("P", f_number=4)
-    assert check_program("S") == "S"
-    with pytest.raises(ValueError, match=r"`program` \(='tuned'\)"):
-        check_program("tuned")

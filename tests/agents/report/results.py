@@ -4,7 +4,8 @@ import numpy as np
 
 from ae_env.grid import ExposureGrid
 from agents import EvaluationResult
-from agents.evaluation.result import Track
+from agents.evaluation.plan import EvaluationPlan
+from agents.evaluation.result import BRACKET_METRICS, Track
 
 #: The design's columns of an evaluation, in their order.
 COLUMNS = [
@@ -23,8 +24,9 @@ def made_result(groups: int = 20) -> EvaluationResult:
     best = scores[:, 0].argmax(-1)
 
     def track(states: np.ndarray, privileged: bool = False) -> Track:
-        zeros = np.zeros(states.shape)
-        return Track(states, zeros, zeros, zeros + 0.25, zeros, 0.5, 1.0, privileged)
+        names = ("image_mean", "code_mean", "clipped_high", "clipped_low")
+        arrays = {name: np.full(states.shape, 0.25 * (name == "clipped_high")) for name in names}
+        return Track({"states": states, **arrays}, 0.5, 1.0, privileged)
 
     def choose(seeds: int) -> np.ndarray:
         return rng.integers(64, size=(seeds, episodes, frames))
@@ -46,4 +48,27 @@ def made_result(groups: int = 20) -> EvaluationResult:
             "spot:P": track(np.where(rng.random(oracle.shape) < 0.5, oracle, 0)),
         },
         seed=11,
+    )
+
+
+def made_brackets(groups: list[str] | None = None, **quality: np.ndarray) -> EvaluationResult:
+    """One episode of brackets of each source group, by policy ``(K, G)``; other metrics are 0.5."""
+    count = next(iter(quality.values())).shape[1]
+    names = np.array(groups or [f"g{i:02d}" for i in range(count)])
+    arrays = {
+        name: {**dict.fromkeys(BRACKET_METRICS, np.full(own.shape, 0.5)), "quality": own}
+        for name, own in quality.items()
+    }
+    return EvaluationResult(
+        grid=ExposureGrid.from_spec("bracket"),
+        scene_ids=names,
+        groups=names,
+        kinds=names,
+        hard=np.zeros(count, bool),
+        start_states=np.zeros(count, np.int64),
+        scores=np.zeros((count, 0, 0)),
+        allowed=np.zeros((count, 0, 0), bool),
+        tracks={name: Track(own, 0.5, 1.0, privileged=False) for name, own in arrays.items()},
+        seed=0,
+        plan=EvaluationPlan(budgets=(0.1, 0.2), task="bracket", hash="h"),
     )

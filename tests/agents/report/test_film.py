@@ -9,7 +9,7 @@ from PIL import Image
 
 from agents.policy import PolicyContext
 from agents.policy_names import make_policy
-from agents.report.film import CHART, GAP, PICTURE, TITLE, Recording, film, record, write_film
+from agents.report.plots import CHART, GAP, PICTURE, TITLE, Recording, film, record, write_film
 from tests.agents.conftest import TINY
 
 

@@ -8,7 +8,7 @@ import torch
 
 from simulator import CameraSettings, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED, ExposureModule, LinearFit
-from simulator.reference.reference_camera import BodyError, ReferenceCamera, ReferenceScene
+from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceScene
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training.data import ReferencePairs

@@ -18,7 +18,7 @@ from simulator.capture.prepared_scene import PreparedScene
 from simulator.capture.sensor import Transitions, record
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.noise.read_noise import ReadNoise, averaged_shape, tukey_lambda
-from simulator.reference.reference_camera import ReferenceCamera
+from simulator.reference.camera import ReferenceCamera
 from simulator.settings import CameraSettings
 
 BASE = CameraSettings(100, 1 / 64, 4)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from simulator.raw.metadata import camera_identity, describe_file, read_directories
+from simulator.raw.metadata import camera_identity, is_raw_container, read_directories
 from tests.simulator.raw.test_read import CODE, write_sample_dng
 
 
@@ -52,8 +52,17 @@ def test_identities_of_other_containers(tmp_path):
     known |= {ciff: ("Canon", "PowerShot"), b"": ("", ""), bytes(99): ("", "")}
     for content, identity in known.items():
         assert camera_identity(io.BytesIO(content), []) == identity
-    assert describe_file(ciff) == "a Canon CRW file"
-    assert describe_file(raf) == "a Fujifilm RAF file"
+    kinds = {
+        raf: True,
+        mrw: True,
+        cr3: True,
+        b"FOVb": True,
+        ciff: False,
+        b"text": False,
+        b"": False,
+    }
+    for content, is_raw in kinds.items():  # a whole Canon CRW names its camera
+        assert is_raw_container(io.BytesIO(content)) is is_raw
 
 
 @pytest.mark.parametrize("count", [2**32 - 1, 2**30, 2**18])

@@ -26,7 +26,6 @@ from simulator import (
     write_dng,
 )
 from simulator.camera import BayerPattern
-from simulator.raw import decoding
 from simulator.raw import read as read_module
 from simulator.raw.metadata import read_own_record
 
@@ -251,26 +250,16 @@ def test_what_is_no_file(given, own_dng, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("jpg", "a JPEG"),
-        ("png", "a PNG"),
-        ("tif", "TIFF"),
-        (b"hello\n" * 99, "a text file"),
-        (b"\0\1" * 999, "unknown type"),
-        (b"", "an empty file"),
-        (b"II*\0", "a TIFF-structured file"),
-    ],
+    "content", ["jpg", "png", "tif", b"hello\n" * 99, b"\0\1" * 999, b"", b"II*\0"]
 )
-def test_files_that_are_no_raw_say_what_they_are(tmp_path, content, words):
+def test_files_that_are_no_raw_are_named(tmp_path, content):
     path = tmp_path / "a.dng"
     if isinstance(content, str):
         imsave(tmp_path / f"b.{content}", np.zeros((8, 8, 3), np.uint8), check_contrast=False)
         content = (tmp_path / f"b.{content}").read_bytes()
     path.write_bytes(content)
-    with pytest.raises(RawFileError, match=words) as caught:
+    with pytest.raises(RawFileError, match=r"`path` \(='a\.dng'\)") as caught:
         read_raw(path, settings=SETTINGS)
-    assert "`path` (='a.dng')" in str(caught.value)
     assert str(tmp_path) not in str(caught.value)
 
 
@@ -431,7 +420,7 @@ def test_damaged_files_are_read_or_refused(path, own_dng, name):
 def test_white_beyond_the_bits_of_a_sample(tags, white, brightest, wanted):
     directory = {"PhotometricInterpretation": (32803,), **tags}
     mosaic = np.full((2, 2), brightest, np.uint16)
-    found = decoding._white_level(Path("a.arw"), white, [512.0] * 4, [directory], mosaic)
+    found = read_module._white_level(Path("a.arw"), white, [512.0] * 4, [directory], mosaic)
     assert found == wanted
 
 

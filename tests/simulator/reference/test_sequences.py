@@ -8,7 +8,7 @@ import torch
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera
 from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.camera import ReferenceScene
 from simulator.reference.sequences import (
     EXPOSURE_TIMES,
     F_NUMBERS,

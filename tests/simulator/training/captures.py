@@ -4,7 +4,7 @@ import csv
 from pathlib import Path
 
 from simulator import CameraSettings, RawImage
-from simulator.reference.reference_camera import BodyError, ReferenceCamera
+from simulator.reference.camera import BodyError, ReferenceCamera
 from simulator.training.paper_dataset import PARAMETERS, packed_camera, write_packed_sequence
 from tests.simulator.training.scenes import scene
 

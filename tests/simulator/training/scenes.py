@@ -5,7 +5,7 @@ import torch
 
 from simulator import CameraSettings
 from simulator.optics.thin_lens import Lens
-from simulator.reference.reference_camera import ReferenceScene
+from simulator.reference.camera import ReferenceScene
 
 #: 640 lux is EV100 8: a white card gives 0.663 of sensor white here.
 LUX = 640.0

@@ -12,8 +12,8 @@ from torch import Tensor
 from simulator import get_camera
 from simulator.capture.residual import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
-from simulator.training.calibration import calibrate
-from simulator.training.crops import DetailCrops, DetailPicture
+from simulator.training.data import DetailCrops, DetailPicture
+from simulator.training.train import calibrate
 
 Z6 = get_camera("nikon_z6")
 
@@ -34,8 +34,8 @@ class Known(NoiseModule):
 
 @pytest.fixture(autouse=True)
 def small_crops(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("simulator.training.calibration._SIDE", 32)
-    monkeypatch.setattr("simulator.training.calibration._CROPS", 64)
+    monkeypatch.setattr("simulator.training.train._SIDE", 32)
+    monkeypatch.setattr("simulator.training.train._CROPS", 64)
 
 
 def found(left: float, shift: Callable[[int], float]) -> Residual:

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from simulator.training.config import SimulatorConfig, load_config
+from simulator.training.train import SimulatorConfig, load_config
 
 STAGES = "exposure: {steps: 2}\nnoise: {steps: 3}\naperture: {minutes: 0.5, crop: 128}\n"
 COMPACT = f"preset: compact\n{STAGES}"

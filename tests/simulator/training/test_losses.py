@@ -11,8 +11,7 @@ from simulator.networks.aperture_module import DEAD_ZONE, ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule, Preset
 from simulator.optics.disc_bank import DiscBank
-from simulator.training.crops import NoiseBatch
-from simulator.training.data import Batch
+from simulator.training.data import Batch, NoiseBatch
 from simulator.training.losses import (
     ApertureLoss,
     BaselineLoss,

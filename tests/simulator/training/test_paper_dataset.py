@@ -14,8 +14,7 @@ import torch
 from benchmarks import paper_baselines as paper_baselines  # presets pc and dl
 from simulator import CameraSettings, RawImage, get_camera
 from simulator.networks.weights import build_modules, load_modules
-from simulator.reference.reference_camera import ReferenceCamera, ReferenceScene
-from simulator.training.config import SimulatorConfig
+from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.losses import BaselineLoss
 from simulator.training.paper_dataset import (
     CapturedPairs,
@@ -26,6 +25,7 @@ from simulator.training.paper_dataset import (
     train_on_captures,
     write_packed_sequence,
 )
+from simulator.training.train import SimulatorConfig
 from tests.simulator.training.captures import SETTINGS, write_dataset
 
 #: NoiseProfile of a Nikon Z6 raw at ISO 800, as exiftool prints it: (shot, read) of R, G, B.

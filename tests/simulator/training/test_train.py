@@ -2,6 +2,7 @@ import itertools
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Sequence as SequenceOf
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from simulator import CameraSettings, get_camera
 from simulator.networks.weights import load_modules
-from simulator.reference.reference_camera import (
+from simulator.reference.camera import (
     DRAPED,
     MOSAIC,
     ReferenceCamera,
@@ -23,10 +24,16 @@ from simulator.reference.reference_camera import (
 from simulator.reference.sequences import Sequence
 from simulator.settings import exposure_ratio
 from simulator.training import train
-from simulator.training.config import SimulatorConfig, StageConfig
-from simulator.training.crops import DetailPicture
-from simulator.training.data import ReferencePairs, draw_sequences
-from simulator.training.train import Clock, make_accelerator, train_and_save, train_stage, validate
+from simulator.training.data import DetailPicture, ReferencePairs, draw_sequences
+from simulator.training.train import (
+    Clock,
+    SimulatorConfig,
+    StageConfig,
+    make_accelerator,
+    train_and_save,
+    train_stage,
+    validate,
+)
 from tests.simulator.training.scenes import REFERENCE, scene
 
 STAGE = {"steps": 2, "batch": 2, "crop": 16}
@@ -52,8 +59,8 @@ def pictures(config: SimulatorConfig, split: str) -> list[DetailPicture]:
 @pytest.fixture(autouse=True, scope="module")
 def quick_calibration():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("simulator.training.calibration._CROPS", 8)
-        patch.setattr("simulator.training.calibration._SIDE", 16)
+        patch.setattr("simulator.training.train._CROPS", 8)
+        patch.setattr("simulator.training.train._SIDE", 16)
         yield
 
 
@@ -62,7 +69,9 @@ def save(
 ) -> Path:
     made, file = config(*given, **changes), folder / "net"
     options = {"command": "ae-env train-simulator x.yaml", "progress": progress}
-    return train_and_save(made, scenes, pictures, file, tensorboard=True, **options)
+    return train_and_save(
+        made, file, make_scenes=scenes, make_pictures=pictures, tensorboard=True, **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +200,8 @@ def test_what_a_scene_teaches():
     ):
         one = replace(scene(depth=kind == DRAPED), kind=kind, in_focus=in_focus)
         stages = ("exposure", "aperture", "baseline")
-        assert [stage for stage in stages if train._teaches(one, stage)] == teaches
+        # Private, as a whole training would take minutes to show it.
+        assert [stage for stage in stages if train._is_useful_for(one, stage)] == teaches
 
 
 def test_nothing_changes_where_all_is_in_focus():
@@ -301,3 +311,17 @@ def test_minutes_count_work_on_a_cpu_and_the_wall_clock_elsewhere(monkeypatch):
     watch.cpu = 1e6
     clocks[0].tick()
     assert (clocks[0].step, clocks[0].share) == (2, 1.0)
+
+
+def test_scenes_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "_VALIDATION_SCENES", 2)
+    made = config(scenes={"procedural": 4, "size": 32})
+    splits = {split: train.scenes_of(made, split) for split in ("train", "validation")}
+    groups = {split: {one.group for one in found} for split, found in splits.items()}
+    assert not groups["train"] & groups["validation"]
+    # Three of four procedural scenes have depth; the fourth is draped over two depths.
+    deep = [Counter(one.kind for one in own if one.depth is not None) for own in splits.values()]
+    assert deep == [{"depth": 3, "draped": 2}, {"depth": 2}]
+    for one in itertools.chain(*splits.values()):
+        assert (one.size, one.sampled) == ((32, 32), True)
+        assert one.illuminance is not None

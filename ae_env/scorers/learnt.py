@@ -1,0 +1,518 @@
+"""Scorers that are networks of others: NIMA, a user's own classifier, the metrics of pyiqa."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils import fuse_conv_bn_eval
+
+from ae_env.scorers.protocol import Captures, DependsOn, Domain
+from ae_env.utils.user_code import UserCodeError
+from simulator.utils.cache import cache_dir
+from simulator.utils.checks import check_integer
+
+
+def find_model_file(
+    scorer: str,
+    given: str | os.PathLike[str] | None,
+    variable: str,
+    names: tuple[str, ...],
+    *,
+    how: str,
+) -> Path:
+    """The model file of a scorer.
+
+    It is `given`, or else the one that the environment variable names, or else in the cache folder.
+
+    Args:
+        scorer: Name of the scorer, for errors.
+        given: A file, or None.
+        variable: Environment variable that may name one.
+        names: File names in the cache folder; the first that exists is taken.
+        how: How to get the file: the end of the message where there is none.
+
+    Raises:
+        ValueError: If there is none; the message says where to put it.
+    """
+    named = os.environ.get(variable) if given is None else os.fspath(given)
+    if named:
+        file = Path(named).expanduser()
+        if file.is_file():
+            return file
+        source = f"`{variable}`" if given is None else "`file`"
+        raise ValueError(f"{source} (={named!r}) must be the model file of {scorer!r}; {how}")
+    folder = cache_dir()
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    raise ValueError(
+        f"scorer {scorer!r} needs a model file, which does not come with ae-env: set "
+        f"{variable}=FILE, or put it at {folder / names[0]}; {how}"
+    )
+
+
+# -- NIMA: MobileNet v1 with ten ratings as its output --------------------------------------------
+
+#: Ratings are from 1 to this.
+RATINGS = 10
+#: Added to the variance in Keras' MobileNet.
+_EPS = 1e-3
+#: Output channels and stride of the 13 depthwise separable blocks.
+_BLOCKS = (
+    *((64, 1), (128, 2), (128, 1), (256, 2), (256, 1), (512, 2)),
+    *((512, 1), (512, 1), (512, 1), (512, 1), (512, 1), (1024, 2), (1024, 1)),
+)
+
+
+class ConvNormReLU6(nn.Sequential):
+    """Convolution without bias, batch normalisation and ReLU6, padded as Keras' MobileNet is.
+
+    With stride 2 only the right and the lower edge are padded, by one pixel.
+
+    Args:
+        inputs: Channels.
+        outputs: Channels.
+        kernel: 1 or 3.
+        stride: 1 or 2.
+        groups: Of the convolution; `inputs` makes it depthwise.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, groups: int = 1):
+        padding = (kernel - 1) // 2 if stride == 1 else 0
+        convolution = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups, bias=False)
+        super().__init__(
+            nn.ZeroPad2d((0, 1, 0, 1)) if stride == 2 else nn.Identity(),
+            convolution,
+            nn.BatchNorm2d(outputs, eps=_EPS),
+            nn.ReLU6(),
+        )
+
+    def fuse(self) -> None:
+        """Takes the normalisation into the convolution, for inference only."""
+        convolution, normalisation = self[1], self[2]
+        assert isinstance(convolution, nn.Conv2d)
+        assert isinstance(normalisation, nn.BatchNorm2d)
+        self[1] = fuse_conv_bn_eval(convolution, normalisation)
+        self[2] = nn.Identity()
+
+
+class NimaMobileNet(nn.Module):
+    """MobileNet v1 (width 1) with ten ratings as its output: 3,239,114 numbers.
+
+    Source: Howard et al., MobileNets, 2017; Talebi and Milanfar, NIMA: Neural Image Assessment,
+    IEEE Transactions on Image Processing 27(8), 2018, with the head of the published weights:
+    global mean, then one dense layer.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [ConvNormReLU6(3, 32, 3, 2)]
+        inputs = 32
+        for outputs, stride in _BLOCKS:
+            layers.append(ConvNormReLU6(inputs, inputs, 3, stride, groups=inputs))
+            layers.append(ConvNormReLU6(inputs, outputs, 1, 1))
+            inputs = outputs
+        self.features = nn.Sequential(*layers)
+        self.head = nn.Linear(inputs, RATINGS)
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Share of each rating.
+
+        Args:
+            pictures: (B, 3, 224, 224) in [-1, 1].
+
+        Returns:
+            (B, 10), each row sums to 1.
+        """
+        features = self.features(pictures).mean(dim=(2, 3))
+        ratings: Tensor = self.head(features).softmax(dim=1)
+        return ratings
+
+
+#: Git blob ids of the published Keras files, by the scorer that they make.
+PUBLISHED = {
+    "nima_aesthetic": "003fb321ce92445e41d708144a3656589f9214e7",
+    "nima_technical": "5e4a4ca2ce639309bfa4038d0bc10ba92b93bd26",
+}
+
+
+def read_network(file: str | os.PathLike[str]) -> NimaMobileNet:
+    """The network of a file, ready for inference.
+
+    Args:
+        file: ``.safetensors``, as ``examples/convert_nima.py`` writes it.
+
+    Raises:
+        ValueError: If it cannot be read, or is not of this network.
+    """
+    network = NimaMobileNet()
+    try:
+        weights = load_file(file)
+        missing, unexpected = network.load_state_dict(weights, strict=False)
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise ValueError(
+            f"`file` (={str(file)!r}) must be weights of NIMA's MobileNet in .safetensors: {error}"
+        ) from error
+    # The counters of training batches are not among the published numbers.
+    missing = [key for key in missing if not key.endswith("num_batches_tracked")]
+    if missing or unexpected:
+        raise ValueError(
+            f"`file` (={str(file)!r}) must hold exactly the arrays of NIMA's MobileNet: {missing} "
+            f"are missing, {unexpected} are none of it"
+        )
+    for key, values in weights.items():
+        if not bool(values.isfinite().all()):
+            raise ValueError(f"`file` (={str(file)!r}): {key} must be finite")
+    network.eval().requires_grad_(False)
+    for layer in network.features:
+        assert isinstance(layer, ConvNormReLU6)
+        layer.fuse()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return network
+
+
+#: Side of the pictures that the network was trained on [pixel].
+INPUT_SIZE = 224
+#: Pictures that the network sees at once: more only spend time in memory paging.
+_CHUNK = 8
+
+
+def mean_rating(network: nn.Module, images: Tensor) -> Tensor:
+    """Mean rating (B,) in [1, 10] of sRGB pictures.
+
+    Args:
+        network: A `NimaMobileNet`.
+        images: (B, 3, H, W) sRGB in [0, 1], resized to 224 x 224 whatever their shape.
+    """
+    size = (INPUT_SIZE, INPUT_SIZE)
+    ratings = torch.arange(1.0, RATINGS + 1.0, dtype=torch.float64)
+    means = []
+    with torch.no_grad():
+        for part in images.split(_CHUNK):  # type: ignore[no-untyped-call]
+            if part.shape[2:] != size:
+                part = functional.interpolate(part, size, mode="bilinear", antialias=True)
+            part = (2.0 * part.clamp(0.0, 1.0) - 1.0).to(memory_format=torch.channels_last)
+            means.append(network(part).double() @ ratings)
+    return torch.cat(means)
+
+
+@lru_cache(maxsize=4)
+def _network(file: str, digest: str) -> NimaMobileNet:
+    """The network of a file, read once per content, which `digest` stands for."""
+    return read_network(file)
+
+
+class Nima:
+    """Mean rating of people as a MobileNet expects it: (mean of 1..10 - 1) / 9.
+
+    Talebi and Milanfar, NIMA: Neural Image Assessment, 2018. The weights do not come with the
+    package: `file`, else what the scorer's environment variable names, else in the cache folder.
+
+    Args:
+        file: Weights (.safetensors) that ``examples/convert_nima.py`` made from the published ones.
+
+    Raises:
+        ValueError: If the file is not there or does not fit.
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = "weights"
+    version = 1
+    #: Name of the scorer and of its weights.
+    name = ""
+
+    def __init__(self, file: str | os.PathLike[str] | None = None) -> None:
+        found = find_model_file(
+            self.name,
+            file,
+            f"AE_ENV_{self.name.upper()}",
+            (f"{self.name}.safetensors",),
+            how=(
+                "examples/convert_nima.py makes it from the published Keras weights, whose git "
+                f"blob id is {PUBLISHED[self.name]} (docs/scorers.md)"
+            ),
+        )
+        self.file = str(found.resolve())
+        #: SHA-256 of the file: other weights under the same name give other scores.
+        self.digest = hashlib.sha256(found.read_bytes()).hexdigest()
+        _network(self.file, self.digest)  # raises now, not at the first score
+
+    def __call__(self, images: Tensor | None, captures: Captures) -> Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        assert images is not None
+        return (mean_rating(_network(self.file, self.digest), images) - 1.0) / (RATINGS - 1.0)
+
+
+class NimaAesthetic(Nima):
+    """Aesthetic quality as people rate it: NIMA (2018), trained on AVA."""
+
+    needs = "weights: AE_ENV_NIMA_AESTHETIC"
+    name = "nima_aesthetic"
+
+
+class NimaTechnical(Nima):
+    """Technical quality as people rate it: NIMA (2018), trained on TID2013."""
+
+    needs = "weights: AE_ENV_NIMA_TECHNICAL"
+    name = "nima_technical"
+
+
+# -- confidence of a user's own image classifier --------------------------------------------------
+
+#: Environment variable that names the ONNX file.
+VARIABLE = "AE_ENV_CLASSIFIER"
+#: Side of the pictures that a classifier sees where it does not say so [pixel].
+DEFAULT_SIZE = 224
+#: Mean and standard deviation of sRGB over ImageNet, by which most classifiers want it normalised.
+MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+#: Pictures that are classified at once.
+_CLASSIFIED_AT_ONCE = 16
+#: Rows whose sum is this close to 1, and that have nothing negative, are probabilities already.
+_SUM_ERROR = 1e-3
+
+#: From normalised pictures (B, 3, S, S) float32 to logits or probabilities (B, classes).
+Network = Callable[[Tensor], Any]
+
+
+class Classifier:
+    """Largest class probability of your own classifier, an ONNX file or a callable.
+
+    The maximum of the softmax: what Lens chooses a camera's settings by, without knowing the label
+    (Baek et al., Adaptive Camera Sensor for Vision Models, ICLR 2025). A picture is resized to
+    `size` x `size`, whatever its shape, and normalised per channel.
+
+    Args:
+        model: ``.onnx`` of one float32 input (B, 3, S, S) whose first output is (B, classes), or a
+            callable likewise, such as a `torch.nn.Module` in evaluation mode. Logits, or
+            probabilities. By default the file that ``AE_ENV_CLASSIFIER`` names, else
+            ``classifier.onnx`` in the cache folder.
+        size: S [pixel]; by default the file's own, else 224.
+        mean: Subtracted from R, G, B in [0, 1].
+        std: What the differences are divided by.
+
+    Raises:
+        ValueError: If there is no such file, or it is no classifier.
+        ImportError: If it is a file and ONNX Runtime is not installed.
+
+    >>> from ae_env.scorers import make_scorer
+    >>> scorer = make_scorer(Classifier(lambda pictures: pictures.mean(dim=(2, 3)), size=64))
+    >>> list(scorer.parts)
+    ['Classifier']
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = f"ONNX file: {VARIABLE}"
+    version = 1
+
+    def __init__(
+        self,
+        model: str | os.PathLike[str] | Network | None = None,
+        *,
+        size: int | None = None,
+        mean: Sequence[float] = MEAN,
+        std: Sequence[float] = STD,
+    ) -> None:
+        if size is not None:
+            check_integer("size", size, 1, 4096)
+        self.mean, self.std = _triple("mean", mean), _triple("std", std)
+        if min(self.std) <= 0.0:
+            raise ValueError(f"`std` (={std!r}) must be > 0")
+        self.batch: int | None = None  # of a network that takes no other number of pictures
+        if callable(model):
+            if getattr(model, "training", False):
+                raise ValueError("`model` must be in evaluation mode: call its eval() first")
+            self._model: Network | tuple[str, str] = model
+            self.size = size or DEFAULT_SIZE
+            return
+        if not isinstance(model, str | os.PathLike | None):
+            raise ValueError(f"`model` (={model!r}) must be an ONNX file, a callable or None")
+        found = find_model_file(
+            "classifier",
+            model,
+            VARIABLE,
+            ("classifier.onnx",),
+            how="an ONNX file of one input (B, 3, S, S) and an output (B, classes)",
+        ).resolve()
+        # SHA-256 of the file: another network under the same name gives other scores.
+        self._model = str(found), hashlib.sha256(found.read_bytes()).hexdigest()
+        self.batch, own_size = _input_shape(*self._model)
+        if size is not None and own_size not in (None, size):
+            raise ValueError(f"`size` (={size}) must be that of {str(found)!r}, {own_size}")
+        self.size = own_size or size or DEFAULT_SIZE
+
+    def __call__(self, images: Tensor | None, captures: Captures) -> Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W).
+
+        Raises:
+            UserCodeError: If the network raises, or returns anything but numbers (B, classes).
+        """
+        assert images is not None
+        mean, std = (torch.tensor(v)[:, None, None] for v in (self.mean, self.std))
+        shape = (self.size, self.size)
+        scores = []
+        with torch.no_grad():
+            for part in images.split(self.batch or _CLASSIFIED_AT_ONCE):  # type: ignore[no-untyped-call]
+                if part.shape[2:] != shape:
+                    part = functional.interpolate(part, shape, mode="bilinear", antialias=True)
+                outputs = self._outputs((part.float().clamp(0.0, 1.0) - mean) / std)
+                scores.append(_confidence(outputs, len(part)))
+        return torch.cat(scores)
+
+    def _outputs(self, pictures: Tensor) -> Any:
+        model = self._model
+        run = model if callable(model) else partial(self._run, _session(*model))
+        try:
+            return run(pictures)
+        except Exception as error:  # whatever a user's network raises
+            text = f"the classifier raised {type(error).__name__}: {error}"
+            raise UserCodeError(text) from error
+
+    def _run(self, session: Any, pictures: Tensor) -> Any:
+        missing = 0 if self.batch is None else self.batch - len(pictures)
+        if missing:
+            pictures = torch.cat([pictures, pictures[-1:].expand(missing, -1, -1, -1)])
+        outputs = session.run(None, {session.get_inputs()[0].name: pictures.numpy()})[0]
+        return outputs[: len(outputs) - missing]
+
+
+def _triple(name: str, values: Sequence[float]) -> tuple[float, float, float]:
+    try:
+        red, green, blue = (float(value) for value in values)
+    except (TypeError, ValueError):
+        raise ValueError(f"`{name}` (={values!r}) must be three numbers, for R, G and B") from None
+    return red, green, blue
+
+
+def _confidence(outputs: Any, count: int) -> Tensor:
+    """Largest probability (B,) float64 of logits or probabilities (B, classes)."""
+    try:
+        values = torch.as_tensor(outputs)
+        found = "complex numbers" if values.is_complex() else str(tuple(values.shape))
+    except (TypeError, ValueError, RuntimeError):
+        values, found = torch.empty(0), type(outputs).__name__
+    if values.is_complex() or values.ndim != 2 or len(values) != count or values.shape[1] < 2:
+        raise UserCodeError(
+            f"the classifier returned {found}: it must return (B, classes), two classes or more, "
+            f"of {count} pictures"
+        )
+    values = values.double()
+    sums = values.sum(dim=1)
+    if bool((values >= 0.0).all()) and bool(((sums - 1.0).abs() < _SUM_ERROR).all()):
+        return values.amax(dim=1).clamp(max=1.0)
+    return values.softmax(dim=1).amax(dim=1)
+
+
+@lru_cache(maxsize=4)
+def _session(file: str, digest: str) -> Any:
+    """The network of a file, read once per content."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ImportError(
+            f"scorer 'classifier' reads {file!r} by ONNX Runtime: pip install 'ae-env[onnx]' "
+            f"({error})"
+        ) from error
+    content = Path(file).read_bytes()
+    if hashlib.sha256(content).hexdigest() != digest:
+        raise ValueError(f"`model` (={file!r}) must not change while it is in use")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    try:
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime has errors of its own
+        raise ValueError(f"`model` (={file!r}) cannot be read: {error}") from error
+
+
+def _input_shape(file: str, digest: str) -> tuple[int | None, int | None]:
+    """Batch and side of the pictures that a file's network takes; None where it takes any."""
+    inputs = _session(file, digest).get_inputs()
+    shape = list(inputs[0].shape)
+    numbers = [n if isinstance(n, int) else None for n in shape]
+    if len(inputs) != 1 or len(shape) != 4 or numbers[1] not in (3, None):
+        found = [list(each.shape) for each in inputs]
+        raise ValueError(f"`model` (={file!r}, inputs {found}) must have one input (B, 3, S, S)")
+    if inputs[0].type != "tensor(float)" or numbers[2] != numbers[3]:
+        raise ValueError(
+            f"`model` (={file!r}, input {inputs[0].type} {shape}) must take float32 squares"
+        )
+    return numbers[0], numbers[2]
+
+
+# -- metrics of the package pyiqa, named ``pyiqa:musiq`` ------------------------------------------
+# It has a non-commercial licence and is large, so it is no dependency of this package and imported
+# only where one of its metrics is asked for.
+
+_NUMBER = re.compile(r"[-+]?(?:inf|\d+\.?\d*(?:e[-+]?\d+)?)", re.IGNORECASE)
+
+
+class PyiqaMetric:
+    """A no-reference metric of pyiqa, its stated range mapped to [0, 1], higher better.
+
+    Score = (value - low) / (high - low), clipped, or 1 minus that where lower is better. The range
+    is the metric's own ``score_range``, which pyiqa calls a rough estimate.
+
+    Args:
+        metric: Its name, as ``pyiqa.create_metric`` takes it.
+
+    Raises:
+        ImportError: If pyiqa is not installed.
+        ValueError: If pyiqa has no such metric, it needs a reference picture, or it states no
+            finite range.
+    """
+
+    domain: Domain = "srgb"
+    depends_on: DependsOn = "image"
+    needs = "pip install pyiqa"
+
+    def __init__(self, metric: str) -> None:
+        rule = f"`scorer` (='pyiqa:{metric}')"
+        try:
+            import pyiqa
+        except ImportError as error:
+            raise ImportError(
+                f"{rule} needs pyiqa, which is non-commercial and no extra of this package: "
+                f"pip install pyiqa ({error})"
+            ) from error
+        try:
+            self._metric: Any = pyiqa.create_metric(metric, device=torch.device("cpu"))
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}"
+            raise ValueError(f"{rule} cannot be made by pyiqa.create_metric: {what}") from error
+        if getattr(self._metric, "metric_mode", "NR") != "NR":
+            raise ValueError(f"{rule} must be a metric that needs no reference picture")
+        self.metric = metric
+        self.low, self.high = _range(getattr(self._metric, "score_range", None), rule)
+        self.lower_better = bool(getattr(self._metric, "lower_better", False))
+
+    def __call__(self, images: torch.Tensor | None, captures: Captures) -> torch.Tensor:
+        """Scores (B,) of sRGB `images` (B, 3, H, W)."""
+        assert images is not None
+        with torch.no_grad():
+            values = torch.as_tensor(self._metric(images)).double().reshape(len(images))
+        share = ((values - self.low) / (self.high - self.low)).clamp(0.0, 1.0)
+        return 1.0 - share if self.lower_better else share
+
+
+def _range(stated: Any, rule: str) -> tuple[float, float]:
+    """Two finite numbers from such as ``"~0, ~100"``."""
+    numbers = [float(n) for n in _NUMBER.findall(str(stated))]
+    if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or numbers[0] >= numbers[1]:
+        raise ValueError(
+            f"{rule} states the score range {stated!r}, which must be two finite numbers to be "
+            "mapped to [0, 1]: wrap the metric in a scorer of your own"
+        )
+    return numbers[0], numbers[1]

@@ -1,0 +1,403 @@
+"""Runs a plan by the names of its policies: finished parts in files, work in several processes.
+
+A part's name is a hash of everything that decides its content: the version of this package, the
+plan's entries, the scenes' light, and the files of policies, scorers and lightings of a user's own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ae_env.scorers import make_scorer
+from ae_env.scorers.registry import scorer_fingerprint
+from agents.evaluation.engine import (
+    Arrays,
+    EvaluationRun,
+    Progress,
+    Report,
+    TrainedPolicy,
+    other_scores,
+)
+from agents.evaluation.plan import Condition, EvaluationPlan
+from agents.evaluation.result import EvaluationResult, Track
+from agents.learning.workers import core_count, run_in_parallel, send_progress
+from agents.policy_names import (
+    FORECASTERS,
+    LEARNT,
+    split_class,
+    split_options,
+    training_seeds,
+    weight_files,
+)
+from simulator.utils.cache import Store, cache_key
+from simulator.utils.files import sibling
+
+if TYPE_CHECKING:
+    from ae_env.scenes import Scene
+
+#: About the time of a frame's score table in static and in changing light, of a frame of a policy,
+#: and of a policy's `fit` [ms]: only the order of the work and the progress bar depend on it.
+_STATIC_MS, _LIGHT_MS, _FRAME_MS, _FIT_MS = 0.2, 20.0, 0.3, 6000.0
+#: Work that does not pay for a second process, which takes some seconds to begin [ms].
+_SMALL_MS = 12_000
+#: Python files beside one's own that count as parts of it.
+_MAX_NEIGHBOURS = 200
+
+
+@dataclass(frozen=True)
+class Job:
+    """A piece of work for one process.
+
+    Args:
+        conditions: Names of the condition whose light is scored, or of those in which a policy is
+            run, which have one delay or budget.
+        trained: The policy; None for the light.
+        cost: About the time that it takes [ms].
+    """
+
+    conditions: tuple[str, ...]
+    trained: TrainedPolicy | None
+    cost: float
+
+    @property
+    def label(self) -> str:
+        """For the progress bar."""
+        return f"light: {self.conditions[0]}" if self.trained is None else self.trained.name
+
+
+class Jobs(EvaluationRun):
+    """A run of a plan in jobs, whose finished parts are stored.
+
+    Args:
+        plan: The plan, of JSON values.
+        folder: Folder of the finished parts.
+        scenes: Those of the plan; loaded by default.
+        device: Torch device of a learnt agent's network.
+    """
+
+    def __init__(
+        self,
+        plan: EvaluationPlan,
+        folder: Path,
+        scenes: list[Scene] | None = None,
+        *,
+        device: str = "cpu",
+    ) -> None:
+        plan.protocol()  # raises where an entry cannot be a part of a key
+        super().__init__(plan, scenes, device=device)
+        self.store = Store(folder)
+        options = plan.options()
+        shown = options.load_scenes() if options.in_sequences else self.scenes
+        scorer = plan.environment.get("scorer")
+        judge = (scorer_fingerprint(options.make_scorer()), file_content(scorer))
+        base = {k: v for k, v in plan.environment.items() if k != "costs"}
+        task = (plan.env_id, plan.frames, plan.max_frames, plan.seeds)
+        self._shared = (base, judge, scene_content(shown), task)
+
+    def light_key(self, condition: Condition) -> str:
+        """Key of the part with the score tables of the light of `condition`."""
+        lighting = condition.lighting
+        return cache_key("light", [*self._shared, lighting, file_content(lighting)])
+
+    def policy_key(self, trained: TrainedPolicy, condition: Condition) -> str:
+        """Key of the part with the track of `trained` in `condition`."""
+        own = (trained.name, policy_content(trained.name), self.device)
+        shown = (condition.delay, condition.budget, self.plan.starts)
+        return cache_key("policy", [self.light_key(condition), *shown, *own])
+
+    @property
+    def _cameras(self) -> dict[str, Condition]:
+        """The first of the conditions of each delay and budget, by these."""
+        found: dict[str, Condition] = {}
+        for condition in self.plan.all_conditions.values():
+            found.setdefault(_camera(condition), condition)
+        return found
+
+    @cached_property
+    def privileged(self) -> dict[TrainedPolicy, bool]:
+        """Whether each policy is told the best states.
+
+        Raises:
+            ValueError: If a policy is unknown, or does not fit the environment of some condition.
+        """
+        return {
+            trained: bool(getattr(self.make(trained, condition), "privileged", False))
+            for condition in self._cameras.values()
+            for trained in self.trained
+        }
+
+    @property
+    def ranked_policies(self) -> list[str]:
+        """Policies that a ranking has: all but privileged ones."""
+        return list(dict.fromkeys(one.policy for one, told in self.privileged.items() if not told))
+
+    def run(
+        self, *, workers: int | None = 1, progress: Progress | None = None
+    ) -> dict[str, EvaluationResult]:
+        """Does the work that is left; see `run_plan`."""
+        if not self.plan.policies:
+            raise ValueError("`policies` (=[]) must hold at least one policy")
+        for scorer in self.plan.other_scorers:
+            _check_scorer(scorer)
+        privileged = self.privileged
+        jobs = self._left()
+        total = max(sum(job.cost for job in jobs), 1.0)
+        done = 0.0
+
+        def report(job: Job, cost: float) -> None:
+            nonlocal done
+            done += cost
+            if progress is not None:
+                progress(int(min(done, total)), int(total), job.label)
+
+        if workers is None:
+            workers = core_count() if total > _SMALL_MS else 1
+        # A privileged policy needs the score tables: it waits for all of them.
+        last = [job for job in jobs if job.trained is not None and privileged[job.trained]]
+        first = [job for job in jobs if job not in last]
+        if workers > 1 and len(first) > 1:
+            tasks = [(self.plan, self.store.folder, self.device, job) for job in first]
+            run_in_parallel(_work, tasks, workers=workers, progress=report)
+            first = []
+        for job in (*first, *last):
+            self.do(job, partial(report, job))
+        if progress is not None:
+            progress(int(total), int(total), "")
+        return self._finished()
+
+    def _left(self) -> list[Job]:
+        """The jobs that are left: light first, and the longest first of each, so that processes end
+        at about the same time.
+        """
+        conditions, frames = self.plan.all_conditions, self.plan.frames
+        lights: dict[str, str] = {}
+        for name, condition in conditions.items() if self.num_tables else ():
+            lights.setdefault(self.light_key(condition), name)
+        found = []
+        for key, name in lights.items():
+            if self.store.get(key) is None:
+                ms = _STATIC_MS if conditions[name].lighting == "static" else _LIGHT_MS
+                found.append(Job((name,), None, ms * frames * self.num_tables))
+        for trained in self.trained:
+            for camera in self._cameras:
+                left = tuple(
+                    name
+                    for name, c in conditions.items()
+                    if _camera(c) == camera and self.store.get(self.policy_key(trained, c)) is None
+                )
+                if left:
+                    fit = _FIT_MS * ("tuned" in trained.name)
+                    cost = fit + len(left) * len(self.episodes) * frames * _FRAME_MS
+                    found.append(Job(left, trained, cost))
+        return sorted(found, key=lambda job: (job.trained is not None, -job.cost))
+
+    def do(self, job: Job, report: Report) -> None:
+        """Does a job and stores its parts; `report` gets its costs as they are done [ms]."""
+        conditions = [self.plan.all_conditions[name] for name in job.conditions]
+        if job.trained is None:
+            each = job.cost / (self.plan.frames * self.num_tables)
+            light = self.score_light(conditions[0], lambda frames: report(frames * each))
+            self.store.put(self.light_key(conditions[0]), light)
+            return
+        policy = self.fitted(job.trained, conditions[0])
+        for condition in conditions:
+            privileged = getattr(policy, "privileged", False)
+            track = self.run_policy(
+                job.trained.name,
+                policy,
+                condition,
+                self.light(condition) if privileged else None,
+                lambda frames: report(frames * _FRAME_MS),
+            )
+            others = {key: value for key, value in vars(track).items() if key != "arrays"}
+            self.store.put(self.policy_key(job.trained, condition), {**track.arrays, **others})
+
+    def light(self, condition: Condition) -> Arrays:
+        """The finished score tables of `condition`, see `score_light`; nothing for brackets."""
+        return self._stored(self.light_key(condition)) if self.num_tables else {}
+
+    def _stored(self, key: str) -> dict[str, Any]:
+        found = self.store.get(key)
+        if found is None:
+            raise FileNotFoundError(f"{self.store.path(key)} was removed while the evaluation ran")
+        return found
+
+    def _track(self, trained: TrainedPolicy, condition: Condition) -> Track:
+        """The finished part of a policy."""
+        stored = self._stored(self.policy_key(trained, condition))
+        arrays = {k: v for k, v in stored.items() if isinstance(v, np.ndarray)}
+        return Track(arrays, **{k: v for k, v in stored.items() if k not in arrays})
+
+    def _finished(self) -> dict[str, EvaluationResult]:
+        """The results of all conditions, from the finished parts."""
+        results = {}
+        for name, condition in self.plan.all_conditions.items():
+            tracks = {trained: self._track(trained, condition) for trained in self.trained}
+            results[name] = self.result(condition, self.light(condition), tracks)
+        static = self.plan.static_condition
+        if self.plan.other_scorers:
+            results[static] = self._rated(results[static], self.plan.all_conditions[static])
+        return results
+
+    def _rated(self, result: EvaluationResult, condition: Condition) -> EvaluationResult:
+        """`result` with other scorers' means, which are a part too: image scorers take a while."""
+        plan, tracks = self.plan, result.tracks.items()
+        states = {n: hashlib.sha256(t.states.tobytes()).hexdigest() for n, t in tracks}
+        names = list(plan.other_scorers)
+        own = (names, file_content(dict.fromkeys(names)), plan.other_scorer_scenes, states)
+        key = cache_key("scorers", [self.light_key(condition), plan.starts, *own])
+        scores = self.store.get(key)
+        if scores is None:
+            scores = other_scores(result)
+            self.store.put(key, scores)
+        return replace(result, other_scores=scores)
+
+
+def _camera(condition: Condition) -> str:
+    """What a policy's context depends on: policies are made and fitted once for each."""
+    return f"{condition.delay}, {condition.budget}"
+
+
+def run_plan(
+    plan: EvaluationPlan,
+    folder: str | os.PathLike[str],
+    *,
+    scenes: list[Scene] | None = None,
+    workers: int | None = 1,
+    device: str = "cpu",
+    progress: Progress | None = None,
+) -> dict[str, EvaluationResult]:
+    """Runs a plan, or the part of it that is left.
+
+    Args:
+        plan: The plan, with its policies.
+        folder: Folder of finished parts.
+        scenes: Those of the plan where they are loaded already.
+        workers: Processes; None for one per core where the work is enough to pay for them.
+        device: Torch device of a learnt agent's network.
+        progress: Called with work done, work in all, and what is being done.
+
+    Returns:
+        The results by condition.
+
+    Raises:
+        ValueError: If a policy, a scorer or a scene is unknown, or a policy does not fit the
+            environment; before any work is done.
+        UserCodeError: If a policy raises, or returns something else than allowed states.
+    """
+    with Jobs(plan, Path(folder), scenes, device=device) as run:
+        return run.run(workers=workers, progress=progress)
+
+
+def _check_scorer(name: str) -> None:
+    try:
+        make_scorer(name)
+    except ValueError as error:
+        raise ValueError(f"`other_scorers` (={name!r}): {error}") from error
+
+
+#: In a worker, which serves one run: the run, made by its first job.
+_worker_jobs: Jobs | None = None
+
+
+def _work(task: tuple[EvaluationPlan, Path, str, Job]) -> None:
+    global _worker_jobs
+    plan, folder, device, job = task
+    if _worker_jobs is None:
+        _worker_jobs = Jobs(plan, folder, device=device)
+    _worker_jobs.do(job, partial(send_progress, job))
+
+
+# -- what a part depends on -----------------------------------------------------------------------
+
+
+def scene_content(scenes: Sequence[Scene]) -> list[Any]:
+    """JSON values that change with the scenes."""
+    return [
+        [
+            *(s.scene_id, s.group, s.kind, s.hard, s.content, s.median_speed, s.box_factor),
+            # Computed again, these may differ in the last bit from those of the cache.
+            *(round(value, 5) for value in (s.ev100, s.reference.log2_exposure, *s.white_balance)),
+            None if s.allowed is None else np.flatnonzero(~s.allowed).tolist(),
+        ]
+        for s in scenes
+    ]
+
+
+def file_content(spec: Any) -> list[str]:
+    """Hashes of the files that a scorer's or a lighting's specification names.
+
+    Args:
+        spec: A name, or a mapping of names to weights or from options to files.
+    """
+    names: list[Any] = [spec]
+    if isinstance(spec, Mapping):
+        names = [*spec, *spec.values()]
+    return [policy_content(name) for name in names if isinstance(name, str)]
+
+
+def policy_content(name: str) -> str:
+    """Hash of the files that decide a policy: its module, weights and folders; "" without any.
+
+    With a Python file, all others of its folder count, since it may import them; data that it reads
+    is not known.
+
+    Args:
+        name: As `agents.make_policy` takes it; the name of a scorer or a file works as well.
+    """
+    base, options = split_options(name)
+    files = _own_files(base) or _named_files(base)
+    for value in options.values():
+        files += _named_files(str(value))
+        if value == LEARNT:
+            files += [Path(f"{file}.safetensors") for file in weight_files(FORECASTERS)]
+    if not files:
+        return ""
+    found = hashlib.sha256()
+    for file in files:
+        content = file.read_bytes() if file.is_file() else b""
+        found.update(f"{file.name}\0{len(content)}\0".encode() + content)
+    return found.hexdigest()
+
+
+def _own_files(base: str) -> list[Path]:
+    head, tail = split_class(base)
+    if head.endswith(".py"):
+        return _with_neighbours(Path(head).expanduser())
+    if head in ("ppo", "regression"):
+        names = training_seeds(base)
+        return [file for name in names for file in _named_files(name.partition(":")[2])]
+    if head == "recorded":
+        return _named_files(tail)
+    if tail and "." in head:
+        try:
+            found = find_spec(head)
+        except (ImportError, ValueError):
+            found = None
+        if found is not None and found.origin is not None:
+            return _with_neighbours(Path(found.origin))
+    return []
+
+
+def _with_neighbours(file: Path) -> list[Path]:
+    """A Python file, and the first `_MAX_NEIGHBOURS` others of its folder by name."""
+    others = sorted(other for other in file.parent.glob("*.py") if other.name != file.name)
+    return [file, *others[:_MAX_NEIGHBOURS]]
+
+
+def _named_files(text: str) -> list[Path]:
+    """The file of this name, the two of an agent, or all in a folder; none where there is none."""
+    path = Path(text).expanduser()
+    if path.is_dir():
+        return sorted(file for file in path.rglob("*") if file.is_file())
+    pair = [sibling(path, end) for end in (".safetensors", ".json")] if path.name else []
+    return [file for file in (path, *pair) if file.is_file()]

@@ -1,0 +1,370 @@
+"""An evaluation's plan, from YAML: scenes, conditions, starts, frames, seeds, policies."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from ae_env.options import checked_delay
+from ae_env.scenes.folder import sequence_bounds
+from agents.rollouts import RolloutPlan
+from simulator.utils.checks import check_integer, check_number, check_word, did_you_mean
+from simulator.utils.config_file import Configuration, load_yaml
+
+if TYPE_CHECKING:
+    from ae_env.grid import ExposureGrid
+    from ae_env.options import EnvOptions
+    from ae_env.scenes import Scene
+
+#: Where an episode may begin; see `start_state`.
+STARTS = ("dark", "middle", "bright", "random")
+#: Names of parts of the static condition, which no condition may have.
+_RESERVED = ("all", "hard", "rest")
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_+./-]*")
+MAX_FRAMES, MAX_SEED, MAX_SCENES = 10_000, 2**32 - 1, 100_000
+#: Seeds of two entries of a plan's `seeds` are this far apart: more than any plan has scenes.
+SEED_STRIDE = 2**20
+#: Arguments of the environment that a condition has, and those that the evaluation itself sets.
+CONDITION_ARGUMENTS = ("lighting", "delay")
+_SET_BY_EVALUATION = (
+    *("with_oracle", "max_episode_steps", "autoreset_mode"),
+    *("budget", "max_frames", "num_envs", "render_mode"),
+)
+#: Entries that say how results are shown, or which policies run: another run of the same plan.
+NOT_OF_THE_PROTOCOL = ("policies", "other_scorers", "other_scorer_scenes", "suite", "hash")
+#: Entries of plans of one measure only.
+_ONLY_OF = {
+    "score": ("conditions", "delays", "starts", "frames", "other_scorers", "other_scorer_scenes"),
+    "quality": ("budgets", "max_frames"),
+}
+
+
+class Condition(Configuration):
+    """What some episodes have that others have not: light and delay, or the time of a bracket.
+
+    Args:
+        lighting: As the environment's argument: a name, or a mapping with ``kind``.
+        delay: Frames from a decision to the first frame that has it, of all controls or by
+            control; as the environment's argument.
+        budget: Time of all frames of a bracket [s]; the plan's `budgets` set it.
+    """
+
+    lighting: Any = "static"
+    delay: Any = 0
+    budget: float | None = None
+
+    @field_validator("delay")
+    @classmethod
+    def _delay(cls, value: Any) -> Any:
+        return checked_delay(value)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the light is static and nothing delayed."""
+        return self.lighting in ("static", {"kind": "static"}) and self.delay == 0
+
+
+class EvaluationPlan(Configuration):
+    """Everything that decides an evaluation except the policies' own content.
+
+    A plan with `budgets` is of ``ae_env/ExposureBracket-v0``: its measure is the quality of the
+    merged picture, its conditions are the budgets, and it has no entries about frames.
+
+    Args:
+        name: Shown in the report.
+        environment: Arguments of the environment that all conditions share; `lighting` and `delay`
+            are those of the conditions.
+        scene_ids: Scenes to use, in this order; empty for all of the split.
+        max_scenes: Use at most so many scenes, source groups in turn; None for all.
+        conditions: By name.
+        delays: Each condition is run with each of these delays; except for the first, it is called
+            ``NAME/delayD`` then. Conditions with a delay of their own are run with that only.
+        starts: Where episodes begin: ``"dark"``, ``"middle"``, ``"bright"`` or ``"random"``.
+        frames: Actions per episode.
+        budgets: Of brackets: times that all frames of an episode may take together [s].
+        max_frames: Of brackets: frames of an episode at most.
+        seeds: Each gives every scene another motion, defocus, phase of the light and noise.
+        policies: Names, as `agents.make_policy` takes them.
+        other_scorers: Names of scorers that no policy was trained on; chosen states are also rated
+            by these.
+        other_scorer_scenes: Scenes that they rate, source groups in turn.
+        task: Of a plan that is a part of a benchmark: which of its tables has the results.
+        suite: Presets of all plans of that benchmark, which have one hash.
+        hash: Of a benchmark: sha256 of the plan, or of all of its suite, and of the scenes' light,
+            which is checked.
+    """
+
+    name: str = "evaluation"
+    environment: dict[str, Any] = Field(default_factory=dict)
+    scene_ids: tuple[str, ...] = ()
+    max_scenes: int | None = Field(default=None, ge=1, le=MAX_SCENES)
+    conditions: dict[str, Condition] = Field(default_factory=lambda: {"static": Condition()})
+    delays: tuple[int, ...] = (0,)
+    starts: tuple[str, ...] = ("dark", "middle", "bright")
+    frames: int = Field(default=24, ge=1, le=MAX_FRAMES)
+    budgets: tuple[float, ...] | None = Field(default=None, min_length=1)
+    max_frames: int = Field(default=3, ge=1, le=4)
+    seeds: tuple[int, ...] = (0,)
+    policies: tuple[str, ...] = ()
+    other_scorers: tuple[str, ...] = ()
+    other_scorer_scenes: int = Field(default=8, ge=1, le=MAX_SCENES)
+    task: str = ""
+    suite: tuple[str, ...] = ()
+    hash: str | None = None
+
+    @field_validator(
+        *("scene_ids", "delays", "starts", "budgets", "seeds", "policies", "other_scorers")
+    )
+    @classmethod
+    def _no_repeats(cls, values: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        if values is not None and len(set(values)) < len(values):
+            raise ValueError(f"must not have an entry twice: {list(values)}")
+        return values
+
+    @model_validator(mode="after")
+    def _check(self) -> EvaluationPlan:
+        for entry in ("starts", "seeds", "conditions", "delays"):
+            if not getattr(self, entry):
+                raise ValueError(f"`{entry}` must have one entry or more")
+        for entry in self._unused:
+            field = type(self).model_fields[entry]
+            if getattr(self, entry) != field.get_default(call_default_factory=True):
+                also = "no `budgets`" if entry == "max_frames" else "`budgets`"
+                raise ValueError(f"`{entry}` must not be given in a plan that has {also}")
+        for start in self.starts:
+            check_word("starts", start, STARTS)
+        for seed in self.seeds:
+            check_integer("seeds", seed, 0, MAX_SEED)
+        for budget in self.budgets or ():
+            check_number("budgets", budget, 1e-5, 3600.0, more=" s")
+        for name, condition in self.conditions.items():
+            if not _NAME.fullmatch(name) or name in _RESERVED or condition.budget is not None:
+                raise ValueError(
+                    f"`conditions` (={name!r}): a name must be of letters, digits and _+./-, and "
+                    f"none of {list(_RESERVED)}; and none has a `budget`"
+                )
+        for name in (*CONDITION_ARGUMENTS, *_SET_BY_EVALUATION):
+            if name in self.environment:
+                raise ValueError(f"`environment` must not have `{name}`: give it as a condition's")
+        for name, condition in self.all_conditions.items():
+            try:
+                self._check_condition(condition)
+            except ValueError as error:
+                raise ValueError(f"condition {name!r}: {error}") from error
+        return self
+
+    def _check_condition(self, condition: Condition) -> None:
+        options = self.options(condition)
+        options.make_grid(), options.make_camera(), options.make_scorer(), options.make_lighting()
+        if max(options.delays) >= self.frames:
+            raise ValueError(
+                f"`delay` (={max(options.delays)}) must be below `frames` (={self.frames}): no "
+                "decision would show"
+            )
+
+    @property
+    def measure(self) -> Literal["score", "quality"]:
+        """What the policies are compared by: scores of frames, or the quality of brackets."""
+        return "quality" if self.budgets else "score"
+
+    @property
+    def _unused(self) -> tuple[str, ...]:
+        """Entries that plans of the other measure have."""
+        return _ONLY_OF["score" if self.budgets else "quality"]
+
+    @property
+    def env_id(self) -> str:
+        """Id of the environment."""
+        return f"ae_env/{'ExposureBracket' if self.budgets else 'AutoExposure'}-v0"
+
+    @property
+    def observation(self) -> str:
+        """What policies are shown."""
+        return str(self.environment.get("observation", "uint8"))
+
+    @property
+    def all_conditions(self) -> dict[str, Condition]:
+        """`conditions` with every one of `delays`, or `budgets`, by the names in the tables."""
+        if self.budgets:
+            return {f"{budget:g} s": Condition(budget=budget) for budget in self.budgets}
+        found: dict[str, Condition] = {}
+        for i, delay in enumerate(self.delays):
+            for name, condition in self.conditions.items():
+                if condition.delay and i == 0:
+                    found[name] = condition
+                elif not condition.delay:
+                    label = f"{name}/delay{delay}" if i or delay else name
+                    found[label] = condition.model_copy(update={"delay": delay})
+        return found
+
+    @property
+    def static_condition(self) -> str:
+        """The condition of unchanging light without delay; the first one where there is none."""
+        conditions = self.all_conditions
+        return next((n for n, c in conditions.items() if c.at_rest), next(iter(conditions)))
+
+    def options(self, condition: Condition | None = None) -> EnvOptions:
+        """The checked arguments of the environment in `condition`."""
+        from ae_env.options import EnvOptions
+
+        # A bracket's environment sets these itself.
+        own = {"grid": "bracket", "depth": "far"} if self.budgets else {}
+        return EnvOptions.from_kwargs(own | self.arguments(condition or Condition()))
+
+    def arguments(self, condition: Condition) -> dict[str, Any]:
+        """Arguments of the environment's observations and light in `condition`."""
+        base = {"split": "test", **self.environment}
+        return {**base, "lighting": condition.lighting, "delay": condition.delay}
+
+    def describe(self, other: Callable[[Any], Any] = repr) -> dict[str, Any]:
+        """Every entry as JSON values; objects of a caller's own by the function `other`."""
+
+        def converted(value: Any) -> Any:
+            if isinstance(value, Condition):
+                return {"lighting": value.lighting, "delay": value.delay}
+            return other(value)
+
+        entries = {k: v for k, v in dict(self).items() if k not in self._unused}
+        return dict(json.loads(json.dumps(entries, default=converted, allow_nan=False)))
+
+    def protocol(self) -> dict[str, Any]:
+        """JSON values of everything that decides the episodes and their scores.
+
+        Raises:
+            ValueError: If an entry is no JSON value.
+        """
+
+        def refuse(value: Any) -> Any:
+            raise ValueError(f"every entry of a plan must be a JSON value, not {value!r}")
+
+        found = {k: v for k, v in self.describe(refuse).items() if k not in NOT_OF_THE_PROTOCOL}
+        if not self.task and not self.budgets:  # plans of before there were tasks keep their digest
+            del found["task"]
+        return found
+
+    def changed(self, **entries: Any) -> EvaluationPlan:
+        """The same plan with other entries, checked.
+
+        Raises:
+            ValueError: If an entry is out of range.
+        """
+        given = {name: getattr(self, name) for name in self.model_fields_set}
+        return EvaluationPlan.model_validate(given | entries)
+
+
+def load_plan(name: str | Path) -> EvaluationPlan:
+    """The plan of a preset of ``configs/evaluation``, or of a YAML file of one's own.
+
+    Raises:
+        ValueError: If there is none, or an entry is unknown, out of range or no JSON value; the
+            message names the file and the entry.
+    """
+    from ae_env.utils.presets import find_preset
+
+    plan = load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
+    plan.protocol()
+    return plan
+
+
+def light_name(lighting: Any) -> str:
+    """Name of a condition: the kind of its light.
+
+    >>> light_name("sine"), light_name({"kind": "step", "stops": 4})
+    ('sine', 'step')
+    """
+    kind = lighting.get("kind") if isinstance(lighting, Mapping) else lighting
+    return kind if isinstance(kind, str) and _NAME.fullmatch(kind) else "light"
+
+
+def digest(*parts: object) -> str:
+    """sha256 of JSON values, as hexadecimal digits.
+
+    >>> digest({"a": 1})[:8]
+    'b713f6d2'
+    """
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# -- scenes and episodes --------------------------------------------------------------------------
+
+
+def plan_scenes(plan: EvaluationPlan) -> list[Scene]:
+    """The scenes of `plan`, in its order; of a sequence, its first frame.
+
+    Raises:
+        ValueError: If one of `scene_ids` is not there.
+    """
+    options = plan.options()
+    scenes = options.load_scenes()
+    if options.in_sequences:
+        scenes = [scenes[i] for i in np.unique(sequence_bounds(scenes)[0])]
+    if plan.scene_ids:
+        known = {scene.scene_id: scene for scene in scenes}
+        for name in plan.scene_ids:
+            if name not in known:
+                hint = did_you_mean(name, known)
+                raise ValueError(
+                    f"`scene_ids` (={name!r}) must name scenes of the {len(known)} of "
+                    f"{plan.environment.get('scenes', 'bundled')!r}{hint}"
+                )
+        scenes = [known[name] for name in plan.scene_ids]
+    return groups_in_turn(scenes, plan.max_scenes)
+
+
+def groups_in_turn(scenes: Sequence[Scene], count: int | None) -> list[Scene]:
+    """At most `count` of `scenes`: kinds in turn, and within a kind source groups in turn."""
+    if count is None or count >= len(scenes):
+        return list(scenes)
+    ranks: list[tuple[int, int, int]] = []
+    seen: dict[str, int] = {}
+    groups: dict[str, dict[str, int]] = {}
+    for i, scene in enumerate(scenes):
+        repeat = seen[scene.group] = seen.get(scene.group, -1) + 1
+        of_kind = groups.setdefault(scene.kind, {})
+        rank = of_kind.setdefault(scene.group, len(of_kind))
+        ranks.append((repeat, rank, i))
+    chosen = sorted(sorted(range(len(scenes)), key=lambda i: ranks[i])[:count])
+    return [scenes[i] for i in chosen]
+
+
+def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureGrid) -> RolloutPlan:
+    """The episodes of a condition of `plan`: starts change slowest, then seeds, scenes fastest.
+
+    Episodes that differ in their start only have the same seed: the same motion, defocus, light and
+    noise. Of brackets, which begin with a metered frame, no start is given.
+    """
+    starts = ("random",) if plan.budgets else plan.starts
+    own = [(seed * SEED_STRIDE + j, j) for seed in plan.seeds for j in range(len(scenes))]
+    return RolloutPlan(
+        scenes=scenes,
+        seeds=[seed for seed, _ in own] * len(starts),
+        scene=np.array([j for _, j in own] * len(starts)),
+        starts=[start_state(start, scenes[j], grid) for start in starts for _, j in own],
+    )
+
+
+def start_state(start: str, scene: Scene, grid: ExposureGrid) -> int | None:
+    """State in which an episode begins, among those that the scene allows; ties to the lower ISO.
+
+    Args:
+        start: ``"dark"``: the least exposure of the grid, its highest EV100 (the under-exposed
+            end); ``"middle"``: the state whose EV100 is nearest to that of the scene's right
+            exposure; ``"bright"``: the most exposure of the grid; ``"random"``: drawn.
+        scene: What is photographed.
+        grid: The states.
+    """
+    if start == "random":
+        return None
+    ends = {"dark": float(grid.ev100.max()), "bright": float(grid.ev100.min())}
+    distance = np.abs(grid.ev100 - ends.get(start, scene.ev100)).round(9)
+    if scene.allowed is not None:
+        distance = np.where(scene.allowed, distance, np.inf)
+    return int(np.argmin(distance))

@@ -1,0 +1,699 @@
+"""An evaluation written down: results.json, tables, plots, report.md and report.html."""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import re
+import string
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from agents.evaluation.intervals import MIN_GROUPS, RESAMPLES, Rank
+from agents.evaluation.plan import NOT_OF_THE_PROTOCOL, EvaluationPlan, digest
+from agents.evaluation.result import (
+    MORE_COLUMNS,
+    ROW_COLUMNS,
+    EvaluationResult,
+    Results,
+    as_results,
+    best_meter,
+    bracket_rows,
+    difference_rows,
+    group_rows,
+    oracle_histogram,
+    overall_ranking,
+    ranking_rows,
+    result_rows,
+    scene_rows,
+    scores_by_kind,
+    static_condition,
+    training_seed_rows,
+)
+from agents.report.plots import path_sheets, plot_convergence, plot_cost, plot_scores
+from simulator.settings import format_exposure_time
+from simulator.utils.files import result_meta, write_atomically, write_results
+
+#: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function of
+#: it that returns Markdown, or None.
+Cell = str | Callable[[Mapping[str, Any]], object]
+
+#: Columns of the table of scores.
+_SCORES: dict[str, Cell] = {
+    "policy": "{policy}",
+    "normalised": "{normalised_score:.3f}",
+    "95 % interval": "{ci95:.3f}",
+    "mean score": "{mean_score:.3f}",
+    "regret": "{regret:.3f}",
+    "EV error, median": "{ev_error_median:.2f}",
+    "P95": "{ev_error_p95:.2f}",
+    "within 1/3 EV": "{ev_within_third:.0%}",
+    "frames to converge": "{frames_to_converge:.1f}",
+    "overshoot [EV]": "{overshoot:.2f}",
+    "reversals": "{reversals:.2f}",
+    "flicker": "{flicker:.4f}",
+    "clipped high": "{clipped_high:.1%}",
+    "clipped low": "{clipped_low:.1%}",
+    "ms/decision": "{ms_per_decision:.3f}",
+}
+#: Of brackets, for each budget.
+_BRACKETS: dict[str, Cell] = {
+    "policy": "{policy}",
+    "quality": "{quality:.4f}",
+    "95 % interval": "{ci95:.4f}",
+    "to the best": "{to_best:+.3f} ({to_best_ci95:+.3f})",
+    "error [EV]": "{log_error:.4f}",
+    "unseen": "{unseen:.2%}",
+    "frames": "{frames:.2f}",
+}
+#: Tables of several conditions: heading, column of the rows, and format.
+_BY_CONDITION = (
+    ("Normalised score", "normalised_score", ".3f"),
+    ("EV error, P95 [EV]", "ev_error_p95", ".1f"),
+    ("Frames to converge, from the last change of the light on", "frames_to_converge", ".1f"),
+    ("Overshoot [EV]", "overshoot", ".2f"),
+    ("Visible jump (mean change of the companded picture)", "jump", ".4f"),
+)
+#: Source groups in one table on the terminal.
+_GROUPS_ABREAST = 4
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
+       max-width: 78rem; margin: 2rem auto; padding: 0 1.2rem; }
+h1 { font-size: 1.7rem; } h2 { margin-top: 2.4rem; border-bottom: 1px solid #ddd; }
+img { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-size: .86rem; display: block; overflow-x: auto; }
+th, td { padding: .22rem .6rem; border-bottom: 1px solid #e6e6e6; white-space: nowrap; }
+thead th { border-bottom: 2px solid #999; } tbody tr:hover { background: #f5f7fa; }
+code { background: #f3f3f3; padding: .08rem .25rem; border-radius: 3px; }
+pre { background: #f3f3f3; padding: .8rem; overflow-x: auto; } pre code { padding: 0; }
+"""
+#: Characters that mean something to Markdown anywhere, and underscores that are not within a word.
+_SPECIAL = re.compile(r"[\\`*\[\]<>|&!~$]|(?<![^\W_])_|_(?![^\W_])")
+
+
+# -- Markdown -------------------------------------------------------------------------------------
+
+
+class _Format(string.Formatter):
+    """Formats of rows: ``{a[b]}`` is an entry of an entry, a pair of numbers is "1 to 2"."""
+
+    def get_field(self, name: str, args: Any, kwargs: Any) -> Any:
+        try:
+            value, used = super().get_field(name, args, kwargs)
+        except (KeyError, IndexError, TypeError):
+            value, used = None, name
+        if value is None or (isinstance(value, float) and np.isnan(value)):
+            raise LookupError(name)
+        return value, used
+
+    def format_field(self, value: Any, spec: str) -> Any:
+        if isinstance(value, list | tuple):
+            return " to ".join(format(one, spec) for one in value)
+        return escape(value) if isinstance(value, str) else format(value, spec)
+
+
+def to_markdown(
+    rows: pd.DataFrame | Iterable[Mapping[str, Any]],
+    columns: Mapping[str, Cell],
+    missing: str = "-",
+) -> str:
+    """A Markdown table with a line for each row; columns but the first are aligned to the right.
+
+    Args:
+        rows: The rows.
+        columns: Content of the cells by heading. Texts of a row are shown as they are, whatever
+            they mean to Markdown; of a function, the result is Markdown.
+        missing: Text of a cell a value of which is missing, None or NaN. Columns without any other
+            cell are left out where it is empty.
+
+    >>> rows = [{"a": "x|y", "b": [1, 2]}, {"a": "z", "b": None}]
+    >>> print(to_markdown(rows, {"A": "{a}", "B": "{b:.1f}"}))
+    | A    |          B |
+    |:-----|-----------:|
+    | x\\|y | 1.0 to 2.0 |
+    | z    |          - |
+    """
+    records = rows.to_dict("records") if isinstance(rows, pd.DataFrame) else list(rows)
+    cells = {
+        heading: [cell(row, content, missing) for row in records]
+        for heading, content in columns.items()
+    }
+    if not missing:
+        first = next(iter(cells))
+        cells = {heading: own for heading, own in cells.items() if heading == first or any(own)}
+    return _aligned(pd.DataFrame(cells))
+
+
+def cell(row: Mapping[Any, Any], content: Cell, missing: str = "-") -> str:
+    """Text of a cell, see `to_markdown`."""
+    if callable(content):
+        value = content(row)
+        return missing if value is None else str(value)
+    try:
+        return _Format().vformat(content, (), row)
+    except LookupError:
+        return missing
+
+
+def _wide(frame: pd.DataFrame, form: str) -> str:
+    """A frame of numbers of one kind as Markdown, its index as the first column."""
+    texts = frame.map(lambda value: format(value, form)).rename(columns=escape, index=escape)
+    return _aligned(texts.rename_axis(columns=None).reset_index())
+
+
+def _aligned(frame: pd.DataFrame) -> str:
+    """A frame of texts as Markdown."""
+    align = ["left", *["right"] * (frame.shape[1] - 1)] if len(frame) else None
+    return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
+
+
+def escape(name: object) -> str:
+    r"""A name from outside, as of a file or a policy, so that Markdown shows it as it is.
+
+    >>> escape("centre_weighted:P"), escape("![x](a.png)")
+    ('centre_weighted:P', '\\!\\[x\\](a.png)')
+    """
+    return _SPECIAL.sub(r"\\\g<0>", " ".join(str(name).split()))
+
+
+def code(text: object) -> str:
+    """Text from outside as code within a line; not for tables, whose cells a bar ends.
+
+    >>> print(code("a | b"), code("`x`"))
+    `a | b` `` `x` ``
+    """
+    line = " ".join(str(text).split())
+    fence = "`" * (_longest_run(line) + 1)
+    pad = " " if line.startswith("`") or line.endswith("`") else ""
+    return f"{fence}{pad}{line}{pad}{fence}"
+
+
+def code_block(*lines: str) -> str:
+    """Lines from outside as a block of code."""
+    fence = "`" * max(3, max(map(_longest_run, lines), default=0) + 1)
+    return "\n".join([fence, *(" ".join(line.splitlines()) for line in lines), fence])
+
+
+def _longest_run(text: str) -> int:
+    """Length of the longest run of backticks."""
+    return max(map(len, re.findall("`+", text)), default=0)
+
+
+def html_report(markdown: str, pictures: Mapping[str, Path], title: str) -> str:
+    """The page of a report.
+
+    Args:
+        markdown: CommonMark with tables; raw HTML in it is shown as text.
+        pictures: The picture files that may be shown, by their names in `markdown`; they are put
+            into the page. Of any other only the caption is shown.
+        title: Of the page.
+    """
+    from markdown_it import MarkdownIt
+
+    def image(_: Any, tokens: Any, index: int, *__: Any) -> str:
+        token = tokens[index]
+        file, caption = pictures.get(str(token.attrs["src"])), html.escape(token.content)
+        if file is None:
+            return caption
+        content = base64.b64encode(file.read_bytes()).decode()
+        kind = file.suffix.removeprefix(".")
+        return f'<img src="data:image/{kind};base64,{content}" alt="{caption}">'
+
+    page = MarkdownIt("commonmark", {"html": False}).enable("table")
+    page.add_render_rule("image", image)
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)}</title>\n<style>{_STYLE}</style>\n</head>\n"
+        f"<body>\n{page.render(markdown)}</body>\n</html>\n"
+    )
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def write_report(
+    results: EvaluationResult | Results,
+    out: str | os.PathLike[str],
+    *,
+    command: str,
+    source: str | None = None,
+    split: str | None = None,
+    next_commands: Sequence[str] = (),
+    extra_meta: Mapping[str, Any] | None = None,
+    resamples: int = RESAMPLES,
+) -> dict[str, Path]:
+    """Write everything that an evaluation shows into `out`.
+
+    Those are ``results.json`` and ``report.md``; of frames also ``scenes.csv``, ``metrics.csv``,
+    ``report.html`` and pictures: ``scores.png``, ``ev_error.png``, ``cost.png`` where decisions of
+    one camera were timed, ``contact_sheet.webp`` and so on where the scenes are known.
+
+    Args:
+        results: The return value of `evaluate` or `run_plan`.
+        out: Folder, made where missing.
+        command: The command line that repeats the evaluation.
+        source: Where the scenes come from, such as ``"bundled"``; by default as the plan says.
+        split: ``"test"``, ``"train"`` or ``"all"``; by default as the plan says.
+        next_commands: Command lines for the reader to try next.
+        extra_meta: Further entries of the JSON's ``meta``, such as training seeds.
+        resamples: Bootstrap resamples.
+
+    Returns:
+        The files by name.
+    """
+    folder, results = Path(out), as_results(results)
+    result = results[static_condition(results)]
+    ranking = overall_ranking(results, resamples=resamples)
+    if result.measure == "quality":
+        assert result.plan is not None
+        rows = bracket_rows(results, ranking)
+        meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
+        text = _bracket_report(result.plan, rows, command)
+        return {
+            "results.json": write_results(folder / "results.json", _records(rows), meta),
+            "report.md": write_atomically(folder / "report.md", text),
+        }
+    rows = result_rows(results, source=source, split=split, resamples=resamples)
+    meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
+    title = f"{rows.source[0]}, {rows.split[0]} split"
+    title = title if result.plan is None else result.plan.name
+    order = [one.policy for one in ranking]
+    order += [name for name in result.tracks if name not in order]
+    contract = _records(rows[list(ROW_COLUMNS)])
+    files = {
+        "results.json": write_results(folder / "results.json", contract, meta),
+        "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
+        "metrics.csv": _write_csv(folder / "metrics.csv", _metrics(rows)),
+    }
+    shown = pd.concat([rows, _overall_rows(ranking)]) if len(results) > 1 else rows
+    pictures = {
+        "scores.png": plot_scores(folder / "scores.png", shown, title),
+        "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
+    }
+    costs = {n: t.ms_alone for n, t in result.tracks.items() if t.ms_alone}
+    scores = {r.policy: r.score.value for r in ranking if r.policy in costs}
+    if scores:
+        costs = {name: costs[name] for name in scores}
+        pictures["cost.png"] = plot_cost(folder / "cost.png", costs, scores)
+    pictures |= path_sheets(folder, result, order)
+    text = _Report(results, rows, meta, ranking, list(pictures)).markdown(title, next_commands)
+    page = html_report(text, pictures, f"Exposure policies compared: {title}")
+    return {
+        **files,
+        **pictures,
+        "report.md": write_atomically(folder / "report.md", text),
+        "report.html": write_atomically(folder / "report.html", page),
+    }
+
+
+def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows as JSON values."""
+    return [{str(key): value for key, value in row.items()} for row in rows.to_dict("records")]
+
+
+def _write_csv(path: Path, rows: pd.DataFrame) -> Path:
+    """Writes rows as CSV, numbers with six digits."""
+    text = rows.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    return write_atomically(path, text)
+
+
+def _metrics(rows: pd.DataFrame) -> pd.DataFrame:
+    """Every metric of every policy in every condition, the ends of intervals in two columns."""
+    pairs = [pair or (None, None) for pair in rows.ci95]
+    plain = rows[[name for name in ROW_COLUMNS if name != "ci95"]]
+    ends = pd.DataFrame(pairs, columns=["ci95_low", "ci95_high"])
+    return pd.concat([plain, ends, rows[list(MORE_COLUMNS)]], axis=1)
+
+
+def _overall_rows(ranking: Sequence[Rank]) -> pd.DataFrame:
+    """Rows of all conditions together, for the plot of the scores."""
+    rows = [(r.policy, r.score.value, r.score.pair, r.score.num_groups) for r in ranking]
+    columns = ["policy", "normalised_score", "ci95", "num_groups"]
+    return pd.DataFrame(rows, columns=columns).assign(condition="all conditions")
+
+
+def _meta(
+    results: Results, ranking: Sequence[Rank], command: str, resamples: int
+) -> dict[str, Any]:
+    result = results[static_condition(results)]
+    plan, best = result.plan, best_meter(result)
+    described = None
+    if plan is not None:
+        described = plan.describe()
+        protocol = {k: v for k, v in described.items() if k not in NOT_OF_THE_PROTOCOL}
+        described["sha256"] = digest(protocol)
+    differences = pd.DataFrame()
+    if best is not None:
+        differences = difference_rows(result, best, resamples=resamples)
+    return {
+        **result_meta(command, result.seed),
+        "plan": described,
+        "episodes": len(result.scene_ids),
+        "scenes": len(set(result.scene_ids.tolist())),
+        "frames": result.scores.shape[1],
+        "ranking": ranking_rows(ranking),
+        "by_kind": scores_by_kind(result),
+        "oracle_histogram": oracle_histogram(result),
+        "best_meter": best,
+        "differences_to_best_meter": _records(differences),
+        "training_seeds": training_seed_rows(result),
+        "ms_alone": {name: track.ms_alone for name, track in result.tracks.items()},
+        "other_scorers": result.other_scores,
+    }
+
+
+# -- the report -----------------------------------------------------------------------------------
+
+
+def _bracket_report(plan: EvaluationPlan, rows: pd.DataFrame, command: str) -> str:
+    """``report.md`` of brackets."""
+    scenes = plan.environment.get("scenes", "bundled")
+    parts = [
+        f"# Brackets compared: {escape(plan.name)}",
+        code_block(command),
+        f"{rows.num_groups[0]} source groups of {scenes!r}; {len(plan.seeds)} episodes of each "
+        f"scene; up to {plan.max_frames} frames, merged. Quality is 1 - mean error / 2 EV; the "
+        "error is that of the log radiance of the samples that a frame shows, unseen the share "
+        "that is white in all. Intervals: paired bootstrap over source groups and training seeds.",
+    ]
+    for budget, own in rows.groupby("budget", sort=False):
+        parts += [f"## {budget:g} s", to_markdown(own, _BRACKETS)]
+    return "\n\n".join(parts) + "\n"
+
+
+class _Report:
+    """The parts of ``report.md`` of an evaluation of frames."""
+
+    def __init__(
+        self,
+        results: Results,
+        rows: pd.DataFrame,
+        meta: Mapping[str, Any],
+        ranking: Sequence[Rank],
+        pictures: Sequence[str],
+    ) -> None:
+        self.results, self.rows, self.meta = results, rows, meta
+        self.ranking, self.pictures = ranking, pictures
+        self.static = static_condition(results)
+        self.result = results[self.static]
+        by = rows.replace({"condition": {"all": self.static}})
+        #: Of each condition as a whole.
+        self.by = by[by.condition.isin(list(results))]
+        self.scores = {one.policy: one.score.value for one in ranking}
+
+    def markdown(self, title: str, next_commands: Sequence[str]) -> str:
+        """The report as Markdown."""
+        parts = [
+            *self._introduction(title),
+            *self._ranking(),
+            "![Scores with intervals](scores.png)",
+            "*Frames to converge*: an episode that never converges counts with all its frames.",
+            *self._scores(),
+            *self._conditions(),
+            *self._cost(),
+            *self._clipping(),
+            *self._kinds(),
+            *self._other_scorers(),
+            *self._paths(),
+            *self._differences(),
+            "## What the oracle chooses",
+            "Share of the episodes; where one value dominated, the control would not matter.",
+            _histogram_table(self.meta["oracle_histogram"]),
+        ]
+        if self.result.plan is not None:
+            parts += _plan_part(self.result.plan, self.meta["plan"])
+        if next_commands:
+            parts += ["## Next", code_block(*next_commands)]
+        return "\n\n".join(parts) + "\n"
+
+    def _introduction(self, title: str) -> list[str]:
+        meta, row, plan = self.meta, self.rows.iloc[0], self.result.plan
+        seeds = self.rows.training_seeds.max()
+        resampled = f" and {seeds} training seeds" if seeds > 1 else " (one training seed each)"
+        starts = ["random"] if plan is None else plan.starts
+        drawn = [self.result.seed] if plan is None else plan.seeds
+        return [
+            f"# Exposure policies compared: {escape(title)}",
+            f"{code(meta['command'])}, {meta['date']}, commit {meta['commit'] or 'unknown'}.",
+            f"{meta['scenes']} scenes of '{escape(row.source)}' ({row.split} split) from "
+            f"{row.num_groups} source groups; {len(self.results)} "
+            f"condition{'s' * (len(self.results) > 1)} of {meta['episodes']} episodes and "
+            f"{meta['frames']} frames each; starts: {', '.join(starts)}; seeds: "
+            f"{', '.join(map(str, drawn))}. Normalised score: 0 is a random policy, 1 the oracle, "
+            "which knows the expected score of every state. Intervals: paired bootstrap over "
+            f"source groups{resampled}. How everything is defined: `docs/evaluation.md`.",
+        ]
+
+    def _ranking(self) -> list[str]:
+        if not self.ranking:
+            return []
+        over = f"all {len(self.results)} conditions, each with the same weight"
+        columns: dict[str, Cell] = {
+            "tier": "{tier}",
+            "policy": "{policy}",
+            "normalised": "{normalised_score:.3f}",
+            "95 % interval": "{ci95:.3f}",
+            "minus the best": lambda row: _change(row["to_best"]),
+            "minus the next": lambda row: _change(row["to_next"]),
+        }
+        return [
+            "## Ranking",
+            f"Over {'all scenes' if len(self.results) == 1 else over}. Differences are paired; "
+            "their 95 % intervals hold for all pairs at once, and \\* marks those that leave out "
+            "zero. Policies within a tier do not differ significantly from the tier's best.",
+            to_markdown(self.meta["ranking"], columns),
+        ]
+
+    def _scores(self) -> list[str]:
+        parts = []
+        for part in self.result.conditions:
+            own = self.rows[self.rows.condition == part]
+            own = own.sort_values("normalised_score", ascending=False, kind="stable")
+            parts += [
+                f"## {self.static}, scenes: {part} ({own.num_groups.iloc[0]} groups)",
+                to_markdown(own, _SCORES),
+            ]
+        if self.rows.num_groups[0] < MIN_GROUPS:
+            parts += [
+                "## Every source group",
+                f"Fewer than {MIN_GROUPS} source groups: no intervals, but every value (mean "
+                "score).",
+                _wide(group_rows(self.result), ".3f"),
+            ]
+        return parts
+
+    def _conditions(self) -> list[str]:
+        picture = "![EV error over time](ev_error.png)"
+        if len(self.results) < 2:
+            return ["## EV error over time", picture]
+        names = [*self.scores, *(p for p in self.result.tracks if p not in self.scores)]
+        parts = ["## Conditions", picture]
+        for title, key, form in _BY_CONDITION:
+            table = self.by.pivot(index="condition", columns="policy", values=key)
+            parts += [f"### {title}", _wide(table.loc[list(self.results), names], form)]
+        for title, key, reduce, form in (
+            ("Frames until the exposure stays, median", "frames_to_settle", np.median, ".1f"),
+            ("Share of episodes that converge", "converged", np.mean, ".0%"),
+        ):
+            values = {
+                name: [reduce(r.episode_metrics(name)[key]) for r in self.results.values()]
+                for name in names
+            }
+            table = pd.DataFrame(values, index=pd.Index(self.results, name="condition"))
+            parts += [f"### {title}", _wide(table, form)]
+        return parts
+
+    def _cost(self) -> list[str]:
+        columns: dict[str, Cell] = {
+            "policy": "{policy}",
+            "normalised": "{score:.3f}",
+            "ms, in batches": "{ms_per_decision:.3f}",
+            "ms, one camera alone": "{ms_alone:.3f}",
+            "captures": "{captures_per_decision:g}",
+        }
+        picture = ["![Score against time](cost.png)"] if "cost.png" in self.pictures else []
+        text = "Time in `act` per decision. The plot shows that of one camera alone."
+        own = self.by[self.by.condition == self.static]
+        own = own.assign(score=own.policy.map(self.scores))
+        return ["## Score against time", text, *picture, to_markdown(own, columns)]
+
+    def _clipping(self) -> list[str]:
+        rows = []
+        for name in self.result.tracks:
+            own = self.by[self.by.policy == name].set_index("condition")
+            row = {"policy": name}
+            for key in ("clipped_high", "clipped_low"):
+                worst = own[key].idxmax()
+                row[key] = own.loc[self.static, key]
+                row[f"{key}_worst"] = f"{own.loc[worst, key]:.2%} ({worst})"
+            rows.append(row)
+        columns = {
+            "policy": "{policy}",
+            f"white, {self.static}": "{clipped_high:.2%}",
+            "white, worst": "{clipped_high_worst}",
+            f"black, {self.static}": "{clipped_low:.2%}",
+            "black, worst": "{clipped_low_worst}",
+        }
+        return [
+            "## Clipping",
+            "Share of the pixels at white and at black.",
+            to_markdown(rows, columns),
+        ]
+
+    def _kinds(self) -> list[str]:
+        kinds = self.meta["by_kind"]
+        if len(kinds) < 2:
+            return []
+        table = pd.DataFrame(kinds).drop(index="groups").rename_axis("policy")
+        table.columns = [f"{kind} ({values['groups']})" for kind, values in kinds.items()]
+        text = f"Normalised score ({self.static}); in brackets the source groups of each kind."
+        return ["## By kind of scene", text, _wide(table, ".3f")]
+
+    def _other_scorers(self) -> list[str]:
+        scores, plan = self.meta["other_scorers"], self.result.plan
+        if not scores or plan is None:
+            return []
+        table = pd.DataFrame(scores, index=pd.Index(self.result.tracks, name="policy"))
+        count = min(plan.other_scorer_scenes, self.meta["scenes"])
+        text = (
+            f"Mean expected score of the chosen states of {count} scenes under scorers that "
+            "nothing was trained on. Scorers that read noise as detail rise with gain: see "
+            "`docs/scorers.md`."
+        )
+        return ["## Under other scorers", text, _wide(table, ".3f")]
+
+    def _paths(self) -> list[str]:
+        sheets = [name for name in self.pictures if name.startswith("contact_sheet")]
+        if not sheets or self.result.plan is None:
+            return []
+        text = (
+            "The states of one scene, the oracle's starred, with those that each policy chose from "
+            f"the start '{self.result.plan.starts[0]}', frame by frame."
+        )
+        return ["## Paths", text, *(f"![States and paths]({name})" for name in sheets)]
+
+    def _differences(self) -> list[str]:
+        found = self.meta["differences_to_best_meter"]
+        if not found:
+            return []
+        columns = {
+            "policy": "{policy}",
+            "scenes": "{condition}",
+            "difference": "{difference:+.3f}",
+            "95 % interval": "{ci95:+.3f}",
+        }
+        return [
+            f"## Difference to the best meter, {code(self.meta['best_meter'])} ({self.static})",
+            "Paired on the same episodes; intervals of single differences, not simultaneous.",
+            to_markdown(found, columns),
+        ]
+
+
+def _change(change: Mapping[str, Any] | None) -> str | None:
+    """A paired difference with its simultaneous interval, marked where it leaves out zero."""
+    if change is None:
+        return None
+    mark = " \\*" if change["significant"] else ""
+    interval = "" if change["simultaneous_ci95"] is None else " ({simultaneous_ci95:+.3f})"
+    return cell(change, "{difference:+.3f}" + interval) + mark
+
+
+def _histogram_table(histogram: Mapping[str, Mapping[str, float]]) -> str:
+    """Share of the episodes in which each value of each control is the oracle's, as a table."""
+    labels: dict[str, Callable[[float], str]] = {
+        "iso": lambda v: f"ISO {v:g}",
+        "exposure_time": format_exposure_time,
+        "f_number": lambda v: f"f/{v:g}",
+    }
+    rows = []
+    for name, own in histogram.items():
+        shares = [f"{labels[name](float(v))}: {share:.0%}" for v, share in own.items()]
+        rows.append({"control": name.replace("_", " "), "share": ", ".join(shares)})
+    return to_markdown(rows, {"control": "{control}", "share": "{share}"})
+
+
+def _plan_part(plan: EvaluationPlan, described: Mapping[str, Any]) -> list[str]:
+    rows = [
+        {"condition": name, "lighting": str(condition.lighting), "delay": str(condition.delay)}
+        for name, condition in plan.all_conditions.items()
+    ]
+    columns = {name: f"{{{name}}}" for name in rows[0]}
+    text = f"Environment: {code(described['environment'])}. sha256 of the plan: "
+    return ["## What was run", f"{text}`{described['sha256']}`.", to_markdown(rows, columns)]
+
+
+# -- the terminal ---------------------------------------------------------------------------------
+
+
+def summary(
+    results: EvaluationResult | Results, ranking: Sequence[Rank] | None = None
+) -> list[tuple[str, pd.DataFrame]]:
+    """Tables of an evaluation for the terminal: titles, and frames of texts.
+
+    Args:
+        results: The return value of `evaluate` or `run_plan`.
+        ranking: Of `overall_ranking`; computed by default.
+    """
+    results = as_results(results)
+    static = static_condition(results)
+    result = results[static]
+    ranking = overall_ranking(results) if ranking is None else ranking
+    if result.measure == "quality":
+        return [
+            ("quality of the merged picture, by time of all frames", _budgets(results, ranking))
+        ]
+    if len(results) == 1:
+        rows = result_rows(result, resamples=2000)
+        table = rows.pivot(index="policy", columns="condition", values="normalised_score")
+        table = table.loc[list(result.tracks), list(result.conditions)].map("{:.3f}".format)
+        pairs = rows[rows.condition == "all"].set_index("policy").ci95
+        table["95 % interval (all)"] = [_interval(pair) for pair in pairs[table.index]]
+        title = "normalised score: 0 is random, 1 the best state of every frame"
+    else:
+        table = pd.DataFrame(
+            {
+                "tier": ["-" if one.tier is None else str(one.tier) for one in ranking],
+                "policy": [one.policy for one in ranking],
+                "all conditions": [f"{one.score.value:.3f}" for one in ranking],
+                "95 % interval": [_interval(one.score.pair) for one in ranking],
+                static: [f"{_normalised(result, one.policy):.3f}" for one in ranking],
+            }
+        ).set_index("tier")
+        title = f"normalised score over {len(results)} conditions, and in {static!r}"
+    tables = [(title, table.reset_index())]
+    groups = group_rows(result)
+    if len(groups) < MIN_GROUPS:
+        for first in range(0, len(groups), _GROUPS_ABREAST):
+            own = groups.iloc[first : first + _GROUPS_ABREAST].map("{:.3f}".format).T
+            own = own.rename_axis("policy").reset_index()
+            tables.append(("mean score of every source group", own))
+    return tables
+
+
+def _budgets(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
+    """The quality that each policy reaches in each budget, as texts."""
+    rows = [
+        {
+            "policy": one.policy,
+            "all": f"{one.score.value:.4f}",
+            "95 % interval": _interval(one.score.pair, ".4f"),
+            **{name: f"{_normalised(r, one.policy):.4f}" for name, r in results.items()},
+        }
+        for one in ranking
+    ]
+    return pd.DataFrame(rows)
+
+
+def _normalised(result: EvaluationResult, policy: str) -> float:
+    gains, span = result.group_gains(policy)
+    return float(gains.mean(axis=0).sum() / span.sum())
+
+
+def _interval(pair: list[float] | None, form: str = ".3f") -> str:
+    return cell({"pair": pair}, f"{{pair:{form}}}", "too few groups")

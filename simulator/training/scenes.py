@@ -1,0 +1,760 @@
+"""Scenes for the reference camera, and pictures of real detail, that train and test the networks.
+
+All of it is light at the pitch of the photosites: procedural scenes, dead leaves, charts and smooth
+shading are drawn there; photographs, radiance maps and raws of a folder of real files (see
+docs/networks.md) are cut out at it and never enlarged.
+
+The split by source group is fixed: drawn groups by their index, files by name (`detail_split`). The
+same place, subject or photographer's series is in one split only, and the scenes of a split stay
+when `number` grows.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import logging
+import math
+import zlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tifffile
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import distance_transform_edt
+
+from simulator.camera import CameraProfile
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.thin_lens import Lens
+from simulator.radiance.depth import F_NUMBER, FOCAL_LENGTH, draw_depth, lens_and_depth
+from simulator.radiance.light import (
+    camera_light,
+    mean_anchor,
+    reference_settings,
+    temperature_tint,
+)
+from simulator.radiance.maps import (
+    AZIMUTHS,
+    EV100_RANGE,
+    RADIANCE_SUFFIXES,
+    assumed_ev100,
+    read_radiance,
+)
+from simulator.radiance.photographs import PHOTOGRAPHS, read_photograph, unprocess
+from simulator.radiance.procedural import LeafStyle, dead_leaves, draw, fractal_noise, list_kinds
+from simulator.raw.read import read_raw
+from simulator.reference.camera import DRAPED, MOSAIC, ReferenceScene
+from simulator.reference.sequences import ILLUMINANCE
+from simulator.settings import incident_ev100
+from simulator.training.data import DetailPicture
+from simulator.utils.checks import check_integer, check_word
+
+logger = logging.getLogger(__name__)
+
+Split = Literal["train", "validation", "test"]
+
+#: Index of the first procedural group of each split.
+FIRST_INDEX = {"train": 0, "validation": 100_000, "test": 200_000}
+#: Groups whose split was fixed before the hash decided; all others follow `detail_split`.
+_FIXED: dict[Split, tuple[str, ...]] = {
+    "train": ("bridge", "dawn", "forest", "lobby"),
+    "validation": ("StillLife", "city"),
+    "test": ("Desk", "apartment", "lab", "park", "sunset", "venice", "warehouse"),
+}
+#: Folders of radiance maps and of photographs.
+_MAP_FOLDERS, _PHOTOGRAPH_FOLDER = ("hdri_pool", "hdri_cc0", "openexr_bsd"), "photo_pool"
+#: Shares of the source groups: training, validation; the rest tests.
+_TRAIN, _VALIDATION = 0.62, 0.70
+#: Raws of known subjects: file name (its beginning) to group and split.
+_RAWS: dict[str, tuple[str, Split]] = {
+    "CRW_0101": ("colour_checker", "train"),
+    "CRW_0104": ("colour_checker", "train"),
+    "CRW_0105": ("colour_checker", "train"),
+    "CRW_0112": ("pantone_strip", "train"),
+    "CRW_0113": ("pantone_strip", "train"),
+    "CRW_0117": ("camera_box", "test"),
+    "CRW_0118": ("camera_box", "test"),
+    "CRW_0119": ("camera_box", "test"),
+    "GOPR0024": ("gopro_courtyard", "train"),
+    "GOPR9231": ("gopro_courtyard", "train"),
+}
+#: Brightest light of a picture, in its medians: lamps beyond it would be all that a mean shows.
+_BRIGHTEST = 64.0
+#: Photosites a side of drawn pictures, and how many of each kind there are in a split.
+_SIZE = 640
+_DRAWN = {"train": 60, "validation": 8, "test": 8}
+#: Most procedural groups of a split, the gap between the first indices of two.
+MOST_GROUPS = 100_000
+#: Every fourth procedural group has no depth: one of the bundled kinds, for noise and exposure.
+_FLAT_EVERY = 4
+#: Focus of the groups with depth, in turn: a third of them have everything in focus.
+FOCUS_CYCLE = (
+    *("everything", "front", "back"),
+    *("everything", "middle", "front"),
+    *("everything", "back", "middle"),
+)
+#: The photograph of the bundled training split that validates.
+VALIDATION_PHOTOGRAPH = "coffee"
+#: Pictures that give fewer packed pixels a side than this are left out, unless smaller scenes are
+#: asked for.
+LEAST_VIEW = 128
+#: Photographs (by file) with a blur of their own, by depth of field or motion.
+_BLURRED = {
+    *("buddiesofbudgie_budgie-branch", "buddiesofbudgie_fragrant-chamomile"),
+    *("buddiesofbudgie_kitten-on-lawn", "buddiesofbudgie_motherboard-circuits"),
+    *("buddiesofbudgie_noche-bogota", "buddiesofbudgie_oakland-zoo-otters"),
+    *("buddiesofbudgie_solaris-grapes", "buddiesofbudgie_the-spices-of-life"),
+    *("elementary_Jonas_Nilsson_Lee", "elementary_Pablo_Garcia_Saldana"),
+    *("elementary_photo-1452953008873-ae5837174535", "elementary_victor-svistunov-233897-KB"),
+    *("getsolus_Twigonometry", "nextcloud_Frog", "nextcloud_Gorilla", "nextcloud_Vineyard"),
+    "solus-project_HermiteCrab2560x1600",
+}
+#: See `_edge_ratio`: that of edges averaged over square pixels is 0.4.
+_SHARP = 0.36
+#: Largest circle of confusion of the photographs with depth at f/11 [packed pixels].
+_PHOTOGRAPH_BLUR = 6.0
+
+
+# -- pictures -------------------------------------------------------------------------------------
+
+
+def detail_split(group: str) -> Split:
+    """The split of a source group, by a stable hash of its name.
+
+    >>> detail_split("quarry_02") == detail_split("quarry_02")
+    True
+    """
+    for split, names in _FIXED.items():
+        if group in names:
+            return split
+    draw = int.from_bytes(hashlib.sha256(group.encode()).digest()[:8], "big") / 2**64
+    return "train" if draw < _TRAIN else "validation" if draw < _VALIDATION else "test"
+
+
+def detail_pictures(
+    split: Split, *, data: Path | None, drawn: int | None = None, seed: int = 0
+) -> list[DetailPicture]:
+    """The pictures of a split.
+
+    Args:
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        data: Folder of real files; None uses drawn pictures only. What is missing in it is logged.
+        drawn: Dead leaves, and as many charts and smooth pictures; 60 to train on, else 8.
+        seed: Seed of the drawn pictures.
+
+    Raises:
+        ValueError: If `split` is no split.
+    """
+    check_word("split", split, tuple(FIRST_INDEX))
+    pictures: list[DetailPicture] = []
+    if data is None:
+        logger.warning("no folder of real files (AE_ENV_DATA): training on drawn pictures only")
+    else:
+        pictures += _maps(data, split)
+        pictures += photograph_pictures(data, split)
+        pictures += recorded_mosaics(data, split)
+        pictures += _linear(data, split)
+    pictures += _drawings(split, _DRAWN[split] if drawn is None else drawn, seed)
+    return pictures
+
+
+def radiance_files(data: Path, split: Split) -> Iterator[tuple[Path, str]]:
+    """Radiance maps of a split, each with its source group."""
+    for folder in _MAP_FOLDERS:
+        for path in _files(data / folder, RADIANCE_SUFFIXES):
+            group = _groups(data).get(path.name, path.stem)
+            if detail_split(group) == split:
+                yield path, group
+
+
+def _maps(data: Path, split: Split) -> Iterator[DetailPicture]:
+    for path, group in radiance_files(data, split):
+        light = read_radiance(path)
+        light = light / max(float(np.median(light[1])), 1e-6 * float(light.max()))
+        clipped = torch.from_numpy(np.minimum(light, _BRIGHTEST))
+        yield DetailPicture(path.stem, group, "radiance", clipped)
+
+
+def photograph_pictures(data: Path, split: Split) -> Iterator[DetailPicture]:
+    """Photographs of a split, unprocessed to linear light, 1.0 at the photograph's white."""
+    for path in _files(data / _PHOTOGRAPH_FOLDER, (".jpg", ".png")):
+        group = _groups(data).get(path.name, path.stem)
+        if detail_split(group) == split:
+            rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
+            with Image.open(path) as picture:
+                light = unprocess(np.asarray(picture.convert("RGB")), rng)
+            yield DetailPicture(path.stem, group, "photograph", torch.from_numpy(light))
+
+
+def recorded_mosaics(data: Path, split: Split) -> Iterator[DetailPicture]:
+    """Raws of real sensors at low ISO, of a split."""
+    for path in _files(data / "canon_crw_cc0", (".CRW",)):
+        group, belongs = _RAWS.get(path.stem, (path.stem, detail_split(path.stem)))
+        if belongs == split:
+            raw = read_raw(path)
+            yield DetailPicture(path.stem, group, "mosaic", raw.data, raw.noise)
+    description = data / "gopro_raw" / "meta.json"
+    if not description.is_file():
+        return
+    for name, meta in json.loads(description.read_text(encoding="utf-8")).items():
+        group, belongs = _RAWS.get(name.partition("_")[0], (name, detail_split(name)))
+        if belongs != split:
+            continue
+        with Image.open(description.parent / name) as picture:
+            mosaic = np.asarray(picture).astype(np.float32)
+        planes = np.stack([mosaic[i::2, j::2] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))])
+        black = np.array(meta["black"], np.float32)[:, None, None]
+        light = torch.from_numpy((planes - black) / (meta["white"] - black))
+        slope, offset = (float(v) for v in meta["dng_tags"]["NoiseProfile"].strip("()").split(","))
+        yield DetailPicture(
+            name, group, "mosaic", light, NoiseLevelFunction((slope,) * 4, (offset,) * 4)
+        )
+
+
+def _linear(data: Path, split: Split) -> Iterator[DetailPicture]:
+    """Demosaicked linear frames."""
+    for path in _files(data / "intel_tau_small", (".png",)):
+        if detail_split(path.stem) == split:
+            import cv2
+
+            image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+            light = image[:, :, ::-1].transpose(2, 0, 1).astype(np.float32) / 65535.0
+            yield DetailPicture(
+                path.stem, path.stem, "linear", torch.from_numpy(np.ascontiguousarray(light))
+            )
+
+
+def _files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    files = sorted(p for p in folder.glob("*") if p.suffix in suffixes)
+    if not files:
+        logger.warning("no %s files in %s: they are left out", " or ".join(suffixes), folder)
+    return files
+
+
+@cache
+def _groups(data: Path) -> dict[str, str]:
+    """Source group by file name, where a table beside the files states it."""
+    table = data / "MANIFEST_POOL.csv"
+    if not table.is_file():
+        return {}
+    with table.open(newline="", encoding="utf-8") as stream:
+        return {Path(r["file"]).name: r["group"] for r in csv.DictReader(stream) if r["group"]}
+
+
+# -- drawn pictures -------------------------------------------------------------------------------
+
+
+def _drawings(split: Split, number: int, seed: int) -> Iterator[DetailPicture]:
+    for kind, make in (("leaves", _leaves), ("chart", _chart), ("smooth", _smooth)):
+        for index in range(number):
+            name = f"{kind}-{seed}-{FIRST_INDEX[split] + index:06d}"
+            rng = np.random.default_rng(
+                [zlib.crc32(kind.encode()), seed, FIRST_INDEX[split], index]
+            )
+            yield DetailPicture(name, name, kind, torch.from_numpy(make(rng)))
+
+
+def _leaves(rng: np.random.Generator) -> np.ndarray:
+    """Dead leaves down to less than a photosite: the sharpest edges that can be."""
+    style = LeafStyle(
+        smallest=float(np.exp(rng.uniform(np.log(0.7), np.log(4.0)))),
+        contrast=float(rng.uniform(0.3, 1.1)),
+        chroma=float(rng.uniform(0.1, 0.6)),
+        texture=float(rng.uniform(0.0, 0.5)),
+        palette=int(rng.integers(3, 30)),
+    )
+    return dead_leaves(rng, _SIZE, style)
+
+
+def _chart(rng: np.random.Generator) -> np.ndarray:
+    """Text, gratings, zone plates and checks in two colours."""
+    paper, ink = (np.exp2(rng.uniform(-5.0, 0.0, (2, 1))) * rng.uniform(0.6, 1.0, (2, 3)))[
+        :, :, None
+    ]
+    row, column = np.mgrid[:_SIZE, :_SIZE].astype(np.float32)
+    kind = int(rng.integers(4))
+    if kind == 0:
+        mask = _text(rng)
+    elif kind == 1:
+        angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(2.0), np.log(40.0)))
+        wave = np.sin((row * np.sin(angle) + column * np.cos(angle)) * 2 * np.pi / period)
+        mask = (wave > 0).astype(np.float32) if rng.random() < 0.5 else 0.5 + 0.5 * wave
+    elif kind == 2:
+        centre = rng.uniform(-0.2, 1.2, 2) * _SIZE
+        radius = np.hypot(row - centre[0], column - centre[1])
+        mask = 0.5 + 0.5 * np.cos(np.pi * radius**2 / _SIZE * rng.uniform(0.3, 1.0))
+    else:
+        side = int(rng.integers(1, 48))
+        mask = ((row // side + column // side) % 2).astype(np.float32)
+    light = paper[..., None] * (1.0 - mask) + ink[..., None] * mask
+    return np.ascontiguousarray(light, np.float32)
+
+
+def _text(rng: np.random.Generator) -> np.ndarray:
+    page = Image.new("L", (_SIZE, _SIZE))
+    draw, top = ImageDraw.Draw(page), 0
+    while top < _SIZE:
+        size = int(rng.integers(7, 40))
+        letters = "".join(chr(c) for c in rng.integers(33, 127, 90))
+        words = letters.replace("~", " ").replace("|", " ")
+        draw.text((int(rng.integers(-20, 5)), top), words, 255, ImageFont.load_default(size))
+        top += size + int(rng.integers(1, 8))
+    return np.asarray(page, np.float32) / 255.0
+
+
+def _smooth(rng: np.random.Generator) -> np.ndarray:
+    """Shading without detail: walls, skies, flat fields."""
+    tint = np.exp2(rng.uniform(-0.8, 0.8, 3))[:, None, None]
+    if rng.random() < 0.3:
+        return np.ascontiguousarray(np.broadcast_to(tint, (3, _SIZE, _SIZE)), np.float32)
+    shape = fractal_noise(rng, _SIZE, float(rng.uniform(1.8, 3.0)))
+    return np.asarray(tint * np.exp(rng.uniform(0.02, 0.8) * shape), np.float32)
+
+
+# -- scenes of the reference camera ---------------------------------------------------------------
+
+
+def reference_scenes(
+    split: Split,
+    camera: CameraProfile,
+    *,
+    number: int = 48,
+    size: int = 256,
+    data: Path | None = None,
+    seed: int = 0,
+) -> list[ReferenceScene]:
+    """The scenes of `split`: procedural ones, photographs, and views into radiance maps.
+
+    Of the procedural groups three quarters have depth (`simulator.radiance.depth`), a third of
+    these with everything in focus; the rest are the bundled kinds, in turn. Nothing else has depth.
+
+    Args:
+        split: ``"train"``, ``"validation"`` or ``"test"``.
+        camera: Camera in whose colours light is stated, and in whose pixels blur is.
+        number: Procedural groups, one scene each, at most `MOST_GROUPS`; the first are the same
+            whatever `number` is.
+        size: Height and width [packed pixels], half as many as photosites; pictures that are
+            smaller keep their size, and are left out below 128 and below `size`, which is logged.
+        data: Folder of real files (see docs/networks.md), for radiance maps and further
+            photographs; None leaves them out.
+        seed: Seed of the procedural groups; part of their names.
+
+    Raises:
+        FileNotFoundError: If there is no folder `data`.
+        ValueError: If an argument is invalid.
+    """
+    check_word("split", split, tuple(FIRST_INDEX))
+    check_integer("number", number, 0, MOST_GROUPS)
+    check_integer("size", size, 16, more=" packed pixels")
+    check_integer("seed", seed, 0)
+    scenes = [_procedural(camera, FIRST_INDEX[split], i, size, seed) for i in range(number)]
+    for picture in (*_bundled_photographs(split), *_real_pictures(data, split)):
+        scenes += _cut_out(picture, camera, size)
+    return scenes
+
+
+def _procedural(
+    camera: CameraProfile, first: int, position: int, size: int, seed: int
+) -> ReferenceScene:
+    """The scene at `position` of the split that begins at index `first`."""
+    block, within = divmod(position, _FLAT_EVERY)
+    flat = within == _FLAT_EVERY - 1
+    kinds = list_kinds()
+    kind = kinds[block % len(kinds)] if flat else "depth"
+    rng = np.random.default_rng([zlib.crc32(b"reference"), seed, first + position])
+    depth, lens = None, Lens()
+    if flat:
+        drawing = draw(kind, rng, 2 * size, lens=False)
+    else:
+        focus = FOCUS_CYCLE[(block * (_FLAT_EVERY - 1) + within) % len(FOCUS_CYCLE)]
+        drawn = draw_depth(rng, 2 * size, focus)
+        drawing = drawn.drawing
+        distance, depths = lens_and_depth(drawn.blur, drawn.far, packed_pitch(camera))
+        depth, lens = torch.from_numpy(depths), Lens(FOCAL_LENGTH, distance)
+    name = f"reference-{seed}-{first + position:06d}-{kind}"
+    return _scene(
+        drawing.light,
+        camera,
+        drawing.illuminance,
+        illuminant=drawing.illuminant,
+        scene_id=name,
+        group=name,
+        kind=kind,
+        source="procedural, ae-env (MIT)",
+        depth=depth,
+        lens=lens,
+    )
+
+
+def _scene(
+    rgb: np.ndarray,
+    camera: CameraProfile,
+    lux: float,
+    *,
+    scale_known: bool = True,
+    illuminant: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    **fields: Any,
+) -> ReferenceScene:
+    """A scene of one pixel to a photosite under `lux`, moved into `ILLUMINANCE`.
+
+    Light is relative to the reference settings: under less of it they expose longer, and `light`
+    stays as it is. Where the scale of `rgb` is unknown, its mean is set to a usual exposure.
+    """
+    light, reference, white_balance = camera_light(
+        rgb,
+        camera,
+        illuminance=lux if scale_known else None,
+        ev100=incident_ev100(lux),
+        illuminant=illuminant,
+    )
+    within = min(max(lux, ILLUMINANCE[0]), ILLUMINANCE[1])
+    if within != lux:
+        reference = reference_settings(-reference.log2_exposure + math.log2(within / lux))
+    return ReferenceScene(
+        light=light[[0, 1, 3]],
+        reference=reference,
+        illuminance=within,
+        white_balance=white_balance,
+        **fields,
+    )
+
+
+def packed_pitch(camera: CameraProfile) -> float:
+    """Distance between packed pixels of `camera` [m], twice the sensor's.
+
+    Raises:
+        ValueError: If the camera does not know it.
+    """
+    if camera.pixel_pitch_um is None:
+        raise ValueError(
+            f"`pixel_pitch_um` (=None) of camera {camera.name!r} must be known where there is depth"
+        )
+    return 2e-6 * camera.pixel_pitch_um
+
+
+# -- pictures without depth -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    """Linear light (3, H, W), its pixels as sharp as photosites see.
+
+    Args:
+        views: By scene id; the parts of it that become scenes.
+        illuminance, tint: The light, where it is known.
+    """
+
+    group: str
+    kind: str
+    views: dict[str, np.ndarray]
+    source: str
+    illuminance: float | None = None
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    in_focus: bool = True
+
+
+def _bundled_photographs(split: Split) -> Iterator[_Picture]:
+    """scikit-image's photographs, of which nobody knows what was in focus."""
+    for photograph in PHOTOGRAPHS:
+        validates = photograph.name == VALIDATION_PHOTOGRAPH
+        if split != ("validation" if validates else photograph.split):
+            continue
+        rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
+        light = unprocess(read_photograph(photograph.file), rng)
+        low, high = (math.log(v) for v in photograph.illuminance)
+        yield _Picture(
+            photograph.name,
+            "photograph",
+            {photograph.name: light},
+            f"scikit-image {photograph.file}: {photograph.credit}",
+            illuminance=float(f"{math.exp(rng.uniform(low, high)):.4g}"),
+            tint=temperature_tint(rng.uniform(*photograph.tint)),
+            in_focus=False,
+        )
+
+
+def _real_pictures(data: Path | None, split: Split) -> Iterator[_Picture]:
+    """Radiance maps and photographs of a folder of real files."""
+    if data is None:
+        return
+    if not Path(data).is_dir():
+        raise FileNotFoundError(f"`data` (={str(data)!r}) must be an existing folder")
+    for path, group in radiance_files(Path(data), split):
+        image = read_radiance(path)
+        yield _Picture(group, "radiance", _views(path.stem, image), path.name)
+    for photograph in photograph_pictures(Path(data), split):
+        yield _Picture(
+            photograph.group,
+            "photograph",
+            {photograph.name: _sharpened(photograph.light.numpy())},
+            f"photo_pool {photograph.name}",
+            in_focus=photograph.name not in _BLURRED,
+        )
+
+
+def _views(name: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    """Four square cuts out of a panorama's band of 45 degrees around the horizon; other pictures as
+    they are.
+
+    A perspective view has its edges enlarged; the band is stretched by 1.41 at most, sideways.
+    """
+    height, width = image.shape[1:]
+    if abs(width / height - 2.0) > 0.01:
+        return {name: _sharpened(image)}
+    side = width // 8 * 2
+    top = (height - side) // 2
+    views = {}
+    for azimuth in AZIMUTHS:
+        left = round((azimuth / 360.0 + 0.5) * width) - side // 2
+        columns = np.arange(left, left + side) % width
+        views[f"{name}-{azimuth:03.0f}"] = image[:, top : top + side, columns]
+    return views
+
+
+def _sharpened(light: np.ndarray) -> np.ndarray:
+    """`light`, or its means over 2 x 2 pixels where it is softer than edges that pixels average."""
+    if _edge_ratio(light[1]) >= _SHARP:
+        return light
+    height, width = (n // 2 for n in light.shape[1:])
+    tiles = light[:, : 2 * height, : 2 * width].reshape(3, height, 2, width, 2)
+    return np.asarray(tiles.mean(axis=(2, 4)))
+
+
+def _edge_ratio(values: np.ndarray) -> float:
+    """Mean square difference of the logarithm of neighbours, relative to that of second neighbours.
+
+    An edge that falls anywhere in a square pixel gives (2/3) / (5/3) = 0.4; soft pictures tend to
+    1/4, white noise to 1.
+    """
+    logs = np.log(values + 0.02 * np.median(values) + 1e-9)
+    near, far = (np.square(logs[:, n:] - logs[:, :-n]).mean() for n in (1, 2))
+    return float(near / max(far, 1e-12))
+
+
+def _cut_out(picture: _Picture, camera: CameraProfile, size: int) -> Iterator[ReferenceScene]:
+    """The middle of each view, at most 2 x `size` photosites a side."""
+    for name, view in picture.views.items():
+        side = min(2 * size, *(n // 2 * 2 for n in view.shape[1:]))
+        if side < 2 * min(size, LEAST_VIEW):
+            logger.info("%s: too coarse (%d photosites a side), left out", name, side)
+            continue
+        top, left = ((n - side) // 2 for n in view.shape[1:])
+        lux, source = picture.illuminance, picture.source
+        if lux is None:
+            lux = assumed_illuminance(name)
+            source += f"; light of unknown scale, {lux:g} lux assumed"
+        yield _scene(
+            view[:, top : top + side, left : left + side],
+            camera,
+            lux,
+            scale_known=picture.illuminance is not None,
+            illuminant=picture.tint,
+            scene_id=name,
+            group=picture.group,
+            kind=picture.kind,
+            source=source,
+            in_focus=picture.in_focus,
+        )
+
+
+def mosaic_scenes(
+    split: Split, camera: CameraProfile, data: Path, *, size: int = 256
+) -> Iterator[ReferenceScene]:
+    """The middle of real raws at low ISO: flat art and far views, in focus throughout.
+
+    For the aperture: their noise is small, but it is there, so they are no truth to denoise. They
+    cannot be defocused, as each plane has but a quarter of the photosites.
+
+    Args:
+        split: See `reference_scenes`; groups are split by `detail_split`.
+        camera: Camera that photographs them; their colours are left as they were recorded.
+        data: Folder of real files.
+        size: Height and width [packed pixels], at most.
+    """
+    for picture in recorded_mosaics(data, split):
+        height, width = picture.light.shape[1:]
+        side = min(size, height, width)
+        top, left = (height - side) // 2, (width - side) // 2
+        light = picture.light[:, top : top + side, left : left + side].clamp(min=0.0)
+        lux = assumed_illuminance(picture.name)
+        yield ReferenceScene(
+            scene_id=picture.name,
+            group=picture.group,
+            kind=MOSAIC,
+            light=light * mean_anchor(light[1:3]),
+            reference=reference_settings(incident_ev100(lux)),
+            illuminance=lux,
+            source=f"raw {picture.name}; light of unknown scale, {lux:g} lux assumed",
+            sampled=True,
+        )
+
+
+def assumed_illuminance(name: str) -> float:
+    """Light [lux] assumed for a picture of unknown scale, in `ILLUMINANCE`, by a hash of its name.
+
+    The assumption is log-uniform, and drawn for each view, so that a few maps cover the range.
+
+    >>> assumed_illuminance("lab-090") == assumed_illuminance("lab-090")
+    True
+    """
+    low, high = EV100_RANGE
+    fraction = (assumed_ev100(name) - low) / (high - low)
+    darkest, brightest = ILLUMINANCE
+    return float(f"{darkest * (brightest / darkest) ** fraction:.4g}")
+
+
+def draped_scenes(
+    scenes: Iterable[ReferenceScene], camera: CameraProfile, *, copies: int = 2, seed: int = 0
+) -> Iterator[ReferenceScene]:
+    """Scenes without depth laid over procedural depth, `copies` of each, in its source group.
+
+    Dead leaves have texture everywhere; real pictures also have smooth surfaces with sharp edges,
+    and a network that learns the map of defocus from leaves alone takes the smooth ones for
+    blurred. A picture that is in focus throughout, laid over depth, shows what defocus does to such
+    surfaces.
+
+    Args:
+        scenes: Scenes to drape; passed over are those with depth, those with a blur of their own,
+            and those that are not at the pitch of the photosites.
+        camera: Camera in whose pixels blur is stated.
+        copies: Depths per scene; every third has everything in focus.
+        seed: Seed of the depths.
+    """
+    number = 0
+    for scene in scenes:
+        if scene.depth is not None or not scene.in_focus or scene.pitch == 1:
+            continue
+        for copy in range(copies):
+            focus = FOCUS_CYCLE[number % len(FOCUS_CYCLE)]
+            number += 1
+            rng = np.random.default_rng([zlib.crc32(scene.scene_id.encode()), seed, copy])
+            height, width = scene.light.shape[1:]
+            drawn = draw_depth(rng, max(height, width), focus)
+            blur = drawn.blur[:height, :width]
+            distance, depth = lens_and_depth(blur, drawn.far, packed_pitch(camera))
+            yield replace(
+                scene,
+                scene_id=f"{scene.scene_id}-draped-{copy}",
+                kind=DRAPED,
+                depth=torch.from_numpy(depth),
+                lens=Lens(FOCAL_LENGTH, distance),
+            )
+
+
+# -- photographs with depth -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _DepthPhotograph:
+    """A photograph and its ground-truth disparity [pixels], not finite where unknown."""
+
+    name: str
+    image: np.ndarray
+    disparity: np.ndarray
+    dioptres_per_pixel: float
+    offset: float
+    illuminance: float
+    source: str
+
+
+def depth_photographs(camera: CameraProfile, *, data: Path | None = None) -> list[ReferenceScene]:
+    """Photographs with measured depth, for testing only, each with two settings of the focus.
+
+    A pixel counts as a photosite. Where no disparity was measured it is that of the nearest pixel
+    that has one. The lens is focused on the front (95 % of the picture are farther) or on
+    the median depth, and its focal length chosen such that the circle of confusion at f/11 reaches
+    6 packed pixels (at the 2 % and 98 % quantiles of inverse depth, whichever is the larger).
+
+    Args:
+        camera: Camera in whose colours light is stated, and in whose pixels blur is.
+        data: Folder that holds ``depth_cones``; without it only ``stereo_motorcycle``, which is
+            inside scikit-image's wheel.
+    """
+    photographs = [_motorcycle()]
+    folder = None if data is None else Path(data) / "depth_cones"
+    if folder is not None and folder.is_dir():
+        photographs.append(_cones(folder))
+    return [scene for photograph in photographs for scene in _focused(photograph, camera)]
+
+
+def _motorcycle() -> _DepthPhotograph:
+    folder = resources.files("skimage.data")
+    with folder.joinpath("motorcycle_left.png").open("rb") as stream, Image.open(stream) as picture:
+        image = np.asarray(picture)
+    with folder.joinpath("motorcycle_disp.npz").open("rb") as stream, np.load(stream) as arrays:
+        disparity = arrays["arr_0"]
+    # Calibration as scikit-image states it: z = baseline * focal length / (disparity + offset).
+    return _DepthPhotograph(
+        name="motorcycle",
+        image=image,
+        disparity=disparity,
+        dioptres_per_pixel=1.0 / (0.193001 * 994.978),
+        offset=31.086,
+        illuminance=500.0,
+        source="scikit-image stereo_motorcycle (Middlebury 2014); 500 lux assumed",
+    )
+
+
+def _cones(folder: Path) -> _DepthPhotograph:
+    image = tifffile.imread(folder / "left_rgb.tif").astype(np.uint8)
+    disparity = tifffile.imread(folder / "Cones_LEFT_GT.tif")
+    # 0 is "no data". The 2003 sets come without calibration: that of Middlebury's 2006 sets (focal
+    # length 3740 pixels at full size, baseline 0.16 m) is assumed, at a quarter of the size.
+    return _DepthPhotograph(
+        name="cones",
+        image=image,
+        disparity=np.where(disparity > 0, disparity, np.nan),
+        dioptres_per_pixel=1.0 / (0.16 * 3740.0 / 4.0),
+        offset=0.0,
+        illuminance=500.0,
+        source="Middlebury 2003 Cones; calibration of the 2006 set and 500 lux assumed",
+    )
+
+
+def _focused(photograph: _DepthPhotograph, camera: CameraProfile) -> Iterator[ReferenceScene]:
+    rng = np.random.default_rng(zlib.crc32(photograph.name.encode()))
+    height, width = (n // 2 * 2 for n in photograph.disparity.shape)
+    light = unprocess(photograph.image, rng)[:, :height, :width]
+    disparity = fill_from_nearest(photograph.disparity)[:height, :width]
+    inverse = (disparity + photograph.offset) * photograph.dioptres_per_pixel
+    far, middle, front, near = np.quantile(inverse, [0.02, 0.5, 0.95, 0.98])
+    depth = torch.from_numpy((1.0 / inverse).astype(np.float32))
+    for name, focus in (("front", front), ("middle", middle)):
+        spread = max(near - focus, focus - far)
+        # c = f^2 (F - D) / (N (1 - f F)), solved for the focal length f at the largest |F - D|.
+        area = _PHOTOGRAPH_BLUR * packed_pitch(camera) * F_NUMBER / spread
+        focal_length = 0.5 * (math.sqrt((area * focus) ** 2 + 4.0 * area) - area * focus)
+        lens = Lens(float(focal_length), float(1.0 / focus))
+        yield _scene(
+            light,
+            camera,
+            photograph.illuminance,
+            scene_id=f"{photograph.name}-{name}",
+            group=photograph.name,
+            kind="depth_photograph",
+            source=photograph.source,
+            depth=depth,
+            lens=lens,
+        )
+
+
+def fill_from_nearest(values: np.ndarray) -> np.ndarray:
+    """`values` (H, W) with every value that is not finite replaced by the nearest finite one.
+
+    >>> fill_from_nearest(np.array([[1.0, np.nan, np.nan, 4.0]])).tolist()
+    [[1.0, 1.0, 4.0, 4.0]]
+    """
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    if not known.any():
+        raise ValueError("`values` must have a finite value")
+    indices = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(values[tuple(indices)])

@@ -1,0 +1,265 @@
+"""Work on the processor: kernels that numba compiles, and threads that share them.
+
+Kernels are compiled once per machine, and run without the interpreter's lock. Compiled code is
+cached beside the source, or in the user's cache folder where that cannot be written
+(``NUMBA_CACHE_DIR`` names another); where neither can, each process compiles for itself.
+
+As many threads are used as torch would use (`torch.set_num_threads`, ``OMP_NUM_THREADS``). They
+belong to the process that made them: a forked child makes its own, where an OpenMP pool would hang
+or die.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import multiprocessing
+import os
+import re
+import sys
+import threading
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numba import types
+from numba.core import event
+
+logger = logging.getLogger(__name__)
+_PACKAGES = ("simulator", "ae_env")
+#: Kernels that a default environment needs for its first frame, about.
+_FIRST_KERNELS = 12
+#: Warnings that kernels are compiled which are not in the cache.
+_KEPT = (
+    "compiling parts of the simulator that were not used on this machine before, for this and "
+    "later runs (all take 10 s or so; `ae-env warm-up` compiles them beforehand)"
+)
+_NOT_KEPT = (
+    "compiling parts of the simulator, as in every run (10 s or so for all): no folder can be "
+    "written to keep them; NUMBA_CACHE_DIR names one"
+)
+#: Folder of the packages.
+_ROOT = Path(__file__).parents[2]
+#: The modules and names of imports from this project, one line or in parentheses.
+_IMPORTS = re.compile(r"^\s*from ((?:simulator|ae_env)[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+
+
+def kernel(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator of a function that numba compiles when it is first called.
+
+    Args:
+        options: Options of `numba.njit`, such as ``fastmath``.
+    """
+
+    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        given: dict[str, Any] = {"nogil": True, "error_model": "numpy", **options}
+        dispatcher: Callable[..., Any]
+        try:
+            dispatcher = numba.njit(cache=True, **given)(function)
+        except RuntimeError as error:
+            logger.info("%s; it is compiled again in each process", error)
+            dispatcher = numba.njit(**given)(function)
+        else:
+            _adapt_cache(dispatcher, Path(function.__code__.co_filename))
+        return dispatcher
+
+    return compiled
+
+
+def _is_kept(dispatcher: Any) -> bool:
+    """Whether what is compiled of a kernel is kept for other processes."""
+    return hasattr(getattr(dispatcher, "_cache", None), "_cache_file")
+
+
+def _adapt_cache(dispatcher: Any, module: Path) -> None:
+    """Makes numba's cache of a kernel stale when any module changes that the kernel depends on.
+
+    Numba itself looks at the kernel's own module alone, but the functions and constants that a
+    kernel names are compiled into it. Also, a full disk must not be an error.
+    """
+    cache = dispatcher._cache
+    index, save = cache._cache_file, cache.save_overload
+    index._source_stamp = (index._source_stamp, _checksum(module))
+
+    def save_if_possible(*arguments: Any) -> None:
+        try:
+            save(*arguments)
+        except OSError as error:
+            logger.info("%s; it is compiled again in each process", error)
+
+    cache.save_overload = save_if_possible
+
+
+@functools.cache
+def _checksum(module: Path) -> int:
+    """Checksum of `module` and of every module of this project that it imports, at any depth."""
+    pending, texts = [module], dict[Path, str]()
+    while pending:
+        path = pending.pop()
+        if path not in texts and path.is_file():
+            texts[path] = path.read_text(encoding="utf-8")
+            for name, imported in _IMPORTS.findall(texts[path]):
+                folder = _ROOT.joinpath(*name.split("."))  # a package, or a module without ".py"
+                modules = (folder / part for part in re.findall(r"\w+", imported))
+                pending += [path.with_suffix(".py") for path in (folder, *modules)]
+    return functools.reduce(
+        lambda value, path: zlib.crc32(texts[path].encode(), value), sorted(texts), 0
+    )
+
+
+class _Announcer(event.Listener):  # type: ignore[misc,unused-ignore]
+    """Warns once that kernels are compiled, which takes seconds, logs each one, and shows a bar."""
+
+    warned = False
+    depth = 0  # kernels compile the kernels that they call
+    compiled = 0
+    shown = ExitStack()
+
+    def on_start(self, event: Any) -> None:
+        """Numba is about to compile a function, not to load one from its cache."""
+        self.depth += 1
+        function = event.data["dispatcher"].py_func
+        if function.__module__.partition(".")[0] in _PACKAGES:
+            if not self.warned and multiprocessing.parent_process() is None:  # children are many
+                self.warned = True
+                logger.warning(_KEPT if _is_kept(event.data["dispatcher"]) else _NOT_KEPT)
+            logger.info("compiling %s.%s", function.__module__, function.__name__)
+            if self.depth == 1:
+                bar = progress_bar("compiling the simulator", _FIRST_KERNELS, done=self.compiled)
+                self.shown.enter_context(bar)
+
+    def on_end(self, event: Any) -> None:
+        """It is compiled."""
+        self.depth -= 1
+        if not self.depth:
+            self.compiled += 1
+            self.shown.close()
+
+
+_announcer = _Announcer()
+event.register("numba:compile", _announcer)  # type: ignore[no-untyped-call]
+
+
+# Images are given to kernels by their addresses: a batch need not lie in one piece of memory.
+def addresses(images: Sequence[torch.Tensor | None]) -> np.ndarray:
+    """(B,) uintp addresses of contiguous float32 images, 0 for None.
+
+    Take them again for each call: sharing a tensor with another process moves its memory.
+    """
+    return np.array([0 if i is None else i.data_ptr() for i in images], np.uintp)
+
+
+@numba.extending.intrinsic
+def as_pointer(typing, address):  # type: ignore[no-untyped-def]
+    """An address as a pointer to float32, inside a kernel."""
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+    return types.CPointer(types.float32)(types.uintp), generate  # type: ignore[no-untyped-call]
+
+
+# -- threads --------------------------------------------------------------------------------------
+
+_POOLS: dict[tuple[int, int], ThreadPoolExecutor] = {}  # by process and size
+_inside = threading.local()
+
+
+def thread_count() -> int:
+    """Number of threads that share work: `torch.get_num_threads()`."""
+    return torch.get_num_threads()
+
+
+def parallel_ranges(
+    task: Callable[[int, int], object], count: int, *, least: int = 1, threads: int | None = None
+) -> None:
+    """Call ``task(first, last)`` on contiguous shares of ``range(count)``, one per thread.
+
+    The caller's thread takes the first share. A task that calls `parallel_ranges` itself gets one
+    share. Returns when all shares are done.
+
+    Args:
+        task: Safe to run on several threads at once; an error in any share is raised here.
+        count: Number of items, >= 0.
+        least: Items below which another thread is not worth waking.
+        threads: Most threads to use; `thread_count()` by default.
+    """
+    shares = min(thread_count() if threads is None else threads, count // max(least, 1))
+    if shares <= 1 or getattr(_inside, "task", False):
+        if count:
+            task(0, count)
+        return
+    bounds = [count * i // shares for i in range(shares + 1)]
+    others: list[Future[None]] = [
+        _pool(shares - 1).submit(_run, task, first, last) for first, last in pairwise(bounds[1:])
+    ]
+    try:
+        _run(task, 0, bounds[1])
+    finally:
+        _inside.task = False
+        errors = [other.exception() for other in others]  # waits for every one of them
+    for error in errors:
+        if error is not None:
+            raise error
+
+
+def _run(task: Callable[[int, int], object], first: int, last: int) -> None:
+    _inside.task = True  # a worker that waited for workers would wait for itself
+    task(first, last)
+
+
+def _pool(size: int) -> ThreadPoolExecutor:
+    key = (os.getpid(), size)
+    if key not in _POOLS:
+        _POOLS[key] = ThreadPoolExecutor(size, thread_name_prefix="simulator")
+    return _POOLS[key]
+
+
+# -- what else a computation needs ----------------------------------------------------------------
+
+
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether the device computes in bfloat16; other processors emulate it, ten times as slow."""
+    return device.type != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
+def check_bfloat16(device: torch.device) -> None:
+    """Logs a warning where bfloat16 is emulated."""
+    if not computes_bfloat16(device):
+        logger.warning(
+            "precision 'bfloat16': this processor emulates it, ten times as slow as 'float32'"
+        )
+
+
+@contextmanager
+def progress_bar(title: str, total: int, *, done: int = 0) -> Iterator[Callable[[], None]]:
+    """A bar on standard error during work that the user did not ask for, wiped out at the end.
+
+    Nothing is shown where that is no terminal, or belongs to a bar of the program's own.
+
+    Args:
+        title: What is done.
+        total: Number of steps; 0 for no bar.
+        done: Steps done before.
+
+    Yields:
+        A function that counts a step; several threads may call it.
+    """
+    stream = sys.stderr
+    if not total or stream is None or stream is not sys.__stderr__ or not stream.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as display:
+        task = display.add_task(title, total=total, completed=min(done, total))
+        yield lambda: display.advance(task)

@@ -1,0 +1,218 @@
+"""Gradient metrics of exposure papers and noise estimates, against SciPy, loops and wavelets."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.ndimage
+import scipy.signal
+import torch
+from skimage.color import rgb2gray
+from skimage.measure import shannon_entropy
+
+from ae_env.scorers import make_scorer
+from ae_env.scorers.measures import (
+    histogram_entropy,
+    immerkaer_sigma,
+    shim_gradient,
+    shin_metric,
+    zhang_gradient,
+)
+from simulator import CameraSettings, NoiseLevelFunction
+from tests.ae_env.scorer_images import CAMERA, captures_of, random_pictures
+
+
+def _levels(count: int = 3, height: int = 40, width: int = 60) -> np.ndarray:
+    """8-bit grey levels (B, H, W)."""
+    return np.round(255.0 * random_pictures(count, height, width)[:, 0].double().numpy())
+
+
+def _sobel(picture: np.ndarray) -> np.ndarray:
+    x, y = (scipy.ndimage.sobel(picture, axis=axis, mode="nearest") for axis in (1, 0))
+    return np.hypot(x, y)
+
+
+KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]])  # Immerkaer's
+
+
+def _shim_pixels(picture: np.ndarray) -> np.ndarray:
+    m = _sobel(picture) / math.sqrt(2 * 16 * 255**2)
+    response = np.log(1000 * np.maximum(m - 0.06, 0) + 1) / np.log(1000 * (1 - 0.06) + 1)
+    return np.where(m >= 0.06, response, 0.0)
+
+
+def test_shim_is_the_mean_of_the_logarithmic_response() -> None:
+    levels = _levels()
+    expected = [_shim_pixels(picture).mean() for picture in levels]
+    assert min(expected) > 0.05
+    got = shim_gradient(torch.from_numpy(levels / 255.0))
+    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
+
+
+def test_zhang_is_the_weighted_mean_of_sorted_squared_gradients() -> None:
+    levels = _levels(height=21, width=33)
+    kernel = np.array([[3, 0, -3], [10, 0, -10], [3, 0, -3]]) / 32
+    expected = []
+    for picture in levels:
+        x, y = (scipy.ndimage.convolve(picture, k, mode="nearest") for k in (kernel, kernel.T))
+        ordered = sorted((x**2 + y**2).ravel())
+        size, n = len(ordered), int(0.7 * len(ordered))
+        weights = []
+        for i in range(size):
+            angle = math.pi / 2 * i / (n - 1)
+            if i >= n:
+                angle = math.pi / 2 - math.pi / 2 * (i - n + 1) / (size - n)
+            weights.append(math.sin(angle) ** 5)
+        expected.append(np.dot(weights, ordered) / sum(weights))
+    got = zhang_gradient(torch.from_numpy(levels / 255.0))
+    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
+    pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
+    scores = make_scorer("zhang").parts["zhang"](pictures, None)
+    np.testing.assert_allclose(scores, np.array(expected) / (np.array(expected) + 256), rtol=1e-4)
+
+
+def _shin(picture: np.ndarray) -> float:
+    """The metric in the words of the paper, for sizes that 10 divides."""
+    height, width = picture.shape
+    response = _shim_pixels(picture)
+    rows, columns = height // 10, width // 10
+    cells = [
+        response[rows * i : rows * (i + 1), columns * j : columns * (j + 1)].mean()
+        for i in range(10)
+        for j in range(10)
+    ]
+    gradient = 2 * np.mean(cells) / np.std(cells, ddof=1)
+    entropy = shannon_entropy(np.round(picture)) / 8
+    squared = _sobel(picture) ** 2
+    flat = squared <= np.sort(squared.ravel())[round(0.1 * picture.size) - 1]
+    used = flat & (picture >= 15) & (picture <= 235)
+    response = np.abs(scipy.ndimage.convolve(picture, KERNEL, mode="nearest"))
+    noise = math.sqrt(math.pi / 2) / (6 * used.sum()) * response[used].sum()
+    return 0.4 * gradient + 0.6 * entropy - 0.4 * noise
+
+
+def test_shin_weighs_even_detail_and_entropy_against_noise() -> None:
+    # Not whole levels, of which many gradients would tie at the percentile.
+    levels = 255.0 * random_pictures(3, 40, 60)[:, 0].double().numpy()
+    expected = np.array([_shin(picture) for picture in levels])
+    got = shin_metric(torch.from_numpy(levels / 255.0))
+    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-6)
+    pictures = torch.from_numpy(levels[:, None] / 255.0).float().expand(-1, 3, -1, -1)
+    scores = make_scorer("shin").parts["shin"](pictures, None)
+    mapped = np.where(expected > 0, 1 - 0.5 / (1 + expected), 0.5 / (1 - np.minimum(expected, 0)))
+    np.testing.assert_allclose(scores, mapped, atol=1e-2)  # a level may round the other way
+
+
+def test_snr_is_the_mean_of_decibels() -> None:
+    light = 0.1 * np.exp(np.random.default_rng(0).normal(0.0, 2.0, (4, 6, 5)))
+    states = [CameraSettings(*s) for s in ((100, 1 / 64, 4), (6400, 1 / 64, 4), (400, 1 / 4000, 4))]
+    expected = []
+    for state in states:
+        nlf = CAMERA.nlf(state.iso)
+        shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
+        x = light * (state.exposure_time * 64) * (state.iso / 100)
+        decibels = 10 * np.log10(np.minimum(x, 1.0) ** 2 / (shot * x + read))
+        expected.append(decibels.clip(0.0, 50.0).mean() / 50.0)
+    scores = make_scorer("snr")(None, captures_of(light, states))
+    np.testing.assert_allclose(scores.numpy(), expected, rtol=1e-5)
+    assert make_scorer("snr").closed_form
+
+
+def test_blind_sigma_is_immerkaers() -> None:
+    luma = random_pictures(3, 20, 31)[:, 0].double()
+    expected = []
+    for picture in 255.0 * luma.numpy():
+        response = np.abs(scipy.signal.convolve2d(picture, KERNEL, mode="valid"))
+        expected.append(math.sqrt(math.pi / 2) / (6 * 29 * 18) * response.sum())
+    np.testing.assert_allclose(immerkaer_sigma(luma).numpy(), expected, rtol=1e-9)
+
+
+def test_blind_sigma_of_known_noise() -> None:
+    rows, columns = np.mgrid[0:200, 0:220]
+    slope = 60.0 + 0.3 * rows + 0.2 * columns  # straight slopes leave nothing
+    noisy = slope + 5.0 * np.random.default_rng(2).normal(size=slope.shape)
+    found = immerkaer_sigma(torch.from_numpy(np.stack([noisy, slope]) / 255.0)).tolist()
+    assert found == pytest.approx([5.0, 0.0], rel=0.02, abs=1e-9)
+    pictures = torch.from_numpy(noisy / 255.0).float().expand(1, 3, -1, -1)
+    score = make_scorer("blind_noise").parts["blind_noise"](pictures, None).item()
+    assert score == pytest.approx(1 / (1 + 5.0 / 10), rel=0.03)
+
+
+def _score(name: str, images: torch.Tensor) -> list[float]:
+    return next(iter(make_scorer(name).parts.values()))(images, None).tolist()
+
+
+def _encoded(linear: float) -> float:
+    return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+
+
+@pytest.mark.parametrize(
+    ("linear", "score"), [(0.18, 1.0), (0.36, 0.5), (0.09, 0.5), (0.0018, 0.01), (1.0, 0.18)]
+)
+def test_mid_grey_is_halved_by_every_stop(linear: float, score: float) -> None:
+    picture = torch.full((1, 3, 4, 5), _encoded(linear))
+    assert _score("mid_grey", picture) == pytest.approx([score], rel=1e-4)
+
+
+def test_mid_grey_takes_the_mean_of_linear_luminance() -> None:
+    pictures = random_pictures(3, 40, 50)[:, :3]
+    encoded = pictures.numpy().astype(np.float64)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    means = [rgb2gray(p.transpose(1, 2, 0)).mean() for p in linear]  # 0.2125, 0.7154, 0.0721
+    expected = [2.0 ** -abs(math.log2(mean / 0.18)) for mean in means]
+    np.testing.assert_allclose(_score("mid_grey", pictures), expected, rtol=2e-3)
+
+
+def test_clipping_counts_samples_of_all_planes() -> None:
+    raw = torch.full((2, 4, 2, 5), 0.5)  # 40 samples each
+    raw[0, 0, 0, :3] = 1.0
+    raw[0, 3, 1, :2] = 0.0
+    raw[1, 1, 0, 0] = 2.0**-9  # the black end itself
+    raw[1, 2, 0, 0] = 2.0**-8
+    raw[1, 2, 1, 0] = 16382 / 16383  # the code below white
+    assert _score("clipping", raw) == pytest.approx([1 - 5 / 40, 1 - 1 / 40])
+
+
+def test_dynamic_range_by_hand() -> None:
+    """The 11th and 991st of 1001 greens, each the mean of G1 and G2, from the noise floor on."""
+    read, shot = (9.0, 2e-6, 6e-6, 9.0), (9.0, 1e-3, 3e-3, 9.0)
+    floor = 0.5 * (2e-3 + math.sqrt(4e-6 + 4 * 4e-6))  # of the greens' means, 2e-3 and 4e-6
+    none, noisy = NoiseLevelFunction.zero(), NoiseLevelFunction(shot, read)
+    stops = math.log2(9e3) * 0.98
+    for darkest, time, nlf, wanted in (
+        (1e-4, 1 / 64, none, stops / 14),
+        (1e-4, 1 / 64, noisy, math.log2(0.9 * 9e3**-0.01 / floor) / 14),
+        # Four stops more: white at 1.
+        (1e-4, 1 / 4, none, (stops - math.log2(0.9 * 9e3**-0.01 * 16)) / 14),
+        (1e-9, 1 / 64, none, 1.0),  # 29 stops are more than 14
+    ):
+        green = np.random.default_rng(0).permutation(np.geomspace(darkest, 0.9, 1001))
+        light = np.stack([green * 0 + 50.0, 1.5 * green, 0.5 * green, green * 0])[:, None]
+        captures = replace(captures_of(light, [CameraSettings(100, time, 4)]), nlf=[nlf])
+        found = make_scorer("dynamic_range")(None, captures).item()
+        assert found == pytest.approx(wanted, rel=1e-5)
+
+
+def test_well_exposedness_is_mertens_product() -> None:
+    pictures = random_pictures(2, 7, 5)[:, :3]
+    weights = np.exp(-((pictures.double().numpy() - 0.5) ** 2) / (2 * 0.2**2))
+    expected = weights.prod(axis=1).mean(axis=(1, 2))
+    assert _score("well_exposedness", pictures) == pytest.approx(expected.tolist(), rel=1e-5)
+
+
+def test_entropy_is_that_of_the_grey_levels() -> None:
+    rng = np.random.default_rng(1)
+    codes = np.stack([rng.integers(0, top, (31, 29)) for top in (2, 17, 200, 256)])
+    luma = torch.from_numpy(codes / 255.0)
+    expected = [shannon_entropy(picture, base=2) for picture in codes]
+    np.testing.assert_allclose(histogram_entropy(luma).numpy(), expected, rtol=1e-9)
+    every = torch.arange(256.0).reshape(1, 16, 16) / 255.0
+    assert _score("entropy", every[:, None].expand(-1, 3, -1, -1)) == pytest.approx([1.0])
+
+
+def test_bad_luma_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"`luma` \(=\(2, 3\)"):
+        histogram_entropy(torch.zeros(2, 3))
+    with pytest.raises(ValueError, match="floating point"):
+        histogram_entropy(torch.zeros(1, 2, 3, dtype=torch.uint8))

@@ -1,0 +1,354 @@
+"""The reference camera against closed forms: geometry, Poisson and Gaussian statistics, ratios."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from simulator.camera import BayerPattern, CameraProfile, get_camera
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics.flicker_integral import PulsedLamp
+from simulator.optics.thin_lens import Lens
+from simulator.reference.camera import (
+    BodyError,
+    ReferenceCamera,
+    ReferenceScene,
+    average_planes,
+    lens_blur,
+    sample_mosaic,
+)
+from simulator.settings import CameraSettings
+
+BASE = CameraSettings(100, 1 / 64, 4)
+Z6 = get_camera("nikon_z6")
+# Shot and read noise of green at each ISO, retyped from the published table.
+Z6_GREEN = {
+    100: (7.47234302281224e-06, 5.73712214136873e-09),
+    1600: (0.00013417868314641, 5.73036984664066e-08),
+    6400: (0.000529454489967193, 7.25184811907467e-07),
+}
+
+
+def sensor(shot: float, read: float, *, span: float = 16000.0, **options: object) -> CameraProfile:
+    """A camera of round numbers: base ISO 100, the same noise in every plane."""
+    table = {100.0: NoiseLevelFunction((shot,) * 4, (read,) * 4)}
+    values = {"nlf_by_iso": table, "pixel_pitch_um": 5.0, **options}
+    return CameraProfile("round", BayerPattern.RGGB, (200.0,) * 4, 200.0 + span, 16, **values)  # type: ignore[arg-type]
+
+
+def scene(light: torch.Tensor, depth: torch.Tensor | None = None, **options: object):
+    settings = {"reference": BASE, "lens": Lens(0.05, 2.0), **options}
+    return ReferenceScene("s", "g", "test", light, depth=depth, **settings)  # type: ignore[arg-type]
+
+
+def flat(level: float, size: int = 8) -> torch.Tensor:
+    return torch.full((4, size, size), level)
+
+
+def diameter_px(depth: float, stop: float, pitch: float = 10e-6) -> float:
+    """Similar triangles with f = 50 mm, focused at 2 m, on a grid of `pitch` metres."""
+    image, focus = 1 / (1 / 0.05 - 1 / depth), 1 / (1 / 0.05 - 1 / 2.0)
+    return 0.05 / stop * abs(focus - image) / image / pitch
+
+
+@pytest.mark.parametrize("depth", [1.2, 1.5, 4.0])
+def test_a_saturated_lamp_becomes_a_white_disc_of_the_thin_lens(depth):
+    camera, light = ReferenceCamera(sensor(1e-4, 1e-7)), torch.zeros(4, 41, 41)
+    light[:, 20, 20] = 1e4
+    shot, expected = scene(light, torch.full((41, 41), depth)), diameter_px(depth, 4.0)
+    np.testing.assert_allclose(camera.blur_diameter(shot, 4.0), expected, rtol=1e-5)
+    spread = camera.blurred_light(shot, 4.0).double().numpy() / 1e4
+    np.testing.assert_allclose(spread.sum((1, 2)), 1.0, rtol=1e-5)
+    moment = spread.sum(1) @ (np.arange(41) - 20) ** 2  # a uniform disc: d^2 / 16
+    np.testing.assert_allclose(moment, expected**2 / 16, rtol=0.01)
+    np.testing.assert_allclose(spread[:, 20, 20], 4 / (math.pi * expected**2), rtol=0.03)
+    capture = camera.capture(shot, BASE, 0)
+    border = math.pi * expected  # pixels that the rim touches may fall on either side
+    for white in (capture.mean == 1.0, capture.sample == 1.0):
+        assert abs(white[1].sum().item() - math.pi * expected**2 / 4) < border
+        assert bool(white[1, 20, 20])
+
+
+def test_photosites_averages_and_marked_stops_in_the_blur():
+    shot = scene(flat(0.1, 4), torch.full((4, 4), 1.0))
+    native, boxed = (ReferenceCamera(sensor(1e-4, 1e-8), box_factor=k) for k in (1, 4))
+    expected = native.blur_diameter(shot, 4.0)
+    torch.testing.assert_close(boxed.blur_diameter(shot, 4.0), expected[:1, :1] / 4)
+    fine = scene(torch.ones(3, 8, 8), torch.full((8, 8), 1.0))  # two photosites to a packed pixel
+    torch.testing.assert_close(native.blur_diameter(fine, 4.0), expected)
+    # f/5.6 stands for 4 sqrt(2), f/11 for 8 sqrt(2)
+    torch.testing.assert_close(native.blur_diameter(shot, 11.0), expected / (2 * math.sqrt(2)))
+
+
+def test_scene_without_depth_or_in_focus_is_left_as_it_is():
+    light, camera = torch.rand(4, 7, 5), ReferenceCamera(sensor(1e-4, 1e-8))
+    assert not scene(light).sampled
+    assert float(camera.blur_diameter(scene(light), 4.0).max()) == 0.0
+    far = scene(light, torch.full((7, 5), math.inf), lens=Lens(0.05, math.inf))
+    for sharp in (scene(light), scene(light, torch.full((7, 5), 2.0)), far):
+        assert torch.equal(camera.blurred_light(sharp, 4.0), light)
+
+
+def record(camera: ReferenceCamera, level: float, iso: float, size: int = 160) -> np.ndarray:
+    generator = torch.Generator().manual_seed(7)
+    return camera.record(flat(level, size), iso, generator).double().numpy()
+
+
+@pytest.mark.parametrize("iso", Z6_GREEN)
+@pytest.mark.parametrize("level", [0.0, 0.003, 0.1, 0.6])
+def test_mean_and_variance_of_a_flat_field(iso, level):
+    shot, read = Z6_GREEN[iso]
+    expected = read + shot * level
+    sample = record(ReferenceCamera(Z6), level, iso)[1:3]
+    numbers, count = sample * 14512, sample.size  # white - black, retyped
+    np.testing.assert_allclose(numbers, numbers.round(), atol=2e-3)
+    assert abs(sample.mean() - level) < 5 * math.sqrt(expected / count)
+    # Fourth central moment of Poisson plus Gauss: 3 v^2 + shot^3 x.
+    standard_error = math.sqrt((2 * expected**2 + shot**3 * level) / count)
+    assert abs(sample.var() - expected) < 5 * standard_error + 0.01 * expected
+
+
+def test_counts_are_poisson_and_read_noise_is_gaussian():
+    # White is 64 electrons at ISO 100, each 250 numbers high; 0.05 of white is 3.2 electrons.
+    sample = record(ReferenceCamera(sensor(1 / 64, 0.0)), 0.05, 100.0) * 64
+    np.testing.assert_allclose(sample, sample.round(), atol=1e-4)
+    share = [(np.abs(sample - k) < 0.5).mean() for k in range(8)]
+    expected = [math.exp(-3.2) * 3.2**k / math.factorial(k) for k in range(8)]
+    np.testing.assert_allclose(share, expected, atol=5 * math.sqrt(0.25 / sample.size))
+    sample = record(ReferenceCamera(sensor(0.0, 1e-6)), 0.5, 100.0) - 0.5
+    assert sample.std() == pytest.approx(1e-3, rel=0.01)
+    for numbers in (8.5, 15.5, 31.5):  # sigma is 16 numbers; between two of them nothing is cut
+        inside = (np.abs(sample) * 16000 < numbers).mean()
+        assert inside == pytest.approx(math.erf(numbers / 16 / math.sqrt(2)), abs=0.008)
+
+
+def test_rounding_and_box_average_in_the_variance():
+    # sigma = 0.6 numbers: with 1/12 counted twice the variance would be 23 % too large.
+    read = (0.6 / 16000) ** 2
+    sample = record(ReferenceCamera(sensor(1e-5, read)), 0.0, 100.0)
+    assert sample.var() == pytest.approx(read, rel=0.03)
+    # An average of k x k has whole multiples of 1/k^2 numbers: sigma is 0.6 of them, then 0.2.
+    camera = ReferenceCamera(sensor(1e-5, read), box_factor=3)
+    boxed = record(camera, 0.0, 100.0, 480) * 16000 * 9
+    np.testing.assert_allclose(boxed, boxed.round(), atol=2e-3)
+    assert (boxed.round() % 9 != 0).mean() > 0.5
+    assert boxed.var() == pytest.approx(read * 16000**2 * 9, rel=0.03)
+    assert record(camera, 0.2, 100.0).mean() == pytest.approx(0.2, rel=1e-3)
+    # Clipped first, averaged then: half of the samples white, half at 0.2.
+    half = flat(0.2, 8)
+    half[..., ::2] = 5.0
+    even = ReferenceCamera(sensor(0.0, 0.0), box_factor=4)
+    for averaged in (even.record(half, 100.0, torch.Generator()), even.clip(half, 100.0)):
+        torch.testing.assert_close(averaged, flat(0.6, 2))
+
+
+def test_each_photosite_sees_its_own_colour_at_its_own_place():
+    """A point lands in the plane of its photosite; stripes of one photosite tell G1 from G2."""
+    for cfa, order in (("RGGB", (0, 1, 2, 3)), ("GBRG", (2, 3, 0, 1))):
+        body = sensor(1e-4, 1e-8)
+        camera = ReferenceCamera(replace(body, cfa=BayerPattern(cfa)))
+        # A lens of half a photosite, cut at two: what falls on photosites of the same plane.
+        middle = 1 + 2 * math.exp(-8.0)
+        middle = (middle / (middle + 2 * math.exp(-2.0))) ** 2
+        for plane, (row, column) in zip(order, ((4, 4), (4, 5), (5, 4), (5, 5)), strict=True):
+            light = torch.zeros(3, 8, 8)
+            light[(0, 1, 1, 2)[plane], row, column] = 1.0
+            seen = camera.blurred_light(scene(light), 4.0)
+            assert float(seen[plane].sum()) == pytest.approx(middle, rel=1e-3)
+            others = seen.sum((1, 2)) > 0
+            assert others.tolist() == [i == plane or {i, plane} == {1, 2} for i in range(4)]
+        # Rows red and green in turn at the finest pitch: G1 shares red's rows, G2 does not.
+        rows = torch.arange(16) % 2
+        light = torch.stack([1.0 - rows, 1.0 * rows, 0.0 * rows])[:, :, None].expand(3, 16, 16)
+        g1, g2 = camera.blurred_light(scene(light.contiguous()), 4.0)[1:3, 2:-2, 2:-2]
+        first = cfa == "RGGB"  # G1 in the even rows, which are red
+        assert float((g2 if first else g1).min()) > 0.75
+        assert float((g1 if first else g2).max()) < 0.25
+    # Transposed, the greens change places; mirrored, every plane lies elsewhere.
+    light = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
+    seen, turned, mirrored = (
+        sample_mosaic(each) for each in (light, light.transpose(1, 2), light.flip(2))
+    )
+    assert torch.equal(turned, seen.transpose(1, 2)[[0, 2, 1, 3]])
+    assert not torch.equal(mirrored, seen.flip(2))
+    plain = camera.blurred_light(scene(torch.full((3, 8, 8), 0.3)), 4.0)
+    torch.testing.assert_close(plain, flat(0.3, 4))
+
+
+def test_no_noise_at_all_is_exact():
+    camera = ReferenceCamera(sensor(0.0, 0.0, span=1000.0))
+    signal = torch.tensor([-1.0, -0.2, -0.0012, 0.1234, 0.9996, 7.0]).expand(4, 1, 6)
+    found = camera.record(signal, 100.0, torch.Generator()) * 1000
+    # Black is 200 of 1200 numbers: nothing below -200, nothing above 1000. Light is never negative.
+    np.testing.assert_allclose(found, [[[0, 0, 0, 123, 1000, 1000]]] * 4, rtol=1.3e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize("iso", [100.0, 400.0, 6400.0])
+def test_clipped_flat_field_is_white_at_every_iso(iso):
+    camera = ReferenceCamera(Z6, body=BodyError(black_offset=(-1e-4, -1e-4, 1e-4, 1e-4)))
+    for level in (3.0, 1e30):
+        bright = camera.capture(scene(flat(level, 32)), replace(BASE, iso=iso), 1)
+        assert float(bright.sample.min()) == float(bright.mean.min()) == 1.0
+
+
+def test_full_well_ends_the_signal_below_white_under_the_base_iso():
+    # At ISO 50 a number stands for twice the electrons: the well is full at half of white.
+    camera = ReferenceCamera(sensor(1e-4, 0.0))
+    capture = camera.capture(scene(flat(8.0, 16)), replace(BASE, iso=50), 0)
+    assert capture.sample.unique().numel() == 1
+    for recorded in (capture.sample, capture.mean):
+        np.testing.assert_allclose(recorded, 0.5, rtol=0.005)
+
+
+def test_ratio_of_two_captures_is_the_bodys():
+    body = BodyError(shutter_delay=-20e-6, shutter_scale=0.01, transmission={12: 0.03, 21: -0.05})
+    camera = ReferenceCamera(sensor(1e-6, 1e-9), body=body)
+    first, second = CameraSettings(100, 1 / 4000, 4), CameraSettings(400, 1 / 125, 11)
+    shot = scene(flat(0.05, 96), reference=first)
+    captures = [camera.capture(shot, s, 3) for s in (first, second)]
+    times = (1.01 / 4000 - 20e-6, 1.01 / 125 - 20e-6)
+    expected = 4 * times[1] / times[0] * (0.95 / 1.03) / 8  # f/4 to f/11: three stops of light
+    for name, rel in (("mean", 1e-5), ("sample", 1e-3)):
+        one, other = (getattr(c, name).double().mean() for c in captures)
+        assert float(other / one) == pytest.approx(expected, rel=rel)
+    # A stop without an entry has no error.
+    plain = camera.capture(shot, replace(first, f_number=8), 3).mean.mean()
+    assert float(captures[0].mean.mean() / plain) == pytest.approx(4 * 1.03, rel=1e-5)
+
+
+def test_black_offset_moves_the_numbers_but_not_the_noise_of_light():
+    offset = (2 / 16000, -1.5 / 16000, 0.0, 1 / 16000)
+    dark = ReferenceCamera(sensor(1e-4, 1e-6), body=BodyError(black_offset=offset))
+    capture = dark.capture(scene(flat(0.0, 200)), BASE, 0)
+    np.testing.assert_allclose(capture.sample.mean((1, 2)), offset, atol=5 * 1e-3 / 200)
+    np.testing.assert_allclose(capture.mean.mean((1, 2)), offset, rtol=1e-5)
+    np.testing.assert_allclose(capture.sample.var((1, 2)), 1e-6, rtol=0.04)
+
+
+def test_drawn_bodies():
+    assert BodyError.none().light_error(CameraSettings(800, 1 / 8000, 22)) == 1.0
+    bodies = [BodyError.draw(Z6, seed) for seed in range(300)]
+    assert bodies[5] == BodyError.draw(Z6, 5) != bodies[6]
+    assert pickle.loads(pickle.dumps(bodies[5])) == bodies[5]  # for workers of a data loader
+    assert min(b.exposure_time(1 / 8000) for b in bodies) > 0
+    assert np.std([b.shutter_delay for b in bodies]) == pytest.approx(15e-6, rel=0.2)
+    assert 1.8 < np.abs([b.black_offset for b in bodies]).max() * 14512 <= 2.0
+    light = np.array([list(b.transmission.values()) for b in bodies])
+    assert light.std() == pytest.approx(0.02, rel=0.1)
+    assert np.abs(light).max() <= 0.06
+    stops = {CameraSettings(100, 1, f).aperture_stop for f in (1, 1.4, 2.8, 4, 5.6, 11, 22, 32)}
+    assert stops <= set(bodies[5].transmission)
+
+
+def test_moving_image_is_smeared_over_the_true_exposure_time():
+    light = torch.zeros(4, 20, 80)
+    light[:, :, 40] = 1.0
+    camera = ReferenceCamera(sensor(1e-4, 1e-8), body=BodyError(shutter_scale=0.5))
+    settings = replace(BASE, exposure_time=1 / 16)
+    signal = camera.expose(light, settings, settings, image_speed=4.0)[0, 0].double().numpy()
+    extent = 4.0 * 1.5 / 16 * 20  # frame heights per second, seconds, pixels per frame height
+    assert signal.sum() == pytest.approx(1.5, rel=1e-5)
+    assert signal @ (np.arange(80) - 40) ** 2 / 1.5 == pytest.approx(extent**2 / 12, rel=1e-3)
+
+
+def test_same_seed_same_capture():
+    camera, shot = ReferenceCamera(Z6), scene(flat(0.2, 16))
+    first = camera.capture(shot, BASE, 4)
+    state = torch.get_rng_state()
+    again = camera.capture(shot, BASE, 4, light=camera.blurred_light(shot, 4.0))
+    assert torch.equal(torch.get_rng_state(), state)  # nothing draws from the global generator
+    assert torch.equal(first.sample, again.sample)
+    assert again.settings == BASE
+    # Captures of a sequence do not repeat each other's noise, whatever seed or setting differs.
+    dark = scene(flat(0.0, 40))
+    changes = [{}, {"iso": 200}, {"exposure_time": 1 / 128}, {"f_number": 8}]
+    drawn = [camera.capture(dark, replace(BASE, **c), 4) for c in changes]
+    drawn.append(camera.capture(dark, BASE, 5))
+    noise = torch.stack([capture.sample.flatten() for capture in drawn])
+    correlation = torch.corrcoef(noise) - torch.eye(5)
+    assert float(correlation.abs().max()) < 5 / math.sqrt(4 * 40 * 40)
+
+
+def test_bad_input_is_refused():
+    plain, depth = sensor(1e-4, 1e-8), torch.full((8, 8), 2.0)
+    blind = ReferenceCamera(replace(plain, pixel_pitch_um=None))
+    assert torch.equal(blind.blurred_light(scene(flat(0.1)), 4.0), flat(0.1))  # no depth, no need
+    late = ReferenceCamera(plain, body=BodyError(shutter_delay=-0.001))
+    brief = replace(BASE, exposure_time=1 / 2000)
+    bad = [torch.where(torch.eye(8) > 0, z, depth) for z in (0.0, -1.0, 0.04, math.nan)]
+    for call, arguments, message in (
+        (scene, (flat(-0.1),), r"`light`.*must be >= 0"),
+        (scene, (torch.zeros(5, 8, 8),), "`light`"),
+        (scene, (torch.zeros(3, 7, 8),), "`light`.*even sides"),
+        (scene, (flat(0.1), depth[:, :4]), r"`depth` .*shape"),
+        *((scene, (flat(0.1), each), "above the focal length") for each in bad),
+        (partial(ReferenceCamera, plain, box_factor=0), (), r"`box_factor`.*must be >= 1"),
+        (ReferenceCamera, (replace(plain, nlf_by_iso={}),), "noise calibration"),
+        (blind.blurred_light, (scene(flat(0.1), depth + 1), 4.0), "pixel pitch"),
+        (late.capture, (scene(flat(0.1)), brief, 0), r"`exposure_time`.*shutter error"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call(*arguments)
+
+
+def test_a_rolling_shutter_shows_bands_of_a_lamp():
+    camera = ReferenceCamera(sensor(1e-5, 1e-8, row_time=1e-3), box_factor=2)
+    # On for 5 ms of every 10; exposed for 1 us, four sensor rows of 1 ms to a packed row.
+    lit = PulsedLamp(frequency=100.0, duty=0.5)
+    settings = CameraSettings(100, 1e-6, 4)
+    lights = (
+        camera.clip(camera.expose(flat(0.1, 10), BASE, settings, lamp=lamp), 100)
+        for lamp in (lit, None)
+    )
+    # Sensor rows begin at 0, 1, ... 19 ms: lit in 0 to 4 and 10 to 14.
+    shares = [np.mean([t % 10 < 5 for t in range(4 * row, 4 * row + 4)]) for row in range(5)]
+    bands = torch.div(*lights)[:, :, 0]
+    np.testing.assert_allclose(bands, 2.0 * np.array([shares] * 4), rtol=1e-5)
+    # A whole period has no bands.
+    shot, whole = scene(flat(0.1, 10)), CameraSettings(100, 0.01, 4)
+    even = camera.capture(shot, whole, seed=0, lamp=lit, start=0.0031).mean
+    np.testing.assert_allclose(even, camera.capture(shot, whole, seed=0).mean)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3, 0.5, 1.2])
+def test_the_lens_is_scipys_gaussian(sigma: float) -> None:
+    light = np.random.default_rng(0).random((3, 21, 34), dtype=np.float32)
+    reach = max(1, int(np.ceil(3 * sigma)))
+    expected = gaussian_filter(light, (0, sigma, sigma), mode="nearest", radius=(0, reach, reach))
+    found = lens_blur(torch.from_numpy(light), sigma).numpy()
+    np.testing.assert_allclose(found, expected if sigma else light, atol=2e-7)
+
+
+@pytest.mark.parametrize("cfa", BayerPattern)
+def test_a_point_lands_in_the_plane_of_its_colour_and_place(cfa: BayerPattern) -> None:
+    """The letters of the pattern say which: RGGB has red at (0, 0), green at (0, 1) and (1, 0)."""
+    seen: list[str] = []
+    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        for index, colour in enumerate("RGB"):
+            light = torch.zeros(3, 6, 8)
+            light[index, 2 + row, 4 + column] = 1.0
+            planes = sample_mosaic(light, cfa)
+            letter = cfa.name[2 * row + column]
+            assert float(planes.sum()) == (letter == colour)
+            if letter == colour:
+                plane = "RGGB"[int(planes.flatten(1).sum(dim=1).argmax())]
+                assert plane == colour
+                assert planes[:, 1, 2].sum() == 1.0
+                seen.append(letter)
+    assert "".join(seen) == cfa.name
+    odd = torch.rand(3, 7, 9)
+    assert torch.equal(sample_mosaic(odd, cfa), sample_mosaic(odd[:, :6, :8], cfa))
+
+
+def test_planes_are_averaged_one_by_one() -> None:
+    planes = torch.rand(4, 13, 17, generator=torch.Generator().manual_seed(0))
+    assert average_planes(planes, 1) is planes
+    expected = planes[:, :12, :15].reshape(4, 4, 3, 5, 3).mean(dim=(2, 4))
+    torch.testing.assert_close(average_planes(planes, 3), expected)
