@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +79,7 @@ class BestFixed(Policy):
 
 
 class Oracle(Policy):
-    """Knows the expected score of every state, in the light that it is told of.
+    """Knows the expected score of every state, in the light that it knows.
 
     Args:
         context: The camera, the grid and the observation.
@@ -155,17 +156,15 @@ class Recorded(Policy):
 
 
 def _raw_files(path: str | os.PathLike[str]) -> list[Path]:
-    given = Path(path).expanduser()
-    if not os.fspath(path) or not given.exists():
+    raws = []
+    if os.fspath(path) and Path(path).expanduser().exists():
+        with suppress(ValueError):  # no file of any known kind
+            files = find_files(Path(path).expanduser())[1]
+            raws = [file for file in files if file.suffix.lower() in RAW_SUFFIXES]
+    if not raws:
         raise ValueError(
             f"`path` (={os.fspath(path)!r}) must be a folder of raws: 'recorded:FOLDER'"
         )
-    try:
-        raws = [file for file in find_files(given)[1] if file.suffix.lower() in RAW_SUFFIXES]
-    except ValueError:  # no file of any known kind
-        raws = []
-    if not raws:
-        raise ValueError(f"`path` (={os.fspath(path)!r}) holds no raw file")
     return raws
 
 

@@ -1,7 +1,7 @@
 """From what a state is worth in some light to what to choose for the light to come.
 
 Settings reach a sensor frames late, each control after its own delay. A policy with foresight knows
-what it has asked for already, expects what the light will be when its decision is in effect
+its earlier decisions, expects what the light will be when its decision is in effect
 (`LightTracker`), and asks what each state is worth in that light.
 """
 
@@ -125,7 +125,7 @@ class Foresight:
 
     @property
     def pending_action(self) -> Ints:
-        """States that were asked for last, ``(N,)``."""
+        """States of the last decision, ``(N,)``."""
         return self._actions[-1]
 
     def ev100(self, frames: int) -> Floats:
@@ -149,8 +149,8 @@ class Foresight:
                 if lead < frame:
                     promised = promised.max(axis=1 + axis, keepdims=True)
                 elif lead > frame:
-                    asked = self.grid.controls(self._actions[frame - lead])[:, axis]
-                    index = asked.reshape(-1, 1, 1, 1)
+                    pending = self.grid.controls(self._actions[frame - lead])[:, axis]
+                    index = pending.reshape(-1, 1, 1, 1)
                     promised = np.take_along_axis(promised, index, axis=1 + axis)
             total = total + promised
         return total.reshape(len(total), -1)
@@ -166,7 +166,7 @@ class Foresight:
         return np.sum(found, axis=0)
 
     def record_action(self, states: Ints) -> None:
-        """Remember what was asked for after the frame in hand, ``(N,)``."""
+        """Remember the decision after the frame in hand, ``(N,)`` states."""
         self._actions = [*self._actions[1:], states]
 
     def _shown(self, observations: Observations) -> Ints:

@@ -67,7 +67,7 @@ class PolicyContext:
 
     @property
     def has_sensors(self) -> bool:
-        """Whether the observation tells image speed and defocus spread."""
+        """Whether the observation has image speed and defocus spread."""
         return "sensors" in self.observation_space.spaces
 
 

@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl
 
 import yaml
 
-from ae_env.utils.user_code import find_attribute, load_from_file
+from ae_env.utils.user_files import find_attribute, load_from_file
 from agents.policy import Policy, PolicyContext
 from simulator.utils.checks import did_you_mean
 
@@ -30,6 +30,7 @@ PRETRAINED_SEEDS = (0, 1, 2)
 FORECASTERS, LEARNT = str(PRETRAINED / "forecaster-*"), "learnt"
 
 _METERING = "agents.metering.metering_policy:MeteringPolicy"
+_RPI_AGC = "agents.metering.rpi_agc:RpiAgc"
 #: Classes whose names take a file after the colon, and the argument that it is.
 _WITH_FILE = {
     "ppo": ("agents.learning.ppo:PPOPolicy", "weights"),
@@ -103,7 +104,7 @@ def training_seeds(name: str) -> list[str]:
     elif head in ("ppo", "regression") and "*" in tail:
         files = weight_files(tail)
         if not files:
-            raise ValueError(f"`policy` (={name!r}): no .safetensors file fits {tail!r}")
+            raise _refusal(name, f": no .safetensors file fits {tail!r}")
     else:
         return [name]
     return [f"{head}:{file}{name[len(base) :]}" for file in files]
@@ -143,7 +144,7 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
     ('ppo:runs/mine', {})
     """
     if not isinstance(name, str):
-        raise ValueError(f"`policy` (={name!r}) must be a name, such as 'matrix:P'")
+        raise _refusal(name, " must be a name, such as 'matrix:P'")
     # A folder may have a question mark in its name, a class may not.
     mark = _OPTIONS.search(name, max(name.find(".py:"), 0))
     if mark is None:
@@ -153,12 +154,11 @@ def split_options(name: str) -> tuple[str, dict[str, Any]]:
     try:
         pairs = parse_qsl(query or "&", keep_blank_values=True, strict_parsing=True)
     except ValueError as error:
-        raise ValueError(
-            f"`policy` (={name!r}): options are written name?key=value&key=value: {error}"
-        ) from None
+        text = f": options are written name?key=value&key=value: {error}"
+        raise _refusal(name, text) from None
     for key, text in pairs:
         if key.strip() in options:
-            raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
+            raise _refusal(name, f": option {key!r} is given twice")
         options[key.strip()] = _scalar(name, key, text)
     return name[: mark.start()], options
 
@@ -174,7 +174,7 @@ def _scalar(name: str, key: str, text: str) -> Any:
         except (ValueError, ZeroDivisionError):
             return value
     if not (value is None or isinstance(value, bool | int | float)):
-        raise ValueError(f"`policy` (={name!r}): option {key!r} (={text!r}) must be a YAML scalar")
+        raise _refusal(name, f": option {key!r} (={text!r}) must be a YAML scalar")
     return value
 
 
@@ -204,7 +204,7 @@ def make_policy(
     """
     base, named = split_options(name)
     for key in set(options) & set(named):
-        raise ValueError(f"`policy` (={name!r}): option {key!r} is given twice")
+        raise _refusal(name, f": option {key!r} is given twice")
     cls, fixed = _find(name, base)
     options = {**options, **named}
     if "weights" in fixed:
@@ -222,9 +222,10 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     if found is None and head in _WITH_FILE:
         path, argument = _WITH_FILE[head]
         if "*" in tail and argument == "weights":
-            raise ValueError(
-                f"`policy` (={name!r}) is a pattern, so several agents: it is for evaluations; "
-                "`training_seeds` lists the names of the single ones"
+            raise _refusal(
+                name,
+                " is a pattern, so several agents: it is for evaluations; `training_seeds` lists "
+                "the names of the single ones",
             )
         found = path, {argument: tail}
     if found is not None:
@@ -233,20 +234,20 @@ def _find(name: str, base: str) -> tuple[Any, dict[str, Any]]:
     if head.endswith(".py"):
         return load_from_file(head, tail, f"`policy` (={name!r})", example="MyPolicy"), {}
     if not tail or head in {known.partition(":")[0] for known in (*_POLICIES, *_BRACKETS)}:
-        raise ValueError(_unknown(base))
+        raise _refusal(name, _known(base))
     return _class_in_module(head, tail, name), {}
 
 
 def _class_in_module(module: str, name: str, policy: str) -> Any:
     if not all(part.isidentifier() for part in module.split(".")):
-        raise ValueError(_unknown(policy))
+        raise _refusal(policy, _known(policy))
     try:
         loaded = importlib.import_module(module)
     except Exception as error:  # the user's module runs, and may raise anything
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and (module == missing or module.startswith(f"{missing}.")):
-            raise ValueError(f"{_unknown(policy)} (there is no module {missing!r})") from None
-        raise ValueError(_broken(policy, f"{module} cannot be imported", error)) from error
+            raise _refusal(policy, f"{_known(policy)} (there is no module {missing!r})") from None
+        raise _broken(policy, f"{module} cannot be imported", error) from error
     return find_attribute(loaded, name, f"`policy` (={policy!r})")
 
 
@@ -255,30 +256,27 @@ def _construct(
 ) -> Policy:
     """A `cls` with `options` of the caller's and the arguments that the name has `fixed`."""
     if not inspect.isclass(cls):
-        raise ValueError(f"`policy` (={name!r}) must name a class")
+        raise _refusal(name, " must name a class")
     missing = [m for m in ("reset", "act") if not callable(getattr(cls, m, None))]
     if not missing and issubclass(cls, Policy) and cls.act is Policy.act:
         missing = ["act"]
     if missing:
         methods = " and ".join(f"`{m}`" for m in missing)
-        raise ValueError(
-            f"`policy` (={name!r}): {cls.__name__} is not a policy, it has no {methods}; "
-            "derive it from agents.Policy"
+        text = (
+            f": {cls.__name__} is not a policy, it has no {methods}; derive it from agents.Policy"
         )
+        raise _refusal(name, text)
     ours = cls.__module__.startswith("agents.")
     for_brackets = cls.__module__.startswith("agents.bracketing.") or cls.__name__ == "Random"
     if context.bracket is not None and ours and not for_brackets:
-        raise ValueError(
-            f"`policy` (={name!r}) is not for ae_env/ExposureBracket-v0: take random, "
-            f"{', '.join(_BRACKETS)} or one of your own"
-        )
+        others = f"random, {', '.join(_BRACKETS)} or one of your own"
+        raise _refusal(name, f" is not for ae_env/ExposureBracket-v0: take {others}")
     _check_options(cls, name, options, fixed)
     try:
         policy: Policy = cls(context, **fixed, **options)
     except Exception as error:  # a user's constructor may raise anything
         if not ours:
-            message = _broken(name, f"{cls.__name__} cannot be made", error)
-            raise ValueError(message) from error
+            raise _broken(name, f"{cls.__name__} cannot be made", error) from error
         if not isinstance(error, ValueError | FileNotFoundError):
             raise
         kind = ValueError if isinstance(error, ValueError) else FileNotFoundError
@@ -294,24 +292,27 @@ def _check_options(cls: Any, name: str, options: dict[str, Any], fixed: dict[str
     known = [p.name for p in parameters if p.kind is not p.VAR_POSITIONAL and p.name not in fixed]
     for option in set(options) - set(known):
         takes = f"it takes {', '.join(known)}" if known else "it takes none"
-        raise ValueError(
-            f"`policy` (={name!r}): {cls.__name__} does not take the option {option!r}; "
-            f"{takes}{did_you_mean(option, known)}"
-        )
+        text = f": {cls.__name__} does not take the option {option!r}; {takes}"
+        raise _refusal(name, text + did_you_mean(option, known))
 
 
-def _unknown(name: str) -> str:
+def _known(name: str) -> str:
+    """What a name may be, for an error about the unknown `name`."""
     files = [f"{head}:{'FOLDER' if head == 'recorded' else 'PATH'}" for head in _WITH_FILE]
     known = [*_SHORT, *_POLICIES, *files, *_BRACKETS]
     single = [n for n in (*_POLICIES, *files, *_BRACKETS) if n.partition(":")[0] not in _SHORT]
     return (
-        f"`policy` (={name!r}) must be one of {', '.join(single)}; oracle, alone or with "
-        f":last_frame or :clairvoyant; a meter ({', '.join(METERS)}), alone or with a program "
+        f" must be one of {', '.join(single)}; oracle, alone or with :last_frame or :clairvoyant; "
+        f"a meter ({', '.join(METERS)}), alone or with a program "
         f"({', '.join(f':{p}' for p in PROGRAMS)}); rpi_agc, alone or with "
         f"{', '.join(f':{p}' for p in MANUAL_PROGRAMS)}; "
         f"package.module:Class or path.py:Class{did_you_mean(name, known, cutoff=0.5)}"
     )
 
 
-def _broken(policy: str, what: str, error: BaseException) -> str:
-    return f"`policy` (={policy!r}): {what}: {type(error).__name__}: {error}"
+def _broken(policy: str, what: str, error: BaseException) -> ValueError:
+    return _refusal(policy, f": {what}: {type(error).__name__}: {error}")
+
+
+def _refusal(policy: object, text: str) -> ValueError:
+    return ValueError(f"`policy` (={policy!r}){text}")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import string
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,14 +22,14 @@ import torch
 from matplotlib.figure import Figure
 
 from agents.cli.console import print_files, progress_bars
+from agents.report.evaluation import Cell, to_markdown
+from agents.report.evaluation import cell as markdown_cell
 from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator.utils.files import data_folder as data_root
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
-#: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function.
-Cell = str | Callable[[Row], object]
 #: Significant digits of numbers in result files.
 DIGITS = 6
 #: Folder of what unfinished runs have measured.
@@ -265,50 +264,21 @@ def data_folder(name: str) -> Path:
 # -- tables ---------------------------------------------------------------------------------------
 
 
-class _Format(string.Formatter):
-    """Formats of rows, in which ``{a[b]}`` is an entry of an entry; a missing one is None."""
-
-    def get_field(self, name: str, args: Any, kwargs: Any) -> Any:
-        try:
-            value, used = super().get_field(name, args, kwargs)
-        except (KeyError, IndexError, TypeError):
-            return _Missing(), name
-        return (_Missing() if value is None else value), used
-
-
-class _Missing:
-    """Stands for a value that is not there: its cell stays empty."""
-
-    def __format__(self, spec: str) -> str:
-        raise LookupError
-
-
 def cell(row: Row, content: Cell) -> str:
     """Text of a cell; empty where a value of its format is missing or None.
 
     >>> cell({"ms": 1.25, "error": None}, "{ms:.1f} ms"), cell({"error": None}, "{error:.2f}")
     ('1.2 ms', '')
     """
-    if callable(content):
-        value = content(row)
-        return "" if value is None else str(value)
-    try:
-        return _Format().vformat(content, (), row)
-    except LookupError:
-        return ""
+    return markdown_cell(row, content, missing="")
 
 
 def table(rows: Iterable[Row], columns: Mapping[str, Cell]) -> str:
-    """A Markdown table with a line for each row; columns but the first are aligned to the right.
+    """A Markdown table with a line for each row, see `agents.report.evaluation.to_markdown`.
 
     `columns` maps headings to content; columns that are empty in every row are left out.
     """
-    rows = list(rows)
-    cells = {heading: [cell(row, content) for row in rows] for heading, content in columns.items()}
-    first = next(iter(columns))
-    cells = {h: column for h, column in cells.items() if h == first or any(column)}
-    head = [_line(cells), "|---|" + "--:|" * (len(cells) - 1)]
-    return "\n".join([*head, *(_line(line) for line in zip(*cells.values(), strict=True))])
+    return to_markdown(rows, columns, missing="")
 
 
 def pivot(
@@ -329,7 +299,7 @@ def pivot(
         group = cell(row, columns)
         groups[group] = None
         lines.setdefault(cell(row, named), {}).setdefault(group, row)
-    shown: dict[str, Cell] = {heading: "{line}"}
+    shown: dict[str, Cell] = {heading: lambda row: row["line"]}
     for group in groups:
         for name, content in contents.items():
             shown[": ".join(filter(None, (group, name)))] = _of_group(group, content)
@@ -351,10 +321,6 @@ def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str])
     for row in rows:
         groups.setdefault(cell(row, title), []).append(row)
     return [block for name, own in groups.items() for block in (f"### {name}", show(own))]
-
-
-def _line(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(text.replace('|', chr(92) + '|') for text in cells)} |"
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -9,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ae_env.episodes.bracket_core import FRAME_GAP
+from ae_env.episodes.bracket import FRAME_GAP
+from ae_env.merging import LOG_FLOOR, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
-from ae_env.utils.merging import LOG_FLOOR, merge
 from agents.bracketing.schedules import BINS, Floats, Ints, Schedules, bin_of
 from agents.policy import Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of
@@ -43,7 +44,7 @@ class Bracketing(Policy):
     """Base of the policies: keeps the frames of each camera, and what they show together.
 
     Args:
-        context: The camera; it must tell the limits of a bracket.
+        context: The camera, with the limits of a bracket.
 
     Raises:
         ValueError: If the context is not that of `ExposureBracket-v0`.
@@ -73,11 +74,6 @@ class Bracketing(Policy):
         self._reference = np.full(num_envs, np.nan)  # EV100 of the viewfinder's frame
         self._done = np.zeros(num_envs, bool)
 
-    def forget(self, ended: NDArray[np.bool_]) -> None:
-        """Forgets the frames of the cameras that begin a new episode."""
-        for i in np.flatnonzero(ended).tolist():
-            self._frames[i], self._reference[i], self._done[i] = [], np.nan, False
-
     def observe(self, observations: Observations) -> None:
         """Keeps the frames of `observations`."""
         self.check_reset(observations)
@@ -95,7 +91,7 @@ class Bracketing(Policy):
         new = np.isnan(self._reference)
         self._reference[new] = self.context.grid.ev100[states[new]]
 
-    def kept(self, camera: int) -> Ints:
+    def taken(self, camera: int) -> Ints:
         """States of the frames that a camera has taken, without the viewfinder's."""
         return np.array([state for state, _ in self._frames[camera][1:]], np.int64)
 
@@ -120,16 +116,12 @@ class Bracketing(Policy):
         flat = light.flatten().double().numpy() / scale, precision.flatten().double().numpy()
         return flat[0], flat[1] * scale**2, limit
 
-    def time_left(self, observations: Observations) -> Floats:
-        """(N,) time left [s]."""
-        return np.asarray(observations["bracket"][:, 0], np.float64) * self.schedules.budget
-
     def act(
         self, observations: Observations, action_masks: NDArray[np.bool_] | None = None
     ) -> Ints:
         """The next frame's state for each camera, or to stop."""
         self.observe(observations)
-        left = self.time_left(observations)
+        left = np.asarray(observations["bracket"][:, 0], np.float64) * self.schedules.budget
         speeds = np.zeros(self.num_envs)
         if "sensors" in observations:
             speeds = decode_sensors(observations["sensors"])[0]
@@ -168,12 +160,12 @@ class FixedBracket(Bracketing):
 
     def choose(self, camera: int, time_left: float, speed: float) -> int:
         """The next of the frames."""
-        taken = len(self.kept(camera))
+        count = len(self.taken(camera))
         steps = np.array([0.0, 1.0, -1.0] if self.step else [0.0])
         wanted = (self._reference[camera] + self.step * steps)[: self.schedules.max_frames]
-        if taken >= len(wanted):
+        if count >= len(wanted):
             return self.stop
-        return int(self._plan(wanted)[taken])
+        return int(self._plan(wanted)[count])
 
     def _plan(self, wanted: Floats) -> Ints:
         """States within half a stop of the EV100 `wanted`, at the lowest ISO, that fit."""
@@ -224,8 +216,9 @@ class Hasinoff(Bracketing):
         """Takes what gives the best pictures of the training scenes."""
 
         def quality(headroom: float, longest: float) -> float:
-            self.headroom, self.longest = headroom, longest
-            found = run_brackets(self, envs, seed=seed, most=_FIT_SCENES)
+            tried = copy.copy(self)
+            tried.headroom, tried.longest = headroom, longest
+            found = run_brackets(tried, envs, seed=seed, most=_FIT_SCENES)
             return float(found["quality"].mean())
 
         headroom, longest = self.headroom, self.longest
@@ -242,20 +235,20 @@ class Hasinoff(Bracketing):
         if self.headroom is None or self.longest is None:
             raise ValueError("policy 'bracket:hasinoff' learns from scenes first: call fit(envs)")
         reference = float(self._reference[camera])
-        kept = self.kept(camera)
-        if not len(kept):
+        taken = self.taken(camera)
+        if not len(taken):
             low, high = self._range(camera)
             total, _ = self.schedules.precision(reference)
             inside = (low <= BINS + reference) & (high >= BINS + reference)
             inside[np.abs(BINS + reference - 0.5 * (low + high)).argmin()] = True
             ratio = np.exp2(BINS + reference) * np.sqrt(total)
             worst = ratio[:, inside].min(axis=1) + 1e-6 * ratio[:, inside].mean(axis=1)
-            fits = self.schedules.completions(kept, time_left)
+            fits = self.schedules.completions(taken, time_left)
             fits &= self.schedules.longest <= self.longest * (1.0 + 1e-6)
             self._plans[camera] = int(np.where(fits, worst, -1.0).argmax())
         plan = self._plans[camera]
         exposed = self.context.grid.ev100
-        state = self.schedules.next_state(plan, kept, np.abs(exposed - reference))
+        state = self.schedules.next_state(plan, taken, np.abs(exposed - reference))
         return self.stop if state < 0 else state
 
     def _range(self, camera: int) -> tuple[float, float]:
@@ -308,12 +301,12 @@ class Planner(Bracketing):
 
     def choose(self, camera: int, time_left: float, speed: float) -> int:
         """The next state, or to stop where no further frame helps."""
-        reference, kept = float(self._reference[camera]), self.kept(camera)
+        reference, taken = float(self._reference[camera]), self.taken(camera)
         blur = blur_error(64.0 * speed * self._times) if self.blur else np.zeros(self.stop)
         errors = self.schedules.errors(reference, reference + _FLOOR, self.light(camera), blur)
-        fits = self.schedules.completions(kept, time_left)
+        fits = self.schedules.completions(taken, time_left)
         best = int(np.where(fits, errors, np.inf).argmin())
-        state = self.schedules.next_state(best, kept, self._of_one(errors))
+        state = self.schedules.next_state(best, taken, self._of_one(errors))
         return self.stop if state < 0 else state
 
     def light(self, camera: int) -> Floats:

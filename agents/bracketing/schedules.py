@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ae_env.episodes.bracket_core import FRAME_GAP
+from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.grid import ExposureGrid
-from ae_env.utils.merging import SATURATED, WORST_EV
+from ae_env.merging import SATURATED, WORST_EV
 from simulator.camera import CameraProfile
 
 Floats = NDArray[np.float64]
@@ -141,30 +141,30 @@ class Schedules:
         both = np.where(noise < WORST_EV, np.hypot(noise, merged), noise)
         return np.minimum(both, WORST_EV) @ light.astype(np.float32)
 
-    def completions(self, kept: Ints, time_left: float) -> NDArray[np.bool_]:
-        """(M,) bool: schedules that hold the frames `kept` and fit into the time left.
+    def completions(self, taken: Ints, time_left: float) -> NDArray[np.bool_]:
+        """(M,) bool: schedules that hold the frames `taken` so far and fit into the time left.
 
         Args:
-            kept: States of the frames that were taken.
+            taken: States of the frames so far.
             time_left: Time left [s].
         """
-        counts = np.bincount(kept, minlength=len(self.grid)) if len(kept) else 0
-        more = self.frames - len(kept)
+        counts = np.bincount(taken, minlength=len(self.grid)) if len(taken) else 0
+        more = self.frames - len(taken)
         exposures = np.array([s.exposure_time for s in self.grid])
         needed = (self.counts - counts) @ exposures + FRAME_GAP * np.maximum(more - 1, 0)
         fits = needed <= time_left + _SLACK
         holds: NDArray[np.bool_] = (self.counts >= counts).all(axis=1) & fits
         return holds
 
-    def next_state(self, schedule: int, kept: Ints, alone: Floats) -> int:
+    def next_state(self, schedule: int, taken: Ints, alone: Floats) -> int:
         """The state of `schedule` to take next, the best by `alone`; -1 when all are taken.
 
         Args:
             schedule: Index of the schedule.
-            kept: States of the frames that were taken.
+            taken: States of the frames so far.
             alone: (S,) error of each state alone.
         """
         left = self.counts[schedule].copy()
-        np.subtract.at(left, kept, 1)
+        np.subtract.at(left, taken, 1)
         wanted = np.flatnonzero(left > 0)
         return int(wanted[np.argmin(alone[wanted])]) if len(wanted) else -1

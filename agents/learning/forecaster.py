@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from pydantic import Field
 from torch import nn
 
 from ae_env.lighting.moving import FRAMES, KIND_SETS, MOVES
-from agents.learning.networks import Optimisation, Progress
+from agents.learning.networks import UNWATCHED, Optimisation, Session
 from agents.learning.weights import MAX_WIDTH, load_agent, load_into
 from agents.metering.reading import (
     BLACK_SIGNAL,
@@ -178,43 +177,27 @@ def load_forecaster(path: str | Path, device: str = "cpu") -> LightForecaster:
 
 def train_forecaster(
     training: ForecasterTraining,
-    *,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    identity: Any = None,
+    session: Session = UNWATCHED,
 ) -> LightForecaster:
     """Trains a forecaster on light of the training kinds.
 
     Args:
         training: Hyperparameters.
-        checkpoint: File for the state of the training; a second run resumes from it.
-        progress: Called with steps done, steps in all, and the error [EV].
-        device: Torch device.
-        identity: JSON value; the checkpoint of a training with another one is not resumed. By
-            default the hyperparameters.
+        session: Where it runs, and what it reports to.
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(training.seed)
-        network = LightForecaster(training.width).to(device)
-    run = Optimisation(
-        network,
-        steps=training.steps,
-        learning_rate=training.learning_rate,
-        weight_decay=training.weight_decay,
-        checkpoint=checkpoint,
-        identity=identity or training.model_dump(),
-    )
+        network = LightForecaster(training.width).to(session.device)
+    run = Optimisation(network, training, session, steps=training.steps)
     rng = np.random.default_rng([training.seed, run.done])
     traces = np.stack([MOVES[KINDS[i % len(KINDS)]](rng) for i in range(training.traces)])
     with run.store:
         while run.done < training.steps:
             readings, changes = sample(traces, training, rng)
-            found, spread, _ = network(torch.from_numpy(readings).to(device))
-            error = (found - torch.from_numpy(changes).to(device)).abs()
+            found, spread, _ = network(torch.from_numpy(readings).to(session.device))
+            error = (found - torch.from_numpy(changes).to(session.device)).abs()
             run.step((error / spread + spread.log()).mean())  # likelihood of a Laplace distribution
-            if progress is not None:
-                progress(run.done, training.steps, {"EV": error.mean().item()})
+            session.report(run.done, training.steps, {"EV": error.mean().item()})
             run.store.save_when_due()
     return network.eval()
 

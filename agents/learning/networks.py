@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from agents.metering.meters import make_meter
 from agents.metering.reading import frame_ev100
 from agents.policy import Observations, PolicyContext
 from simulator.utils.checkpoint import Checkpoint
+from simulator.utils.config_file import Configuration
 
 #: Takes frames done, frames in all, and the latest losses of a training.
 Progress = Callable[[int, int, dict[str, float]], None]
@@ -260,8 +262,7 @@ class StateHead(nn.Module):
         """
         states = self.states.expand(features.shape[0], -1, -1)  # (B, S, 4)
         if self.has_sensors:
-            if sensors is None:
-                raise ValueError("`sensors` must be given: the network was made for them")
+            assert sensors is not None
             states = torch.cat([states, self._blur(sensors)], dim=2)
         histograms = light.view(light.shape[0], _HISTOGRAMS, len(_BINS))
         shares = torch.einsum("bhi,isl->bshl", histograms, self.exposed).flatten(2)
@@ -360,16 +361,46 @@ def random_shift(raw: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
 # -- optimiser steps -------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Session:
+    """Where a training runs, what it reports to, and where its state is kept.
+
+    Args:
+        checkpoint: File for the state of the training; a second run resumes from it, with new
+            episodes. None for none.
+        progress: Takes frames (of a forecaster: steps) done, those in all, and the latest losses.
+        device: Torch device of the network.
+        identity: JSON value; the checkpoint of a training with another one is not resumed. By
+            default the hyperparameters.
+    """
+
+    checkpoint: Path | None = None
+    progress: Progress | None = None
+    device: str = "cpu"
+    identity: Any = None
+
+    def store(self, training: Configuration, state: Callable[[], Mapping[str, Any]]) -> Checkpoint:
+        """The checkpoint of `training`, whose state is what `state` returns."""
+        return Checkpoint(self.checkpoint, self.identity or training.model_dump(), state)
+
+    def report(self, done: int, total: int, values: dict[str, float]) -> None:
+        """Passes on how far the training is."""
+        if self.progress is not None:
+            self.progress(done, total, values)
+
+
+#: A session without checkpoint and progress.
+UNWATCHED = Session()
+
+
 class Optimisation:
     """AdamW with a one-cycle schedule; a training that was interrupted goes on where it was.
 
     Args:
         network: What is trained.
+        training: Hyperparameters, with ``learning_rate``, the peak, and ``weight_decay``.
+        session: Where the state is kept.
         steps: Optimiser steps in all.
-        learning_rate: Peak of the schedule.
-        weight_decay: Of AdamW.
-        checkpoint: File for the state of the training; None for none.
-        identity: JSON value; the checkpoint of a training with another one is not resumed.
         warm_up: Share of the steps in which the learning rate rises.
 
     Attributes:
@@ -380,27 +411,26 @@ class Optimisation:
     def __init__(
         self,
         network: nn.Module,
+        training: Any,
+        session: Session,
         *,
         steps: int,
-        learning_rate: float,
-        weight_decay: float,
-        checkpoint: Path | None,
-        identity: Any,
         warm_up: float = 0.3,
     ) -> None:
         self.network, self.done = network, 0
+        rate = training.learning_rate
         self.optimizer = torch.optim.AdamW(
-            network.parameters(), lr=learning_rate, weight_decay=weight_decay
+            network.parameters(), lr=rate, weight_decay=training.weight_decay
         )
         self.schedule = torch.optim.lr_scheduler.OneCycleLR(
-            self.optimizer, max_lr=learning_rate, total_steps=steps + 1, pct_start=warm_up
+            self.optimizer, max_lr=rate, total_steps=steps + 1, pct_start=warm_up
         )
         self._parts: dict[str, Any] = {
             "network": network,
             "optimizer": self.optimizer,
             "schedule": self.schedule,
         }
-        self.store = Checkpoint(checkpoint, identity, self._state)
+        self.store = session.store(training, self._state)
         past = self.store.load()
         if past is not None:
             self.done = int(past["step"])

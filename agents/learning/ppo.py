@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -27,9 +26,10 @@ from ae_env.grid import ExposureGrid
 from agents.learning.networks import (
     LIGHT_NUMBERS,
     NUMBERS,
+    UNWATCHED,
     ExposureFeatures,
     MeterHistory,
-    Progress,
+    Session,
     StateHead,
     with_history,
 )
@@ -227,31 +227,22 @@ class PPOPolicy(NetworkPolicy):
 def train_ppo(
     envs: gym.vector.VectorEnv,
     training: PPOTraining,
-    *,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    identity: Any = None,
+    session: Session = UNWATCHED,
 ) -> ExposureActorCritic:
     """Trains PPO on the scenes of `envs` (autoreset mode SAME_STEP).
 
     Args:
         envs: Vector environments.
         training: Hyperparameters.
-        checkpoint: File for the state of the training; a second run resumes from it, with new
-            episodes.
-        progress: Called with frames done, frames in all, and the mean reward.
-        device: Torch device of the network.
-        identity: JSON value; the checkpoint of a training with another one is not resumed. By
-            default the hyperparameters.
+        session: Where it runs, and what it reports to.
 
     Returns:
         The trained policy network.
     """
     training.check_batch(envs.num_envs)
     context = PolicyContext.from_envs(envs)
-    callback = _TrainingCallback(training, progress)
-    store = Checkpoint(checkpoint, identity or training.model_dump(), callback.state)
+    callback = _TrainingCallback(training, session)
+    store = session.store(training, callback.state)
     past = store.load()
     done = 0 if past is None else int(past["timesteps"])
     seen: VecEnv = SB3VectorAdapter(envs)
@@ -272,7 +263,7 @@ def train_ppo(
         max_grad_norm=training.max_grad_norm,
         policy_kwargs={"grid": context.grid, "width": training.width},
         seed=_seed(training.seed, done),
-        device=device,
+        device=session.device,
     )
     if past is not None:
         model.policy.load_state_dict(past["policy"])
@@ -291,9 +282,9 @@ def train_ppo(
 class _TrainingCallback(BaseCallback):
     """Progress, falling entropy, and checkpoints between the updates."""
 
-    def __init__(self, training: PPOTraining, progress: Progress | None) -> None:
+    def __init__(self, training: PPOTraining, session: Session) -> None:
         super().__init__()
-        self.training, self.progress = training, progress
+        self.training, self.session = training, session
         self._rewards: deque[float] = deque(maxlen=50)
 
     def start(self, model: PPO, checkpoint: Checkpoint) -> None:
@@ -312,9 +303,8 @@ class _TrainingCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         self._rewards.append(float(np.mean(self.locals["rewards"])))
-        if self.progress is not None:
-            recent = float(np.mean(self._rewards))
-            self.progress(self.num_timesteps, self.training.total_timesteps, {"reward": recent})
+        recent = float(np.mean(self._rewards))
+        self.session.report(self.num_timesteps, self.training.total_timesteps, {"reward": recent})
         return True
 
     def _on_rollout_start(self) -> None:

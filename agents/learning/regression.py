@@ -25,9 +25,10 @@ from ae_env.observation import SETTINGS_RANGES
 from agents.foresight import Floats, Foresight, LightTracker, TrendTracker
 from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
 from agents.learning.networks import (
+    UNWATCHED,
     ExposureFeatures,
     Optimisation,
-    Progress,
+    Session,
     StateHead,
     random_shift,
 )
@@ -49,7 +50,7 @@ WHITE_SHARE = 0.5
 #: Frames whose mean metered EV100 is this near to a frame's show the same light as it [EV]. Chosen
 #: among five values from 0.35 to 1.5 on the small bundled training scenes under moving light.
 SAME_LIGHT_EV = 0.35
-#: What a state must promise beyond the one asked for last, to be asked for with foresight [score].
+#: What a state must promise beyond that of the last decision to replace it, with foresight [score].
 #: Chosen among 0, 0.01, 0.03 and 0.06 on training scenes and kinds of light.
 HYSTERESIS = 0.01
 #: Past frames come in so many parts, each from another step.
@@ -159,7 +160,7 @@ class RegressionPolicy(NetworkPolicy):
 
     @cached_property
     def _meter(self) -> Meter:
-        """Meter whose reading tells that the light has changed."""
+        """Meter whose reading shows that the light has changed."""
         return make_meter("average", self.context.camera)
 
     @staticmethod
@@ -298,23 +299,14 @@ class RegressionTraining(Configuration):
 def train_regression(
     envs: gym.vector.VectorEnv,
     training: RegressionTraining,
-    *,
-    checkpoint: Path | None = None,
-    progress: Progress | None = None,
-    device: str = "cpu",
-    identity: Any = None,
+    session: Session = UNWATCHED,
 ) -> ScoreRegressor:
     """Trains a regression agent on the training scenes of `envs` (autoreset mode SAME_STEP).
 
     Args:
         envs: Vector environments.
         training: Hyperparameters.
-        checkpoint: File for the state of the training, written three times a minute; a second run
-            resumes from it, with new episodes and an empty memory of past frames.
-        progress: Called with frames done, frames in all, and losses.
-        device: Torch device of the network.
-        identity: JSON value; the checkpoint of a training with another one is not resumed. By
-            default the hyperparameters.
+        session: Where it runs, and what it reports to.
 
     Returns:
         The trained network.
@@ -324,30 +316,20 @@ def train_regression(
         network = ScoreRegressor(
             context.observation_space, context.grid, training.width, training.dropout
         )
-    network.to(device)
+    network.to(session.device)
     steps = max(2, training.frames // envs.num_envs)
-    run = Optimisation(
-        network,
-        steps=steps,
-        learning_rate=training.learning_rate,
-        weight_decay=training.weight_decay,
-        checkpoint=checkpoint,
-        identity=identity or training.model_dump(),
-        warm_up=0.1,
-    )
+    run = Optimisation(network, training, session, steps=steps, warm_up=0.1)
     rollout = Rollout(envs, RegressionPolicy(context, network=network), training, run.done)
     with run.store:
         while run.done < steps:
             observations, target = rollout.batch()
             network.train()
-            with _seeded(
-                device, training.seed, run.done
-            ):  # dropout draws from the global generator
+            # Dropout draws from the global generator.
+            with _seeded(session.device, training.seed, run.done):
                 loss, seen = _loss(network, observations, target)
             run.step(loss)
             network.eval()
-            if progress is not None:
-                progress(run.done * envs.num_envs, steps * envs.num_envs, seen)
+            session.report(run.done * envs.num_envs, steps * envs.num_envs, seen)
             run.store.save_when_due()
     return network
 

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from agents.learning.forecaster import ForecasterTraining, train_forecaster
-from agents.learning.networks import Progress
+from agents.learning.networks import Progress, Session
 from agents.learning.regression import RegressionTraining, train_regression
 from agents.learning.weights import describe_agent, load_agent, save_agent
 from agents.learning.workers import run_in_parallel, send_progress
@@ -24,6 +24,8 @@ from simulator.utils.config_file import Configuration, load_yaml, one_line
 from simulator.utils.files import sibling, write_atomically
 
 if TYPE_CHECKING:
+    import gymnasium as gym
+
     from agents.learning.ppo import PPOTraining
 
     Hyperparameters = RegressionTraining | PPOTraining | ForecasterTraining
@@ -164,19 +166,25 @@ def train_agent(
         return out
     training, checkpoint = config.hyperparameters(), sibling(out, ".checkpoint")
     curve = LearningCurve(sibling(out, ".csv"))
-    if isinstance(training, ForecasterTraining):
-        with _logged(curve, progress, tensorboard) as report:
-            network: Any = train_forecaster(
-                training,
-                checkpoint=checkpoint,
-                progress=report,
-                device=device,
-                identity=config.card(),
-            )
-        description = {"width": network.width, "context": {}, "training": config.card()}
-        save_agent(out, config.agent, network, description)
-        checkpoint.unlink(missing_ok=True)
-        return out
+    with _logged(curve, progress, tensorboard) as report, ExitStack() as stack:
+        session, context = Session(checkpoint, report, device, config.card()), None
+        if isinstance(training, ForecasterTraining):
+            network: Any = train_forecaster(training, session)
+        else:
+            envs = stack.enter_context(closing(_make_envs(config)))
+            context = PolicyContext.from_envs(envs)
+            if isinstance(training, RegressionTraining):
+                network = train_regression(envs, training, session)
+            else:
+                from agents.learning.ppo import train_ppo
+
+                network = train_ppo(envs, training, session)
+    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
+    checkpoint.unlink(missing_ok=True)
+    return out
+
+
+def _make_envs(config: AgentConfig) -> gym.vector.VectorEnv[Any, Any, Any]:
     import gymnasium as gym
 
     import ae_env  # noqa: F401  (registers the environment)
@@ -184,26 +192,9 @@ def train_agent(
     options = dict(config.environment)
     if config.max_episode_steps is not None:
         options["max_episode_steps"] = config.max_episode_steps
-    envs = gym.make_vec(
+    return gym.make_vec(
         config.task, num_envs=config.num_envs, autoreset_mode="SAME_STEP", **options
     )
-    with closing(envs), _logged(curve, progress, tensorboard) as report:
-        common: dict[str, Any] = {
-            "checkpoint": checkpoint,
-            "progress": report,
-            "device": device,
-            "identity": config.card(),
-        }
-        if isinstance(training, RegressionTraining):
-            network = train_regression(envs, training, **common)
-        else:
-            from agents.learning.ppo import train_ppo
-
-            network = train_ppo(envs, training, **common)
-        context = PolicyContext.from_envs(envs)
-    save_agent(out, config.agent, network, describe_agent(network.width, context, config.card()))
-    checkpoint.unlink(missing_ok=True)
-    return out
 
 
 @contextmanager
@@ -288,12 +279,9 @@ def load_curve(path: Path) -> dict[str, list[float]]:
     """
     try:
         rows = list(csv.DictReader(path.read_text().splitlines()))
-        curve = {name: [float(row[name]) for row in rows] for name in (rows[0] if rows else ())}
-    except (TypeError, ValueError, KeyError) as error:
+        return {name: [float(row[name]) for row in rows] for name in ("frames", *rows[0])}
+    except (TypeError, ValueError, LookupError) as error:
         raise ValueError(f"{path} is not a learning curve of `ae-env train`") from error
-    if "frames" not in curve:
-        raise ValueError(f"{path} is not a learning curve of `ae-env train`")
-    return curve
 
 
 @dataclass(frozen=True)

@@ -107,15 +107,18 @@ def load_into(module: nn.Module, tensors: dict[str, Tensor], path: str | Path) -
         raise ValueError(f"`weights` (={str(path)!r}) do not fit the network: {text}") from error
 
 
-def describe_agent(width: int, context: PolicyContext, training: dict[str, Any]) -> dict[str, Any]:
+def describe_agent(
+    width: int, context: PolicyContext | None, training: dict[str, Any]
+) -> dict[str, Any]:
     """Description of an agent for `save_agent`.
 
     Args:
         width: Hidden features of its network.
-        context: The camera, grid and observation that it was trained for.
+        context: The camera, grid and observation that it was trained for; None if for any.
         training: JSON values that identify the training.
     """
-    return {"width": width, "context": describe_context(context), "training": training}
+    described = {} if context is None else describe_context(context)
+    return {"width": width, "context": described, "training": training}
 
 
 def describe_context(context: PolicyContext) -> dict[str, Any]:

@@ -198,7 +198,7 @@ class MeteringPolicy(Policy):
         """Tune on the scenes of `envs` (tuned programs only; the others have nothing to learn).
 
         Episodes run twice: led by program P, then by what was learnt from those, so that the
-        readings are those of the frames that the tuned program itself brings about.
+        readings are those of the frames that the tuned program itself takes.
 
         Args:
             envs: Training environments; their episodes must not end within 4 frames.

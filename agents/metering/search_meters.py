@@ -218,7 +218,7 @@ def encoded(linear: NDArray[Any]) -> Floats:
 def shim_reading(
     observations: Observations, estimate: Floats | None = None, *, camera: CameraProfile
 ) -> Reading:
-    """One update of Shim's controller: the gamma that shows most gradient tells where to go.
+    """One update of Shim's controller: it goes to the gamma that shows most gradient.
 
     The picture (sRGB luma in [0, 1]) is raised to the powers gamma of `GAMMAS`; that with the most
     gradient information (`ae_env.scorers.measures.shim_gradient`; between the powers, the top of a

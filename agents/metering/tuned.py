@@ -142,12 +142,9 @@ class ScoreRegression:
         from safetensors.numpy import load_file
 
         try:
-            arrays = load_file(path)
-        except (OSError, SafetensorError) as error:
-            raise ValueError(f"`{name}` (={str(path)!r}) cannot be read: {error}") from None
-        if set(arrays) != {"features", "scores", "bandwidths"}:
-            raise ValueError(f"`{name}` (={str(path)!r}) holds no tuned program: {sorted(arrays)}")
-        return cls(**arrays)
+            return cls(**load_file(path))
+        except (OSError, SafetensorError, TypeError) as error:
+            raise ValueError(f"`{name}` (={str(path)!r}) holds no tuned program: {error}") from None
 
 
 def _widest_good(bandwidths: Sequence[float], criteria: Sequence[float]) -> float:

@@ -20,7 +20,7 @@ from PIL import Image
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
-from ae_env.scenes.recorded_files import PREFIX
+from ae_env.scenes.recorded import PREFIX
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from simulator import (

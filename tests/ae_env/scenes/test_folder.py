@@ -230,7 +230,7 @@ def test_many_at_once_are_as_single_ones(recorded: Path, extra: dict[str, Any]) 
         ({"sequence": "{}"}, "train", "needs at least 15 source groups"),
         ({"sequence": "{}/none"}, "test", "must name an existing file, folder or glob"),
         ({"sequence": 3}, "test", "must have a 'path' or a 'sequence'"),
-        ({"sequence": "{}", "path": "{}"}, "test", "field 'path' must be one of"),
+        ({"sequence": "{}", "path": "{}"}, "test", "`scenes`"),
         ({"sequence": "{}", "on_error": "skip"}, "test", r"`on_error` \(='skip'\) must be 'stop'"),
         ({"sequence": "{}", "hrad": True}, "test", "did you mean 'hard'"),
         ({"path": "recorded:{}"}, "test", "must be raws or radiance maps here, not a recorded"),

@@ -34,10 +34,6 @@ def test_shapes(size: int, sensors: bool) -> None:
 def test_other_observations_are_refused() -> None:
     with pytest.raises(ValueError, match=r"`observation_space\['raw'\]`.*must be a uint8 image"):
         ExposureFeatures(space(36, dtype=np.float32))
-    with pytest.raises(ValueError, match="`sensors` must be given"):
-        StateHead(ExposureGrid.default(), 6, True)(
-            torch.randn(3, 6), torch.zeros(3, LIGHT_NUMBERS), None
-        )
 
 
 def test_absolute_luminance_does_not_depend_on_the_settings(make_tiny_envs) -> None:

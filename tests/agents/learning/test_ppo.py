@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from agents.learning.networks import Session
 from agents.learning.ppo import PPOPolicy, PPOTraining, train_ppo
 from agents.learning.weights import describe_agent, save_agent
 from agents.policy import PolicyContext
@@ -18,7 +19,7 @@ def test_progress_and_determinism(make_tiny_envs) -> None:
     def train(seed: int) -> dict[str, torch.Tensor]:
         training = TRAINING.model_copy(update={"seed": seed, "total_timesteps": 32})
         return train_ppo(
-            make_tiny_envs(), training, progress=lambda *a: seen.append(a)
+            make_tiny_envs(), training, Session(progress=lambda *a: seen.append(a))
         ).state_dict()
 
     first, again, other = train(3), train(3), train(4)
@@ -36,7 +37,9 @@ def test_it_learns(make_tiny_envs) -> None:
     )
     # Always sharp: short times and small apertures gain nothing, low ISO does.
     envs = make_tiny_envs(num_envs=16, motion="none", depth="far")
-    train_ppo(envs, training, progress=lambda d, t, values: rewards.append(values["reward"]))
+    train_ppo(
+        envs, training, Session(progress=lambda d, t, values: rewards.append(values["reward"]))
+    )
     assert rewards[-1] > rewards[15] + 0.1
 
 
@@ -77,12 +80,12 @@ def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_ppo(make_tiny_envs(), TRAINING, checkpoint=path, progress=stop)
+        train_ppo(make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=stop))
     half = torch.load(path, weights_only=True)["state"]
     assert half["timesteps"] == 48  # the last complete update of 4 x 4 frames before frame 56
     seen: list[int] = []
     network = train_ppo(
-        make_tiny_envs(), TRAINING, checkpoint=path, progress=lambda *a: seen.append(a[0])
+        make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=lambda *a: seen.append(a[0]))
     )
     assert seen == list(range(52, 97, 4))
     # The learning rate falls over the whole training, it does not start at its top again.

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import nn
 
+from agents.learning.networks import Session
 from agents.learning.regression import (
     RegressionPolicy,
     RegressionTraining,
@@ -89,7 +90,7 @@ def test_training_lowers_the_loss(make_tiny_envs) -> None:
     train_regression(
         make_tiny_envs(num_envs=8),
         RegressionTraining(frames=480, width=32),
-        progress=lambda done, total, values: losses.append((done, total, values["mse"])),
+        Session(progress=lambda done, total, values: losses.append((done, total, values["mse"]))),
     )
     assert [(done, total) for done, total, _ in losses] == [(n, 480) for n in range(8, 481, 8)]
     begin, end = (np.mean([v for _, _, v in part]) for part in (losses[:10], losses[-20:]))
@@ -120,12 +121,12 @@ def test_a_stopped_training_goes_on(make_tiny_envs, tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train_regression(make_tiny_envs(), TRAINING, checkpoint=path, progress=stop)
+        train_regression(make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=stop))
     half = torch.load(path, weights_only=True)["state"]
     assert half["step"] == 25
     seen: list[int] = []
     network = train_regression(
-        make_tiny_envs(), TRAINING, checkpoint=path, progress=lambda *a: seen.append(a[0])
+        make_tiny_envs(), TRAINING, Session(checkpoint=path, progress=lambda *a: seen.append(a[0]))
     )
     assert seen == list(range(104, 161, 4))
     end = torch.load(path, weights_only=True)["state"]
