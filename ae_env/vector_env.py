@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence, Set
-from typing import Any
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
+from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
@@ -13,28 +14,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ae_env.env import AutoExposureBase, Observation
-from ae_env.episodes.core import Frames
-from ae_env.episodes.draws import check_options
-from ae_env.grid import ExposureGrid, plain, plain_list
-from ae_env.lighting import Lighting
-from ae_env.options import (
-    DEFAULT_SIMULATOR,
-    DEFAULT_TOLERANCE,
-    Crop,
-    Depth,
-    EnvOptions,
-    Motion,
-    Noise,
-    ObservationKind,
-    Reward,
-    Source,
-    Split,
-)
-from ae_env.registration import names_nearest
-from ae_env.scenes import SceneSpec
-from ae_env.scorers import Scorer
-from simulator.camera import CameraProfile
-from simulator.utils.checks import check_actions, check_integer, check_seed, check_word
+from ae_env.episodes.core import Frames, check_actions
+from ae_env.episodes.state import check_options
+from ae_env.grid import plain, plain_list
+from ae_env.options import EnvArguments, takes_env_arguments
+from simulator.utils.checks import check_integer, check_seed, check_word
 
 #: Most environments in one process: at 64 pixels, they observe 1 GiB.
 MAX_ENVS = 2**16
@@ -59,71 +43,28 @@ class AutoExposureVectorEnv(
     All other arguments are those of `AutoExposureEnv`.
     """
 
-    @names_nearest
+    @takes_env_arguments()
     def __init__(
         self,
         num_envs: int = 1,
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = 8,
-        scenes: SceneSpec = "bundled",
-        split: Split = "train",
-        grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None = None,
-        scorer: str | Mapping[str, float] | Scorer = "balanced",
-        costs: Mapping[str, float] | None = None,
-        observation: ObservationKind = "uint8",
-        sensors: bool = True,
-        resolution: int = 64,
-        crop: Crop = "box",
-        motion: Motion | float = "random",
-        depth: Depth | float = "random",
-        lighting: str | Mapping[str, Any] | Lighting = "static",
-        delay: int | Mapping[str, int] = 0,
-        source: Source = "light",
-        camera: str | CameraProfile = "nikon_z6",
-        simulator: str | None = DEFAULT_SIMULATOR,
-        noise: bool | Noise = True,
-        tolerance: float = DEFAULT_TOLERANCE,
-        reward: Reward = "capture",
-        with_oracle: bool = False,
         render_mode: str | None = None,
+        **arguments: Unpack[EnvArguments],
     ) -> None:
-        num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVS)
+        self.num_envs = num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVS)
         if max_episode_steps is not None:
             rule = ", or None for never"
             max_episode_steps = check_integer("max_episode_steps", max_episode_steps, 1, more=rule)
-        check_word("render_mode", render_mode, ("rgb_array",), None)
+        self.max_episode_steps = max_episode_steps
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": 30,
             "autoreset_mode": self.autoreset_mode,
         }
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self.max_episode_steps = max_episode_steps
-        options = EnvOptions(
-            scenes=scenes,
-            split=split,
-            grid=grid,
-            scorer=scorer,
-            costs={} if costs is None else costs,
-            observation=observation,
-            sensors=sensors,
-            resolution=resolution,
-            crop=crop,
-            motion=motion,
-            depth=depth,
-            lighting=lighting,
-            delay=delay,
-            source=source,
-            camera=camera,
-            simulator=simulator,
-            noise=noise,
-            tolerance=tolerance,
-            reward=reward,
-            with_oracle=with_oracle,
-        )
-        self.core = self._make_core(options, num_envs)
+        self._set_up(arguments, num_envs, render_mode)
         self.single_action_space = gym.spaces.Discrete(self.core.num_actions)
         self.single_observation_space = self.core.observation_space()
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -132,8 +73,6 @@ class AutoExposureVectorEnv(
         self._rngs: dict[int, np.random.Generator] = {}  # by environment, from the first reset on
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._done = np.zeros(num_envs, dtype=bool)
-        self._shown: Observation | None = None  # a copy, only where autoreset is off
-        self._last = None
 
     @property
     def states(self) -> np.ndarray:
@@ -173,10 +112,14 @@ class AutoExposureVectorEnv(
             if seeds[i] is not None or i not in self._rngs:
                 self._rngs[i], _ = seeding.np_random(seeds[i])
         self._begin(env_indices, per_env)
-        frames = self.core.observe(env_indices)
-        self._remember_frames(frames, env_indices)
-        observation = self._merged(frames.observation, env_indices)
-        return observation, self._vector_info(frames.info, env_indices)
+        fresh = self.core.observe(env_indices)
+        info = self._vector_info(fresh.info, env_indices)
+        if len(env_indices) == self.num_envs:
+            return self._shown(fresh), info
+        # The others show their frames again; the same noise keys give the same frames.
+        shown = self._last or self.core.observe(self._all)
+        _replace_rows(shown, fresh, env_indices)
+        return self._shown(shown), info
 
     def step(
         self, actions: np.ndarray
@@ -202,10 +145,8 @@ class AutoExposureVectorEnv(
             observation, infos = self._restart(np.flatnonzero(done), frames)
         else:
             self._done = done
-            self._remember_frames(frames)
-            observation = frames.observation
             infos = self._vector_info(frames.info, self._all)
-        self._remember_shown(observation)
+            observation = self._shown(frames)
         return observation, frames.reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -241,44 +182,21 @@ class AutoExposureVectorEnv(
         self._begin(finished)
         fresh = self.core.observe(finished)
         if whole:
-            frames = Frames(fresh.observation, fresh.info, frames.reward, fresh.raw)
+            frames = replace(fresh, reward=frames.reward)
         else:
-            _assign_rows(frames.observation, fresh.observation, finished)
-            _assign_rows(frames.info, fresh.info, finished)
-            frames.raw[finished] = fresh.raw
-        self._remember_frames(frames)
-        return frames.observation, infos | self._vector_info(frames.info, self._all)
+            _replace_rows(frames, replace(fresh, reward=frames.reward[finished]), finished)
+        infos |= self._vector_info(frames.info, self._all)
+        return self._shown(frames), infos
 
-    def _remember_frames(self, frames: Frames, env_indices: np.ndarray | None = None) -> None:
-        """Stores `frames`, of all or of `env_indices`, for rendering."""
-        if self.render_mode is None:
-            return
-        if self._last is not None and env_indices is not None:
-            last = copy.deepcopy(self._last)  # the caller has its arrays
-            _assign_rows(last.observation, frames.observation, env_indices)
-            _assign_rows(last.info, frames.info, env_indices)
-            last.reward[env_indices], last.raw[env_indices] = frames.reward, frames.raw
-            frames = last
-        self._last = frames
+    def _shown(self, frames: Frames) -> Observation:
+        """The observation of `frames` of all; a copy of them is kept where they are shown again.
 
-    def _merged(self, observation: Observation, env_indices: np.ndarray) -> Observation:
-        """`observation` of `env_indices`, with the unchanged frames of all other environments.
-
-        The arrays are new or private copies, so that the caller may write to them.
+        That is in `render`, and in a masked reset where autoreset is off. The caller may write to
+        the arrays that it gets.
         """
-        if len(env_indices) < self.num_envs:
-            shown = self._shown
-            if shown is None:  # the same noise keys give the same frames again
-                shown = self.core.observe(self._all).observation
-            _assign_rows(shown, observation, env_indices)
-            observation = shown
-        self._remember_shown(observation)
-        return observation
-
-    def _remember_shown(self, observation: Observation) -> None:
-        """Copies the observation, where a masked reset has to show it again."""
-        if self.autoreset_mode == AutoresetMode.DISABLED:
-            self._shown = {name: values.copy() for name, values in observation.items()}
+        if self.render_mode is not None or self.autoreset_mode == AutoresetMode.DISABLED:
+            self._last = copy.deepcopy(frames)
+        return frames.observation
 
     def _vector_info(self, columns: dict[str, Any], env_indices: np.ndarray) -> dict[str, Any]:
         """Info columns of `env_indices` in the layout of Gymnasium's vector environments.
@@ -352,6 +270,13 @@ def _rows_of(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
         name: _rows_of(values, rows) if isinstance(values, dict) else values[rows]
         for name, values in columns.items()
     }
+
+
+def _replace_rows(frames: Frames, new: Frames, rows: np.ndarray) -> None:
+    """Writes the frames `new` of some environments to `rows` of those of all."""
+    _assign_rows(frames.observation, new.observation, rows)
+    _assign_rows(frames.info, new.info, rows)
+    frames.reward[rows], frames.raw[rows] = new.reward, new.raw
 
 
 def _assign_rows(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None:

@@ -27,7 +27,7 @@ from simulator.optics.motion_path import Movement
 from simulator.raw.develop import develop, develop_inverse
 from simulator.raw.image import check_packed
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_integer
+from simulator.utils.checks import check_integer, check_type
 
 #: Parts of the augmentation, in the order in which they act.
 MODULES = ("exposure", "blur", "noise")
@@ -164,8 +164,7 @@ class ExposureAugmentation:
         """
         images = _check_images(images)
         words = _check_seeds(seeds, len(images))
-        if nlf is not None and not isinstance(nlf, NoiseLevelFunction):
-            raise ValueError(f"`nlf` (={nlf!r}) must be a NoiseLevelFunction or None")
+        check_type("nlf", nlf, NoiseLevelFunction, None)
         if not self.modules:
             return images
         source = NoiseLevelFunction.zero() if nlf is None else nlf
@@ -276,8 +275,7 @@ class AugmentedDataset(Dataset[Any]):
     def __init__(
         self, dataset: Dataset[Any], augmentation: ExposureAugmentation, *, seed: int = 0
     ) -> None:
-        if not isinstance(augmentation, ExposureAugmentation):
-            raise ValueError(f"`augmentation` (={augmentation!r}) must be an ExposureAugmentation")
+        check_type("augmentation", augmentation, ExposureAugmentation)
         self.dataset, self.augmentation = dataset, augmentation
         self.seed = _check_seed("seed", seed)
         # Shared memory: workers that persist see it change.

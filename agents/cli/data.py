@@ -86,7 +86,7 @@ def record(
     """
     import gymnasium as gym
 
-    from ae_env.utils.presets import load_preset
+    from ae_env.utils.user_files import load_preset
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
@@ -155,7 +155,7 @@ def score_tables(
     Example: `ae-env score-tables path/to/raws -o tables`
     """
     from ae_env.grid import ExposureGrid
-    from ae_env.scenes.loading import check_weights
+    from ae_env.scenes.load import check_weights
     from ae_env.scorers import make_scorer
     from agents.score_shards import ShardPlan, check_engine, run
     from simulator import get_camera
@@ -265,8 +265,7 @@ def _use_rest() -> None:
     from agents.viewer.library import find_scenes
     from agents.viewer.viewed_scene import View, ViewedScene
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.optics.blur import disc_blur, motion_blur
-    from simulator.optics.blur_kernels import Blur, blur_many
+    from simulator.optics.blur import Blur, blur_many, disc_blur, motion_blur
     from simulator.radiance.procedural import draw
 
     library = find_scenes(DEFAULT_SCENES)

@@ -14,7 +14,7 @@ import torch
 
 from simulator.camera import BayerPattern
 from simulator.raw.image import RawImage, check_packed
-from simulator.utils.checks import check_number, check_word
+from simulator.utils.checks import check_number, check_type, check_word
 
 #: Linear sRGB (D65) to CIE XYZ, IEC 61966-2-1:1999.
 XYZ_FROM_SRGB = (
@@ -113,8 +113,7 @@ def render_srgb(
     Raises:
         ValueError: If `raw` is no `RawImage`, a name is unknown or `exposure_ev` is out of range.
     """
-    if not isinstance(raw, RawImage):
-        raise ValueError(f"`raw` (={type(raw).__name__}) must be a RawImage")
+    check_type("raw", raw, RawImage)
     check_word("demosaic", demosaic, DEMOSAICS)
     check_word("tone", tone, TONES)
     exposure_ev = check_number("exposure_ev", exposure_ev, -32.0, 32.0)

@@ -22,6 +22,7 @@ import tifffile
 
 from simulator.raw.image import RawImage, unpack_mosaic
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_type
 from simulator.utils.files import as_path, package_version, write_atomically
 
 #: Begins the Software tag of every DNG written here.
@@ -94,8 +95,7 @@ def write_dng(path: str | os.PathLike[str], raw: RawImage) -> None:
     path = as_path(path)
     if path.suffix.lower() != ".dng":
         raise ValueError(f"`path` (={str(path)!r}) must end in '.dng'")
-    if not isinstance(raw, RawImage):
-        raise ValueError(f"`raw` (={type(raw).__name__}) must be a RawImage")
+    check_type("raw", raw, RawImage)
     head = tiff_head(_image_tags(raw), _exif_tags(raw), 8 * raw.data[0].numel())
     write_atomically(path, itertools.chain([head], _strip(raw)))
 

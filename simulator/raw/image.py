@@ -13,7 +13,7 @@ import torch
 from simulator.camera import CameraProfile
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.settings import CameraSettings
-from simulator.utils.checks import check_integer
+from simulator.utils.checks import check_integer, check_type
 from simulator.utils.compute import kernel, parallel_ranges
 
 PLANES = ("R", "G1", "G2", "B")
@@ -51,12 +51,9 @@ class RawImage:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "data", check_packed("data", self.data))
-        for name, kind in (("settings", CameraSettings), ("camera", CameraProfile)):
-            value = getattr(self, name)
-            if not isinstance(value, kind):
-                raise ValueError(f"`{name}` (={value!r}) must be a {kind.__name__}")
-        if not isinstance(self.nlf, NoiseLevelFunction | None):
-            raise ValueError(f"`nlf` (={self.nlf!r}) must be a NoiseLevelFunction or None")
+        check_type("settings", self.settings, CameraSettings)
+        check_type("camera", self.camera, CameraProfile)
+        check_type("nlf", self.nlf, NoiseLevelFunction, None)
         gains = tuple(float(g) for g in self.white_balance)
         if len(gains) != 3 or not all(np.isfinite(g) and g > 0 for g in gains):
             raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")

@@ -36,6 +36,7 @@ from simulator.raw.metadata import (
 )
 from simulator.raw.noise_estimation import estimate_nlf
 from simulator.settings import CameraSettings, snap_exposure_time
+from simulator.utils.checks import check_type
 from simulator.utils.files import as_path, refuse_bomb
 
 logger = logging.getLogger(__name__)
@@ -258,10 +259,7 @@ def _profile(
     if isinstance(camera, CameraProfile):
         _check_profile(path, decoded, camera)
         return camera
-    if not isinstance(camera, str | None):
-        raise ValueError(
-            f"`camera` (={camera!r}) must be a CameraProfile or a built-in camera's name"
-        )
+    check_type("camera", camera, str, CameraProfile, None)
     base = get_camera(camera) if camera is not None else _match(make, model)
     matrix, source = decoded.colour_matrix, decoded.colour_matrix_source
     if own is not None:

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
-import numpy as np
-
 
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
     """End of a message that proposes the nearest of `known` to a misspelt `name`; empty if none is.
@@ -34,6 +32,19 @@ def check_word(name: str, value: Any, known: tuple[str, ...], *others: object) -
     rule = ", ".join(map(repr, (*others, *known)))
     hint = did_you_mean(value, known)
     raise ValueError(f"`{name}` (={value!r}) must be one of {rule}{hint}")
+
+
+def check_type(name: str, value: Any, *kinds: type | None) -> None:
+    """Raises a `ValueError` unless `value` is an instance of one of `kinds`, of which None is one.
+
+    >>> check_type("raw", 3, str, None)
+    Traceback (most recent call last):
+    ValueError: `raw` (of type int) must be of type str or None
+    """
+    known = tuple(type(None) if kind is None else kind for kind in kinds)
+    if not isinstance(value, known):
+        rule = " or ".join("None" if kind is None else kind.__name__ for kind in kinds)
+        raise ValueError(f"`{name}` (of type {type(value).__name__}) must be of type {rule}")
 
 
 def check_flag(name: str, value: Any) -> None:
@@ -79,21 +90,3 @@ def check_seed(seed: Any, name: str = "seed") -> int | None:
         ValueError: Unless it is an integer >= 0 or None.
     """
     return None if seed is None else check_integer(name, seed, 0)
-
-
-def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """`actions` as an array.
-
-    Raises:
-        ValueError: Unless they are integers of `shape`, () for a single one.
-    """
-    try:
-        array = np.asarray(actions)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, object)
-    if array.shape != shape or array.dtype.kind not in "iu":
-        rule = f"integers of shape {shape}" if shape else "an integer"
-        raise ValueError(
-            f"`{name}` (={actions!r}, {array.dtype}, shape {array.shape}) must be {rule}"
-        )
-    return array

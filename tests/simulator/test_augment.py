@@ -222,47 +222,45 @@ def test_a_gpu_gives_the_pictures_of_the_cpu() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("name", "value"),
     [
-        ({"stops": (1.0, -1.0)}, r"`stops` \(=\(1.0, -1.0\)\) must be two numbers"),
-        ({"stops": (-1.0, math.nan)}, "`stops`"),
-        ({"stops": 2.0}, "`stops`"),
-        ({"isos": (0.0, 100.0)}, "`isos`"),
-        ({"defocus": (0.0, 65.0)}, r"`defocus` .* must be two numbers in \[0, 64\]"),
-        ({"motion": (-1.0, 1.0)}, "`motion`"),
-        ({"highlights": ("a", "b")}, "`highlights`"),
-        ({"modules": ("exposure", "colour")}, "`modules`"),
-        ({"modules": "noise"}, "`modules`"),
-        ({"modules": None}, "`modules`"),
-        ({"camera": "nikon_z7"}, "did you mean 'nikon_z6'"),
+        *(("stops", v) for v in ((1.0, -1.0), (-1.0, math.nan), 2.0)),
+        ("isos", (0.0, 100.0)),
+        ("defocus", (0.0, 65.0)),
+        ("motion", (-1.0, 1.0)),
+        ("highlights", ("a", "b")),
+        *(("modules", v) for v in (("exposure", "colour"), "noise", None)),
+        ("camera", "nikon_z7"),
     ],
 )
-def test_bad_settings(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ExposureAugmentation(**options)
+def test_bad_settings(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"`{name}`"):
+        ExposureAugmentation(**{name: value})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("images", "seeds", "message"),
+    "images",
     [
-        (torch.zeros(3, 4, 4), [0], "`images`"),
-        (torch.zeros(1, 2, 4, 4), [0], r"`images` \(=\(1, 2, 4, 4\)\)"),
-        (torch.full((1, 3, 4, 4), 1.5), [0], r"`images` .* in \[0, 1\]"),
-        (torch.full((1, 3, 4, 4), math.nan), [0], "`images`"),
-        (torch.full((1, 4, 4, 4), math.inf), [0], "`images` .* finite"),
-        (torch.zeros(1, 3, 4, 4, dtype=torch.int64), [0], "`images`"),
-        (torch.zeros(1, 3, 4, 4, dtype=torch.complex64), [0], "`images` .* real"),
-        (torch.zeros(1, 3, 4, 4).to_sparse(), [0], "`images` .* dense"),
-        (torch.zeros(1, 4, 4, 4, dtype=torch.uint8), [0], "`images` .* floating point"),
-        (torch.zeros(1, 3, 4, 4), [0, 1], "`seeds` .* must be 1 integers"),
-        (torch.zeros(1, 3, 4, 4), [-1], "`seeds`"),
-        (torch.zeros(1, 3, 4, 4), [0.5], "`seeds`"),
-        (torch.zeros(1, 3, 4, 4), 3, "`seeds`"),
+        torch.zeros(3, 4, 4),
+        torch.zeros(1, 2, 4, 4),
+        torch.full((1, 3, 4, 4), 1.5),
+        torch.full((1, 3, 4, 4), math.nan),
+        torch.full((1, 4, 4, 4), math.inf),
+        torch.zeros(1, 3, 4, 4, dtype=torch.int64),
+        torch.zeros(1, 3, 4, 4, dtype=torch.complex64),
+        torch.zeros(1, 3, 4, 4).to_sparse(),
+        torch.zeros(1, 4, 4, 4, dtype=torch.uint8),
     ],
 )
-def test_bad_input(images: torch.Tensor, seeds: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ExposureAugmentation()(images, seeds)
+def test_bad_images(images: torch.Tensor) -> None:
+    with pytest.raises(ValueError, match="`images`"):
+        ExposureAugmentation()(images, [0])
+
+
+@pytest.mark.parametrize("seeds", [[0, 1], [-1], [0.5], 3])
+def test_bad_seeds(seeds: object) -> None:
+    with pytest.raises(ValueError, match="`seeds`"):
+        ExposureAugmentation()(torch.zeros(1, 3, 4, 4), seeds)  # type: ignore[arg-type]
 
 
 def test_bad_samples_and_seeds() -> None:
@@ -275,7 +273,7 @@ def test_bad_samples_and_seeds() -> None:
         sample_seeds(0, -1, [0])
     with pytest.raises(ValueError, match=r"`indices` \(=5\)"):
         sample_seeds(0, 0, 5)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"`augmentation` \(='x'\)"):
+    with pytest.raises(ValueError, match="`augmentation`"):
         AugmentedDataset([], "x")  # type: ignore[arg-type]
 
 

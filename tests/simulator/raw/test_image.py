@@ -58,34 +58,34 @@ def test_bad_mosaic(shape):
         pack_mosaic(np.zeros(shape, np.uint16), camera())
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("data", torch.zeros(3, 4, 4), r"`data` \(shape \(3, 4, 4\)\) must be \(4, H, W\)"),
-        ("data", torch.zeros(4, 4), r"`data` \(shape \(4, 4\)\)"),
-        ("data", torch.zeros(1, 4, 4, 4), r"must be \(4, H, W\)"),
-        ("data", torch.zeros(4, 0, 4), "`data`"),
-        ("data", torch.zeros(4, 2, 2, dtype=torch.int16), "from_mosaic"),
-        ("data", np.zeros((4, 2, 2), np.uint16), "from_mosaic"),
-        ("data", torch.full((4, 2, 2), math.nan), r"\(16 values NaN or infinite\)"),
-        ("data", torch.tensor([1.0, -math.inf, 0.0, 0.0]).reshape(4, 1, 1), r"\(1 values"),
-        ("data", torch.full((4, 2, 2), 1e300, dtype=torch.float64), "infinite"),  # beyond float32
-        ("data", [[0.0]], "`data` .=list. must be a dense torch tensor"),
-        ("data", np.array(["a"]), "`data` .=ndarray. must be a dense torch tensor"),
-        ("data", torch.zeros(4, 2, 2).to_sparse(), "`data` .=torch.sparse_coo. must be a dense"),
-        ("data", None, "`data`"),
-        ("white_balance", (1.0, 1.0), "`white_balance`"),
-        *(("white_balance", (1.0, v, 1.0), "`white_balance`") for v in (0.0, -1.0, math.nan)),
-        ("camera", "nikon_z6", r"`camera` \(='nikon_z6'\) must be a CameraProfile"),
-        ("settings", (100, 0.01), r"`settings` \(=\(100, 0.01\)\) must be a CameraSettings"),
-        ("nlf", (1e-4, 1e-6), "`nlf` .* must be a NoiseLevelFunction"),
-        ("box_factor", 0, r"`box_factor` \(=0\)"),
-        ("box_factor", 1.5, r"`box_factor` \(=1.5\)"),
+BAD = {
+    "data": [
+        torch.zeros(3, 4, 4),
+        torch.zeros(4, 4),
+        torch.zeros(1, 4, 4, 4),
+        torch.zeros(4, 0, 4),
+        torch.zeros(4, 2, 2, dtype=torch.int16),
+        np.zeros((4, 2, 2), np.uint16),
+        torch.full((4, 2, 2), math.nan),
+        torch.tensor([1.0, -math.inf, 0.0, 0.0]).reshape(4, 1, 1),
+        torch.full((4, 2, 2), 1e300, dtype=torch.float64),  # beyond float32
+        [[0.0]],
+        np.array(["a"]),
+        torch.zeros(4, 2, 2).to_sparse(),
+        None,
     ],
-)
-def test_bad_arguments(name, value, message):
+    "white_balance": [(1.0, 1.0), *((1.0, v, 1.0) for v in (0.0, -1.0, math.nan))],
+    "camera": ["nikon_z6"],
+    "settings": [(100, 0.01)],
+    "nlf": [(1e-4, 1e-6)],
+    "box_factor": [0, 1.5],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, values in BAD.items() for v in values])
+def test_bad_arguments(name, value):
     usual = {"data": torch.zeros(4, 2, 2), "settings": SETTINGS, "camera": camera()}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"`{name}`"):
         RawImage(**(usual | {name: value}))
 
 
