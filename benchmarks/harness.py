@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -114,12 +115,15 @@ class Report:
 
     Args:
         rows: Rows of the result file.
+        tables: What stands between the marks ``<!-- NAME -->`` and ``<!-- end -->`` of the page, by
+            name: Markdown of `table` and `pivot`. All else on a page is written by hand.
         page: Blocks of the Markdown page below its heading; none for no page.
         meta: Entries of the result file besides its origin.
         figures: Pictures by file name beside the page (``"throughput.png"``), or by path.
     """
 
     rows: Sequence[Row]
+    tables: Mapping[str, str] = field(default_factory=dict)
     page: Sequence[str] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
     figures: Mapping[str | Path, Figure] = field(default_factory=dict)
@@ -185,11 +189,36 @@ def write_report(
     for name, figure in report.figures.items():
         path = name if isinstance(name, Path) else out / name
         files[f"picture {path.stem}"] = write_picture(path, figure)
+    if report.tables:
+        tables = {"origin": origin(meta), **report.tables}
+        files["page"] = write_atomically(out / f"{stem}.md", filled_page(stem, title, tables))
     if report.page:
         blocks = [f"# {title}", origin(meta), *report.page]
         text = "\n\n".join(block.strip() for block in blocks if block.strip()) + "\n"
         files["page"] = write_atomically(out / f"{stem}.md", text)
     return files
+
+
+def filled_page(stem: str, title: str, tables: Mapping[str, str]) -> str:
+    """The page ``docs/results/STEM.md`` with new tables between its marks; else a bare one.
+
+    Raises:
+        ValueError: If the page and the benchmark do not name the same tables.
+    """
+    path = ROOT / "docs" / "results" / f"{stem}.md"
+    if path.is_file():
+        page = path.read_text(encoding="utf-8")
+    else:
+        page = "\n\n".join([f"# {title}", *(f"<!-- {n} -->\n<!-- end -->" for n in tables)]) + "\n"
+    marked = re.findall(r"^<!-- ([\w-]+) -->$", page, re.MULTILINE)
+    if sorted(name for name in marked if name != "end") != sorted(tables):
+        raise ValueError(f"{path} must have the marks of {sorted(tables)}, not of {marked}")
+
+    def fill(found: re.Match[str]) -> str:
+        return f"<!-- {found[1]} -->\n{tables[found[1]].strip()}\n<!-- end -->"
+
+    # A table that was there may hold anything but the end mark.
+    return re.sub(r"^<!-- ((?!end)[\w-]+) -->\n.*?^<!-- end -->$", fill, page, flags=re.M | re.S)
 
 
 def origin(meta: Mapping[str, Any]) -> str:

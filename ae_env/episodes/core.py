@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -145,6 +145,8 @@ class Task(Protocol):
         """Expected scores of all states in the current frame of environment `env_index`."""
 
 
+#: Constructor of a task, from the episodes, the source of their frames, the scorer, and light and
+#: exposures behind frames where rewards are expectations.
 #: Constructor of a task, from the episodes, what records their frames, the scorer, and the light
 #: and exposures behind frames where rewards are expectations.
 MakeTask = Callable[[Episodes, FrameSource, CompositeScorer, FindTransitions | None], Task]
@@ -397,7 +399,7 @@ class EpisodeCore:
         return prepared
 
     def _with_tolerance(self, prepared: PreparedScene) -> PreparedScene:
-        return replace(prepared, tolerance=self.options.tolerance)
+        return prepared.changed(tolerance=self.options.tolerance)
 
     # -- what is known of an episode ----------------------------------------------------------
 

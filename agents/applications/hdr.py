@@ -79,7 +79,7 @@ def hdr_picture(
     exposures = bracket_exposures(stops, step)
     simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
     prepared = simulator.prepare(raw, tolerance=0.0)
-    light = prepared.denoised[-1].light if prepared.denoised else prepared.light
+    light = prepared.denoised_lights[-1].light if prepared.denoised_lights else prepared.light
 
     # 8 bits a sample: the pictures of a large raw fill the memory.
     codes = [render_srgb(_exposed(replace(raw, data=light), ev)) for ev in exposures]

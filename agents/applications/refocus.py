@@ -76,14 +76,14 @@ def refocus(
     opened = source.effective_f_number / target.effective_f_number
     known = None if depth is None or lens is None else _known_blur(raw, depth, lens)
     prepared = simulator.prepare(raw, tolerance=0.0)
-    clean = prepared.denoised[-1].light if prepared.denoised else prepared.light
+    clean = prepared.denoised_lights[-1].light if prepared.denoised_lights else prepared.light
     diameter = simulator.estimate_defocus(prepared) if known is None else known
     # Second moments add: the blur that is there already is not added again.
     added = diameter.double().cpu() * float(np.sqrt(opened**2 - 1.0))
     blurred = defocus(clean, added)
     settings = replace(target, exposure_time=source.exposure_time / opened**2)
     scene = replace(
-        prepared, light=blurred, denoised=(), nlf=NoiseLevelFunction.zero(), saturated=None
+        prepared, light=blurred, denoised_lights=(), nlf=NoiseLevelFunction.zero(), saturated=None
     )
     frame, _ = scene.capture(settings, seed)
     kept = (added.abs().to(clean.device) <= SHARP) & (blurred == clean).all(dim=0)
