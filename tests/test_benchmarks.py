@@ -75,7 +75,7 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
         name="mine",
         title="Mine",
         parts=lambda *_: [Part(name, print, {"name": name}) for name in ("first", "second")],
-        report=lambda results, meta: Report(list(results.values()), ["text"]),
+        report=lambda results, meta: Report(list(results.values()), {"numbers": "text"}),
         code=("benchmarks/isolated",),
     )
     with pytest.raises(RuntimeError, match="stopped"):
@@ -85,7 +85,9 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
     result = json.loads((tmp_path / "mine.json").read_text())
     assert result["rows"] == [{"name": "first"}, {"name": "second"}]
     assert {"command", "commit", "seed", "date", "machine", "versions"} <= result["meta"].keys()
-    assert (tmp_path / "mine.md").read_text().startswith("# Mine\n\n`ae-env bench mine`")
+    page = (tmp_path / "mine.md").read_text()
+    assert page.startswith("# Mine\n\n<!-- origin -->\n`ae-env bench mine`")
+    assert "<!-- numbers -->\ntext\n<!-- end -->" in page
     assert list((tmp_path / "runs" / "mine").iterdir()) == []
 
 
