@@ -16,8 +16,6 @@ check_package("simulator")
 if TYPE_CHECKING:
     from ae_env import lighting as lighting
     from ae_env import wrappers as wrappers
-    from ae_env.bracket import ExposureBracketEnv as ExposureBracketEnv
-    from ae_env.bracket import ExposureBracketVectorEnv as ExposureBracketVectorEnv
     from ae_env.env import AutoExposureEnv as AutoExposureEnv
     from ae_env.grid import ExposureGrid as ExposureGrid
     from ae_env.lighting import FlickerLighting as FlickerLighting
@@ -44,12 +42,14 @@ if TYPE_CHECKING:
     from ae_env.scorers import register_scorer as register_scorer
     from ae_env.scorers.score_table import ScoreTable as ScoreTable
     from ae_env.scorers.score_table import ScoreTables as ScoreTables
-    from ae_env.utils.presets import list_presets as list_presets
-    from ae_env.utils.presets import load_preset as load_preset
-    from ae_env.utils.user_code import UserCodeError as UserCodeError
+    from ae_env.tasks import AutoExposureVideoEnv as AutoExposureVideoEnv
+    from ae_env.tasks import AutoExposureVideoVectorEnv as AutoExposureVideoVectorEnv
+    from ae_env.tasks import ExposureBracketEnv as ExposureBracketEnv
+    from ae_env.tasks import ExposureBracketVectorEnv as ExposureBracketVectorEnv
+    from ae_env.utils.user_files import UserCodeError as UserCodeError
+    from ae_env.utils.user_files import list_presets as list_presets
+    from ae_env.utils.user_files import load_preset as load_preset
     from ae_env.vector_env import AutoExposureVectorEnv as AutoExposureVectorEnv
-    from ae_env.video import AutoExposureVideoEnv as AutoExposureVideoEnv
-    from ae_env.video import AutoExposureVideoVectorEnv as AutoExposureVideoVectorEnv
     from ae_env.wrappers import ContinuousActions as ContinuousActions
     from ae_env.wrappers import ControlActions as ControlActions
     from ae_env.wrappers import RelativeActions as RelativeActions

@@ -3,38 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
 
-from ae_env.episodes.core import EpisodeCore, Frames
-from ae_env.episodes.draws import check_options
-from ae_env.episodes.recorded import RECORDED
-from ae_env.episodes.state import Episode
+from ae_env.episodes.core import EpisodeCore, Frames, MakeTask, check_actions
+from ae_env.episodes.lookup import RECORDED
+from ae_env.episodes.scores import AutoExposure
+from ae_env.episodes.state import Episode, check_options
 from ae_env.grid import ExposureGrid
-from ae_env.lighting import Lighting
-from ae_env.options import (
-    DEFAULT_SIMULATOR,
-    DEFAULT_TOLERANCE,
-    Crop,
-    Depth,
-    EnvOptions,
-    Motion,
-    Noise,
-    ObservationKind,
-    Reward,
-    Source,
-    Split,
-)
-from ae_env.registration import SpecProperty, names_nearest
-from ae_env.scenes import Scene, SceneSpec
-from ae_env.scorers import Scorer
+from ae_env.options import EnvArguments, EnvOptions, takes_env_arguments
+from ae_env.registration import SpecProperty
+from ae_env.scenes import Scene
 from ae_env.scorers.score_table import ScoreTable
 from simulator.camera import CameraProfile
 from simulator.capture.batch import MODULES
-from simulator.utils.checks import check_actions, check_seed, check_word
+from simulator.utils.checks import check_seed, check_word
 
 logger = logging.getLogger(__name__)
 
@@ -50,11 +36,14 @@ class AutoExposureBase(SpecProperty):
 
     core: EpisodeCore
     render_mode: str | None
+    _make_task: MakeTask = AutoExposure
     _last: Frames | None
 
-    def _make_core(self, options: EnvOptions, num_envs: int) -> EpisodeCore:
-        """The core of `num_envs` episodes."""
-        return EpisodeCore(options, num_envs)
+    def _set_up(self, arguments: Mapping[str, Any], num_envs: int, render_mode: str | None) -> None:
+        """Makes the core of `num_envs` episodes."""
+        check_word("render_mode", render_mode, ("rgb_array",), None)
+        self.render_mode, self._last = render_mode, None
+        self.core = EpisodeCore(EnvOptions.from_kwargs(arguments), num_envs, self._make_task)
 
     @property
     def grid(self) -> ExposureGrid:
@@ -72,7 +61,7 @@ class AutoExposureBase(SpecProperty):
 
         Bundled ones that are not cached yet are drawn when they are looked at.
         """
-        return self.core.first_scenes
+        return self.core.episodes.first_scenes
 
     @property
     def scene_ids(self) -> tuple[str, ...]:
@@ -242,60 +231,13 @@ class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
 
-    @names_nearest
+    @takes_env_arguments()
     def __init__(
-        self,
-        *,
-        scenes: SceneSpec = "bundled",
-        split: Split = "train",
-        grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None = None,
-        scorer: str | Mapping[str, float] | Scorer = "balanced",
-        costs: Mapping[str, float] | None = None,
-        observation: ObservationKind = "uint8",
-        sensors: bool = True,
-        resolution: int = 64,
-        crop: Crop = "box",
-        motion: Motion | float = "random",
-        depth: Depth | float = "random",
-        lighting: str | Mapping[str, Any] | Lighting = "static",
-        delay: int | Mapping[str, int] = 0,
-        source: Source = "light",
-        camera: str | CameraProfile = "nikon_z6",
-        simulator: str | None = DEFAULT_SIMULATOR,
-        noise: bool | Noise = True,
-        tolerance: float = DEFAULT_TOLERANCE,
-        reward: Reward = "capture",
-        with_oracle: bool = False,
-        render_mode: str | None = None,
+        self, *, render_mode: str | None = None, **arguments: Unpack[EnvArguments]
     ) -> None:
-        check_word("render_mode", render_mode, ("rgb_array",), None)
-        self.render_mode = render_mode
-        options = EnvOptions(
-            scenes=scenes,
-            split=split,
-            grid=grid,
-            scorer=scorer,
-            costs={} if costs is None else costs,
-            observation=observation,
-            sensors=sensors,
-            resolution=resolution,
-            crop=crop,
-            motion=motion,
-            depth=depth,
-            lighting=lighting,
-            delay=delay,
-            source=source,
-            camera=camera,
-            simulator=simulator,
-            noise=noise,
-            tolerance=tolerance,
-            reward=reward,
-            with_oracle=with_oracle,
-        )
-        self.core = self._make_core(options, 1)
+        self._set_up(arguments, 1, render_mode)
         self.action_space = gym.spaces.Discrete(self.core.num_actions)
         self.observation_space: Any = self.core.observation_space()
-        self._last = None
 
     @property
     def state(self) -> int:

@@ -2,36 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+import functools
+import inspect
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal, ParamSpec, TypedDict, get_args
 
 from ae_env.grid import ExposureGrid
 from ae_env.lighting import Lighting, MovingLighting, make_lighting
 from ae_env.observation import SETTINGS_RANGES
-from ae_env.scenes import Scene, SceneSpec, load_scenes
-from ae_env.scenes.bundled import Split as Split
-from ae_env.scenes.loading import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
-from ae_env.scenes.loading import (
-    NAMED,
-    SceneNetworks,
-    check_weights,
-    has_frames,
-    scenes_on_demand,
-    without_noise,
-)
-from ae_env.scenes.photographed import photographed
+from ae_env.scenes import Scene, SceneSpec
+from ae_env.scenes.load import DEFAULT_SIMULATOR as DEFAULT_SIMULATOR
+from ae_env.scenes.load import check_weights, environment_scenes, has_frames
 from ae_env.scenes.recorded import RecordedOptions
 from ae_env.scenes.scene import Crop as Crop
-from ae_env.scenes.scene import Resize
+from ae_env.scenes.scene import SceneSet
+from ae_env.scenes.scene import Split as Split
 from ae_env.scorers import CompositeScorer, Scorer, make_scorer
 from simulator.camera import CameraProfile, get_camera
 from simulator.capture.plan import DEFAULT_TOLERANCE as DEFAULT_TOLERANCE
 from simulator.capture.plan import check_tolerance
 from simulator.capture.prepared_scene import MAX_DISC_PX, MAX_IMAGE_SPEED
-from simulator.networks.noise_module import SIZES
-from simulator.utils.cache import LruCache
 from simulator.utils.checks import check_flag, check_integer, check_number, check_word, did_you_mean
 
 #: Smallest frame that the default networks of the common libraries take.
@@ -50,13 +42,37 @@ MAX_DELAY, CONTROLS = 16, ("iso", "exposure_time", "f_number")
 _ROUNDED = 0.07
 #: Highest weight of a cost: scores are in [0, 1].
 MAX_COST = 1e6
-#: Scenes by all that decides them; the bound is on the memory of their light [byte].
-_LOADED: LruCache[Sequence[Scene]] = LruCache(2**30)
+P = ParamSpec("P")
+
+
+class EnvArguments(TypedDict, total=False):
+    """Arguments of all environments; see `AutoExposureEnv`. The defaults are in `EnvOptions`."""
+
+    scenes: SceneSpec
+    split: Split
+    grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None
+    scorer: str | Mapping[str, float] | Scorer
+    costs: Mapping[str, float] | None
+    observation: ObservationKind
+    sensors: bool
+    resolution: int
+    crop: Crop
+    motion: Motion | float
+    depth: Depth | float
+    lighting: str | Mapping[str, Any] | Lighting
+    delay: int | Mapping[str, int]
+    source: Source
+    camera: str | CameraProfile
+    simulator: str | None
+    noise: bool | Noise
+    tolerance: float
+    reward: Reward
+    with_oracle: bool
 
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Arguments of `AutoExposureEnv` and `AutoExposureVectorEnv`, which document them."""
+    """`EnvArguments` with their defaults, checked; ``costs=None`` is the same as no costs."""
 
     scenes: SceneSpec = "bundled"
     split: Split = "train"
@@ -80,6 +96,8 @@ class EnvOptions:
     with_oracle: bool = False
 
     def __post_init__(self) -> None:
+        if self.costs is None:
+            object.__setattr__(self, "costs", {})
         if isinstance(self.scenes, str) and not self.scenes:
             raise ValueError("`scenes` (='') must name scenes, such as 'bundled' or a folder")
         check_word("split", self.split, get_args(Split))
@@ -210,75 +228,67 @@ class EnvOptions:
         return has_frames(self.scenes)
 
     def load_scenes(self) -> list[Scene]:
-        """The scenes of the split at this resolution; of sequences, all frames.
-
-        Those with a name, and recorded ones whose files have not changed, stay in memory for the
-        next environment with the same arguments.
-        """
+        """The scenes of the split at this resolution; of sequences, all frames."""
         return list(self.scenes_on_demand())
 
-    def scenes_on_demand(self) -> Sequence[Scene]:
+    def scenes_on_demand(self) -> SceneSet:
         """Those of `load_scenes`; where they must be drawn first, each when it is needed."""
-        camera = self.make_camera()
-        finds_defocus = self.depth == "unknown"
-        needs_networks = finds_defocus or self.source == "raw"
-        networks_key = (finds_defocus, self.simulator, self.noise) if needs_networks else ()
-        size = (self.resolution, self.crop)
-        content: Any = self.scenes
-        cacheable = isinstance(self.scenes, str) and self.scenes in NAMED
-        if self.recorded is not None:
-            files = self.recorded.files
-            content = self.make_grid(), tuple((f, f.path.stat().st_mtime_ns) for f in files)
-            cacheable = True
-        key = (content, self.split, camera, *size, self.source, *networks_key)
-        # A user's weights may have other content next time.
-        cacheable &= not needs_networks or self.simulator in (None, *SIZES)
-        known = _LOADED.get(key) if cacheable else None
-        if known is not None:
-            return list(known) if isinstance(known, list) else known
-        scenes: Sequence[Scene] | None = None
-        if not needs_networks:  # those without noise, in known light, are taken as they are
-            scenes = scenes_on_demand(self.scenes, self.split, camera, *size)
-        if scenes is None:
-            scenes = self._made_ready(camera, finds_defocus)
-        if cacheable:
-            kept = list(scenes) if isinstance(scenes, list) else scenes
-            tensors = [t for t in (scenes[0].light, scenes[0].recorded) if t is not None]
-            _LOADED.put(key, kept, len(scenes) * sum(tensor.nbytes for tensor in tensors))
-        return scenes
-
-    def _made_ready(self, camera: CameraProfile, finds_defocus: bool) -> list[Scene]:
-        """Every scene, with what networks find in it."""
-        networks = None if self.simulator is None else SceneNetworks(self.simulator)
-        resize: Resize = Scene.resized
-        if networks is not None and finds_defocus:
-            resize = networks.resized
-        scenes = load_scenes(
+        return environment_scenes(
             self.recorded or self.scenes,
             self.split,
-            camera=camera,
+            camera=self.make_camera(),
             resolution=self.resolution,
             crop=self.crop,
-            resize=resize,
             grid=None if self.recorded is None else self.make_grid(),
+            from_raw=self.source == "raw",
+            finds_defocus=self.depth == "unknown",
+            simulator=self.simulator,
+            noise=self.noise,
         )
-        if self.recorded is None and any(scene.recorded is not None for scene in scenes):
-            raise ValueError(
-                "`scenes` must name the folder of recorded scenes ('recorded:FOLDER') to show "
-                "their captures: those of a list would be simulated"
-            )
-        if self.source == "raw":
-            scenes = [photographed(scene) if scene.noise_free else scene for scene in scenes]
-        scenes = [self._prepared(scene, networks) for scene in scenes]
-        _check_light(scenes)
-        return scenes
 
-    def _prepared(self, scene: Scene, networks: SceneNetworks | None) -> Scene:
-        if self.depth != "unknown" and scene.defocus_map is not None:
-            scene = replace(scene, defocus_map=None)
-        if networks is not None:
-            scene = networks.denoised(scene)
-        return scene if self.noise else without_noise(scene)
+
+def takes_env_arguments(
+    without: Collection[str] = (), **defaults: Any
+) -> Callable[[Callable[P, None]], Callable[P, None]]:
+    """Decorates a constructor that passes `EnvArguments` on.
+
+    Its signature shows all of them. An unknown one stays Python's own `TypeError` with its wording,
+    which Gymnasium's consumers look for; the message proposes the nearest name.
+
+    Args:
+        without: Arguments that the task does not have.
+        defaults: Other defaults than those of `EnvOptions` and of the constructor.
+    """
+
+    def decorate(init: Callable[P, None]) -> Callable[P, None]:
+        signature = inspect.signature(init)
+        own = signature.parameters.values()
+        parameters = {p.name: p for p in own if p.kind is not inspect.Parameter.VAR_KEYWORD}
+        for each in fields(EnvOptions):
+            if each.name not in without:
+                default = None if each.default is MISSING else each.default
+                keyword = inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY)
+                taken = keyword.replace(default=default, annotation=each.type)
+                parameters.setdefault(each.name, taken)
+        for name, default in defaults.items():
+            parameters[name] = parameters[name].replace(default=default)
+        known = [name for name in parameters if name != "self"]
+
+        @functools.wraps(init)
+        def checked(*args: P.args, **kwargs: P.kwargs) -> None:
+            for name in kwargs:
+                if name not in known:
+                    raise TypeError(
+                        f"{init.__qualname__}() got an unexpected keyword argument {name!r}"
+                        f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
+                    )
+            init(*args, **{**defaults, **kwargs})
+
+        shown = signature.replace(parameters=list(parameters.values()))
+        checked.__signature__ = shown  # type: ignore[attr-defined]
+        return checked
+
+    return decorate
 
 
 def checked_delay(delay: Any) -> int | dict[str, int]:
@@ -317,12 +327,3 @@ def _check_shown(grid: ExposureGrid) -> None:
                     f"`grid[{name!r}]` (={value:g}) must be in [{low:g}, {high:g}]: the `settings` "
                     "of an observation show no others"
                 )
-
-
-def _check_light(scenes: list[Scene]) -> None:
-    """Raises a `ValueError` where the light is unknown and cannot be estimated from the scene."""
-    for scene in scenes:
-        try:
-            _ = scene.ev100  # a cached property, which every score asks for
-        except ValueError as error:
-            raise ValueError(f"scene {scene.scene_id!r}: {error}") from error

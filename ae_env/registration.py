@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import json
-from collections.abc import Callable
 from dataclasses import fields
-from typing import Any, ParamSpec
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from simulator.utils.checks import did_you_mean
-
-P = ParamSpec("P")
 #: The tasks: module and class, for one episode and for many, and the actions after which an episode
 #: is truncated; None where episodes end by themselves.
 TASKS: dict[str, tuple[str, str, int | None]] = {
@@ -24,13 +18,13 @@ TASKS: dict[str, tuple[str, str, int | None]] = {
         8,
     ),
     "ae_env/AutoExposureVideo-v0": (
-        "ae_env.video:AutoExposureVideoEnv",
-        "ae_env.video:AutoExposureVideoVectorEnv",
+        "ae_env.tasks:AutoExposureVideoEnv",
+        "ae_env.tasks:AutoExposureVideoVectorEnv",
         96,
     ),
     "ae_env/ExposureBracket-v0": (
-        "ae_env.bracket:ExposureBracketEnv",
-        "ae_env.bracket:ExposureBracketVectorEnv",
+        "ae_env.tasks:ExposureBracketEnv",
+        "ae_env.tasks:ExposureBracketVectorEnv",
         None,
     ),
 }
@@ -47,45 +41,6 @@ def register_envs() -> None:
                 vector_entry_point=vector_entry_point,
                 max_episode_steps=steps,
             )
-
-
-def names_nearest(init: Callable[P, None]) -> Callable[P, None]:
-    """Decorates a constructor: its error for an unknown argument proposes the nearest name.
-
-    The error stays Python's own `TypeError` with its wording, which Gymnasium's consumers look for.
-    """
-    known = [name for name in inspect.signature(init).parameters if name != "self"]
-
-    @functools.wraps(init)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> None:
-        for name in kwargs:
-            if name not in known:
-                raise TypeError(
-                    f"{init.__qualname__}() got an unexpected keyword argument {name!r}"
-                    f"{did_you_mean(name, known)} (arguments: {', '.join(known)})"
-                )
-        init(*args, **kwargs)
-
-    return checked
-
-
-def with_defaults(init: Callable[..., None], **defaults: Any) -> Callable[..., None]:
-    """The constructor `init` with other defaults, for a task that is the same environment.
-
-    Its signature shows them.
-    """
-    signature = inspect.signature(init)
-    parameters = [
-        given.replace(default=defaults.get(name, given.default))
-        for name, given in signature.parameters.items()
-    ]
-
-    @functools.wraps(init)
-    def made(self: Any, *args: Any, **kwargs: Any) -> None:
-        init(self, *args, **{**defaults, **kwargs})
-
-    made.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    return made
 
 
 class InProcessSpec(EnvSpec):

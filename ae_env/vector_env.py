@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence, Set
-from typing import Any
+from collections.abc import Mapping, Sequence, Set
+from typing import Any, Unpack
 
 import gymnasium as gym
 import numpy as np
@@ -13,28 +13,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from ae_env.env import AutoExposureBase, Observation
-from ae_env.episodes.core import Frames
-from ae_env.episodes.draws import check_options
-from ae_env.grid import ExposureGrid, plain, plain_list
-from ae_env.lighting import Lighting
-from ae_env.options import (
-    DEFAULT_SIMULATOR,
-    DEFAULT_TOLERANCE,
-    Crop,
-    Depth,
-    EnvOptions,
-    Motion,
-    Noise,
-    ObservationKind,
-    Reward,
-    Source,
-    Split,
-)
-from ae_env.registration import names_nearest
-from ae_env.scenes import SceneSpec
-from ae_env.scorers import Scorer
-from simulator.camera import CameraProfile
-from simulator.utils.checks import check_actions, check_integer, check_seed, check_word
+from ae_env.episodes.core import Frames, check_actions
+from ae_env.episodes.state import check_options
+from ae_env.grid import plain, plain_list
+from ae_env.options import EnvArguments, takes_env_arguments
+from simulator.utils.checks import check_integer, check_seed, check_word
 
 #: Most environments in one process: at 64 pixels, they observe 1 GiB.
 MAX_ENVS = 2**16
@@ -59,71 +42,28 @@ class AutoExposureVectorEnv(
     All other arguments are those of `AutoExposureEnv`.
     """
 
-    @names_nearest
+    @takes_env_arguments()
     def __init__(
         self,
         num_envs: int = 1,
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = 8,
-        scenes: SceneSpec = "bundled",
-        split: Split = "train",
-        grid: ExposureGrid | str | Mapping[str, Iterable[float]] | None = None,
-        scorer: str | Mapping[str, float] | Scorer = "balanced",
-        costs: Mapping[str, float] | None = None,
-        observation: ObservationKind = "uint8",
-        sensors: bool = True,
-        resolution: int = 64,
-        crop: Crop = "box",
-        motion: Motion | float = "random",
-        depth: Depth | float = "random",
-        lighting: str | Mapping[str, Any] | Lighting = "static",
-        delay: int | Mapping[str, int] = 0,
-        source: Source = "light",
-        camera: str | CameraProfile = "nikon_z6",
-        simulator: str | None = DEFAULT_SIMULATOR,
-        noise: bool | Noise = True,
-        tolerance: float = DEFAULT_TOLERANCE,
-        reward: Reward = "capture",
-        with_oracle: bool = False,
         render_mode: str | None = None,
+        **arguments: Unpack[EnvArguments],
     ) -> None:
-        num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVS)
+        self.num_envs = num_envs = check_integer("num_envs", num_envs, 1, MAX_ENVS)
         if max_episode_steps is not None:
             rule = ", or None for never"
             max_episode_steps = check_integer("max_episode_steps", max_episode_steps, 1, more=rule)
-        check_word("render_mode", render_mode, ("rgb_array",), None)
+        self.max_episode_steps = max_episode_steps
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         self.metadata = {
             "render_modes": ["rgb_array"],
             "render_fps": 30,
             "autoreset_mode": self.autoreset_mode,
         }
-        self.num_envs, self.render_mode = num_envs, render_mode
-        self.max_episode_steps = max_episode_steps
-        options = EnvOptions(
-            scenes=scenes,
-            split=split,
-            grid=grid,
-            scorer=scorer,
-            costs={} if costs is None else costs,
-            observation=observation,
-            sensors=sensors,
-            resolution=resolution,
-            crop=crop,
-            motion=motion,
-            depth=depth,
-            lighting=lighting,
-            delay=delay,
-            source=source,
-            camera=camera,
-            simulator=simulator,
-            noise=noise,
-            tolerance=tolerance,
-            reward=reward,
-            with_oracle=with_oracle,
-        )
-        self.core = self._make_core(options, num_envs)
+        self._set_up(arguments, num_envs, render_mode)
         self.single_action_space = gym.spaces.Discrete(self.core.num_actions)
         self.single_observation_space = self.core.observation_space()
         self.action_space = batch_space(self.single_action_space, num_envs)

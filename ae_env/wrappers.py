@@ -23,8 +23,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector.utils import batch_space
 
+from ae_env.episodes.core import check_actions
 from ae_env.grid import ExposureGrid
-from simulator.utils.checks import check_actions
 
 __all__ = [
     "ContinuousActions",

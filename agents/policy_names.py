@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl
 
 import yaml
 
-from ae_env.utils.user_code import find_attribute, load_from_file
+from ae_env.utils.user_files import find_attribute, load_from_file
 from agents.policy import Policy, PolicyContext
 from simulator.utils.checks import did_you_mean
 

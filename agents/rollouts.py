@@ -11,12 +11,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from agents.policy import Observations
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
-    from ae_env.scenes.loading import SceneSpec
+    from ae_env.scenes.load import SceneSpec
 
 ENV_ID = "ae_env/AutoExposure-v0"
 #: Source groups below which a folder of scenes is not split: all of its scenes are for testing.
@@ -52,7 +52,7 @@ def training_arguments(scenes: SceneSpec, resolution: int = 64) -> tuple[dict[st
         ones, because `scenes` has too few source groups for a training split.
     """
     from ae_env.options import EnvOptions
-    from ae_env.scenes.loading import BUNDLED, REAL
+    from ae_env.scenes.load import BUNDLED, REAL
 
     if isinstance(scenes, str) and scenes in (*BUNDLED, *REAL):
         return {"scenes": scenes}, False

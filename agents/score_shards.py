@@ -24,7 +24,7 @@ from safetensors.torch import save
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
-from ae_env.scenes.loading import SceneNetworks
+from ae_env.scenes.load import SceneNetworks
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
 from simulator import get_camera

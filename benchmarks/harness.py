@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import json
 import math
-import string
+import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,14 +23,14 @@ import torch
 from matplotlib.figure import Figure
 
 from agents.cli.console import print_files, progress_bars
+from agents.report.evaluation import Cell, to_markdown
+from agents.report.evaluation import cell as markdown_cell
 from agents.report.plots import write_palette_png
 from benchmarks.isolated import CORES, ROOT, isolated
 from simulator.utils.files import data_folder as data_root
 from simulator.utils.files import result_meta, write_atomically, write_results
 
 Row = dict[str, Any]
-#: Content of a cell: a format of the row, such as ``"{ms:.1f} ± {spread:.1f}"``, or a function.
-Cell = str | Callable[[Row], object]
 #: Significant digits of numbers in result files.
 DIGITS = 6
 #: Folder of what unfinished runs have measured.
@@ -115,12 +115,15 @@ class Report:
 
     Args:
         rows: Rows of the result file.
+        tables: What stands between the marks ``<!-- NAME -->`` and ``<!-- end -->`` of the page, by
+            name: Markdown of `table` and `pivot`. All else on a page is written by hand.
         page: Blocks of the Markdown page below its heading; none for no page.
         meta: Entries of the result file besides its origin.
         figures: Pictures by file name beside the page (``"throughput.png"``), or by path.
     """
 
     rows: Sequence[Row]
+    tables: Mapping[str, str] = field(default_factory=dict)
     page: Sequence[str] = ()
     meta: Mapping[str, Any] = field(default_factory=dict)
     figures: Mapping[str | Path, Figure] = field(default_factory=dict)
@@ -186,11 +189,36 @@ def write_report(
     for name, figure in report.figures.items():
         path = name if isinstance(name, Path) else out / name
         files[f"picture {path.stem}"] = write_picture(path, figure)
+    if report.tables:
+        tables = {"origin": origin(meta), **report.tables}
+        files["page"] = write_atomically(out / f"{stem}.md", filled_page(stem, title, tables))
     if report.page:
         blocks = [f"# {title}", origin(meta), *report.page]
         text = "\n\n".join(block.strip() for block in blocks if block.strip()) + "\n"
         files["page"] = write_atomically(out / f"{stem}.md", text)
     return files
+
+
+def filled_page(stem: str, title: str, tables: Mapping[str, str]) -> str:
+    """The page ``docs/results/STEM.md`` with new tables between its marks; else a bare one.
+
+    Raises:
+        ValueError: If the page and the benchmark do not name the same tables.
+    """
+    path = ROOT / "docs" / "results" / f"{stem}.md"
+    if path.is_file():
+        page = path.read_text(encoding="utf-8")
+    else:
+        page = "\n\n".join([f"# {title}", *(f"<!-- {n} -->\n<!-- end -->" for n in tables)]) + "\n"
+    marked = re.findall(r"^<!-- ([\w-]+) -->$", page, re.MULTILINE)
+    if sorted(name for name in marked if name != "end") != sorted(tables):
+        raise ValueError(f"{path} must have the marks of {sorted(tables)}, not of {marked}")
+
+    def fill(found: re.Match[str]) -> str:
+        return f"<!-- {found[1]} -->\n{tables[found[1]].strip()}\n<!-- end -->"
+
+    # A table that was there may hold anything but the end mark.
+    return re.sub(r"^<!-- ((?!end)[\w-]+) -->\n.*?^<!-- end -->$", fill, page, flags=re.M | re.S)
 
 
 def origin(meta: Mapping[str, Any]) -> str:
@@ -265,50 +293,21 @@ def data_folder(name: str) -> Path:
 # -- tables ---------------------------------------------------------------------------------------
 
 
-class _Format(string.Formatter):
-    """Formats of rows, in which ``{a[b]}`` is an entry of an entry; a missing one is None."""
-
-    def get_field(self, name: str, args: Any, kwargs: Any) -> Any:
-        try:
-            value, used = super().get_field(name, args, kwargs)
-        except (KeyError, IndexError, TypeError):
-            return _Missing(), name
-        return (_Missing() if value is None else value), used
-
-
-class _Missing:
-    """Stands for a value that is not there: its cell stays empty."""
-
-    def __format__(self, spec: str) -> str:
-        raise LookupError
-
-
 def cell(row: Row, content: Cell) -> str:
     """Text of a cell; empty where a value of its format is missing or None.
 
     >>> cell({"ms": 1.25, "error": None}, "{ms:.1f} ms"), cell({"error": None}, "{error:.2f}")
     ('1.2 ms', '')
     """
-    if callable(content):
-        value = content(row)
-        return "" if value is None else str(value)
-    try:
-        return _Format().vformat(content, (), row)
-    except LookupError:
-        return ""
+    return markdown_cell(row, content, missing="")
 
 
 def table(rows: Iterable[Row], columns: Mapping[str, Cell]) -> str:
-    """A Markdown table with a line for each row; columns but the first are aligned to the right.
+    """A Markdown table with a line for each row, see `agents.report.evaluation.to_markdown`.
 
     `columns` maps headings to content; columns that are empty in every row are left out.
     """
-    rows = list(rows)
-    cells = {heading: [cell(row, content) for row in rows] for heading, content in columns.items()}
-    first = next(iter(columns))
-    cells = {h: column for h, column in cells.items() if h == first or any(column)}
-    head = [_line(cells), "|---|" + "--:|" * (len(cells) - 1)]
-    return "\n".join([*head, *(_line(line) for line in zip(*cells.values(), strict=True))])
+    return to_markdown(rows, columns, missing="")
 
 
 def pivot(
@@ -329,7 +328,7 @@ def pivot(
         group = cell(row, columns)
         groups[group] = None
         lines.setdefault(cell(row, named), {}).setdefault(group, row)
-    shown: dict[str, Cell] = {heading: "{line}"}
+    shown: dict[str, Cell] = {heading: lambda row: row["line"]}
     for group in groups:
         for name, content in contents.items():
             shown[": ".join(filter(None, (group, name)))] = _of_group(group, content)
@@ -351,10 +350,6 @@ def sections(rows: Iterable[Row], title: Cell, show: Callable[[list[Row]], str])
     for row in rows:
         groups.setdefault(cell(row, title), []).append(row)
     return [block for name, own in groups.items() for block in (f"### {name}", show(own))]
-
-
-def _line(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(text.replace('|', chr(92) + '|') for text in cells)} |"
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:

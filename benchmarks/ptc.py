@@ -150,22 +150,15 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     rows: list[Row] = [row for own in results.values() for row in own]
     known = {row["camera"] for row in rows if row["row_noise"]}
     shown = [row for row in rows if row["row_noise"] == (row["camera"] in known)]
-    page = [
-        "How to read it: [cameras](../simulator.md#cameras). Flat fields of simulated cameras, "
-        "measured as EMVA 1288 has it (`benchmarks/ptc.py`), with row noise and Tukey-lambda read "
-        "noise where the profile has them; mean and 95 % interval over repetitions. Off, both are "
-        "in the JSON.",
-        "![photon transfer curves](ptc.png)",
-        "Circles: reference camera; crosses: transition engine; lines: what was put in. Intervals "
-        "that hold what was put in, and the time of a frame of 4 x 128 x 128:",
-        table([_coverage(rows, *case) for case in product(PATHS, (True, False))], COVERAGE),
-    ]
-    for key, title in QUANTITIES.items():
+    coverage = [_coverage(rows, *case) for case in product(PATHS, (True, False))]
+    tables = {"coverage": table(coverage, COVERAGE)}
+    for key in QUANTITIES:
         own = [row for row in shown if key != "row" or row["camera"] in known]
         true = {"path": "put in", f"{key}_ci95": None}
         given = [row | true | {key: row["put_in"][key]} for row in own]
-        page += [f"## {title}", _table(given + own, key)]
-    return Report(rows, page, {"fitted": FITTED, "size": SIZE}, {"ptc.png": curves(shown)})
+        tables[key] = _table(given + own, key)
+    meta = {"fitted": FITTED, "size": SIZE}
+    return Report(rows, tables, meta=meta, figures={"ptc.png": curves(shown)})
 
 
 def _table(rows: list[Row], key: str) -> str:

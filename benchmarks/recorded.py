@@ -23,9 +23,8 @@ import torch
 
 from ae_env.grid import ExposureGrid
 from ae_env.scenes import load_scenes
-from ae_env.scenes.loading import DEFAULT_SIMULATOR, SceneNetworks
-from ae_env.scenes.recorded import RecordedOptions, merged_scene
-from ae_env.scenes.recorded_files import PREFIX
+from ae_env.scenes.load import DEFAULT_SIMULATOR, SceneNetworks
+from ae_env.scenes.recorded import PREFIX, RecordedOptions, merged_scene
 from ae_env.scenes.scene import Crop, Scene
 from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables

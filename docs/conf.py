@@ -57,6 +57,7 @@ CONTENTS = {
         *("refocus", "hdr", "augmentation"),
     ],
     "More": [
+        "architecture",
         "gallery",
         "results/README",
         "ae-bench/v1",

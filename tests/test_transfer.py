@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ae_env.options import EnvOptions
-from ae_env.scenes.photographed import photographed
+from ae_env.scenes.load import simulate_source_raw
 from ae_env.scorers.score_table import ScoreTable
 from agents.cli.bench import BENCHMARKS
 from benchmarks import transfer
@@ -143,7 +143,7 @@ def test_sources_of_high_iso_differ_from_others_in_nothing_else() -> None:
     isos = [scene.reference.iso for scene in found]
     assert HIGH_ISO[0] <= min(isos) < 2500.0 < max(isos) <= HIGH_ISO[1]
     for scene, truth in zip(found, plain, strict=True):
-        again = photographed(truth, iso=scene.reference.iso)
+        again = simulate_source_raw(truth, iso=scene.reference.iso)
         assert scene.content == again.content
         assert scene.reference == again.reference
 

@@ -1,15 +1,40 @@
-"""Running episodes: what was drawn for each of them, and where it is now."""
+"""Running episodes: how they are drawn, what their scenes are like, and where each is now."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri
 
+from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
+from ae_env.lighting import Lighting, RollingShutter
+from ae_env.options import EnvOptions
+from ae_env.scenes.folder import sequence_bounds
+from ae_env.scenes.scene import Scene, SceneSet
+from simulator.camera import CameraProfile
 from simulator.optics.motion_path import Movement
+from simulator.utils.checks import check_integer, did_you_mean
+
+#: Share of the episodes in which nothing moves.
+STATIC_SHARE = 1.0 / 3.0
+#: Standard deviation of the natural logarithm of the image speed.
+SPEED_SIGMA = 1.3
+#: Median and spread of the blur diameter at f/4 [pixel of a 64-pixel frame], and its least value.
+DEFOCUS_MEDIAN, DEFOCUS_SIGMA, DEFOCUS_MIN, DEFOCUS_MAX = 1.0, 0.9, 0.1, 8.0
+#: Share of the moving episodes in which the subject moves on its own, in some of them alone.
+SUBJECT_SHARE, ALONE_SHARE = 0.5, 0.15
+#: Standard deviation of the rate at which the direction of the shake turns [rad/s].
+TURN_SIGMA = math.pi
+#: Names that a reset may choose; frames count up to `MAX_FRAME`.
+OPTIONS = ("scene", "state", "frame")
+MAX_FRAME = 2**31 - 1
+#: Uniform numbers that an episode is made of, and how many values each has.
+_NUMBERS, _VALUES = 12, 2.0**53
 
 
 @dataclass(frozen=True)
@@ -51,20 +76,32 @@ class Episode:
 
     @property
     def moves(self) -> dict[str, Any]:
-        """What blur depends on, as arguments of `ae_env.scorers.score_table.prepare_scene`."""
+        """Arguments of `ae_env.scorers.score_table.prepare_scene` that blur depends on."""
         return {"speed": self.speed, "defocus": self.defocus, "movement": self.movement}
+
+
+_FIELDS = tuple(field.name for field in fields(Episode))
+_COLUMNS = (*_FIELDS, "begun", "light_index", "previous", "pending", "image_mean")
 
 
 class Episodes:
     """The episodes of n environments, as columns: a batch takes what it needs of them at once.
 
+    Facts of scenes that are drawn on demand are known once an episode shows them.
+
     Args:
+        options: The environment's arguments.
         count: Number of environments, n.
-        grid: The states.
-        delays: Frames between an action and the first capture that has its ISO, its exposure time
-            and its aperture.
+        scenes: Those of `options` where they are loaded already; of sequences, all frames.
 
     Attributes:
+        grid: The states.
+        camera: The body.
+        lighting: How the light changes.
+        static: Whether it never does.
+        scene_ids: Names of the scenes.
+        allowed: (scenes, S) bool, the states that each allows.
+        box_factor: (scenes,) `Scene.box_factor`.
         begun: (n,) bool, whether there is an episode.
         light_index: (n,) int64, under which what is worked out for its frames is looked up: the
             index of its scene where all episodes that show it at rest share that, else one of its
@@ -75,18 +112,179 @@ class Episodes:
         image_mean: (n,) float64, mean code of the latest frame / 255, where a cost needs it.
 
     The others, (n,) each, are those of `Episode`.
+
+    Raises:
+        ValueError: If a scene was made for another number of states.
     """
 
-    def __init__(self, count: int, grid: ExposureGrid, delays: tuple[int, int, int]) -> None:
+    def __init__(
+        self, options: EnvOptions, count: int, scenes: Sequence[Scene] | None = None
+    ) -> None:
+        self.options = options
+        self.grid: ExposureGrid = options.make_grid()
+        self.camera: CameraProfile = options.make_camera()
+        self.lighting: Lighting = options.make_lighting()
+        self.static = type(self.lighting) is Lighting
+        self.scenes = options.scenes_on_demand() if scenes is None else SceneSet.of(scenes)
         # With one delay of all controls a state needs not be put together.
-        self._grid, self._delays = grid, delays if len(set(delays)) > 1 else delays[:1]
+        self._delays = options.delays if len(set(options.delays)) > 1 else options.delays[:1]
         self.scene, self.state, self.noise_seed, self.frame = np.zeros((4, count), np.int64)
         self.speed, self.defocus, self.focus_drive, self.phase = np.zeros((4, count))
         self.direction, self.turn, self.subject_speed, self.subject_direction = np.zeros((4, count))
         self.begun = np.zeros(count, bool)
         self.light_index, self.previous = np.zeros((2, count), np.int64)
-        self.pending = np.zeros((count, max(delays) + 1), np.int64)
+        self.pending = np.zeros((count, max(options.delays) + 1), np.int64)
         self.image_mean = np.full(count, np.nan)
+        self._learn_about_scenes()
+        # Only recorded scenes forbid states. Those that one allows come first in its row, in order.
+        self._starts = np.argsort(~self.allowed, axis=1, kind="stable")
+        self._num_starts = self.allowed.sum(axis=1)
+        # (scenes, S) state that is shown where another is asked for; None where each can be.
+        self._shown_state: np.ndarray | None = None
+        if options.recorded is not None:
+            self._shown_state = np.stack([nearest_recorded(s, self.grid) for s in self.scenes])
+
+    # -- the scenes ---------------------------------------------------------------------------
+
+    def _learn_about_scenes(self) -> None:
+        count = len(self.scenes)
+        self.allowed = np.ones((count, len(self.grid)), bool)
+        self._median_speed, self._own_blur = np.zeros((2, count))
+        self._has_subject, self._has_map, self._known = np.zeros((3, count), bool)
+        self.box_factor = np.ones(count, np.int64)
+        self.scene_ids = self.scenes.scene_ids
+        self._ensure_loaded(np.array(self.scenes.loaded, np.int64))
+        # First and last frame of the sequence that each scene is a frame of.
+        self._bounds: tuple[np.ndarray, np.ndarray] | None = None
+        self._firsts = np.arange(count)
+        if self.options.in_sequences:
+            self._bounds = sequence_bounds(self.scenes)
+            self._firsts = np.unique(self._bounds[0])
+        self._ids = [self.scene_ids[i] for i in self._firsts]
+        self._index = {scene_id: i for i, scene_id in enumerate(self._ids)}
+        if self._bounds is not None:  # sequences have a name of their own
+            named = enumerate(self.first_scenes)
+            self._index |= {scene.sequence: i for i, scene in named if scene.sequence}
+
+    @property
+    def first_scenes(self) -> Sequence[Scene]:
+        """Scenes that episodes draw from: of a sequence, its first frame."""
+        if self._bounds is None:
+            return self.scenes
+        return [self.scenes[i] for i in self._firsts.tolist()]
+
+    def _ensure_loaded(self, indices: np.ndarray) -> None:
+        """Loads the scenes `indices` and learns their facts: they are about to be shown."""
+        if self._known[indices].all():
+            return
+        new = np.unique(indices[~self._known[indices]]).tolist()
+        self.scenes.load(new)  # several at once: on several threads
+        for index in new:
+            scene = self.scenes[index]
+            self.allowed[index] = _allowed_states(scene, len(self.grid))
+            self._median_speed[index] = scene.median_speed
+            self._own_blur[index] = scene.own_blur(4.0)
+            layout = scene.layout
+            self._has_subject[index] = layout is not None and layout.subject is not None
+            self._has_map[index] = scene.defocus_map is not None
+            self.box_factor[index] = scene.box_factor
+            self._known[index] = True
+
+    # -- drawing ------------------------------------------------------------------------------
+
+    def draw(
+        self,
+        rngs: Sequence[np.random.Generator],
+        options: Sequence[Mapping[str, Any]] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """K episodes as columns, each of its own generator.
+
+        The draws do not depend on what is chosen, which only replaces them.
+
+        Args:
+            rngs: K generators; each gives the same count of numbers for every episode.
+            options: For each the ``scene``, ``state`` and ``frame`` that it shall have.
+
+        Returns:
+            (K,) arrays by the names of `Episode`.
+
+        Raises:
+            ValueError: If there is no such scene, state or frame.
+        """
+        chosen = [self._chosen(one) for one in options or ()]  # errors come before any draw
+        uniforms = np.array([rng.random(_NUMBERS) for rng in rngs]).T
+        which, start, moving, speed, defocus, phase, seed, *motion = uniforms
+        place = (which * len(self._firsts)).astype(np.int64)
+        frame = np.zeros(len(rngs), np.int64)
+        for i, one in enumerate(chosen):
+            place[i], frame[i] = one.get("scene", place[i]), one.get("frame", 0)
+        scene = self._firsts[place]
+        self._ensure_loaded(scene)
+        state = self._starts[scene, (start * self._num_starts[scene]).astype(np.int64)]
+        for i, one in enumerate(chosen):
+            state[i] = one.get("state", state[i])
+        discs = np.exp(DEFOCUS_SIGMA * ndtri(defocus)) * DEFOCUS_MEDIAN
+        discs = np.minimum(np.maximum(discs, DEFOCUS_MIN), DEFOCUS_MAX)
+        discs = _fixed_or_drawn(self.options.depth, discs)
+        own_blur = self._own_blur[scene] * 64.0 / self.options.resolution
+        return {
+            "scene": self._shown_at(scene, frame),
+            "state": state,
+            **self._draw_motion(scene, moving, speed, *motion),
+            "defocus": discs,
+            "focus_drive": np.hypot(discs, own_blur),
+            "phase": phase,
+            "noise_seed": (seed * _VALUES).astype(np.int64),
+            "frame": frame,
+        }
+
+    def _draw_motion(
+        self,
+        scene: np.ndarray,
+        moving: np.ndarray,
+        speed: np.ndarray,
+        direction: np.ndarray,
+        turn: np.ndarray,
+        apart: np.ndarray,
+        subject_speed: np.ndarray,
+        subject_direction: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """Columns of the motion in `scene` (K,), from K uniform numbers each."""
+        speeds = self._median_speed[scene]
+        shake, own = (np.exp(SPEED_SIGMA * ndtri(u)) for u in (speed, subject_speed))
+        # Either may rest where both could move: a camera on a tripod, a subject that waits.
+        moves = moving >= STATIC_SHARE
+        subject_moves = moves & self._has_subject[scene] & (apart < SUBJECT_SHARE)
+        shakes = moves & ~(subject_moves & (apart < ALONE_SHARE))
+        if self.options.motion != "random":  # one speed of the whole image
+            subject_moves = np.zeros(len(scene), bool)
+        return {
+            "speed": _fixed_or_drawn(self.options.motion, shakes * shake * speeds),
+            "direction": 2.0 * math.pi * direction,
+            "turn": TURN_SIGMA * ndtri(turn),
+            "subject_speed": subject_moves * own * speeds,
+            "subject_direction": 2.0 * math.pi * subject_direction,
+        }
+
+    def _chosen(self, options: Mapping[str, Any]) -> dict[str, int]:
+        """The entries of the options of a reset as integers."""
+        found = {name: options[name] for name in OPTIONS if options.get(name) is not None}
+        wanted = found.get("scene")
+        if isinstance(wanted, str) and wanted in self._index:
+            found["scene"] = self._index[wanted]
+        hint = did_you_mean(wanted, self._ids) if isinstance(wanted, str) else ""
+        ids = f", or a scene id, such as {self._ids[0]!r}{hint}"
+        limits = {
+            "scene": (len(self._ids) - 1, ids),
+            "state": (len(self.grid) - 1, ""),
+            "frame": (MAX_FRAME, ""),
+        }
+        for name, value in found.items():
+            most, rule = limits[name]
+            found[name] = check_integer(f"options[{name!r}]", value, 0, most, more=rule)
+        return found
+
+    # -- running ------------------------------------------------------------------------------
 
     def begin(self, env_indices: np.ndarray, drawn: Mapping[str, np.ndarray]) -> None:
         """Puts the episodes `drawn`, columns of `Episode`, into `env_indices`."""
@@ -96,24 +294,157 @@ class Episodes:
         self.pending[env_indices] = self.state[env_indices, None]
         self.image_mean[env_indices] = np.nan
         self.begun[env_indices] = True
+        self._show_recorded(env_indices)
+        self._set_light_index(env_indices)
 
-    def act(self, env_indices: np.ndarray, actions: np.ndarray) -> None:
-        """Advances the episodes of `env_indices` by one frame, each with its action."""
+    def act(self, env_indices: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Advances the episodes of `env_indices` by one frame, each with its action.
+
+        Returns:
+            Those of `env_indices` that show another scene now, the next of their sequence.
+        """
         self.previous[env_indices] = self.state[env_indices]
         self.pending[env_indices, :-1] = self.pending[env_indices, 1:]
         self.pending[env_indices, -1] = actions
         in_effect = [self.pending[env_indices, -1 - delay] for delay in self._delays]
         self.state[env_indices] = (
-            in_effect[0] if len(in_effect) == 1 else self._grid.mixed(*in_effect)
+            in_effect[0] if len(in_effect) == 1 else self.grid.mixed(*in_effect)
         )
         self.frame[env_indices] += 1
+        changed = env_indices[:0]
+        if self._bounds is not None:
+            now = self._shown_at(self.scene[env_indices], self.frame[env_indices])
+            changed = env_indices[now != self.scene[env_indices]]
+            self.scene[env_indices] = now
+            self._set_light_index(changed)
+        self._show_recorded(env_indices)
+        return changed
+
+    def _show_recorded(self, env_indices: np.ndarray) -> None:
+        """Replaces a state that was not recorded by the nearest one that was."""
+        if self._shown_state is not None:
+            wanted = self.scene[env_indices], self.state[env_indices]
+            self.state[env_indices] = self._shown_state[wanted]
+
+    def _shown_at(self, scenes: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Scenes that the sequences of `scenes` show in `frames`; the last one stays."""
+        if self._bounds is None:
+            return scenes
+        first, last = self._bounds
+        return np.minimum(first[scenes] + frames, last[scenes])
+
+    def _set_light_index(self, env_indices: np.ndarray) -> None:
+        """Sets `light_index`: episodes at rest share the light of their scene."""
+        scenes = self.scene[env_indices]
+        own = len(self.scenes) + env_indices
+        if self.static:
+            moves = self.speed[env_indices] > 0.0
+            moves |= self.subject_speed[env_indices] > 0.0
+            moves |= self.defocus[env_indices] > 0.0
+            own = np.where(moves | self._has_map[scenes], own, scenes)
+        self.light_index[env_indices] = own
 
     def columns(self) -> dict[str, np.ndarray]:
-        """All arrays by name; what the episodes are, and where."""
-        return {name: v for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        """All columns by name; what the episodes are, and where."""
+        return {name: getattr(self, name) for name in _COLUMNS}
+
+    def resume(self, columns: Mapping[str, np.ndarray]) -> None:
+        """Continues where `columns`, of another process, are."""
+        for name, values in columns.items():
+            getattr(self, name)[:] = values
+        begun = np.flatnonzero(self.begun)
+        self._ensure_loaded(self.scene[begun])
+        self._set_light_index(begun)
 
     def __getitem__(self, env_index: int) -> Episode:
         return Episode(**{name: getattr(self, name).item(env_index) for name in _FIELDS})
 
+    # -- the light of the current frames ------------------------------------------------------
 
-_FIELDS = tuple(field.name for field in fields(Episode))
+    def gain(self, env_index: int, exposure_time: float) -> tuple[float, np.ndarray | None]:
+        """Light of an exposure in the current frame of an episode, relative to its scene's own.
+
+        Args:
+            env_index: Which episode.
+            exposure_time: Time the shutter is open [s].
+
+        Returns:
+            That of the frame, and (R,) that of each row relative to it; None where all rows have
+            the same.
+        """
+        frame, phase = self.frame.item(env_index), self.phase.item(env_index)
+        if not self.lighting.within_frame:
+            return self.lighting.gain(frame, exposure_time, phase), None
+        rows_per_row = 2 * self.scenes[self.scene[env_index]].box_factor
+        shutter = RollingShutter(self.options.resolution, self.camera.row_time, rows_per_row)
+        return self.lighting.rows(frame, exposure_time, phase, shutter)
+
+    def gains(
+        self, env_indices: np.ndarray, exposure_times: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """`gain` of one exposure of each of `env_indices` (B,).
+
+        Returns:
+            (B,) and (B, R); None where all rows of all frames are alike.
+        """
+        pairs = zip(env_indices.tolist(), exposure_times.tolist(), strict=True)
+        return _stacked([self.gain(env_index, time) for env_index, time in pairs])
+
+    def gains_by_state(self, env_index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        """`gains` (S,) and (S, R) of all states in one environment."""
+        times = [state.exposure_time for state in self.grid]
+        known = {time: self.gain(env_index, time) for time in set(times)}
+        return _stacked([known[time] for time in times])
+
+
+def check_options(options: Any, *more: str) -> dict[str, Any]:
+    """The options of a reset as a dictionary of its own.
+
+    Args:
+        options: The options of `reset`: None or a mapping.
+        more: Names that are allowed beside those of `OPTIONS`.
+
+    Raises:
+        ValueError: If there is another name, or it is no mapping.
+    """
+    known = [*OPTIONS, *more]
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"`options` (={options!r}) must be None or a dictionary with {known}")
+    for name in options:
+        if name not in known:
+            raise ValueError(
+                f"`options` has {name!r}; it may have {known}{did_you_mean(name, known)}"
+            )
+    return dict(options)
+
+
+def _fixed_or_drawn(option: str | float, drawn: np.ndarray) -> np.ndarray:
+    """`drawn` for ``"random"``, 0 for every other word, or the number itself."""
+    if option == "random":
+        return drawn
+    return np.full(len(drawn), 0.0 if isinstance(option, str) else float(option))
+
+
+def _allowed_states(scene: Scene, num_states: int) -> np.ndarray:
+    """(S,) bool: the states that `scene` allows."""
+    if scene.allowed is None:
+        return np.ones(num_states, bool)
+    if len(scene.allowed) != num_states:
+        raise ValueError(
+            f"`allowed` of scene {scene.scene_id!r} (length {len(scene.allowed)}) must have one "
+            f"entry for each of the {num_states} states of `grid`"
+        )
+    return scene.allowed
+
+
+def _stacked(
+    lights: Sequence[tuple[float, np.ndarray | None]],
+) -> tuple[np.ndarray, np.ndarray | None]:
+    gains = np.array([gain for gain, _ in lights])
+    shown = [rows for _, rows in lights if rows is not None]
+    if not shown:
+        return gains, None
+    alike = np.ones_like(shown[0])
+    return gains, np.stack([alike if rows is None else rows for _, rows in lights])

@@ -4,17 +4,21 @@ A lighting gives, for each frame, the factor by which the scene's light differs 
 it changes within a frame (`FlickerLighting`), one for each row.
 """
 
-from ae_env.lighting.base import KINDS, MAX_STOPS, Lighting, RollingShutter, make_lighting
-from ae_env.lighting.changes import (
+from ae_env.lighting.base import (
+    KINDS,
+    MAX_STOPS,
     LensCapLighting,
+    Lighting,
     RampLighting,
+    RollingShutter,
+    ScheduleLighting,
     SineLighting,
     StepLighting,
     TunnelLighting,
+    make_lighting,
 )
 from ae_env.lighting.flicker import FlickerLighting
 from ae_env.lighting.moving import MovingLighting
-from ae_env.lighting.schedule import ScheduleLighting
 
 __all__ = [
     "KINDS",

@@ -1,18 +1,23 @@
-"""`Lighting`, the base of every change of light, and `make_lighting`, which finds one by name."""
+"""`Lighting`, the changes of light from frame to frame, and `make_lighting`, which finds one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import csv
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from simulator.utils.checks import check_integer, check_number, did_you_mean
+from simulator.utils.checks import check_integer, check_number, check_word
 
 #: Most stops that the light may change by: float32 holds it at any settings of a grid.
 MAX_STOPS = 64
+#: Most frames of a schedule.
+MAX_FRAMES = 2**20
 
 
 def _check_frame(name: str, value: Any, low: int, high: int) -> int:
@@ -124,16 +129,193 @@ def make_lighting(spec: str | Mapping[str, Any] | Lighting) -> Lighting:
     options = {"kind": spec} if isinstance(spec, str) else dict(spec)
     if "kind" not in options:
         raise ValueError(f"`lighting` (={spec!r}) needs a 'kind', one of {sorted(KINDS)}")
-    name = options.pop("kind", None)
-    if not isinstance(name, str) or name not in KINDS:
-        hint = did_you_mean(name, KINDS)
-        raise ValueError(f"`lighting` (={spec!r}) must be one of {sorted(KINDS)}{hint}")
+    name = options.pop("kind")
+    check_word("lighting", name, tuple(sorted(KINDS)))
     kind = KINDS[name]
-    known = [f.name for f in fields(kind)]
     for option in options:
-        if option not in known:
-            hint = did_you_mean(option, known)
-            raise ValueError(
-                f"`lighting` (={spec!r}): {name!r} takes {known}, not {option!r}{hint}"
-            )
+        check_word("lighting", option, tuple(f.name for f in fields(kind)))
     return kind(**options)
+
+
+# -- by a rule -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StepLighting(Lighting):
+    """The light changes by `stops` at frame `at` and stays."""
+
+    name: ClassVar[str] = "step"
+    stops: float = -4.0
+    at: int = 4
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        return float(2.0**self.stops) if frame >= self.at else 1.0
+
+
+@dataclass(frozen=True)
+class RampLighting(Lighting):
+    """The light changes by `stops_per_frame` (>= 0) each frame, up to `stops` (of either sign)."""
+
+    name: ClassVar[str] = "ramp"
+    stops: float = -4.0
+    stops_per_frame: float = 0.5
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        change = min(abs(self.stops), self.stops_per_frame * frame)
+        return float(2.0 ** math.copysign(change, self.stops))
+
+
+@dataclass(frozen=True)
+class SineLighting(Lighting):
+    """The light swings by +- `stops` with a period of `period` frames, at the episode's phase."""
+
+    name: ClassVar[str] = "sine"
+    stops: float = 2.0
+    period: float = 16.0
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        turn = frame / self.period + phase
+        return float(2.0 ** (self.stops * math.sin(2.0 * math.pi * turn)))
+
+
+@dataclass(frozen=True)
+class TunnelLighting(Lighting):
+    """Into a tunnel `stops` darker from frame `enter` on, over `edge` frames, and out at `leave`.
+
+    Frame ``enter`` is the last one with the light outside; frame ``enter + k`` has k / `edge` of
+    the change. With `edge` 0 frame ``enter`` has all of it. `leave` works likewise.
+    """
+
+    name: ClassVar[str] = "tunnel"
+    stops: float = -6.0
+    enter: int = 3
+    leave: int = 10
+    edge: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "enter", "leave")
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        inside, outside = self._share(frame - self.enter), self._share(frame - self.leave)
+        return float(2.0 ** (self.stops * (inside - outside)))
+
+    def _share(self, frames: int) -> float:
+        """Share of a change that has happened `frames` after its start."""
+        if self.edge == 0:
+            return 1.0 if frames >= 0 else 0.0
+        return min(max(frames / self.edge, 0.0), 1.0)
+
+
+@dataclass(frozen=True)
+class LensCapLighting(Lighting):
+    """The lens is covered (`stops` darker) from frame `on` to before frame `off`."""
+
+    name: ClassVar[str] = "lens_cap"
+    stops: float = -20.0
+    on: int = 2
+    off: int = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "on", "off")
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        return 2.0**self.stops if self.on <= frame < self.off else 1.0
+
+
+def _check_order(lighting: Lighting, first: str, last: str) -> None:
+    begin, end = getattr(lighting, first), getattr(lighting, last)
+    if end < begin:
+        raise ValueError(
+            f"`lighting[{last!r}]` (={end!r}) must not be before `lighting[{first!r}]` (={begin!r})"
+        )
+
+
+# -- by a list of the user's -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ScheduleLighting(Lighting):
+    """The light changes by `ev[n]` stops in frame n, relative to the scene's; the last one holds.
+
+    Args:
+        ev: One number per frame, within +- `MAX_STOPS`: a list, a tuple or a one-dimensional
+            array.
+        file: In place of `ev`, a text file with one number per line, or a CSV with a column
+            ``ev``.
+
+    >>> ScheduleLighting(ev=[0, -1, 2]).gain(7, 0.01, 0.0)
+    4.0
+    """
+
+    name: ClassVar[str] = "schedule"
+    ev: Sequence[float] | np.ndarray | None = None
+    file: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if (self.ev is None) == (self.file is None):
+            raise ValueError(
+                f"`lighting['ev']` (={self.ev!r}) or `lighting['file']` (={self.file!r}) must be "
+                "given, and only one of them"
+            )
+        values = _numbers(self.ev) if self.file is None else _read(self.file)
+        if not 1 <= len(values) <= MAX_FRAMES:
+            raise ValueError(
+                f"`lighting['ev']` (length {len(values)}) must have 1 to {MAX_FRAMES} numbers"
+            )
+        checked = tuple(
+            check_number(f"lighting['ev'][{i}]", value, -MAX_STOPS, MAX_STOPS)
+            for i, value in enumerate(values)
+        )
+        object.__setattr__(self, "ev", checked)
+
+    def gain(self, frame: int, exposure_time: float, phase: float) -> float:
+        """See `Lighting.gain`."""
+        assert self.ev is not None
+        return float(2.0 ** self.ev[min(frame, len(self.ev) - 1)])
+
+
+def _numbers(ev: Any) -> list[Any]:
+    if isinstance(ev, np.ndarray) and ev.ndim == 1:
+        return list(ev)
+    if isinstance(ev, Sequence) and not isinstance(ev, str | bytes):
+        return list(ev)
+    raise ValueError(f"`lighting['ev']` (={ev!r}) must be a list of numbers, one per frame")
+
+
+def _read(file: Any) -> list[float]:
+    """The numbers of a file.
+
+    Raises:
+        ValueError: If it cannot be read, or a row holds no finite number.
+    """
+    rule = f"`lighting['file']` (={str(file)!r})"
+    if not isinstance(file, str | Path):
+        raise ValueError(f"{rule} must be a path")
+    try:
+        text = Path(file).expanduser().read_text(encoding="utf-8-sig")
+        rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    except (OSError, UnicodeError, csv.Error, RuntimeError) as error:
+        raise ValueError(f"{rule} cannot be read: {error}") from error
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    column, first = 0, 0
+    if "ev" in header:
+        column, first = header.index("ev"), 1
+    elif len(header) > 1:
+        raise ValueError(f"{rule} (columns {header}) must have one column, or a column `ev`")
+    values = []
+    for number, row in enumerate(rows[first:], start=first + 1):
+        cell = row[column].strip() if column < len(row) else ""
+        try:
+            values.append(float(cell))
+        except ValueError:
+            values.append(math.nan)
+        if not math.isfinite(values[-1]):
+            raise ValueError(f"{rule}, row {number} (={cell!r}), must be a number of stops")
+    return values

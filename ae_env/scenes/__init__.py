@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ae_env.scenes.loading import SceneSpec, load_scenes
+from ae_env.scenes.load import SceneSpec, load_scenes
 from ae_env.scenes.scene import Scene
 from simulator.radiance.light import MEAN_SIGNAL, WHITE_SIGNAL, reference_settings
 

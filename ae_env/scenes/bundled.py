@@ -1,31 +1,41 @@
-"""The bundled scenes: fixed source groups in a fixed split, drawn on demand and cached."""
+"""The bundled scenes: fixed source groups in a fixed split, drawn on demand and cached.
+
+A cached scene has float16 light, and a byte a pixel for its layout: defocus in 127 steps, and a bit
+for the subject. One that was just drawn is rounded alike, so that a cached run equals a fresh one.
+"""
 
 from __future__ import annotations
 
+import logging
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import torch
 
-from ae_env.scenes.drawn import DrawnScenes, SceneSource
-from ae_env.scenes.scene import DEFAULT_SPEED, Crop, Scene
-from ae_env.scenes.stored import stored_scenes
+from ae_env.scenes.scene import DEFAULT_SPEED, Scene, SceneRequest, SceneSet
 from simulator.camera import CameraProfile
+from simulator.capture.layout import Layout
 from simulator.radiance.depth import draw_layout
 from simulator.radiance.photographs import PHOTOGRAPHS, Photograph, photograph_drawings
 from simulator.radiance.procedural import (
     GENERATOR_VERSION,
     HARD_KINDS,
     MOTION_SPEED,
+    NATIVE_SIZE,
+    Drawing,
     draw,
 )
-from simulator.utils.cache import cache_key
+from simulator.settings import CameraSettings
+from simulator.utils.cache import cache_key, disk_cache
+from simulator.utils.compute import parallel_ranges, progress_bar
 
-Split = Literal["train", "test", "all"]
+logger = logging.getLogger(__name__)
 
+Size = Literal["small", "normal", "large"]
 #: Source groups of each procedural kind: (train, test).
 GROUPS_PER_KIND = {
     "dead_leaves": (90, 24),
@@ -42,73 +52,138 @@ FIRST_TEST_INDEX = 1000
 SMALL_GROUPS = 2
 #: How many times the training groups of "bundled" there are in "bundled:large"; same test groups.
 LARGE_FACTOR = 4
-Size = Literal["small", "normal", "large"]
 #: Kinds of the bundled scenes; those of scikit-image's photographs last.
 KINDS = (*GROUPS_PER_KIND, "photograph")
 #: Name of the hard kinds together.
 HARD = "hard"
+#: From so many missing groups on, drawing takes long enough for a log line and a progress bar.
+_MANY = 64
+#: Part of every cache key: raise it with any change of the stored values.
+_FORMAT = 8
+#: Fields of a cached scene that JSON holds.
+_FIELDS = (
+    *("scene_id", "group", "illuminance", "white_balance", "kind", "hard", "median_speed"),
+    *("box_factor", "source", "sampled"),
+)
+#: Steps of a cached layout's defocus.
+_STEPS = 127
 
 
 def bundled_scenes(
-    split: Split,
-    camera: CameraProfile,
-    resolution: int | None = 64,
-    crop: Crop = "box",
-    *,
-    size: Size = "normal",
-    part: str | None = None,
-) -> Sequence[Scene]:
-    """The bundled scenes of `split`, from the cache where they have been made before.
+    request: SceneRequest, *, size: Size = "normal", part: str | None = None
+) -> SceneSet:
+    """The bundled scenes of a split, from the cache where they have been made before.
 
     Else those of one split are drawn when they are needed (`DrawnScenes`).
 
     Args:
-        split: ``"train"``, ``"test"`` or ``"all"`` (train, then test).
-        camera: Whose colours the light is taken to.
-        resolution: Packed pixels a side; None keeps 256.
-        crop: See `Scene.resized`.
+        request: Split, camera, resolution and crop; without a resolution they have 256 pixels.
         size: ``"small"``: only `SMALL_GROUPS` groups of each kind and split; ``"large"``:
             `LARGE_FACTOR` times the procedural training groups, and the same test groups.
         part: Only those of one of `KINDS`, or the hard ones (`HARD`); None for all.
     """
+    if request.split == "all":
+        halves = [replace(request, split=split) for split in ("train", "test")]
+        return SceneSet([s for half in halves for s in bundled_scenes(half, size=size, part=part)])
     kinds = KINDS if part is None else HARD_KINDS if part == HARD else (part,)
-    parts: list[Sequence[Scene]] = []
-    for name in ["train", "test"] if split == "all" else [split]:
-        key = _cache_key(name, camera, resolution, crop, size, part)
-        found = stored_scenes(key, camera, resolution)
-        if found is None:
-            sources = list(_sources(name, camera, resolution, crop, size, kinds))
-            parts.append(DrawnScenes(f"the bundled scenes ({name})", sources, key))
-        else:
-            parts.append(found)
-    return parts[0] if len(parts) == 1 else [scene for own in parts for scene in own]
+    key = cache_key(
+        "scenes",
+        {
+            "generator": GENERATOR_VERSION,
+            "format": _FORMAT,
+            "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
+            "photographs": [p.name for p in PHOTOGRAPHS],
+            "camera": request.camera.name,
+            "colour_matrix": request.camera.colour_matrix,
+            "split": request.split,
+            "resolution": request.resolution,
+            "crop": request.crop,
+            "size": size if request.split == "train" or size == "small" else "normal",
+            "part": part,
+        },
+    )
+    found = _stored(key, request.camera, request.resolution)
+    if found is not None:
+        return SceneSet(found)
+    groups = list(_groups(request, size, kinds))
+    return DrawnScenes(f"the bundled scenes ({request.split})", groups, key)
 
 
-def _sources(
-    split: str,
-    camera: CameraProfile,
-    resolution: int | None,
-    crop: Crop,
-    size: Size,
-    kinds: Sequence[str],
-) -> Iterator[SceneSource]:
-    """Where the scenes of `split` come from, the photographs last."""
+# -- drawing --------------------------------------------------------------------------------------
 
-    def source(scene_ids: Sequence[str], draw: Callable[[], Iterable[Scene]]) -> SceneSource:
-        def make() -> list[Scene]:
-            return [add_layout(scene).resized(resolution, crop) for scene in draw()]
 
-        return SceneSource(tuple(scene_ids), make)
+class SceneGroup(NamedTuple):
+    """Scenes that are drawn together.
 
-    for kind, index in _procedural(split, size):
+    Args:
+        scene_ids: Their names.
+        draw: Draws them, always the same ones.
+    """
+
+    scene_ids: Sequence[str]
+    draw: Callable[[], Iterable[Scene]]
+
+
+class DrawnScenes(SceneSet):
+    """Scenes whose names are known, and each of which is drawn when it is first needed.
+
+    The first is drawn at once, so that what cannot be drawn is an error here. When the last one is
+    there, all are stored for the next process. A pickled copy has all of them.
+
+    Args:
+        name: What they are, in messages.
+        groups: What draws them, in order.
+        key: The key in the cache that they are stored under.
+    """
+
+    def __init__(self, name: str, groups: Sequence[SceneGroup], key: str) -> None:
+        self._name, self._groups, self._key = name, groups, key
+        self.scene_ids = tuple(one for group in groups for one in group.scene_ids)
+        self._scenes = [None] * len(self.scene_ids)
+        ends = np.cumsum([len(group.scene_ids) for group in groups]).tolist()
+        self._firsts = [end - len(g.scene_ids) for end, g in zip(ends, groups, strict=True)]
+        self._group_of = np.repeat(np.arange(len(groups)), [len(g.scene_ids) for g in groups])
+        if groups:
+            self.load([0])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SceneSet, (list(self),)
+
+    def load(self, indices: Iterable[int]) -> None:
+        """Draws the groups of the scenes `indices` that are missing, on torch's threads."""
+        missing = sorted({int(self._group_of[i]) for i in indices if self._scenes[i] is None})
+        if not missing:
+            return
+        many = len(missing) >= _MANY
+        if many:
+            logger.warning("drawing %s, once for this camera and resolution", self._name)
+        with progress_bar("drawing scenes", len(missing) if many else 0) as advance:
+
+            def draw_some(first: int, last: int) -> None:
+                for number in missing[first:last]:
+                    start = self._firsts[number]
+                    for place, scene in enumerate(self._groups[number].draw(), start=start):
+                        self._scenes[place] = _rounded(scene)
+                    advance()
+
+            parallel_ranges(draw_some, len(missing))
+        whole = [scene for scene in self._scenes if scene is not None]
+        if len(whole) == len(self):  # which happens once: later calls have none missing
+            _store(self._key, whole)
+
+
+def _groups(request: SceneRequest, size: Size, kinds: Sequence[str]) -> Iterator[SceneGroup]:
+    """The source groups of a split, the photographs last."""
+    for kind, index in procedural_groups(request.split, size):
         if kind in kinds:
-            yield source([_name(kind, index)], partial(_procedural_scenes, kind, index, camera))
-    photographs = [p for p in PHOTOGRAPHS if p.split == split and KINDS[-1] in kinds]
+            name = f"{kind}-{index:03d}"
+            yield SceneGroup([name], partial(_draw_procedural, kind, index, name, request))
+    photographs = [p for p in PHOTOGRAPHS if p.split == request.split and KINDS[-1] in kinds]
     for photograph in photographs[:SMALL_GROUPS] if size == "small" else photographs:
-        yield source(photograph.scene_ids, partial(_photograph_scenes, photograph, camera))
+        yield SceneGroup(photograph.scene_ids, partial(_draw_photograph, photograph, request))
 
 
-def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
+def procedural_groups(split: str, size: Size) -> Iterator[tuple[str, int]]:
     """Kind of each procedural group, and its index within the kind over both splits."""
     for kind, (train, test) in GROUPS_PER_KIND.items():
         first, count = (0, train) if split == "train" else (FIRST_TEST_INDEX, test)
@@ -120,42 +195,36 @@ def _procedural(split: str, size: Size) -> Iterator[tuple[str, int]]:
             yield kind, index
 
 
-def _name(kind: str, index: int) -> str:
-    return f"{kind}-{index:03d}"
+def _draw_procedural(kind: str, index: int, name: str, request: SceneRequest) -> list[Scene]:
+    drawing = draw(kind, np.random.default_rng([zlib.crc32(kind.encode()), index]))
+    speed = MOTION_SPEED if kind == "motion" else DEFAULT_SPEED
+    facts = {"kind": kind, "hard": kind in HARD_KINDS, "median_speed": speed}
+    return [_scene(drawing, name, name, "procedural, ae-env (MIT)", request, **facts)]
 
 
-def _procedural_scenes(kind: str, index: int, camera: CameraProfile) -> Iterator[Scene]:
-    rng = np.random.default_rng([zlib.crc32(kind.encode()), index])
-    drawing = draw(kind, rng)
-    name = _name(kind, index)
-    yield Scene.from_radiance(
+def _draw_photograph(photograph: Photograph, request: SceneRequest) -> list[Scene]:
+    source = f"scikit-image {photograph.file}: {photograph.credit}"
+    drawings = zip(photograph.scene_ids, photograph_drawings(photograph), strict=True)
+    return [
+        _scene(drawing, name, photograph.name, source, request, kind=KINDS[-1])
+        for name, drawing in drawings
+    ]
+
+
+def _scene(
+    drawing: Drawing, name: str, group: str, source: str, request: SceneRequest, **facts: Any
+) -> Scene:
+    scene = Scene.from_radiance(
         drawing.light,
-        camera,
+        request.camera,
         scene_id=name,
-        group=name,
+        group=group,
         illuminance=drawing.illuminance,
         illuminant=drawing.illuminant,
-        kind=kind,
-        hard=kind in HARD_KINDS,
-        median_speed=MOTION_SPEED if kind == "motion" else DEFAULT_SPEED,
-        source="procedural, ae-env (MIT)",
+        source=source,
+        **facts,
     )
-
-
-def _photograph_scenes(photograph: Photograph, camera: CameraProfile) -> Iterator[Scene]:
-    """The scenes of one photograph, a pixel of it one packed pixel, all in one source group."""
-    drawings = photograph_drawings(photograph)
-    for scene_id, drawing in zip(photograph.scene_ids, drawings, strict=True):
-        yield Scene.from_radiance(
-            drawing.light,
-            camera,
-            scene_id=scene_id,
-            group=photograph.name,
-            illuminance=drawing.illuminance,
-            illuminant=drawing.illuminant,
-            kind="photograph",
-            source=f"scikit-image {photograph.file}: {photograph.credit}",
-        )
+    return add_layout(scene).resized(request.resolution, request.crop)
 
 
 def add_layout(scene: Scene) -> Scene:
@@ -163,27 +232,78 @@ def add_layout(scene: Scene) -> Scene:
     return replace(scene, layout=draw_layout(scene.scene_id, *scene.light.shape[1:]))
 
 
-def _cache_key(
-    split: str,
-    camera: CameraProfile,
-    resolution: int | None,
-    crop: str,
-    size: Size,
-    part: str | None,
-) -> str:
-    return cache_key(
-        "scenes",
-        {
-            "generator": GENERATOR_VERSION,
-            "format": 7,
-            "groups": [GROUPS_PER_KIND, FIRST_TEST_INDEX, LARGE_FACTOR],
-            "photographs": [p.name for p in PHOTOGRAPHS],
-            "camera": camera.name,
-            "colour_matrix": camera.colour_matrix,
-            "split": split,
-            "resolution": resolution,
-            "crop": crop,
-            "size": size if split == "train" or size == "small" else "normal",
-            "part": part,
-        },
-    )
+# -- the cache ------------------------------------------------------------------------------------
+
+
+def cached_scenes(
+    key: str, make: Callable[[], Iterable[Scene]], camera: CameraProfile, resolution: int | None
+) -> list[Scene]:
+    """Scenes without noise of `camera`, from the cache where they have been made before.
+
+    All of them have a layout, or none.
+
+    Args:
+        key: Of all that they depend on (`simulator.utils.cache.cache_key`).
+        make: Makes them, all of one size.
+        camera: In whose colours they are.
+        resolution: Packed pixels a side; None for `NATIVE_SIZE`.
+    """
+    found = _stored(key, camera, resolution)
+    if found is None:
+        found = [_rounded(scene) for scene in make()]
+        _store(key, found)
+    return found
+
+
+def _rounded(scene: Scene) -> Scene:
+    layout = None if scene.layout is None else _from_bytes(_to_bytes(scene.layout))
+    light = scene.light.clamp(max=65504.0).half().float()
+    return replace(scene, light=light, layout=layout)
+
+
+def _to_bytes(layout: Layout) -> torch.Tensor:
+    """(H, W) uint8: the defocus, and 128 where the subject is."""
+    found = (layout.defocus * _STEPS).round().byte()
+    return found if layout.subject is None else found + 128 * layout.subject.byte()
+
+
+def _from_bytes(stored: torch.Tensor) -> Layout:
+    return Layout((stored % 128).float() / _STEPS, stored >= 128)
+
+
+def _store(key: str, scenes: Sequence[Scene]) -> None:
+    settings = [(s.reference.iso, s.reference.exposure_time, s.reference.f_number) for s in scenes]
+    facts = [{name: getattr(scene, name) for name in _FIELDS} for scene in scenes]
+    layouts = [_to_bytes(scene.layout) for scene in scenes if scene.layout is not None]
+    values = {
+        "light": torch.stack([scene.light for scene in scenes]).half(),
+        "facts": [own | {"reference": used} for own, used in zip(facts, settings, strict=True)],
+    }
+    disk_cache().put(key, values | ({"layouts": torch.stack(layouts)} if layouts else {}))
+
+
+def _stored(key: str, camera: CameraProfile, resolution: int | None) -> list[Scene] | None:
+    """The scenes in the cache; None if there are none, or they cannot be those asked for."""
+    values = disk_cache().get(key)
+    if values is None:
+        return None
+    try:
+        facts, light = values["facts"], values["light"]
+        side = NATIVE_SIZE if resolution is None else resolution
+        if light.shape != (len(facts), 4, side, side):
+            raise ValueError(f"{len(facts)} scenes of {side} x {side} have light {light.shape}")
+        stored = values.get("layouts")
+        layouts = [None] * len(facts) if stored is None else map(_from_bytes, stored)
+        return [
+            Scene.from_array(
+                own.float(),
+                CameraSettings(*row.pop("reference")),
+                camera,
+                layout=layout,
+                **row,
+            )
+            for row, own, layout in zip(facts, light, layouts, strict=True)
+        ]
+    except (ValueError, KeyError, TypeError) as error:
+        logger.warning("the cached scenes are damaged (%s) and are made again", error)
+        return None

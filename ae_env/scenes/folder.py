@@ -1,58 +1,60 @@
 """Scenes from a user's own files: raws and radiance maps in a folder, by a glob, or one by one.
 
 A sequence is a folder of raws that are the frames of one scene over time.
+
+A source group is the unit of splitting and of resampling: two photographs of one subject in
+different splits, or counted as two independent ones, would make results look better and surer than
+they are. The group of a file is, in this order: the one that a ``groups.csv`` beside it names
+(columns ``file`` and ``group``); its sub-folder; for a radiance map the file itself; for a raw the
+one that `group_shots` finds from its time and colours. No other names are read.
 """
 
 from __future__ import annotations
 
+import csv
 import glob
+import hashlib
 import logging
 import math
 import re
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 
-from ae_env.scenes.recorded_files import PREFIX as RECORDED
 from ae_env.scenes.scene import Scene, SceneRequest
-from ae_env.scenes.split import (
-    FEWEST_GROUPS_TO_SPLIT,
-    Shot,
-    describe,
-    group_shots,
-    log_groups,
-    named_groups,
-    scenes_of_split,
-    too_few_groups,
-)
-from simulator.camera import CameraProfile
 from simulator.radiance.light import camera_from_srgb, mean_anchor
 from simulator.radiance.maps import (
-    AZIMUTHS,
-    FIELD_OF_VIEW,
     RADIANCE_SUFFIXES,
     assumed_ev100,
-    central_square,
-    native_size,
+    map_views,
     near_one,
-    perspective,
     read_radiance,
 )
+from simulator.raw.image import RawImage
 from simulator.raw.read import read_raw
 from simulator.utils.checks import check_flag, check_number, check_word
+from simulator.utils.compute import progress_bar
 from simulator.utils.files import PICTURE_SUFFIXES, RAW_SUFFIXES
 
 logger = logging.getLogger(__name__)
 
 OnError = Literal["stop", "skip"]
-#: Seconds between two log lines about the progress of reading.
-_PROGRESS_SECONDS = 10.0
+#: With fewer source groups than this nothing is held out for training: all of them are for test.
+FEWEST_GROUPS_TO_SPLIT = 15
+#: Share of the groups that the hash puts into the training split.
+TRAIN_SHARE = 0.7
+#: Shots this close in time [s] are of one subject, whatever they show.
+BURST_SECONDS = 30.0
+#: Shots up to this far apart [s] are of one subject if they look alike.
+SESSION_SECONDS = 300.0
+#: From this similarity on, two shots look alike (see `similarity`).
+ALIKE = 0.5
 #: Most file names in a log line about files that were skipped.
 _MOST_NAMES = 5
 _HOW_TO_SKIP = "; --on-error skip, or {'path': ..., 'on_error': 'skip'}, leaves it out"
@@ -115,11 +117,7 @@ class FolderOptions:
 def folder_scenes(
     spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
 ) -> list[Scene]:
-    """The scenes of `split` among the user's files.
-
-    The source group of a file is, in this order: the one that ``groups.csv`` beside it names; its
-    sub-folder under `spec`; for a radiance map the file itself; for a raw the one that
-    `group_shots` finds.
+    """The scenes of a split among the user's files.
 
     Args:
         spec: See `find_files`.
@@ -128,25 +126,21 @@ def folder_scenes(
 
     Raises:
         ValueError: If a file cannot be read (the message names it; with ``on_error="skip"`` only
-            if no file can), or `split` is ``"train"`` and there are too few groups to hold any out.
+            if no file can), or the split is ``"train"`` and there are too few groups to hold any
+            out.
     """
     base, files = find_files(spec)
-    named = named_groups(sorted({base, *(p.parent for p in files)}))
+    named = _named_groups(sorted({base, *(p.parent for p in files)}))
     if request.split == "train" and len(files) < FEWEST_GROUPS_TO_SPLIT:
-        raise too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
-    groups = {p: named[p.resolve()] for p in files if p.resolve() in named}
-    reader = _Reader(base, _scene_names(base, files), groups, options or FolderOptions(), request)
-    scenes, shots = _read_all(spec, files, reader, _HOW_TO_SKIP)
-    found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
-    scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
-    log_groups(str(spec), scenes)
-    return scenes_of_split(spec, scenes, request.split)
+        raise _too_few_groups(spec, f"at most {len(files)}")  # before any time is spent on reading
+    groups = {path: named.get(path.resolve()) or _sub_folder(path, base) for path in files}
+    return _read_files(spec, base, groups, options or FolderOptions(), request, hint=_HOW_TO_SKIP)
 
 
 def sequence_scenes(
     spec: str | Path, request: SceneRequest, options: FolderOptions | None = None
 ) -> list[Scene]:
-    """The frames of every sequence of `split`, one sequence after the other.
+    """The frames of every sequence of a split, one sequence after the other.
 
     The raws of one folder, in the natural order of their names, are one sequence and one source
     group; its name is the folder's below `spec`. Each raw's light is known through its own
@@ -159,8 +153,8 @@ def sequence_scenes(
         options: Facts about the files that the caller knows; `on_error` must be ``"stop"``.
 
     Raises:
-        ValueError: If there are no raws, one cannot be read, there are no sequences of `split`, or
-            unreadable raws were to be skipped: all later frames would come too early.
+        ValueError: If there are no raws, one cannot be read, there are no sequences of the split,
+            or unreadable raws were to be skipped: all later frames would come too early.
     """
     options = options or FolderOptions()
     if options.on_error == "skip":
@@ -169,32 +163,22 @@ def sequence_scenes(
             "would come a frame too early; cut the recording there, into two folders"
         )
     base, found = find_files(spec)
-    by_folder: dict[Path, list[Path]] = {}
-    for path in filter(_is_raw, found):
-        by_folder.setdefault(path.parent, []).append(path)
-    if not by_folder:
+    raws = [path for path in found if _is_raw(path)]
+    folders = list(dict.fromkeys(path.parent for path in raws))
+    if not folders:
         raise ValueError(
             f"`scenes` (={{'sequence': {str(spec)!r}}}) must hold raws ({_RAW_ENDINGS}): radiance "
             "maps have no settings of their own"
         )
-    if request.split == "train" and len(by_folder) < FEWEST_GROUPS_TO_SPLIT:
-        raise too_few_groups(spec, str(len(by_folder)))  # before any time is spent on reading
-    files = [path for paths in by_folder.values() for path in paths]
-    sequences = _sequence_names(base, list(by_folder))
-    groups = {path: sequences[path.parent] for path in files}
-    reader = _Reader(base, _scene_names(base, files), groups, options, request)
-    scenes, _ = _read_all(spec, files, reader, "")
-    scenes = [replace(scene, sequence=scene.group) for scene in scenes]
-    log_groups(str(spec), scenes)
-    return scenes_of_split(spec, scenes, request.split)
-
-
-def _sequence_names(base: Path, folders: list[Path]) -> dict[Path, str]:
+    if request.split == "train" and len(folders) < FEWEST_GROUPS_TO_SPLIT:
+        raise _too_few_groups(spec, str(len(folders)))  # before any time is spent on reading
     names = {folder: folder.relative_to(base).as_posix() for folder in folders}
     own = base.resolve().name
     if base in names and own and own not in names.values():
         names[base] = own  # else "."
-    return names
+    groups = {raw: names[raw.parent] for raw in sorted(raws, key=lambda p: folders.index(p.parent))}
+    scenes = _read_files(spec, base, groups, options, request)
+    return [replace(scene, sequence=scene.group) for scene in scenes]
 
 
 def sequence_bounds(scenes: Sequence[Scene]) -> tuple[np.ndarray, np.ndarray]:
@@ -226,7 +210,7 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
     Raises:
         ValueError: If there is nothing by that name, or no raw or radiance map in it.
     """
-    if str(spec).startswith(RECORDED):
+    if str(spec).startswith("recorded:"):
         raise ValueError(
             f"`scenes` (={str(spec)!r}) must be raws or radiance maps here, not a recorded grid"
         )
@@ -234,17 +218,16 @@ def find_files(spec: str | Path) -> tuple[Path, list[Path]]:
         base, found = _listed(spec)
     except (OSError, RuntimeError) as error:  # no permission, no such user, a folder removed ...
         raise ValueError(f"`scenes` (={str(spec)!r}) cannot be listed: {error}") from error
-    known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
     files = [
         p
         for p in found
-        if p.suffix.lower() in known
+        if p.suffix.lower() in (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
         and not any(part.startswith(".") for part in p.relative_to(base).parts)
     ]
     if not files:
         endings = ", ".join(sorted({p.suffix.lower() or "(none)" for p in found}))
         if any(p.suffix.lower() in PICTURE_SUFFIXES for p in found):
-            endings += f"; developed pictures of every state are '{RECORDED}FOLDER'"
+            endings += "; developed pictures of every state are 'recorded:FOLDER'"
         raise ValueError(
             f"`scenes` (={str(spec)!r}) must hold raws ({_RAW_ENDINGS}) or radiance maps "
             f"({', '.join(RADIANCE_SUFFIXES)}); "
@@ -277,7 +260,12 @@ def _is_raw(path: Path) -> bool:
     return path.suffix.lower() in RAW_SUFFIXES
 
 
-def _scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
+def _sub_folder(path: Path, base: Path) -> str | None:
+    """The sub-folder of `base` that a file is in; None for a file in `base` itself."""
+    return None if path.parent == base else path.parent.relative_to(base).as_posix()
+
+
+def _scene_names(base: Path, files: Sequence[Path]) -> dict[Path, str]:
     """Scene ids: the path below `base` without its ending, with it where two would be equal."""
     stems = [p.relative_to(base).with_suffix("").as_posix() for p in files]
     times = Counter(stems)
@@ -290,98 +278,78 @@ def _scene_names(base: Path, files: list[Path]) -> dict[Path, str]:
 # -- reading --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Reader:
-    """Makes the scenes of one file after the other.
+def _read_files(
+    spec: str | Path,
+    base: Path,
+    groups: Mapping[Path, str | None],
+    options: FolderOptions,
+    request: SceneRequest,
+    *,
+    hint: str = "",
+) -> list[Scene]:
+    """The scenes of a split in files.
 
     Args:
-        base: Folder that the files are under.
-        names: Scene id of each file.
-        groups: Source group of the files whose group is known by name.
+        spec: Their name, for messages.
+        base: The folder that they are under.
+        groups: Source group of each; where it is None the file itself, or shots that belong to it.
         options: See `folder_scenes`.
         request: See `folder_scenes`.
-    """
-
-    base: Path
-    names: Mapping[Path, str]
-    groups: Mapping[Path, str]
-    options: FolderOptions
-    request: SceneRequest
-
-    def read(self, path: Path) -> tuple[list[Scene], Shot | None]:
-        """The scenes of a file; with a `Shot` where that has to tell the group of a raw."""
-        name, group = self.names[path], self.groups.get(path)
-        grouped = group is not None or path.parent != self.base
-        if group is None:
-            group = path.parent.relative_to(self.base).as_posix() if grouped else name
-        fields, shot = self.options.fields(path), None
-        if _is_raw(path):
-            raw = read_raw(path)
-            source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
-            scene = Scene.from_raw(raw, scene_id=name, group=group, source=source, **fields)
-            shot = None if grouped else describe(raw)
-            scenes = [self.request.sized(scene)]
-        else:
-            scenes = list(radiance_scenes(path, self.request, name=name, group=group, **fields))
-        for scene in scenes:
-            _ = scene.ev100  # raises where a frame is black and its light unknown
-        return scenes, shot
-
-
-def _read_all(
-    spec: str | Path, files: list[Path], reader: _Reader, hint: str
-) -> tuple[list[Scene], dict[str, Shot]]:
-    """The scenes of all `files`, and the shots of those raws whose group is still to be found.
-
-    `hint` ends the error of a file that cannot be read, where there are others.
+        hint: End of the error of a file that cannot be read, where there are others.
     """
     scenes: list[Scene] = []
-    shots: dict[str, Shot] = {}
-    skipped: dict[Path, Exception] = {}
-    for path in _with_progress(spec, files):
-        try:
-            own, shot = reader.read(path)
-        except (ValueError, OSError) as error:  # it may also have vanished since it was listed
-            if reader.options.on_error == "stop":
-                more = hint if len(files) > 1 else ""
-                raise ValueError(f"scene file {str(path)!r}: {error}{more}") from error
-            skipped[path] = error
-            continue
-        scenes += own
-        if shot is not None:
-            shots[own[0].scene_id] = shot
-    _report_skipped(spec, skipped, len(files))
-    return scenes, shots
+    shots: dict[str, Shot] = {}  # of raws without a group
+    skipped: list[str] = []
+    names = _scene_names(base, list(groups))
+    logger.info("reading %d scene files of %s", len(groups), spec)
+    with progress_bar("reading scene files", len(groups)) as advance:
+        for path, group in groups.items():
+            try:
+                scenes += _read_file(path, names[path], group, options, request, shots)
+            except (ValueError, OSError) as error:  # it may also have vanished since it was listed
+                if options.on_error == "stop":
+                    more = hint if len(groups) > 1 else ""
+                    raise ValueError(f"scene file {str(path)!r}: {error}{more}") from error
+                skipped.append(f"{path.name}: {error}")
+            advance()
+    if skipped:
+        more = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
+        text = "; ".join(skipped[:_MOST_NAMES] + more)
+        if not scenes:
+            raise ValueError(
+                f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all "
+                f"{len(skipped)} were skipped ({text})"
+            )
+        total = len(groups)
+        logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)
+    found = dict(zip(shots, group_shots(list(shots), list(shots.values())), strict=True))
+    scenes = [replace(s, group=found.get(s.scene_id, s.group)) for s in scenes]
+    log_groups(str(spec), scenes)
+    return scenes_of_split(spec, scenes, request.split)
 
 
-def _with_progress(spec: str | Path, files: list[Path]) -> Iterator[Path]:
-    """`files`, with a log line at the beginning and every few seconds."""
-    logger.info("reading %d scene files of %s", len(files), spec)
-    last = time.monotonic()
-    for number, path in enumerate(files, start=1):
-        if time.monotonic() - last > _PROGRESS_SECONDS:
-            logger.info("reading scene file %d of %d: %s", number, len(files), path.name)
-            last = time.monotonic()
-        yield path
-
-
-def _report_skipped(spec: str | Path, skipped: Mapping[Path, Exception], total: int) -> None:
-    """Logs the files that were left out; raises where none was read."""
-    if not skipped:
-        return
-    reasons = [f"{path.name}: {error}" for path, error in list(skipped.items())[:_MOST_NAMES]]
-    if len(skipped) > _MOST_NAMES:
-        reasons.append(f"and {len(skipped) - _MOST_NAMES} more")
-    text = "; ".join(reasons)
-    if len(skipped) == total:
-        raise ValueError(
-            f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all {total} were "
-            f"skipped ({text})"
-        )
-    logger.warning("%s: %d of %d scene files skipped (%s)", spec, len(skipped), total, text)
-
-
-# -- radiance maps ---------------------------------------------------------------------------------
+def _read_file(
+    path: Path,
+    name: str,
+    group: str | None,
+    options: FolderOptions,
+    request: SceneRequest,
+    shots: dict[str, Shot],
+) -> list[Scene]:
+    """The scenes of a file; the `Shot` of a raw without a group goes into `shots`."""
+    fields = options.fields(path)
+    if _is_raw(path):
+        raw = read_raw(path)
+        source = f"{path.name}; noise: {raw.metadata.get('nlf_source', 'unknown')}"
+        scene = Scene.from_raw(raw, scene_id=name, group=group or name, source=source, **fields)
+        scenes = [request.sized(scene)]
+    else:
+        scenes = list(radiance_scenes(path, request, name=name, group=group or name, **fields))
+    for scene in scenes:
+        _ = scene.ev100  # raises where a frame is black and its light unknown
+    if _is_raw(path) and group is None:
+        shots[name] = describe(raw)
+    return scenes
 
 
 def radiance_scenes(
@@ -398,13 +366,8 @@ def radiance_scenes(
     A radiance map is linear but relative: nothing in it says how many lux it shows. Its views are
     therefore put at an EV100 between 3 and 14 drawn by a stable hash of the source group (an
     assumption, stated in each scene's `source`), and their `illuminance` is None unless given.
-
-    A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
-    with a field of view of 60 degrees; any other gives its central square. Both have about 256
-    packed pixels a side, as the bundled scenes have, before `Scene.resized`. A map with at least as
-    many pixels there as photosites (512 x 512) is sampled through the colour filter array, so is a
-    coarser one with ``crop="native"`` if it has those of the crop; of others the planes share their
-    places, and the log says so (`Scene.sampled`).
+    Both panoramas and other pictures have about 256 packed pixels a side, as the bundled scenes
+    have, before `Scene.resized`; see `map_views`.
 
     Args:
         path: The file.
@@ -415,55 +378,217 @@ def radiance_scenes(
             their relative brightness), if known; see `assumed_ev100`.
         **fields: Further arguments of `Scene.from_radiance`.
     """
+    file = Path(path).name
     image = read_radiance(path)
     if "illuminance" not in fields:
         image = near_one(image)
-    height, width = image.shape[1:]
-    if "illuminance" not in fields and ev100 is None:
-        ev100 = assumed_ev100(group)
-        fields.setdefault("source", f"{Path(path).name}; light of unknown scale, EV100 assumed")
-    fields.setdefault("source", Path(path).name)
-    if abs(width / height - 2.0) <= 0.01:
-        available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
-        size, sampled = _view_size(request, native_size(request.resolution), available)
-        views = [(f"{name}-{round(a):03d}", perspective(image, a, size)) for a in AZIMUTHS]
-    else:
-        available = min(height, width)
-        size = native_size(request.resolution, available)
-        size, sampled = _view_size(request, size, available)
-        views = [(name, central_square(image, size, Path(path).name))]
-    if not sampled:
-        logger.info(
-            "radiance map %s: %d pixels a view, fewer than photosites: planes share their places",
-            *(Path(path).name, available),
-        )
+        if ev100 is None:
+            ev100 = assumed_ev100(group)
+            fields.setdefault("source", f"{file}; light of unknown scale, EV100 assumed")
+    fields.setdefault("source", file)
     try:
-        levels = [_log2_level(view, request.camera) for _, view in views]
-    except ValueError as error:
-        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
-    for (scene_id, view), level in zip(views, levels, strict=True):
-        if ev100 is not None:  # one scale for the whole map: a darker view stays darker
-            fields["ev100"] = ev100 + level - float(np.mean(levels))
-        try:
+        views, sampled = map_views(image, request.resolution, native=request.crop == "native")
+        if not sampled:
+            logger.info(
+                "radiance map %s: fewer pixels than photosites, so planes share their places", file
+            )
+        matrix, _ = camera_from_srgb(request.camera)
+        greens = [torch.from_numpy(np.tensordot(matrix[1], v, axes=1)) for v in views.values()]
+        levels = [-math.log2(mean_anchor(green)) for green in greens]
+        for (ending, view), level in zip(views.items(), levels, strict=True):
+            if ev100 is not None:  # one scale for the whole map: a darker view stays darker
+                fields["ev100"] = ev100 + level - float(np.mean(levels))
+            scene_id = name + ending
             scene = Scene.from_radiance(
                 view, request.camera, scene_id=scene_id, group=group, sampled=sampled, **fields
             )
-        except ValueError as error:
-            raise ValueError(f"radiance map {str(path)!r}, view {scene_id!r}: {error}") from error
-        yield request.sized(scene)
+            yield request.sized(scene)
+    except ValueError as error:
+        raise ValueError(f"radiance map {str(path)!r}: {error}") from error
 
 
-def _view_size(request: SceneRequest, size: int, available: int) -> tuple[int, bool]:
-    """Pixels a side of a view of `size` packed pixels, and whether they are photosites."""
-    if available >= 2 * size:
-        return 2 * size, True
-    if request.crop == "native" and request.resolution and available >= 2 * request.resolution:
-        return available // 2 * 2, True
-    return size, False
+# -- source groups and the split ----------------------------------------------------------------
 
 
-def _log2_level(view: np.ndarray, camera: CameraProfile) -> float:
-    """log2 of the mean of a view's green, clipped at white, relative to 0.12."""
-    matrix, _ = camera_from_srgb(camera)
-    green = torch.from_numpy(np.tensordot(matrix[1], view, axes=1))
-    return -math.log2(mean_anchor(green))
+@dataclass(frozen=True)
+class Shot:
+    """The facts about a raw that decide its source group.
+
+    Args:
+        camera: Make and model.
+        time: When it was taken; None if the file does not say.
+        histogram: Joint histogram of colour and relative brightness, summing to 1.
+    """
+
+    camera: str
+    time: datetime | None
+    histogram: np.ndarray
+
+
+def describe(raw: RawImage) -> Shot:
+    """The `Shot` of a raw, with exposure and white balance divided out."""
+    gains = torch.tensor(raw.white_balance, dtype=torch.float32)[:, None, None]
+    planes = torch.stack([raw.data[0], raw.data[1:3].mean(dim=0), raw.data[3]])
+    small = torch.nn.functional.adaptive_avg_pool2d(planes[None], (48, 64))[0]
+    red, green, blue = (small.clamp(min=1e-3) * gains).flatten(1).double().numpy()
+    brightness = (red + green + blue) / 3.0
+    features = [np.log2(v / np.median(v)) for v in (red / green, blue / green, brightness)]
+    edges = [np.linspace(-2, 2, 11), np.linspace(-2, 2, 11), np.linspace(-3, 3, 7)]
+    clipped = [np.clip(f, e[0], e[-1]) for f, e in zip(features, edges, strict=True)]
+    histogram, _ = np.histogramdd(np.stack(clipped, axis=1), bins=edges)
+    taken = raw.metadata.get("datetime")
+    return Shot(
+        camera=f"{raw.camera.make} {raw.camera.model}",
+        time=None if taken is None else datetime.fromisoformat(str(taken)).replace(tzinfo=None),
+        histogram=histogram / histogram.sum(),
+    )
+
+
+def similarity(first: Shot, second: Shot) -> float:
+    """Bhattacharyya coefficient of two shots' histograms: 1 if equal, 0 if nothing is shared."""
+    return float(np.sqrt(first.histogram * second.histogram).sum())
+
+
+def group_shots(names: Sequence[str], shots: Sequence[Shot]) -> list[str]:
+    """Source group of each raw, found from its time and its colours.
+
+    Shots of one camera are put in the order in which they were taken (by time where every file
+    states it, else as given). A shot joins its predecessor's group
+
+    - if at most 30 s lie between them, or
+    - if at most 300 s lie between them, or the times are unknown, and the two look alike:
+      similarity of their colour and brightness histograms at least 0.5.
+
+    Anything else starts a new group, named after its first shot.
+
+    Args:
+        names: Name of each shot.
+        shots: Time and colours of each.
+
+    Returns:
+        The group of each, in the order given.
+    """
+    timed = all(shot.time is not None for shot in shots)
+
+    def order(i: int) -> tuple[str, datetime, int]:
+        taken = shots[i].time if timed else None
+        return shots[i].camera, taken or datetime.min, i
+
+    groups = [""] * len(shots)
+    previous: int | None = None
+    for i in sorted(range(len(shots)), key=order):
+        same = previous is not None and _same_subject(shots[previous], shots[i])
+        groups[i] = groups[previous] if same and previous is not None else names[i]
+        previous = i
+    return groups
+
+
+def _same_subject(first: Shot, second: Shot) -> bool:
+    if first.camera != second.camera:
+        return False
+    if first.time is None or second.time is None:
+        pause = math.nan
+    else:
+        pause = abs((second.time - first.time).total_seconds())
+    if pause <= BURST_SECONDS:
+        return True
+    return not pause > SESSION_SECONDS and similarity(first, second) >= ALIKE
+
+
+def _named_groups(folders: Sequence[Path]) -> dict[Path, str]:
+    """Groups that ``groups.csv`` files name: columns ``file`` (relative to it) and ``group``.
+
+    Raises:
+        ValueError: If such a file lacks a column, leaves one empty or names a missing file.
+    """
+    groups: dict[Path, str] = {}
+    for folder in folders:
+        table = folder / "groups.csv"
+        if not table.is_file():
+            continue
+        try:
+            with table.open(newline="", encoding="utf-8-sig") as stream:
+                reader = csv.DictReader(stream)
+                rows, columns = list(reader), reader.fieldnames
+        except (csv.Error, OSError, UnicodeError) as error:
+            raise ValueError(f"{str(table)!r} must be a CSV file in UTF-8: {error}") from error
+        if not {"file", "group"} <= set(columns or ()):
+            raise ValueError(
+                f"{str(table)!r} (columns {columns}) must have the columns `file` and `group`"
+            )
+        for number, row in enumerate(rows, start=2):
+            name, group = (row["file"] or "").strip(), (row["group"] or "").strip()
+            if not group or not name or not (folder / name).is_file():
+                raise ValueError(
+                    f"{str(table)!r}, line {number} (={name!r}, {group!r}): `file` must exist "
+                    "beside it and `group` must not be empty"
+                )
+            groups[(folder / name).resolve()] = group
+    return groups
+
+
+def split_groups(groups: Sequence[str]) -> dict[str, str]:
+    """``"train"`` or ``"test"`` for each group.
+
+    Below 15 groups all are ``"test"``: too few to hold out. From 15 on a hash of the group's name
+    decides, 70 % to training, so that adding a file moves no other. Should the hash leave one side
+    empty, the group nearest to the threshold changes sides.
+
+    >>> set(split_groups(["a", "b"]).values())
+    {'test'}
+    """
+    names = sorted(set(groups))
+    if len(names) < FEWEST_GROUPS_TO_SPLIT:
+        return dict.fromkeys(names, "test")
+    draws = {
+        n: int.from_bytes(hashlib.sha256(n.encode()).digest()[:8], "big") / 2**64 for n in names
+    }
+    split = {n: "train" if draws[n] < TRAIN_SHARE else "test" for n in names}
+    if len(set(split.values())) == 1:
+        nearest = min(names, key=lambda n: abs(draws[n] - TRAIN_SHARE))
+        split[nearest] = "test" if split[nearest] == "train" else "train"
+    return split
+
+
+def scenes_of_split(spec: str | Path, scenes: list[Scene], split: str) -> list[Scene]:
+    """The scenes whose source group is in `split`.
+
+    Args:
+        spec: Name of the scenes, for the error.
+        scenes: Scenes of all splits.
+        split: ``"train"``, ``"test"`` or ``"all"``.
+
+    Raises:
+        ValueError: If `split` is ``"train"`` and there are too few groups.
+    """
+    if split == "all":
+        return scenes
+    parts = split_groups([scene.group for scene in scenes])
+    if split == "train" and "train" not in parts.values():
+        raise _too_few_groups(spec, str(len(parts)))
+    left_out = sum(part != split for part in parts.values())
+    if left_out:
+        logger.warning(
+            f"{spec}: split {split!r} leaves out {left_out} of {len(parts)} source groups, those "
+            "of the other split; split='all' (--split all) takes every one"
+        )
+    return [scene for scene in scenes if parts[scene.group] == split]
+
+
+def _too_few_groups(spec: str | Path, number: str) -> ValueError:
+    """The error where `spec` has only `number` source groups, too few to train on."""
+    return ValueError(
+        f"`split` (='train') needs at least {FEWEST_GROUPS_TO_SPLIT} source groups, so that some "
+        f"can be held out; {str(spec)!r} has {number}. Train on scenes='bundled' and use these "
+        "with split='test' (zero-shot) or split='all'; if files are grouped wrongly, name the "
+        "groups in a groups.csv (columns file, group) beside them"
+    )
+
+
+def log_groups(where: str, scenes: Sequence[Scene]) -> None:
+    """Logs the scenes of each source group."""
+    members: dict[str, list[str]] = {}
+    for scene in scenes:
+        members.setdefault(scene.group, []).append(scene.scene_id)
+    text = "; ".join(f"{group}: {', '.join(ids)}" for group, ids in members.items())
+    logger.info("%s: %d source groups (%s)", where, len(members), text)

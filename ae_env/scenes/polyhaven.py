@@ -23,10 +23,9 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from ae_env.scenes.bundled import add_layout
+from ae_env.scenes.bundled import add_layout, cached_scenes
 from ae_env.scenes.scene import Crop, Scene, SceneRequest
-from ae_env.scenes.stored import cached_scenes
-from ae_env.utils.presets import find_preset
+from ae_env.utils.user_files import find_preset
 from simulator.camera import CameraProfile
 from simulator.radiance.maps import native_size, perspective, read_radiance
 from simulator.utils.cache import cache_dir, cache_key
@@ -72,7 +71,7 @@ _CELL = 4
 #: Luminance of linear sRGB.
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 #: Raised when the views change.
-_VERSION = 5
+_VERSION = 6
 
 
 class Asset(Configuration):

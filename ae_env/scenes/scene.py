@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args, overload
 
 import numpy as np
 import torch
@@ -25,12 +25,13 @@ from simulator.raw.develop import neutral_highlights
 from simulator.raw.image import RawImage, check_packed
 from simulator.settings import CameraSettings, incident_ev100
 from simulator.utils.cache import content_digest
-from simulator.utils.checks import check_number
+from simulator.utils.checks import check_integer, check_number, check_word
 
 #: Median image speed of a moving episode [frame heights / s].
 DEFAULT_SPEED = 0.125
 
 Crop = Literal["box", "native"]
+Split = Literal["train", "test", "all"]
 #: Brings a scene to a resolution by a crop, as `Scene.resized` does.
 Resize = Callable[["Scene", int | None, Crop], "Scene"]
 
@@ -77,8 +78,8 @@ class Scene:
         allowed: (S,) bool, exposure states that may be chosen, as a recorded grid with holes has
             them; None for every state of any grid.
 
-    Raises:
-        ValueError: If a value has the wrong shape or lies outside its range.
+    `from_array`, `from_raw` and `from_radiance` make scenes and check all of this; the constructor
+    itself trusts its caller.
     """
 
     scene_id: str
@@ -103,86 +104,6 @@ class Scene:
     recorded: torch.Tensor | None = None
     sequence: str = ""
     allowed: np.ndarray | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("scene_id", "group", "kind"):
-            if not isinstance(getattr(self, name), str) or not getattr(self, name):
-                raise ValueError(f"`{name}` (={getattr(self, name)!r}) must be a non-empty string")
-        types = {"camera": CameraProfile, "reference": CameraSettings, "nlf": NoiseLevelFunction}
-        for name, kind in types.items():
-            if not isinstance(getattr(self, name), kind):
-                found = getattr(self, name)
-                raise ValueError(f"`{name}` (={found!r}) must be a {kind.__name__}")
-        object.__setattr__(self, "light", check_packed("light", self.light).contiguous())
-        for name in ("saturated", "defocus_map"):
-            found = getattr(self, name)
-            if not isinstance(found, torch.Tensor | None):
-                raise ValueError(f"`{name}` (={type(found).__name__}) must be a Tensor or None")
-        if self.illuminance is not None:
-            check_number("illuminance", self.illuminance, 0.0, math.inf)
-            incident_ev100(self.illuminance)  # raises unless it is positive and finite
-        gains = tuple(float(gain) for gain in self.white_balance)
-        if len(gains) != 3 or not all(math.isfinite(gain) and gain > 0 for gain in gains):
-            raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
-        object.__setattr__(self, "white_balance", gains)
-        if not (math.isfinite(self.median_speed) and self.median_speed >= 0):
-            raise ValueError(f"`median_speed` (={self.median_speed!r}) must be finite and >= 0")
-        if self.box_factor < 1:
-            raise ValueError(f"`box_factor` (={self.box_factor}) must be at least 1")
-        self._check_saturated()
-        self._check_networks()
-        if self.allowed is not None:
-            allowed = np.asarray(self.allowed)
-            if allowed.dtype != np.bool_ or allowed.ndim != 1 or not allowed.any():
-                raise ValueError(
-                    f"`allowed` ({allowed.dtype}, shape {allowed.shape}) must be bool of shape "
-                    "(S,) with at least one state that is allowed"
-                )
-            object.__setattr__(self, "allowed", allowed)
-        if self.recorded is not None:
-            states = None if self.allowed is None else len(self.allowed)
-            if self.allowed is None or self.recorded.shape != (states, *self.light.shape):
-                raise ValueError(
-                    f"`recorded` (shape {tuple(self.recorded.shape)}) must be (S, 4, H, W) like "
-                    f"`light`, {tuple(self.light.shape)}, with one frame for each of the "
-                    f"{states} entries of `allowed`"
-                )
-
-    def _check_saturated(self) -> None:
-        mask = self.saturated
-        if mask is None:
-            return
-        if mask.dtype != torch.bool or mask.shape != self.light.shape[1:]:
-            raise ValueError(
-                f"`saturated` ({mask.dtype}, shape {tuple(mask.shape)}) must be bool of shape "
-                f"{tuple(self.light.shape[1:])}"
-            )
-        if not bool(mask.any()):
-            object.__setattr__(self, "saturated", None)
-
-    def _check_networks(self) -> None:
-        size, found = self.light.shape[1:], self.defocus_map
-        if self.denoised is not None:
-            object.__setattr__(self, "denoised", check_packed("denoised", self.denoised))
-            if self.denoised.shape[1:] != size:
-                raise ValueError(
-                    f"`denoised` (shape {tuple(self.denoised.shape)}) must be of the shape of "
-                    f"`light`, {tuple(self.light.shape)}"
-                )
-        if found is not None:
-            if found.shape != size or not bool(torch.isfinite(found).all() & (found >= 0).all()):
-                raise ValueError(
-                    f"`defocus_map` (shape {tuple(found.shape)}) must be finite, >= 0 and of shape "
-                    f"{tuple(size)}"
-                )
-            object.__setattr__(self, "defocus_map", found.float())
-        if not isinstance(self.layout, Layout | None):
-            raise ValueError(f"`layout` (={type(self.layout).__name__}) must be a Layout or None")
-        if self.layout is not None and self.layout.defocus.shape != size:
-            raise ValueError(
-                f"`layout` (shape {tuple(self.layout.defocus.shape)}) must be of shape "
-                f"{tuple(size)}"
-            )
 
     @property
     def noise_free(self) -> bool:
@@ -290,11 +211,14 @@ class Scene:
             white_balance: Gains of R, G, B.
             kind: Sort of scene.
             **fields: Further fields of `Scene`.
+
+        Raises:
+            ValueError: If a value has the wrong shape or lies outside its range.
         """
-        return cls(
+        scene = cls(
             scene_id=scene_id,
             group=scene_id if group is None else group,
-            light=check_packed("packed", packed),
+            light=check_packed("packed", packed).contiguous(),
             reference=reference,
             camera=camera,
             nlf=NoiseLevelFunction.zero() if nlf is None else nlf,
@@ -303,6 +227,7 @@ class Scene:
             kind=kind,
             **fields,
         )
+        return _checked(scene)
 
     @classmethod
     def from_raw(
@@ -366,21 +291,18 @@ class Scene:
         """A noise-free scene from linear light, taken into the camera's colours.
 
         Args:
-            rgb: (3, H, W) linear light, sRGB primaries, at least 0 and finite. With `illuminance`
-                given, 1.0 is a perfectly white surface under it (so the values of surfaces are
-                reflectances); without, the scale is arbitrary.
+            rgb: (3, H, W), or (3, 2H, 2W) with `sampled`: linear light; see `camera_light`.
             camera: Its `colour_matrix` takes sRGB to the camera; without one the colours stay.
             scene_id: Unique name.
             group: Source group; `scene_id` by default.
-            illuminance: Light on the subject [lux]; None where the scale is unknown.
+            illuminance: Light on the subject [lux], under which 1.0 is a perfectly white surface;
+                None where the scale is unknown.
             ev100: Used only without `illuminance`: the EV100 at which the mean of green, clipped
                 at white, is set to 0.12.
-            illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`; decides the white
-                balance.
+            illuminant: Colour of the light, linear sRGB, multiplied onto `rgb`.
             kind: Sort of scene.
-            sampled: Whether the pixels of `rgb`, (3, 2H, 2W), are photosites: they go through a
-                lens that is sharp to about a pixel and the camera's colour filter array. Otherwise
-                each becomes a packed pixel, all four planes of it at one place.
+            sampled: Whether the pixels of `rgb` are photosites; otherwise each becomes a packed
+                pixel, all four planes of it at one place.
             **fields: Further fields of `Scene`.
         """
         light, reference, white_balance = camera_light(
@@ -421,12 +343,10 @@ class Scene:
         Raises:
             ValueError: If the scene is smaller than `resolution` or an argument is invalid.
         """
-        if crop not in ("box", "native"):
-            raise ValueError(f"`crop` (={crop!r}) must be 'box' or 'native'")
+        check_word("crop", crop, get_args(Crop))
         if resolution is None:
             return self
-        if not isinstance(resolution, int) or resolution < 1:
-            raise ValueError(f"`resolution` (={resolution!r}) must be a positive integer or None")
+        check_integer("resolution", resolution, 1)
         height, width = self.light.shape[1:]
         if min(height, width) < resolution:
             raise ValueError(
@@ -446,10 +366,11 @@ class Scene:
         def part(planes: torch.Tensor | None) -> torch.Tensor | None:
             return None if planes is None else planes[..., rows, columns]
 
+        mask = part(self.saturated)
         return replace(
             self,
-            light=self.light[..., rows, columns],
-            saturated=part(self.saturated),
+            light=self.light[..., rows, columns].contiguous(),
+            saturated=mask if mask is not None and bool(mask.any()) else None,
             denoised=part(self.denoised),
             recorded=part(self.recorded),
             residual=None,  # of the whole frame
@@ -498,6 +419,107 @@ class Scene:
         return f"Scene({self.scene_id!r}, {self.kind}, {height} x {width} packed, {light})"
 
 
+def _checked(scene: Scene) -> Scene:
+    """The scene with its fields in their types; a `ValueError` names one that is invalid."""
+    for name in ("scene_id", "group", "kind"):
+        if not isinstance(getattr(scene, name), str) or not getattr(scene, name):
+            raise ValueError(f"`{name}` (={getattr(scene, name)!r}) must be a non-empty string")
+    types: dict[str, Any] = {"camera": CameraProfile, "reference": CameraSettings}
+    types |= {"nlf": NoiseLevelFunction, "layout": Layout | None}
+    types |= dict.fromkeys(("saturated", "denoised", "defocus_map"), torch.Tensor | None)
+    for name, kind in types.items():
+        found = getattr(scene, name)
+        if not isinstance(found, kind):
+            shown = found if isinstance(found, str) else type(found).__name__
+            raise ValueError(f"`{name}` (={shown!r}) must be a {getattr(kind, '__name__', kind)}")
+    if scene.illuminance is not None:
+        check_number("illuminance", scene.illuminance, 1e-300, 1e300, more=" lux")
+    gains = tuple(float(gain) for gain in scene.white_balance)
+    if len(gains) != 3 or not all(math.isfinite(gain) and gain > 0 for gain in gains):
+        raise ValueError(f"`white_balance` (={gains}) must be 3 positive gains (R, G, B)")
+    check_number("median_speed", scene.median_speed, 0.0, 1e300)
+    check_integer("box_factor", scene.box_factor, 1)
+    size, mask, blur = scene.light.shape[1:], scene.saturated, scene.defocus_map
+    denoised = scene.denoised
+    if denoised is not None:
+        denoised = check_packed("denoised", denoised)
+    maps = {"saturated": mask, "defocus_map": blur}
+    maps["layout"] = None if scene.layout is None else scene.layout.defocus
+    maps["denoised"] = None if denoised is None else denoised[0]
+    for name, found in maps.items():
+        if found is not None and found.shape != size:
+            shapes = f"{tuple(found.shape)} must be that of `light`, {tuple(size)}"
+            raise ValueError(f"`{name}`: height and width {shapes}")
+    if mask is not None and mask.dtype != torch.bool:
+        raise ValueError(f"`saturated` (dtype {mask.dtype}) must be bool")
+    if blur is not None and not bool((torch.isfinite(blur) & (blur >= 0)).all()):
+        raise ValueError("`defocus_map` must be finite and >= 0 everywhere")
+    allowed, frames = scene.allowed, scene.recorded
+    if allowed is not None and (allowed.dtype != np.bool_ or allowed.ndim != 1):
+        raise ValueError(f"`allowed` ({allowed.dtype}, shape {allowed.shape}) must be bool, (S,)")
+    if allowed is not None and not allowed.any():
+        raise ValueError("`allowed` must allow a state")
+    if frames is not None and (allowed is None or frames.shape != (len(allowed), 4, *size)):
+        raise ValueError("`recorded` must be (S, 4, H, W) with one frame for each of `allowed`")
+    return replace(
+        scene,
+        white_balance=gains,
+        denoised=denoised,
+        saturated=mask if mask is not None and bool(mask.any()) else None,
+        defocus_map=None if blur is None else blur.float(),
+    )
+
+
+class SceneSet(Sequence[Scene]):
+    """Scenes in a fixed order; those that must be drawn first are drawn when they are needed.
+
+    All names are known at once, so whoever holds a set need not know which kind it is: `load` the
+    scenes that are about to be used, several at a time, and ask `loaded` which are there already.
+    Indexing and iterating load what they need. Where some are not there yet, all are alike in what
+    they have: those that are there tell whether any has a layout.
+
+    Args:
+        scenes: All of them, in order.
+
+    Attributes:
+        scene_ids: Their names.
+    """
+
+    def __init__(self, scenes: Iterable[Scene]) -> None:
+        self._scenes: list[Scene | None] = list(scenes)
+        self.scene_ids = tuple(scene.scene_id for scene in self)
+
+    @classmethod
+    def of(cls, scenes: Sequence[Scene]) -> SceneSet:
+        """`scenes` as a set, which they may be already."""
+        return scenes if isinstance(scenes, SceneSet) else cls(scenes)
+
+    @property
+    def loaded(self) -> list[int]:
+        """Indices of the scenes that are there, at least the first."""
+        return [index for index, scene in enumerate(self._scenes) if scene is not None]
+
+    def load(self, indices: Iterable[int]) -> None:
+        """Makes sure that the scenes at `indices` are there."""
+
+    def __len__(self) -> int:
+        return len(self._scenes)
+
+    @overload
+    def __getitem__(self, index: int) -> Scene: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Scene]: ...
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            self.load(range(len(self))[index])
+        elif self._scenes[index] is None:
+            self.load([index])
+        return self._scenes[index]
+
+    def __iter__(self) -> Iterator[Scene]:
+        return iter(self[:])
+
+
 @dataclass(frozen=True)
 class SceneRequest:
     """The split, the camera and the size that scenes are loaded for.
@@ -510,7 +532,7 @@ class SceneRequest:
         resize: Brings each scene to `resolution`, as `Scene.resized` does.
     """
 
-    split: str
+    split: Split
     camera: CameraProfile
     resolution: int | None = 64
     crop: Crop = "box"

@@ -1,4 +1,4 @@
-"""Scorers made of other scorers: the weighted mean, and the default `balanced`."""
+"""`CompositeScorer`: the weighted mean of other scorers, each of which is checked."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from ae_env.scorers.protocol import Captures, ColourMatrix, DependsOn, Domain, Scorer
-from ae_env.scorers.terms import Brightness, Highlights, Noise, Shadows, Sharpness
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from simulator.raw.develop import develop
 
 logger = logging.getLogger(__name__)
@@ -138,37 +137,6 @@ class CompositeScorer:
         return np.minimum(np.maximum(totals, 0.0), 1.0)
 
 
-class Balanced(CompositeScorer):
-    """The default scorer: a photograph is as good as its worst fault allows.
-
-    Product of the five terms, each to its weight, times ``(1 - fh^4) (1 - fs^4)``, fh and fs the
-    shares of blown and blocked pixels: a frame that is all white or all black scores near 0.
-    """
-
-    def __init__(self) -> None:
-        weighted: dict[str, tuple[Any, float]] = {
-            "brightness": (Brightness(), 0.30),
-            "highlights": (Highlights(), 0.15),
-            "shadows": (Shadows(), 0.10),
-            "noise": (Noise(), 0.20),
-            "sharpness": (Sharpness(), 0.25),
-        }
-        super().__init__(
-            {name: part for name, (part, _) in weighted.items()},
-            {name: weight for name, (_, weight) in weighted.items()},
-        )
-
-    def combine(self, scores: Mapping[str, Any]) -> Any:
-        """Total score from the parts' scores: tensors, arrays of any one shape, or numbers."""
-        blown = -Highlights.scale * _log(scores["highlights"])
-        blocked = -Shadows.scale * _log(scores["shadows"])
-        # Rounding may leave a share above 1.
-        score = (1.0 - blown**4).clip(0.0, 1.0) * (1.0 - blocked**4).clip(0.0, 1.0)
-        for name, weight in self.weights.items():
-            score = score * scores[name] ** weight
-        return score
-
-
 def developed(
     images: torch.Tensor, white_balance: torch.Tensor, matrices: Sequence[ColourMatrix | None]
 ) -> torch.Tensor:
@@ -183,11 +151,6 @@ def developed(
         return develop(images, white_balance, matrices[0])
     pairs = zip(images, white_balance, matrices, strict=True)
     return torch.cat([develop(image[None], gains, matrix) for image, gains, matrix in pairs])
-
-
-def _log(values: Any) -> Any:
-    """Natural logarithm; of arrays by NumPy, as torch's threads do not survive a fork."""
-    return values.log() if torch.is_tensor(values) else np.log(values)
 
 
 def _check_part(name: str, part: Any) -> None:

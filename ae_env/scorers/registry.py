@@ -23,7 +23,7 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Any, TypeVar
 
-from ae_env.scorers.composite import Balanced, CompositeScorer
+from ae_env.scorers.composite import CompositeScorer
 from ae_env.scorers.defects import (
     AnalyticBlur,
     AnalyticExposure,
@@ -49,8 +49,16 @@ from ae_env.scorers.measures import (
 )
 from ae_env.scorers.opencv import Keypoints, Matches
 from ae_env.scorers.protocol import Scorer
-from ae_env.scorers.terms import Banding, Brightness, Highlights, Noise, Shadows, Sharpness
-from ae_env.utils.user_code import load_attribute, load_from_file, split_file_name
+from ae_env.scorers.terms import (
+    Balanced,
+    Banding,
+    Brightness,
+    Highlights,
+    Noise,
+    Shadows,
+    Sharpness,
+)
+from ae_env.utils.user_files import load_attribute, load_from_file, split_file_name
 from simulator.utils.checks import did_you_mean
 
 ENTRY_POINT_GROUP = "ae_env.scorers"

@@ -2,7 +2,7 @@
 
 ``q(s)`` is the expectation, over noise, of the score of a capture at state s. Where a part of the
 scorer has that in closed form it is used (of the terms that are measured on frames, to the first
-order: see `ae_env.scorers.code_terms`); other parts are averaged over common noise seeds, with
+order: see `ae_env.scorers.terms`); other parts are averaged over common noise seeds, with
 their standard error.
 """
 
@@ -20,10 +20,9 @@ from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes.scene import Scene
 from ae_env.scorers.captures import SceneCaptures
-from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.composite import CompositeScorer, is_own
 from ae_env.scorers.protocol import Captures, DependsOn, reads_pixels
-from ae_env.scorers.terms import Sharpness
+from ae_env.scorers.terms import Sharpness, TermScores
 from simulator.camera import CameraProfile
 from simulator.capture.plan import DEFAULT_TOLERANCE, check_tolerance
 from simulator.capture.prepared_scene import PreparedScene
@@ -135,8 +134,8 @@ class ScoreTables:
         tolerance: How far the captures that are scored may be off, see `PreparedScene.tolerance`.
 
     Attributes:
-        code_scores: The parts that are measured on a frame, with an expectation in closed form.
-        others: All other parts; None if there are none.
+        term_scores: The parts that are measured on a frame, with an expectation in closed form.
+        torch_terms: All other parts, which torch evaluates; None if there are none.
     """
 
     def __init__(
@@ -156,13 +155,13 @@ class ScoreTables:
         self.tolerance = tolerance
         # Scorers of one's own get a copy of the light, lest they write to the scene.
         self._captures = SceneCaptures(camera, _MEMORY_BYTES, copies=is_own(scorer))
-        self.code_scores = CodeScores(scorer, camera, grid.states, noise=noise)
-        self.others = scorer.subset(set(scorer.parts) - set(self.code_scores.parts))
+        self.term_scores = TermScores(scorer, camera, grid.states, noise=noise)
+        self.torch_terms = scorer.subset(set(scorer.parts) - set(self.term_scores.parts))
 
     @property
     def closed_form(self) -> bool:
         """Whether every part's expectation has a closed form, so that no noise is drawn for it."""
-        return self.others is None or self.others.closed_form
+        return self.torch_terms is None or self.torch_terms.closed_form
 
     def table(
         self,
@@ -192,15 +191,15 @@ class ScoreTables:
                 scene, self.camera, speed=speed, defocus=defocus, movement=movement
             )
             prepared = replace(prepared, tolerance=self.tolerance)
-        parts = self.known_parts(scene, prepared, gain=gain, row_gain=row_gain)
+        parts = self.closed_form_terms(scene, prepared, gain=gain, row_gain=row_gain)
         if scene.recorded is not None:
             return self._recorded_table(scene, prepared, parts)
-        if self.code_scores.parts:
+        if self.term_scores.parts:
             captures = None
-            if self.code_scores.reads_captures:
+            if self.term_scores.reads_captures:
                 captures = self._described(scene, prepared, slice(None), gain, row_gain)
             means = self._expected_means(prepared, gain, row_gain)
-            parts |= self.code_scores.scores(captures, means)
+            parts |= self.term_scores.score(means, captures)
         error = np.zeros(len(self.grid))
         if self.closed_form:
             mean = self.scorer.totals(parts)
@@ -233,13 +232,13 @@ class ScoreTables:
             states = np.arange(len(self.grid))[part]
             captures = self._described(scene, prepared, part, 1.0, None)
             found: dict[str, np.ndarray] = {}
-            if self.code_scores.parts:
+            if self.term_scores.parts:
                 codes = encode_observation(frames[part]).numpy()
-                means = self.code_scores.measured(codes, states, np.zeros((len(states), 2, 4)))
-                found |= self.code_scores.scores(captures, means)
-            if self.others is not None and not self.others.closed_form:
+                means = self.term_scores.measured(codes, states, np.zeros((len(states), 2, 4)))
+                found |= self.term_scores.score(means, captures)
+            if self.torch_terms is not None and not self.torch_terms.closed_form:
                 shown = frames[part].clamp(0.0, 1.0)
-                scored = self.others.score_parts(shown, captures, ("image",))
+                scored = self.torch_terms.score_parts(shown, captures, ("image",))
                 found |= {name: values.numpy() for name, values in scored.items()}
             for name, values in found.items():
                 parts.setdefault(name, np.zeros(len(self.grid)))[part] = values
@@ -247,7 +246,7 @@ class ScoreTables:
         shown_parts = {name: np.where(allowed, parts[name], 0.0) for name in self.scorer.parts}
         return ScoreTable(mean, np.zeros(len(self.grid)), shown_parts, allowed)
 
-    def known_parts(
+    def closed_form_terms(
         self,
         scene: Scene,
         prepared: PreparedScene,
@@ -257,17 +256,17 @@ class ScoreTables:
         kinds: tuple[DependsOn, ...] = ("light", "blur"),
     ) -> dict[str, np.ndarray]:
         """Scores (S,) of those parts that look at no frame but depend on `kinds`; see `table`."""
-        others = self.others
-        names = [] if others is None else others.names(*kinds)
-        if others is None or not names:
+        torch_terms = self.torch_terms
+        names = [] if torch_terms is None else torch_terms.names(*kinds)
+        if torch_terms is None or not names:
             return {}
-        if all(type(others.parts[name]) is Sharpness for name in names):  # reads nothing else
+        if all(type(torch_terms.parts[name]) is Sharpness for name in names):  # reads nothing else
             return dict.fromkeys(names, self._sharpness(scene, prepared))
-        looks = any(reads_pixels(others.parts[name]) for name in names)
+        looks = any(reads_pixels(torch_terms.parts[name]) for name in names)
         chunks = []
         for part in _slices(len(self.grid), _CHUNK if looks else len(self.grid)):
             captures = self._described(scene, prepared, part, gain, row_gain)
-            scores = others.score_parts(None, captures, kinds)
+            scores = torch_terms.score_parts(None, captures, kinds)
             chunks.append({name: values.numpy() for name, values in scores.items()})
         return {name: np.concatenate([c[name] for c in chunks]) for name in names}
 
@@ -301,7 +300,7 @@ class ScoreTables:
     def _expected_means(
         self, prepared: PreparedScene, gain: float | np.ndarray, row_gain: np.ndarray | None
     ) -> np.ndarray:
-        """`CodeScores.expected` of all states, (S, 3)."""
+        """`TermScores.expected` of all states, (S, 3)."""
         gains = np.broadcast_to(gain, len(self.grid)).tolist()
         prepared = replace(prepared, blurred_light=prepared.blurred_light.copy(_LIGHT_BYTES))
         exposures = [
@@ -318,7 +317,7 @@ class ScoreTables:
             transitions = Transitions.of([light] * len(states), found)
             boxes = np.full(len(states), prepared.box_factor)
             rows = None if row_gain is None else row_gain[states]
-            means[states] = self.code_scores.expected(transitions, np.array(states), boxes, rows)
+            means[states] = self.term_scores.expected(transitions, np.array(states), boxes, rows)
         return means
 
     def _samples(
@@ -329,16 +328,18 @@ class ScoreTables:
         row_gain: np.ndarray | None,
     ) -> dict[str, np.ndarray]:
         """Scores (seeds, S) of the parts without a closed form, on common noise seeds."""
-        assert self.others is not None
+        assert self.torch_terms is not None
         gains = np.broadcast_to(gain, len(self.grid))
-        names = self.others.names("image")
+        names = self.torch_terms.names("image")
         samples = {name: np.zeros((self.noise_seeds, len(self.grid))) for name in names}
         for part in _slices(len(self.grid), _CHUNK):
             states, rows = self.grid.states[part], None if row_gain is None else row_gain[part]
             light: Any = {"gain": gains[part], "row_gain": rows}
             captures = self._described(scene, prepared, part, gain, row_gain)
             for seed, images in enumerate(self._images(prepared, states, **light)):
-                for name, values in self.others.score_parts(images, captures, ("image",)).items():
+                for name, values in self.torch_terms.score_parts(
+                    images, captures, ("image",)
+                ).items():
                     samples[name][seed, part] = values.numpy()
         return samples
 

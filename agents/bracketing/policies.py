@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ae_env.episodes.bracket_core import FRAME_GAP
+from ae_env.episodes.bracket import FRAME_GAP
+from ae_env.merging import LOG_FLOOR, merge
 from ae_env.observation import decode_observation, decode_sensors, decode_settings
-from ae_env.utils.merging import LOG_FLOOR, merge
 from agents.bracketing.schedules import BINS, Floats, Ints, Schedules, bin_of
 from agents.policy import Observations, Policy, PolicyContext
 from agents.rollouts import RolloutPlan, checked_states, errors_of, scenes_of

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from ae_env.episodes.bracket_core import FRAME_GAP
+from ae_env.episodes.bracket import FRAME_GAP
 from ae_env.grid import ExposureGrid
-from ae_env.utils.merging import SATURATED, WORST_EV
+from ae_env.merging import SATURATED, WORST_EV
 from simulator.camera import CameraProfile
 
 Floats = NDArray[np.float64]

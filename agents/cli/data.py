@@ -86,7 +86,7 @@ def record(
     """
     import gymnasium as gym
 
-    from ae_env.utils.presets import load_preset
+    from ae_env.utils.user_files import load_preset
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
@@ -155,7 +155,7 @@ def score_tables(
     Example: `ae-env score-tables path/to/raws -o tables`
     """
     from ae_env.grid import ExposureGrid
-    from ae_env.scenes.loading import check_weights
+    from ae_env.scenes.load import check_weights
     from ae_env.scorers import make_scorer
     from agents.score_shards import ShardPlan, check_engine, run
     from simulator import get_camera

@@ -194,7 +194,7 @@ def _plan(
     condition: dict[str, Any] = {}
     if env is not None:
         from ae_env.options import EnvOptions
-        from ae_env.utils.presets import load_preset
+        from ae_env.utils.user_files import load_preset
 
         arguments = load_preset(env)
         arguments.pop("max_episode_steps", None)

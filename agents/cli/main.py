@@ -74,7 +74,7 @@ def main() -> None:
     except Exception as error:  # whatever it is, the user gets one line; --debug shows the rest
         if "--debug" in sys.argv:
             raise
-        from ae_env.utils.user_code import UserCodeError
+        from ae_env.utils.user_files import UserCodeError
 
         Console(stderr=True).print(f"[bold red]error[/] {escape(_one_line(error))}", soft_wrap=True)
         usage = isinstance(error, _USAGE) and not isinstance(error, UserCodeError)

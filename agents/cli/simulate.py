@@ -170,7 +170,7 @@ def sweep(
 
 def _small_scene(scene: Scene, weights: str, depth: str, cache: bool) -> Scene:
     """`scene` at the size of a contact sheet, with what the networks find out about it."""
-    from ae_env.scenes.loading import SceneNetworks
+    from ae_env.scenes.load import SceneNetworks
 
     size = min(_SHEET_SIZE, *scene.light.shape[1:])
     if weights == "none":

@@ -42,7 +42,7 @@ def train(
 
     Example: `ae-env train configs/ppo.yaml --out runs/ppo`
     """
-    from ae_env.utils.presets import find_config
+    from ae_env.utils.user_files import find_config
     from agents.learning.training import load_config, load_curve, train_agent
     from agents.report.plots import plot_learning
     from simulator.utils.files import sibling
@@ -99,7 +99,7 @@ def train_simulator(
 
     Several processes or GPUs: `accelerate launch -m agents.cli train-simulator CONFIG`.
     """
-    from ae_env.utils.presets import find_config
+    from ae_env.utils.user_files import find_config
     from simulator.networks.weights import build_modules
     from simulator.training.train import load_config, load_start, train_and_save
 

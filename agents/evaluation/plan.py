@@ -266,7 +266,7 @@ def load_plan(name: str | Path) -> EvaluationPlan:
         ValueError: If there is none, or an entry is unknown, out of range or no JSON value; the
             message names the file and the entry.
     """
-    from ae_env.utils.presets import find_preset
+    from ae_env.utils.user_files import find_preset
 
     plan = load_yaml(find_preset(str(name), "evaluation"), EvaluationPlan)
     plan.protocol()

@@ -12,7 +12,7 @@ from typing import Any
 
 from ae_env.scenes import Scene, load_scenes
 from ae_env.scenes.folder import find_files
-from ae_env.scenes.recorded_files import PREFIX
+from ae_env.scenes.recorded import PREFIX
 from simulator import RawImage, get_camera, read_raw
 from simulator.radiance.maps import RADIANCE_SUFFIXES
 from simulator.raw.develop import quarter_turns

@@ -17,8 +17,7 @@ from scipy.stats import rankdata, spearmanr
 
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene
-from ae_env.scenes.loading import SceneNetworks
-from ae_env.scenes.photographed import photographed
+from ae_env.scenes.load import SceneNetworks, simulate_source_raw
 from ae_env.scenes.scene import Crop
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from agents.cli.console import progress_bars
@@ -108,7 +107,7 @@ class Predictions:
 
     def _measured(self, index: int, iso: float, ev: float) -> list[Measured]:
         scene, true = self.scenes[index], self._true[index]
-        taken = photographed(scene, seed=self.seed, iso=iso, ev=ev)
+        taken = simulate_source_raw(scene, seed=self.seed, iso=iso, ev=ev)
         saturated = taken.prepared.saturated_share
         found = []
         for name, networks in self._simulators.items():

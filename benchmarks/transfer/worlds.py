@@ -9,10 +9,9 @@ from typing import Any
 
 from ae_env.options import EnvOptions
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.bundled import Split
-from ae_env.scenes.photographed import photographed
+from ae_env.scenes.load import simulate_source_raw
 from ae_env.scenes.polyhaven import list_assets
-from ae_env.scenes.scene import Crop
+from ae_env.scenes.scene import Crop, Split
 from agents.evaluation.plan import groups_in_turn
 from benchmarks.fidelity.models import weights
 from simulator import CameraProfile
@@ -63,7 +62,7 @@ def at_high_iso(
         resolution: Packed pixels a side.
     """
     scenes = scenes_of(name, crop, split, camera, resolution)
-    return [photographed(scene, iso_range=HIGH_ISO) for scene in scenes]
+    return [simulate_source_raw(scene, iso_range=HIGH_ISO) for scene in scenes]
 
 
 #: What the environment's `scenes` names, as ``"benchmarks.transfer.worlds:high_iso_both_box"``.

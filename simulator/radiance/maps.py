@@ -74,6 +74,45 @@ def near_one(image: np.ndarray) -> np.ndarray:
         return np.asarray(np.minimum(np.ldexp(image, -exponent), np.float32(2.0**100)))
 
 
+def map_views(
+    image: np.ndarray, resolution: int | None, *, native: bool = False
+) -> tuple[dict[str, np.ndarray], bool]:
+    """The views of a map that become scenes, and whether their pixels are photosites.
+
+    A picture twice as wide as high (to 1 %) is an equirectangular panorama and gives four views
+    with a field of view of 60 degrees; any other gives its central square. Both have about 256
+    packed pixels a side. Where the map has at least as many pixels there as photosites (512 x 512)
+    the views have twice as many, for a colour filter array to sample.
+
+    Args:
+        image: (3, H, W) linear light.
+        resolution: Packed pixels a side that the views are for; see `native_size`.
+        native: Whether the middle is to be cut out: then a coarser map is sampled, too, if it has
+            the photosites of that middle.
+
+    Returns:
+        The views by the ending of their names, and whether they are to be sampled.
+    """
+    height, width = image.shape[1:]
+    is_panorama = abs(width / height - 2.0) <= 0.01
+    if is_panorama:
+        available = int(width / math.pi * math.tan(math.radians(FIELD_OF_VIEW) / 2.0))
+        size = native_size(resolution)
+    else:
+        available = min(height, width)
+        size = native_size(resolution, available)
+    sampled = True
+    if available >= 2 * size:
+        size = 2 * size
+    elif native and resolution and available >= 2 * resolution:
+        size = available // 2 * 2
+    else:
+        sampled = False
+    if is_panorama:
+        return {f"-{round(a):03d}": perspective(image, a, size) for a in AZIMUTHS}, sampled
+    return {"": _central_square(image, size)}, sampled
+
+
 def native_size(resolution: int | None, available: int = NATIVE_SIZE) -> int:
     """Packed pixels a side of a view before it is resized to `resolution`.
 
@@ -154,14 +193,12 @@ def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndar
     return values[0].numpy()
 
 
-def central_square(image: np.ndarray, size: int, name: str) -> np.ndarray:
+def _central_square(image: np.ndarray, size: int) -> np.ndarray:
     """The middle of `image`, box-averaged by the largest integer that leaves `size` pixels."""
     height, width = image.shape[1:]
     k = min(height, width) // size
     if k == 0:
-        raise ValueError(
-            f"radiance map {name!r} ({height} x {width}) must have at least {size} pixels a side"
-        )
+        raise ValueError(f"{height} x {width} pixels must be at least {size} a side")
     top, left = (height - k * size) // 2, (width - k * size) // 2
     square = image[:, top : top + k * size, left : left + k * size]
     return np.asarray(square.reshape(3, size, k, size, k).mean(axis=(2, 4)))

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
-import numpy as np
-
 
 def did_you_mean(name: Any, known: Iterable[str], mark: str = "'", *, cutoff: float = 0.6) -> str:
     """End of a message that proposes the nearest of `known` to a misspelt `name`; empty if none is.
@@ -92,21 +90,3 @@ def check_seed(seed: Any, name: str = "seed") -> int | None:
         ValueError: Unless it is an integer >= 0 or None.
     """
     return None if seed is None else check_integer(name, seed, 0)
-
-
-def check_actions(name: str, actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """`actions` as an array.
-
-    Raises:
-        ValueError: Unless they are integers of `shape`, () for a single one.
-    """
-    try:
-        array = np.asarray(actions)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, object)
-    if array.shape != shape or array.dtype.kind not in "iu":
-        rule = f"integers of shape {shape}" if shape else "an integer"
-        raise ValueError(
-            f"`{name}` (={actions!r}, {array.dtype}, shape {array.shape}) must be {rule}"
-        )
-    return array

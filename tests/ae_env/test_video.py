@@ -88,7 +88,7 @@ def test_equal_delays_of_all_controls_are_one_number():
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_the_light_is_of_the_kinds_of_the_split(split: Any) -> None:
     core = gym.make(ID, split=split, **SMALL).unwrapped.core
-    assert core.lighting.drawn_from == KIND_SETS[split]
+    assert core.episodes.lighting.drawn_from == KIND_SETS[split]
     chosen = {"kind": "moving", "kinds": ["pans"]}
     core = gym.make(ID, split=split, lighting=chosen, **SMALL).unwrapped.core
-    assert core.lighting.drawn_from == ("pans",)
+    assert core.episodes.lighting.drawn_from == ("pans",)

@@ -66,7 +66,7 @@ def test_frames_are_those_of_the_simulator(noise: Any, tolerance: float, lightin
         for i in range(3):
             episode, raw = core.episode(i), observation["raw"][i]
             state = core.grid[episode.state]
-            gain = core.lighting.gain(episode.frame, state.exposure_time, episode.phase)
+            gain = core.episodes.lighting.gain(episode.frame, state.exposure_time, episode.phase)
             scene = core.scenes[episode.scene]
             prepared = replace(prepare_scene(scene, core.camera, **episode.moves), gain=gain)
             prepared = replace(prepared, tolerance=tolerance)
@@ -162,7 +162,7 @@ def test_expected_rewards_are_those_of_the_running_episodes(arguments: dict[str,
         for i in range(8):
             episode = core.episode(i)
             scene = core.scenes[episode.scene]
-            wanted = core.tables.table(scene, **episode.moves)
+            wanted = core.task.tables.table(scene, **episode.moves)
             for name, scores in wanted.parts.items():
                 assert info["rewards"][name][i] == pytest.approx(scores[episode.state], abs=1e-12)
             score = wanted.mean[episode.state]
@@ -203,7 +203,7 @@ def _scene(allowed: Any, scene_id: str = "holes") -> Scene:
 
 def test_forbidden_states_are_masked_never_best_and_never_drawn() -> None:
     free = _scene(None, "free")
-    best = int(np.argmax(make_envs(1, scenes=[free]).core.tables.table(free).mean))
+    best = int(np.argmax(make_envs(1, scenes=[free]).core.task.tables.table(free).mean))
     allowed = np.ones(64, bool)
     allowed[[best, 0, 1, 2, 63]] = False
     holes = _scene(allowed)

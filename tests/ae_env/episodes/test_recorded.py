@@ -15,7 +15,7 @@ from gymnasium.vector import SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 from ae_env import contact_sheet, load_scenes
-from ae_env.episodes.recorded import nearest_recorded
+from ae_env.episodes.lookup import nearest_recorded
 from ae_env.grid import ExposureGrid
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene

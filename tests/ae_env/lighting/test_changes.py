@@ -58,7 +58,7 @@ def test_whole_numbers_are_frames(frame: float) -> None:
     [
         ("stepp", "did you mean 'step'"),
         ({"stops": 3}, r"`lighting` \(={'stops': 3}\) needs a 'kind', one of"),
-        ({"kind": "step", "stop": 3}, "not 'stop'; did you mean 'stops'"),
+        ({"kind": "step", "stop": 3}, "did you mean 'stops'"),
         ({"kind": "step", "stops": math.nan}, r"`lighting\['stops'\]` \(=nan\) must be a number"),
         ({"kind": "step", "stops": -2000}, r"`lighting\['stops'\]` \(=-2000\) .*\[-64, 64\]"),
         ({"kind": "step", "stops": "4"}, r"`lighting\['stops'\]` \(='4'\)"),

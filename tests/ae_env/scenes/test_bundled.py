@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ae_env.scenes import Scene, load_scenes
-from ae_env.scenes.bundled import _procedural
+from ae_env.scenes.bundled import procedural_groups
 from simulator.camera import get_camera
 from simulator.radiance.photographs import PHOTOGRAPHS, unprocess
 from simulator.radiance.procedural import HARD_KINDS, dead_leaves, draw, list_kinds
@@ -57,7 +57,7 @@ def test_split_has_enough_groups_and_half_of_them_are_hard(unseen: list[Scene]) 
 
 
 def test_splits_share_no_group(unseen: list[Scene]) -> None:
-    train = {f"{kind}-{index:03d}" for kind, index in _procedural("train", "large")}
+    train = {f"{kind}-{index:03d}" for kind, index in procedural_groups("train", "large")}
     train |= {p.name for p in PHOTOGRAPHS if p.split == "train"}
     assert len(train) >= 195
     assert not train & {scene.group for scene in unseen}

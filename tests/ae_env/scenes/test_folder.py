@@ -46,16 +46,15 @@ def test_bad_files_stop_or_are_skipped_with_a_reason(
     (line,) = (r.getMessage() for r in caplog.records if "skipped" in r.getMessage())
     assert "8 of 12 scene files skipped" in line
     assert "bad0.dng" in line
-    assert "names no camera" in line
     assert line.endswith("and 3 more)")
 
 
 def test_nothing_left_is_an_error(tmp_path: Path) -> None:
     for name in "ab":
         (tmp_path / f"{name}.dng").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"all 2 were skipped \(a\.dng: .*names no camera"):
+    with pytest.raises(ValueError, match=r"all 2 were skipped \(a\.dng: "):
         load(tmp_path, on_error="skip")
-    with pytest.raises(ValueError, match="names no camera") as caught:
+    with pytest.raises(ValueError, match=r"a\.dng") as caught:
         load(tmp_path / "a.dng")
     assert "skip" not in str(caught.value)  # which would not help with one file
 
@@ -230,7 +229,7 @@ def test_many_at_once_are_as_single_ones(recorded: Path, extra: dict[str, Any]) 
         ({"sequence": "{}"}, "train", "needs at least 15 source groups"),
         ({"sequence": "{}/none"}, "test", "must name an existing file, folder or glob"),
         ({"sequence": 3}, "test", "must have a 'path' or a 'sequence'"),
-        ({"sequence": "{}", "path": "{}"}, "test", "field 'path' must be one of"),
+        ({"sequence": "{}", "path": "{}"}, "test", "`scenes`"),
         ({"sequence": "{}", "on_error": "skip"}, "test", r"`on_error` \(='skip'\) must be 'stop'"),
         ({"sequence": "{}", "hrad": True}, "test", "did you mean 'hard'"),
         ({"path": "recorded:{}"}, "test", "must be raws or radiance maps here, not a recorded"),

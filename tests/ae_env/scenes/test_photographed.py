@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ae_env.scenes.loading import load_scenes
-from ae_env.scenes.photographed import ISO_RANGE, photographed
+from ae_env.scenes.load import ISO_RANGE, load_scenes, simulate_source_raw
 from simulator import CameraSimulator, exposure_ratio, get_camera
 from tests.ae_env.environments import make_env
 from tests.ae_env.scorer_images import random_scene
@@ -16,7 +15,9 @@ CAMERA = get_camera("nikon_z6")
 
 
 def test_it_is_metered_by_its_mean():
-    darker, metered, brighter = (photographed(random_scene(), iso=100.0, ev=e) for e in (-1, 0, 1))
+    darker, metered, brighter = (
+        simulate_source_raw(random_scene(), iso=100.0, ev=e) for e in (-1, 0, 1)
+    )
     assert metered.light[1:3].mean().item() == pytest.approx(0.12, rel=0.01)
     for taken, ev in ((darker, -1), (brighter, 1)):
         assert exposure_ratio(metered.reference, taken.reference) == pytest.approx(2.0**ev)
@@ -27,7 +28,7 @@ def test_it_is_metered_by_its_mean():
 def test_its_noise_is_the_cameras_averaged(box_factor: int) -> None:
     """Against the exposed truth: variance read + shot x of a native pixel, over k^2."""
     scene = random_scene(box_factor=box_factor)
-    taken = photographed(scene, iso=3200.0, ev=-1.0)
+    taken = simulate_source_raw(scene, iso=3200.0, ev=-1.0)
     truth = scene.light * exposure_ratio(scene.reference, taken.reference)
     native = CAMERA.nlf(3200.0)
     shot, read = (torch.tensor(v)[:, None, None] for v in (native.shot, native.read))
@@ -40,15 +41,15 @@ def test_its_noise_is_the_cameras_averaged(box_factor: int) -> None:
 
 def test_iso_and_exposure_are_drawn_by_name_and_seed():
     scenes = [random_scene(scene_id=f"scene-{i}") for i in range(40)]
-    drawn = [photographed(scene) for scene in scenes]
+    drawn = [simulate_source_raw(scene) for scene in scenes]
     isos = np.array([scene.reference.iso for scene in drawn])
     assert isos.min() >= ISO_RANGE[0]
     assert isos.max() <= ISO_RANGE[1]
     assert np.ptp(np.log2(isos)) > 4
-    assert torch.equal(photographed(scenes[3]).light, drawn[3].light)
-    assert photographed(scenes[3], seed=1).reference != drawn[3].reference
+    assert torch.equal(simulate_source_raw(scenes[3]).light, drawn[3].light)
+    assert simulate_source_raw(scenes[3], seed=1).reference != drawn[3].reference
     with pytest.raises(ValueError, match=r"`scene` \(='scene-0'\) must be free of noise"):
-        photographed(drawn[0])
+        simulate_source_raw(drawn[0])
 
 
 @pytest.mark.parametrize(
@@ -61,13 +62,13 @@ def test_iso_and_exposure_are_drawn_by_name_and_seed():
 )
 def test_settings_that_no_camera_has_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        photographed(random_scene(), **options)
+        simulate_source_raw(random_scene(), **options)
 
 
 def test_a_scene_too_dark_for_the_meter_is_named():
     black = replace(random_scene(scene_id="cellar"), light=torch.zeros(4, 8, 8))
-    with pytest.raises(ValueError, match=r"'cellar'.* is too dark for the meter"):
-        photographed(black)
+    with pytest.raises(ValueError, match=r"'cellar'.* is too dark"):
+        simulate_source_raw(black)
 
 
 def test_in_the_environment_everything_comes_from_the_raw():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ae_env.scenes import polyhaven
-from ae_env.scenes.loading import load_scenes
+from ae_env.scenes.load import load_scenes
 from ae_env.scenes.polyhaven import (
     ILLUMINANCE,
     Asset,

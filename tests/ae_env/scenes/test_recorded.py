@@ -190,11 +190,11 @@ def test_settings_can_stand_behind_the_folder() -> None:
     [
         ("recorded:", r"`scenes\['recorded'\]` \(=''\) must be the path of a folder"),
         ({"recorded": 3}, r"`scenes\['recorded'\]` \(=3\) must be the path"),
-        ({"recorded": "a", "isos": 3}, r"field 'isos' must be one of .*did you mean 'iso'"),
+        ({"recorded": "a", "isos": 3}, r"did you mean 'iso'"),
         ({"recorded": "a", "iso": -3}, r"`iso` \(=-3\) must be"),
         ("recorded:a?iso=-3", r"`iso` \(=-3.0\) must be"),
         ("recorded:a?iso=fast", r"f_number=4: 'iso=fast' is no setting"),
-        ("recorded:a?isos=3", r"field 'isos' must be one of .*did you mean 'iso'"),
+        ("recorded:a?isos=3", r"did you mean 'iso'"),
         ("recorded:/no/such", r"`scenes` \(='recorded:/no/such'\) must name an existing folder"),
     ],
 )

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ae_env.grid import ExposureGrid
-from ae_env.scenes.recorded_files import index_recorded, recorded_grid, settings_in_name, state_of
+from ae_env.scenes.recorded import index_recorded, recorded_grid, settings_in_name, state_of
 from simulator import CameraSettings
 from tests.ae_env.recorded_files import GRID, write_picture, write_raws, write_states, write_video
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ae_env.scenes.split import Shot, group_shots, split_groups
+from ae_env.scenes.folder import Shot, group_shots, split_groups
 from tests.ae_env.scene_files import load, write_hdr
 
 

@@ -10,9 +10,8 @@ import torch
 from ae_env.observation import encode_observation
 from ae_env.scenes import Scene
 from ae_env.scorers import CompositeScorer, make_scorer
-from ae_env.scorers.code_terms import CodeScores
 from ae_env.scorers.score_table import ScoreTables, prepare_scene, source_noises
-from ae_env.scorers.terms import Highlights, Noise, Shadows
+from ae_env.scorers.terms import Highlights, Noise, Shadows, TermScores
 from simulator.capture.layout import Layout
 from simulator.capture.sensor import clip_and_quantise
 from simulator.optics.motion_path import Movement
@@ -45,12 +44,12 @@ def test_scores_of_frames_are_those_of_the_terms(scorer: Any, make: Any, size: i
     noises = source_noises(prepared, GRID.states, np.ones(64))
     captures = make_captures([scene] * 64, list(GRID), 0.1, 1.0)
     captures = replace(captures, source_noise=noises)
-    brought = NOTHING if noises is None else np.array([[n.shot, n.read] for n in noises])
-    assert brought.any() == (not scene.noise_free)
-    scores = CodeScores(made, CAMERA, GRID.states, noise=True)
-    means = scores.measured(encode_observation(images).numpy(), np.arange(64), brought)
+    source_noise = NOTHING if noises is None else np.array([[n.shot, n.read] for n in noises])
+    assert source_noise.any() == (not scene.noise_free)
+    scores = TermScores(made, CAMERA, GRID.states, noise=True)
+    means = scores.measured(encode_observation(images).numpy(), np.arange(64), source_noise)
     wanted = made.score_parts(images.clamp(0.0, 1.0), captures)
-    for name, found in scores.scores(captures, means).items():
+    for name, found in scores.score(means, captures).items():
         np.testing.assert_allclose(found, wanted[name], atol=1e-6, err_msg=name)
 
 
@@ -173,7 +172,7 @@ def test_frames_of_static_and_changing_light_need_no_torch(monkeypatch: pytest.M
 def test_compiled_and_loaded_kernels_agree_to_the_last_bit(compiled_and_loaded: Any) -> None:
     """The first process of a fresh installation compiles; all others load what it cached."""
     code = (
-        "import sys, numpy as np; from ae_env.scorers.code_kernels import measure_codes\n"
+        "import sys, numpy as np; from ae_env.scorers.terms import measure_codes\n"
         "rng = np.random.default_rng(0); n = np.float32\n"
         "codes, means = rng.integers(0, 256, (3, 4, 900)).astype(np.uint8), np.empty((3, 3))\n"
         "shares, dark = rng.random((2, 4, 256)).astype(n), rng.random(256).astype(n)\n"

@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 import examples.convert_nima as convert_nima
 from ae_env.scorers import make_scorer
 from ae_env.scorers.learnt import PUBLISHED, Classifier, NimaMobileNet, read_network
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from tests.ae_env.recorded_files import GRID, write_raws
 
 KERAS = """

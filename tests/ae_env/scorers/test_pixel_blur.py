@@ -108,7 +108,7 @@ def test_sharpness_of_all_states_at_once_is_that_of_each_capture(
     scene = _scene() if layout else replace(_scene(), layout=None)
     tables = ScoreTables(GRID, CAMERA, make_scorer("balanced"))
     moves: Any = {"speed": 0.2, "defocus": 6.0, "movement": movement}
-    found = tables.known_parts(scene, prepare_scene(scene, CAMERA, **moves), kinds=("blur",))
+    found = tables.closed_form_terms(scene, prepare_scene(scene, CAMERA, **moves), kinds=("blur",))
     for index, state in enumerate(GRID):
         numbers = {"speed": np.array([0.2]), "defocus": np.array([6.0]), "gain": np.ones(1)}
         capture = describe_captures([scene], [state], CAMERA, movements=[movement], **numbers)

@@ -125,7 +125,7 @@ def test_captures_that_are_scored_have_the_tolerance_that_was_asked_for(
         return expose(prepared, *args, **kwargs)
 
     monkeypatch.setattr(PreparedScene, "expose", exposed)
-    EpisodeCore(EnvOptions(**ENV, scorer=Own(), tolerance=0.375), 1).tables.table(_scene())
+    EpisodeCore(EnvOptions(**ENV, scorer=Own(), tolerance=0.375), 1).task.tables.table(_scene())
     assert seen == {0.375}
     with pytest.raises(ValueError, match="`tolerance`"):
         _tables(tolerance=-1.0)

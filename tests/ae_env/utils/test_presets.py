@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env
 
 import ae_env
 from ae_env.options import EnvOptions
-from ae_env.scenes.loading import BUNDLED, BUNDLED_PARTS
-from ae_env.utils.presets import find_config
+from ae_env.scenes.load import BUNDLED, BUNDLED_PARTS
+from ae_env.utils.user_files import find_config
 from tests.ae_env.environments import ID, SMALL
 
 PRESETS = ae_env.list_presets()

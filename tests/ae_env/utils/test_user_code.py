@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ae_env.utils.user_code import load_from_file, split_file_name
+from ae_env.utils.user_files import load_from_file, split_file_name
 
 ARGUMENT = "`thing` (='mine.py:Mine')"
 

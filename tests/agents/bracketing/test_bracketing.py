@@ -11,9 +11,9 @@ import torch
 
 import ae_env  # noqa: F401  (registers the environment)
 from ae_env import ExposureGrid
+from ae_env.merging import log_error, merge
 from ae_env.observation import encode_sensors
-from ae_env.utils.merging import log_error, merge
-from ae_env.utils.user_code import UserCodeError
+from ae_env.utils.user_files import UserCodeError
 from agents.bracketing.policies import FixedBracket, blur_error, describe, run_brackets
 from agents.bracketing.schedules import BINS, Schedules
 from agents.policy import Policy, PolicyContext

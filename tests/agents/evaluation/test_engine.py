@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from ae_env.scorers import make_scorer
+from ae_env.scorers.score_table import ScoreTables
 from agents import Policy, evaluate, fit_policies, make_policy, run_plan
+from agents.evaluation.engine import other_scores
 from agents.evaluation.plan import EvaluationPlan, plan_scenes
 from agents.policy import PolicyContext
 from agents.rollouts import make_envs
@@ -161,3 +164,26 @@ def test_fit_makes_tuned_and_fixed_policies_better_than_random(small):
     np.testing.assert_array_equal(
         again.regression.scores, policies["average:tuned"].regression.scores
     )
+
+
+RATED = EvaluationPlan(
+    environment={"scenes": "bundled:small", "split": "test", "resolution": 36},
+    max_scenes=3,
+    frames=3,
+    starts=("dark",),
+    policies=("matrix:P", "random"),
+    other_scorers=("brightness", "sharpness"),
+    other_scorer_scenes=2,
+)
+
+
+def test_other_scorers_rate_chosen_states_over_frames_then_groups(tmp_path):
+    result = run_plan(RATED, tmp_path)["static"]
+    table = result.other_scores
+    assert table == other_scores(result)  # those of the run are these
+    assert list(table) == ["brightness", "sharpness"]
+    # By hand: two scenes of the three, each a group of its own.
+    tables = ScoreTables(result.grid, RATED.options().make_camera(), make_scorer("brightness"))
+    for policy, track in result.tracks.items():
+        means = [tables.table(result.scenes[j]).mean[track.states[0, j]].mean() for j in (0, 1)]
+        assert table["brightness"][policy] == pytest.approx(np.mean(means), abs=1e-9)

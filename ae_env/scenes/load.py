@@ -1,4 +1,4 @@
-"""`load_scenes`: from a name, a path or a list to scenes; and the networks that prepare them."""
+"""From a name, a path or a list to scenes: `load_scenes`, and the scenes of an environment."""
 
 from __future__ import annotations
 
@@ -6,26 +6,35 @@ import inspect
 import logging
 import os
 import re
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import torch
 
 from ae_env.grid import ExposureGrid
-from ae_env.scenes.bundled import HARD, KINDS, Size, Split, bundled_scenes
+from ae_env.scenes.bundled import HARD, KINDS, Size, bundled_scenes
 from ae_env.scenes.folder import FolderOptions, folder_scenes, sequence_scenes
 from ae_env.scenes.polyhaven import mixed_scenes, polyhaven_scenes, split_assets
 from ae_env.scenes.recorded import RecordedOptions, recorded_scenes
-from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest
-from ae_env.utils.user_code import load_attribute
+from ae_env.scenes.scene import Crop, Resize, Scene, SceneRequest, SceneSet, Split
+from ae_env.utils.user_files import load_attribute
 from simulator.camera import CameraProfile
 from simulator.camera_simulator import CameraSimulator
 from simulator.networks.aperture_module import DEAD_ZONE
 from simulator.networks.network_cache import NetworkCache
-from simulator.utils.checks import did_you_mean
+from simulator.networks.noise_module import SIZES
+from simulator.noise.generator import noise_generator
+from simulator.radiance.light import mean_anchor
+from simulator.raw.image import RawImage
+from simulator.reference.camera import ReferenceCamera
+from simulator.settings import CameraSettings
+from simulator.utils.cache import LruCache
+from simulator.utils.checks import check_number, check_word, did_you_mean
 from simulator.utils.files import sibling
 
 logger = logging.getLogger(__name__)
@@ -45,6 +54,18 @@ NAMED = (*BUNDLED, *BUNDLED_PARTS, *REAL)
 #: Ways to name scenes, see `load_scenes`.
 SceneSpec = str | Path | Sequence[Scene] | Mapping[str, Any] | RecordedOptions
 _ATTRIBUTE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+#: The weights that come with the package.
+DEFAULT_SIMULATOR = "compact"
+#: Raised when the estimation of defocus maps changes.
+MAP_VERSION = 2
+#: Pixels around a crop that the networks see, too: at least their field of view.
+_MARGIN = 112
+#: Range of the ISO of a source raw, drawn log-uniformly, and its f-number.
+ISO_RANGE, F_NUMBER = (100.0, 6400.0), 8.0
+#: Exposure of a source raw relative to the meter's [EV], uniform.
+EV_RANGE = (-1.0, 1.0)
+#: Scenes by all that decides them; the bound is on the memory of their light [byte].
+_LOADED: LruCache[SceneSet] = LruCache(2**30)
 
 
 def load_scenes(
@@ -75,7 +96,7 @@ def load_scenes(
             - a mapping ``{"sequence": folder or glob, ...}`` likewise: the raws of each folder are
               the frames of one scene over time (`ae_env.scenes.folder`);
             - ``"recorded:FOLDER"`` or a mapping ``{"recorded": folder, ...}``: grids whose every
-              state is a real capture (`ae_env.scenes.recorded_files` has the layouts), with the
+              state is a real capture (`ae_env.scenes.recorded` has the layouts), with the
               ``iso``, ``exposure_time`` and ``f_number`` of files that do not state theirs.
 
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
@@ -96,8 +117,7 @@ def load_scenes(
         ValueError: If `spec` names nothing known or no scene of `split`, if a file cannot be read,
             or if a scene is smaller than `resolution`.
     """
-    if split not in get_args(Split):
-        raise ValueError(f"`split` (={split!r}) must be one of {list(get_args(Split))}")
+    check_word("split", split, get_args(Split))
     if not isinstance(camera, CameraProfile):
         hint = "; `simulator.get_camera` gives one by name"
         raise ValueError(f"`camera` (={camera!r}) must be a CameraProfile{hint}")
@@ -107,19 +127,15 @@ def load_scenes(
     if recorded is not None:
         scenes = recorded_scenes(recorded, request, grid or recorded.grid)
     elif isinstance(spec, Mapping):
-        load = sequence_scenes if is_sequence(spec) else folder_scenes
+        load = sequence_scenes if "sequence" in spec else folder_scenes
         path, options = _options(spec)
         scenes = load(path, request, options)
     elif isinstance(spec, Path):
         scenes = folder_scenes(spec, request)
     elif isinstance(spec, str):
-        scenes = _by_name(spec, split, request)
-    elif isinstance(spec, Sequence):
-        scenes = [request.sized(scene) for scene in _checked(spec, "scenes")]
+        scenes = _by_name(spec, request)
     else:
-        raise ValueError(
-            f"`scenes` (={spec!r}) must be a name, a path, a mapping or a list of Scene"
-        )
+        scenes = _sized_list(spec, "scenes", request)
     if not scenes:
         raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
     seen: set[str] = set()
@@ -130,41 +146,20 @@ def load_scenes(
     return list(scenes)
 
 
-def scenes_on_demand(
-    spec: object, split: Split, camera: CameraProfile, resolution: int | None, crop: Crop
-) -> Sequence[Scene] | None:
-    """As `load_scenes`, but scenes that must be drawn are when they are needed; None for others.
-
-    Those are the bundled ones, if not found in the cache.
-    """
-    if split == "all" or not isinstance(spec, str) or spec not in (*BUNDLED, *BUNDLED_PARTS):
-        return None
-    return _by_name(spec, split, SceneRequest(split, camera, resolution, crop))
-
-
-def is_sequence(spec: object) -> bool:
-    """Whether `spec` asks for scenes whose frames are raws of their own."""
-    return isinstance(spec, Mapping) and "sequence" in spec
-
-
 def has_frames(spec: object) -> bool:
     """Whether the scenes of `spec` may be frames that follow each other."""
-    return is_sequence(spec) or RecordedOptions.of(spec) is not None
+    sequence = isinstance(spec, Mapping) and "sequence" in spec
+    return sequence or RecordedOptions.of(spec) is not None
 
 
-def _by_name(spec: str, split: Split, request: SceneRequest) -> Sequence[Scene]:
-    camera, resolution = request.camera, request.resolution
+def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
     if spec in BUNDLED or spec in BUNDLED_PARTS:
-        size, part = BUNDLED.get(spec, "normal"), BUNDLED_PARTS.get(spec)
-        if request.resize is Scene.resized:
-            return bundled_scenes(split, camera, resolution, request.crop, size=size, part=part)
-        finest = bundled_scenes(split, camera, None, size=size, part=part)
-        return [request.sized(scene) for scene in finest]
+        return _bundled(spec, request)
     if spec == "polyhaven":
         return polyhaven_scenes(request)
     if spec == "mixed":
-        maps = len(split_assets("mixed", split))  # raises before anything is drawn
-        bundled = _by_name("bundled:large", split, request)
+        maps = len(split_assets("mixed", request.split))  # raises before anything is drawn
+        bundled = _bundled("bundled:large", request)
         procedural = [scene for scene in bundled if scene.kind != "photograph"]
         return mixed_scenes(request, procedural, maps)
     if not os.path.exists(os.path.expanduser(spec)):  # unlike Path's, false for odd names
@@ -172,10 +167,10 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> Sequence[Scene]:
         if _ATTRIBUTE.fullmatch(spec) and not ours:
             found: Any = load_attribute(spec, f"`scenes` (={spec!r})")
             if callable(found):
-                known = {"split": split, "camera": camera, "resolution": resolution}
+                known = {name: getattr(request, name) for name in ("split", "camera", "resolution")}
                 names = inspect.signature(found).parameters
-                found = found(**{name: given for name, given in known.items() if name in names})
-            return [request.sized(scene) for scene in _checked(found, spec)]
+                found = found(**{name: value for name, value in known.items() if name in names})
+            return _sized_list(found, spec, request)
         hint = did_you_mean(spec, NAMED, cutoff=0.7)
         if hint or ours:
             raise ValueError(
@@ -185,18 +180,24 @@ def _by_name(spec: str, split: Split, request: SceneRequest) -> Sequence[Scene]:
     return folder_scenes(spec, request)
 
 
+def _bundled(name: str, request: SceneRequest) -> Sequence[Scene]:
+    size, part = BUNDLED.get(name, "normal"), BUNDLED_PARTS.get(name)
+    if request.resize is Scene.resized:
+        return bundled_scenes(request, size=size, part=part)
+    finest = replace(request, resolution=None, crop="box")
+    return [request.sized(scene) for scene in bundled_scenes(finest, size=size, part=part)]
+
+
 def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
-    where = "sequence" if is_sequence(spec) else "path"
-    known = [field.name for field in fields(FolderOptions)]
+    where = "sequence" if "sequence" in spec else "path"
+    known = tuple(field.name for field in fields(FolderOptions))
     if not isinstance(spec.get(where), str | Path):
         raise ValueError(
             f"`scenes` (={dict(spec)!r}) must have a 'path' or a 'sequence'; the other fields are "
             f"{known}"
         )
     for name in spec:
-        if name != where and name not in known:
-            hint = did_you_mean(name, known)
-            raise ValueError(f"`scenes` field {name!r} must be one of {[where, *known]}{hint}")
+        check_word("scenes", name, (where, *known))
     if spec[where] in NAMED:
         raise ValueError(
             f"`scenes` (={dict(spec)!r}): {where!r} must be a file, folder or glob; give the name "
@@ -205,25 +206,182 @@ def _options(spec: Mapping[str, Any]) -> tuple[str | Path, FolderOptions]:
     return spec[where], FolderOptions(**{k: v for k, v in spec.items() if k != where})
 
 
-def _checked(spec: Any, name: str) -> Sequence[Scene]:
-    if isinstance(spec, str | bytes) or not isinstance(spec, Sequence):
+def _sized_list(found: Any, name: str, request: SceneRequest) -> list[Scene]:
+    if isinstance(found, str | bytes) or not isinstance(found, Sequence):
         raise ValueError(
-            f"`scenes` (={name!r}) must give a list of Scene, not {type(spec).__name__}"
+            f"`scenes` (={name!r}) must give a list of Scene, not {type(found).__name__}; else it "
+            "is a name, a path or a mapping"
         )
-    for i, scene in enumerate(spec):
+    for i, scene in enumerate(found):
         if not isinstance(scene, Scene):
             raise ValueError(f"{name}[{i}] (={type(scene).__name__}) must be a Scene")
-    return spec
+    return [request.sized(scene) for scene in found]
+
+
+# -- the scenes of an environment -----------------------------------------------------------------
+
+
+def environment_scenes(
+    spec: SceneSpec,
+    split: Split,
+    *,
+    camera: CameraProfile,
+    resolution: int | None,
+    crop: Crop,
+    grid: ExposureGrid | None,
+    from_raw: bool,
+    finds_defocus: bool,
+    simulator: str | None,
+    noise: bool | str,
+) -> SceneSet:
+    """The scenes of `load_scenes`, with what networks find in them, for an environment.
+
+    Those with a name, and recorded ones whose files have not changed, stay in memory for the next
+    environment with the same arguments. Bundled ones that must be drawn are when they are needed.
+
+    Args:
+        spec: See `load_scenes`.
+        split: See `load_scenes`.
+        camera: See `load_scenes`.
+        resolution: See `load_scenes`.
+        crop: See `load_scenes`.
+        grid: States of recorded grids; not used by others.
+        from_raw: Whether a scene without noise is known through one raw of it only
+            (`simulate_source_raw`).
+        finds_defocus: Whether a defocus map is estimated where a scene has none.
+        simulator: Weights of the networks; None for none, so that noise stays.
+        noise: False denoises the light of scenes.
+
+    Raises:
+        ValueError: As `load_scenes`; if the light of a scene is unknown and cannot be estimated; or
+            if recorded scenes are in a list, where their captures would be simulated.
+    """
+    needs_networks = finds_defocus or from_raw
+    recorded = RecordedOptions.of(spec)
+    content: Any = spec
+    cacheable = isinstance(spec, str) and spec in NAMED
+    if recorded is not None:
+        content = grid, tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files)
+        cacheable = True
+    key = (content, split, camera, resolution, crop, from_raw)
+    if needs_networks:
+        key = (*key, finds_defocus, simulator, noise)
+        # A user's weights may have other content next time.
+        cacheable &= simulator in (None, *SIZES)
+    known = _LOADED.get(key) if cacheable else None
+    if known is not None:
+        return known
+    is_bundled = isinstance(spec, str) and (spec in BUNDLED or spec in BUNDLED_PARTS)
+    if is_bundled and not needs_networks and split != "all":  # without noise, in known light
+        scenes = SceneSet.of(_bundled(str(spec), SceneRequest(split, camera, resolution, crop)))
+    else:
+        networks = None if simulator is None else SceneNetworks(simulator)
+        found = load_scenes(
+            recorded or spec,
+            split,
+            camera=camera,
+            resolution=resolution,
+            crop=crop,
+            resize=networks.resized if networks is not None and finds_defocus else Scene.resized,
+            grid=grid,
+        )
+        if recorded is None and any(scene.recorded is not None for scene in found):
+            raise ValueError(
+                "`scenes` must name the folder of recorded scenes ('recorded:FOLDER') to show "
+                "their captures: those of a list would be simulated"
+            )
+        if from_raw:
+            found = [simulate_source_raw(s) if s.noise_free else s for s in found]
+        scenes = SceneSet(_prepare(scene, networks, finds_defocus, noise) for scene in found)
+    if cacheable:
+        tensors = [t for t in (scenes[0].light, scenes[0].recorded) if t is not None]
+        _LOADED.put(key, scenes, len(scenes) * sum(tensor.nbytes for tensor in tensors))
+    return scenes
+
+
+def _prepare(
+    scene: Scene, networks: SceneNetworks | None, finds_defocus: bool, noise: bool | str
+) -> Scene:
+    if not finds_defocus and scene.defocus_map is not None:
+        scene = replace(scene, defocus_map=None)
+    if networks is not None:
+        scene = networks.denoised(scene)
+    if not noise and scene.denoised is not None:
+        scene = replace(scene, light=scene.denoised, nlf=scene.nlf.zero(), denoised=None)
+    try:
+        _ = scene.ev100  # a cached property, which every score asks for
+    except ValueError as error:
+        raise ValueError(f"scene {scene.scene_id!r}: {error}") from error
+    return scene
+
+
+def simulate_source_raw(
+    scene: Scene,
+    *,
+    seed: int = 0,
+    iso: float | None = None,
+    ev: float | None = None,
+    iso_range: tuple[float, float] = ISO_RANGE,
+) -> Scene:
+    """`scene` as one simulated raw of it tells; its illuminance stays known.
+
+    The reference camera takes the raw as an average meter would have it, at an ISO drawn between
+    100 and 6400. It replaces the scene: noise, white highlights and all. What is simulated from it
+    is the neural simulator's estimate, as in the paper.
+
+    Args:
+        scene: Without noise.
+        seed: Of the ISO, the exposure and the noise, which also depend on the scene's name.
+        iso: ISO of the raw; drawn by default.
+        ev: Its exposure relative to a mean of green, clipped at white, of 0.12 [EV]; drawn by
+            default.
+        iso_range: What the ISO is drawn from, log-uniformly.
+
+    Raises:
+        ValueError: If the scene carries noise, as a raw does; if it is black nearly everywhere, so
+            that no meter can expose it; or for settings out of range.
+    """
+    low, high = (check_number(f"iso_range[{i}]", iso_range[i], 1.0, 1e7) for i in (0, 1))
+    if low > high:
+        raise ValueError(f"`iso_range` (={iso_range!r}) must be ascending")
+    if iso is not None:
+        check_number("iso", iso, 1.0, 1e7)
+    if ev is not None:
+        check_number("ev", ev, -20.0, 20.0)
+    if not scene.noise_free:
+        raise ValueError(f"`scene` (={scene.scene_id!r}) must be free of noise")
+    number = zlib.crc32(scene.scene_id.encode())
+    rng = np.random.default_rng([number, seed])
+    drawn_iso, drawn_ev = np.exp(rng.uniform(*np.log((low, high)))), rng.uniform(*EV_RANGE)
+    iso, ev = float(drawn_iso if iso is None else iso), float(drawn_ev if ev is None else ev)
+    try:
+        ratio = mean_anchor(scene.light[1:3]) * 2.0**ev
+    except ValueError as error:
+        raise ValueError(
+            f"`scene` (={scene.scene_id!r}) is too dark for a meter: its green is 0 nearly "
+            "everywhere"
+        ) from error
+    unit = CameraSettings(iso, 1.0, F_NUMBER)
+    exposure = scene.reference.log2_exposure + np.log2(ratio)
+    settings = replace(unit, exposure_time=float(2.0 ** (exposure - unit.log2_exposure)))
+    k = scene.box_factor
+    light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
+    noise = noise_generator(seed, number, iso, ev)
+    taken = ReferenceCamera(scene.camera, box_factor=k).record(light, iso, noise)
+    raw = RawImage(taken, settings, scene.camera, white_balance=scene.white_balance, box_factor=k)
+    known = Scene.from_raw(raw, scene_id=scene.scene_id)
+    return replace(
+        scene,
+        light=known.light,
+        reference=settings,
+        nlf=known.nlf,
+        saturated=known.saturated,
+        defocus_map=None,  # of another f-number
+        source=f"{scene.source}; photographed at {settings}",
+    )
 
 
 # -- networks: noise and defocus of scenes, estimated once, before any episode --------------------
-
-#: The weights that come with the package.
-DEFAULT_SIMULATOR = "compact"
-#: Raised when the estimation of defocus maps changes.
-MAP_VERSION = 2
-#: Pixels around a crop that the networks see, too: at least their field of view.
-_MARGIN = 112
 
 
 def check_weights(name: str) -> None:
@@ -323,10 +481,3 @@ class SceneNetworks:
         inputs = {"light": scene.light, "denoised": scene.denoised}
         nlf = [scene.nlf.shot, scene.nlf.read]
         return self._results.result(kind, modules, inputs, make, shape=shape, nlf=nlf, **numbers)
-
-
-def without_noise(scene: Scene) -> Scene:
-    """The scene with its denoised light in place of its light, where it has one."""
-    if scene.denoised is None:
-        return scene
-    return replace(scene, light=scene.denoised, nlf=scene.nlf.zero(), denoised=None)

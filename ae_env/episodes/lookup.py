@@ -22,7 +22,7 @@ _MODULE = len(MODULES)
 _LOW = 2.0**-10
 
 
-class RecordedBatch:
+class LookupBatch:
     """Looks frames up, where `simulator.capture.batch.CaptureBatch` would photograph them.
 
     Args:

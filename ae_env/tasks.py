@@ -1,22 +1,100 @@
-"""`ae_env/ExposureBracket-v0`: a few frames, merged into one of a higher dynamic range."""
+"""The other tasks: `ae_env/AutoExposureVideo-v0`, in which the light moves and settings take effect
+frames late, and `ae_env/ExposureBracket-v0`, in which a few frames are merged into one.
+"""
 
 from __future__ import annotations
 
 import functools
-import inspect
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Unpack
+
+from gymnasium.vector import AutoresetMode
 
 from ae_env.env import AutoExposureBase, AutoExposureEnv
-from ae_env.episodes.bracket_core import BracketCore
-from ae_env.episodes.core import EpisodeCore
-from ae_env.options import EnvOptions
-from ae_env.registration import names_nearest
+from ae_env.episodes.bracket import ExposureBracket
+from ae_env.options import EnvArguments, takes_env_arguments
+from ae_env.registration import TASKS
 from ae_env.vector_env import AutoExposureVectorEnv
 from simulator.utils.checks import check_integer, check_number
 
-#: Arguments that differ from those of `AutoExposureEnv`, and those that there are not.
-DEFAULTS: dict[str, Any] = {"grid": "bracket", "depth": "far"}
+#: Defaults of the video task that differ from those of `AutoExposureEnv`.
+VIDEO: dict[str, Any] = {
+    "grid": "video",
+    "lighting": "moving",
+    "delay": {"iso": 1, "exposure_time": 2, "f_number": 2},
+    "costs": {"flicker": 1.0},
+}
+
+
+class AutoExposureVideoEnv(AutoExposureEnv):
+    """Keep a film well exposed while the light moves and the sensor answers late.
+
+    ## Description
+
+    An episode is 3.2 seconds of film at 30 frames per second. The light of the scene ramps, swings,
+    drifts or jumps, it comes and goes with tunnels, or lamps flicker; in tests shadows and clouds
+    pass, or the light is that of a camera that turns in a real place (`ae_env.lighting.moving`).
+    As on a real sensor an exposure time reaches the frame two frames after the next, a gain one
+    frame after it, and the aperture follows with the exposure time. Whoever exposes for the frame
+    that he has just seen is late: the light of the frame that an action exposes must be predicted,
+    from a few frames, noisy and clipped. Neither a bandit nor a meter of the frame in hand can.
+
+    The task is partially observable: a frame shows the light of its moment, not how it changes, nor
+    which settings are on their way. An agent needs memory, or a stack of frames and its actions.
+
+    Everything else is as in `AutoExposureEnv`, which has the observation and the info.
+
+    ## Action Space
+
+    `Discrete(64)`: index into `ExposureGrid.video()`, whose exposures fit between two frames. All
+    three controls may change in every frame; each takes effect after its own delay.
+
+    | control | values | in effect |
+    |---|---|---|
+    | ISO | 100, 400, 1600, 6400 | 1 frame after the next |
+    | exposure time [s] | 1/2000, 1/500, 1/125, 1/30 | 2 frames after the next |
+    | f-number | 2.8, 4, 5.6, 8 | 2 frames after the next |
+
+    ## Rewards
+
+    The score of the frame in [0, 1], of which sharpness is a part, minus the visible jump: the
+    absolute change of the mean of the companded picture since the frame before (`costs`).
+
+    ## Starting State
+
+    As in `AutoExposureEnv`; the kind of light, its size and its pace are drawn, too.
+
+    ## Episode End
+
+    Truncated after 96 steps.
+
+    ## Arguments
+
+    Those of `AutoExposureEnv`, with other defaults: `grid="video"`, `costs={"flicker": 1.0}`,
+    `delay={"iso": 1, "exposure_time": 2, "f_number": 2}`, and `lighting="moving"`, whose kinds are
+    those of the split: `"train"` has ramps, sines, tunnels, steps, drifts and lamps, `"test"` has
+    shadows, clouds and pans. `{"kind": "moving", "kinds": ["tunnels"]}` chooses.
+
+    ## Version History
+
+    * v0: first version
+    """
+
+    __init__ = takes_env_arguments(**VIDEO)(AutoExposureEnv.__init__)
+
+
+class AutoExposureVideoVectorEnv(AutoExposureVectorEnv):
+    """`num_envs` episodes of `AutoExposureVideoEnv`, photographed in batches.
+
+    All arguments are those of `AutoExposureVectorEnv`, with the defaults of the task.
+    """
+
+    __init__ = takes_env_arguments(
+        max_episode_steps=TASKS["ae_env/AutoExposureVideo-v0"][2], **VIDEO
+    )(AutoExposureVectorEnv.__init__)
+
+
+#: Defaults of the bracket task, and arguments that it does not have.
+BRACKET: dict[str, Any] = {"grid": "bracket", "depth": "far"}
 WITHOUT = ("scorer", "costs", "lighting", "delay", "reward", "with_oracle")
 #: Time of all frames together [s], and how many there may be.
 BUDGET, MAX_FRAMES = 0.3, 3
@@ -24,17 +102,14 @@ _MOST_SECONDS, _MOST_FRAMES = 3600.0, 16
 
 
 class _Bracket(AutoExposureBase):
-    """The arguments that both environments add."""
+    """The limits that both environments of the bracket task add."""
 
-    _budget: float
-    _max_frames: int
-
-    def _take(self, budget: float, max_frames: int) -> None:
+    def _set_limits(self, budget: float, max_frames: int) -> None:
         self._budget = check_number("budget", budget, 1e-5, _MOST_SECONDS, more=" seconds")
         self._max_frames = check_integer("max_frames", max_frames, 1, _MOST_FRAMES)
-
-    def _make_core(self, options: EnvOptions, num_envs: int) -> EpisodeCore:
-        return BracketCore(options, num_envs, self._budget, self._max_frames)
+        self._make_task = functools.partial(
+            ExposureBracket, budget=self._budget, max_frames=self._max_frames
+        )
 
     @property
     def budget(self) -> float:
@@ -45,28 +120,6 @@ class _Bracket(AutoExposureBase):
     def max_frames(self) -> int:
         """Frames of an episode at most."""
         return self._max_frames
-
-
-def _with_arguments_of(base: type, **defaults: Any) -> Callable[..., Any]:
-    """Decorates a constructor that passes the arguments of `base` on, with this task's defaults."""
-    other = DEFAULTS | defaults
-
-    def decorate(init: Callable[..., None]) -> Callable[..., None]:
-        own = inspect.signature(init)
-        taken = [p for p in own.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        names = {p.name for p in taken}
-        for name, given in inspect.signature(base).parameters.items():
-            if name not in names and name not in WITHOUT:
-                taken.append(given.replace(default=other.get(name, given.default)))
-
-        @functools.wraps(init)
-        def made(self: Any, *args: Any, **kwargs: Any) -> None:
-            init(self, *args, **{**other, **kwargs})
-
-        made.__signature__ = own.replace(parameters=taken)  # type: ignore[attr-defined]
-        return names_nearest(made)
-
-    return decorate
 
 
 class ExposureBracketEnv(_Bracket, AutoExposureEnv):
@@ -158,12 +211,17 @@ class ExposureBracketEnv(_Bracket, AutoExposureEnv):
     * v0: first version
     """
 
-    @_with_arguments_of(AutoExposureEnv)
+    @takes_env_arguments(WITHOUT, **BRACKET)
     def __init__(
-        self, *, budget: float = BUDGET, max_frames: int = MAX_FRAMES, **options: Any
+        self,
+        *,
+        budget: float = BUDGET,
+        max_frames: int = MAX_FRAMES,
+        render_mode: str | None = None,
+        **arguments: Unpack[EnvArguments],
     ) -> None:
-        self._take(budget, max_frames)
-        super().__init__(**options)
+        self._set_limits(budget, max_frames)
+        super().__init__(render_mode=render_mode, **arguments)
 
 
 class ExposureBracketVectorEnv(_Bracket, AutoExposureVectorEnv):
@@ -173,14 +231,23 @@ class ExposureBracketVectorEnv(_Bracket, AutoExposureVectorEnv):
     have.
     """
 
-    @_with_arguments_of(AutoExposureVectorEnv, max_episode_steps=None)
+    @takes_env_arguments(WITHOUT, **BRACKET)
     def __init__(
         self,
         num_envs: int = 1,
         *,
         budget: float = BUDGET,
         max_frames: int = MAX_FRAMES,
-        **options: Any,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **arguments: Unpack[EnvArguments],
     ) -> None:
-        self._take(budget, max_frames)
-        super().__init__(num_envs, **options)
+        self._set_limits(budget, max_frames)
+        super().__init__(
+            num_envs,
+            autoreset_mode=autoreset_mode,
+            max_episode_steps=max_episode_steps,
+            render_mode=render_mode,
+            **arguments,
+        )
