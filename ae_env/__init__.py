@@ -61,7 +61,6 @@ __version__ = "0.2.0"
 
 #: Public names by module; those of `_MODULES` are modules themselves.
 _NAMES_BY_MODULE = {
-    "bracket": "ExposureBracketEnv ExposureBracketVectorEnv",
     "env": "AutoExposureEnv",
     "grid": "ExposureGrid",
     "lighting": (
@@ -73,10 +72,12 @@ _NAMES_BY_MODULE = {
     "scenes": "Scene load_scenes",
     "scorers": "Captures CompositeScorer Scorer list_scorers make_scorer register_scorer",
     "scorers.score_table": "ScoreTable ScoreTables",
-    "utils.user_code": "UserCodeError",
-    "utils.presets": "list_presets load_preset",
+    "tasks": (
+        "AutoExposureVideoEnv AutoExposureVideoVectorEnv ExposureBracketEnv "
+        "ExposureBracketVectorEnv"
+    ),
+    "utils.user_files": "UserCodeError list_presets load_preset",
     "vector_env": "AutoExposureVectorEnv",
-    "video": "AutoExposureVideoEnv AutoExposureVideoVectorEnv",
     "wrappers": (
         "ContinuousActions ControlActions RelativeActions VectorContinuousActions "
         "VectorControlActions VectorRelativeActions"

@@ -113,7 +113,17 @@ class AutoExposureBase(SpecProperty):
             return None
         if self._last is None:
             raise gym.error.ResetNeeded("call reset() before render()")
-        return tuple(render_frame(self.core, i, self._last) for i in range(num_envs))
+        info, scores = self._last.info, self._last.info["rewards"]["score"]
+        return tuple(
+            render_frame(
+                self._last.raw[i],
+                self.scene(i),
+                self.camera,
+                self.grid[info["state"].item(i)],
+                scores.item(i),
+            )
+            for i in range(num_envs)
+        )
 
 
 class AutoExposureEnv(AutoExposureBase, gym.Env[Observation, np.int64]):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +20,7 @@ from ae_env.scorers.score_table import ScoreTable, ScoreTables, prepare_scene
 from simulator.camera import CameraProfile
 from simulator.optics.motion_path import ALONG_ROWS, Movement
 from simulator.raw.develop import develop
-from simulator.settings import format_exposure_time
-
-if TYPE_CHECKING:
-    from ae_env.episodes.core import EpisodeCore, Frames
+from simulator.settings import CameraSettings, format_exposure_time
 
 #: Least side of a rendered frame [pixel].
 FRAME_PIXELS = 256
@@ -40,35 +37,32 @@ _BORDER, _GAP, _MARGIN, _PANEL_GAP = 5, 4, 18, 22
 _TITLE_HEIGHT, _LABEL_WIDTH, _LABEL_HEIGHT = 76, 48, 20
 
 
-def render_frame(core: EpisodeCore, index: int, frames: Frames) -> np.ndarray:
-    """The latest capture of an episode, developed, with its settings and score written on it.
+def render_frame(
+    raw: np.ndarray, scene: Scene, camera: CameraProfile, settings: CameraSettings, score: float
+) -> np.ndarray:
+    """A capture, developed, with its settings and score written on it.
 
     Args:
-        core: The core that the episode runs on.
-        index: Index of the episode.
-        frames: Current frames of all episodes.
+        raw: (4, H, W) as it is observed: uint8 codes, uint16 digital numbers or float signals.
+        scene: The scene that it shows.
+        camera: The body.
+        settings: Settings of the capture.
+        score: Score of the capture.
 
     Returns:
         (H, W, 3) uint8 sRGB; the capture enlarged by a whole factor to at least 256 pixels.
     """
-    raw = frames.raw[index]
     if raw.dtype == np.uint8:
         signal = decode_observation(raw)
     elif raw.dtype == np.uint16:
-        black = np.array(core.camera.black_level)[:, None, None]
-        signal = ((raw - black) / np.array(core.camera.span)[:, None, None]).astype(np.float32)
+        black = np.array(camera.black_level)[:, None, None]
+        signal = ((raw - black) / np.array(camera.span)[:, None, None]).astype(np.float32)
     else:
         signal = raw
-    scene = core.scenes[core.episode(index).scene]
     image = developed(torch.from_numpy(signal)[None], scene)[0]
     factor = -(-FRAME_PIXELS // min(image.shape[:2]))
     picture = Image.fromarray(np.repeat(np.repeat(image, factor, 0), factor, 1))
-    info = frames.info
-    settings = core.grid[int(info["state"][index])]
-    lines = (
-        str(settings),
-        f"EV100 {info['ev100'][index]:.1f}   score {info['rewards']['score'][index]:.3f}",
-    )
+    lines = (str(settings), f"EV100 {settings.ev100:.1f}   score {score:.3f}")
     return np.asarray(_captioned(picture, lines)).copy()
 
 

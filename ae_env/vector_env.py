@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
 from typing import Any, Unpack
 
 import gymnasium as gym
@@ -72,8 +73,6 @@ class AutoExposureVectorEnv(
         self._rngs: dict[int, np.random.Generator] = {}  # by environment, from the first reset on
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._done = np.zeros(num_envs, dtype=bool)
-        self._shown: Observation | None = None  # a copy, only where autoreset is off
-        self._last = None
 
     @property
     def states(self) -> np.ndarray:
@@ -113,10 +112,14 @@ class AutoExposureVectorEnv(
             if seeds[i] is not None or i not in self._rngs:
                 self._rngs[i], _ = seeding.np_random(seeds[i])
         self._begin(env_indices, per_env)
-        frames = self.core.observe(env_indices)
-        self._remember_frames(frames, env_indices)
-        observation = self._merged(frames.observation, env_indices)
-        return observation, self._vector_info(frames.info, env_indices)
+        fresh = self.core.observe(env_indices)
+        info = self._vector_info(fresh.info, env_indices)
+        if len(env_indices) == self.num_envs:
+            return self._shown(fresh), info
+        # The others show their frames again; the same noise keys give the same frames.
+        shown = self._last or self.core.observe(self._all)
+        _replace_rows(shown, fresh, env_indices)
+        return self._shown(shown), info
 
     def step(
         self, actions: np.ndarray
@@ -142,10 +145,8 @@ class AutoExposureVectorEnv(
             observation, infos = self._restart(np.flatnonzero(done), frames)
         else:
             self._done = done
-            self._remember_frames(frames)
-            observation = frames.observation
             infos = self._vector_info(frames.info, self._all)
-        self._remember_shown(observation)
+            observation = self._shown(frames)
         return observation, frames.reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -181,44 +182,21 @@ class AutoExposureVectorEnv(
         self._begin(finished)
         fresh = self.core.observe(finished)
         if whole:
-            frames = Frames(fresh.observation, fresh.info, frames.reward, fresh.raw)
+            frames = replace(fresh, reward=frames.reward)
         else:
-            _assign_rows(frames.observation, fresh.observation, finished)
-            _assign_rows(frames.info, fresh.info, finished)
-            frames.raw[finished] = fresh.raw
-        self._remember_frames(frames)
-        return frames.observation, infos | self._vector_info(frames.info, self._all)
+            _replace_rows(frames, replace(fresh, reward=frames.reward[finished]), finished)
+        infos |= self._vector_info(frames.info, self._all)
+        return self._shown(frames), infos
 
-    def _remember_frames(self, frames: Frames, env_indices: np.ndarray | None = None) -> None:
-        """Stores `frames`, of all or of `env_indices`, for rendering."""
-        if self.render_mode is None:
-            return
-        if self._last is not None and env_indices is not None:
-            last = copy.deepcopy(self._last)  # the caller has its arrays
-            _assign_rows(last.observation, frames.observation, env_indices)
-            _assign_rows(last.info, frames.info, env_indices)
-            last.reward[env_indices], last.raw[env_indices] = frames.reward, frames.raw
-            frames = last
-        self._last = frames
+    def _shown(self, frames: Frames) -> Observation:
+        """The observation of `frames` of all; a copy of them is kept where they are shown again.
 
-    def _merged(self, observation: Observation, env_indices: np.ndarray) -> Observation:
-        """`observation` of `env_indices`, with the unchanged frames of all other environments.
-
-        The arrays are new or private copies, so that the caller may write to them.
+        That is in `render`, and in a masked reset where autoreset is off. The caller may write to
+        the arrays that it gets.
         """
-        if len(env_indices) < self.num_envs:
-            shown = self._shown
-            if shown is None:  # the same noise keys give the same frames again
-                shown = self.core.observe(self._all).observation
-            _assign_rows(shown, observation, env_indices)
-            observation = shown
-        self._remember_shown(observation)
-        return observation
-
-    def _remember_shown(self, observation: Observation) -> None:
-        """Copies the observation, where a masked reset has to show it again."""
-        if self.autoreset_mode == AutoresetMode.DISABLED:
-            self._shown = {name: values.copy() for name, values in observation.items()}
+        if self.render_mode is not None or self.autoreset_mode == AutoresetMode.DISABLED:
+            self._last = copy.deepcopy(frames)
+        return frames.observation
 
     def _vector_info(self, columns: dict[str, Any], env_indices: np.ndarray) -> dict[str, Any]:
         """Info columns of `env_indices` in the layout of Gymnasium's vector environments.
@@ -292,6 +270,13 @@ def _rows_of(columns: dict[str, Any], rows: np.ndarray) -> dict[str, Any]:
         name: _rows_of(values, rows) if isinstance(values, dict) else values[rows]
         for name, values in columns.items()
     }
+
+
+def _replace_rows(frames: Frames, new: Frames, rows: np.ndarray) -> None:
+    """Writes the frames `new` of some environments to `rows` of those of all."""
+    _assign_rows(frames.observation, new.observation, rows)
+    _assign_rows(frames.info, new.info, rows)
+    frames.reward[rows], frames.raw[rows] = new.reward, new.raw
 
 
 def _assign_rows(columns: dict[str, Any], new: dict[str, Any], rows: np.ndarray) -> None:

@@ -13,8 +13,12 @@ from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
-from agents.applications.exposure_fusion import fuse
-from agents.applications.hdr import bracket_exposures, developed, hdr_picture
+from agents.applications.hdr import (
+    bracket_exposures,
+    expose_and_develop,
+    fuse,
+    hdr_picture,
+)
 from benchmarks.captures import psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums
@@ -76,16 +80,19 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
         ours = hdr_picture(raw, simulator=simulator)
         seconds = time.perf_counter() - begun
         merged = _merged(captures, exposures, raw)
-        taken = [developed(replace(raw, data=capture)) for capture in captures]
-        mine = [developed(replace(raw, data=ours.radiance), ev) for ev in exposures]
-        right = [developed(truth, ev) for ev in exposures]
+        taken = [expose_and_develop(replace(raw, data=capture)) for capture in captures]
+        mine = [expose_and_develop(replace(raw, data=ours.radiance), ev) for ev in exposures]
+        right = [expose_and_develop(truth, ev) for ev in exposures]
         fused, mertens = fuse(right), _mertens(right)
         pictures = {
-            "single": (developed(raw), fused),
-            "scaled": (fuse([developed(raw, ev) for ev in exposures]), fused),
+            "single": (expose_and_develop(raw), fused),
+            "scaled": (fuse([expose_and_develop(raw, ev) for ev in exposures]), fused),
             "ours": (ours.fused, fused),
             "bracket": (fuse(taken), fused),
-            "merged": (fuse([developed(replace(raw, data=merged), ev) for ev in exposures]), fused),
+            "merged": (
+                fuse([expose_and_develop(replace(raw, data=merged), ev) for ev in exposures]),
+                fused,
+            ),
             "ours mertens": (_mertens(mine), mertens),
             "bracket mertens": (_mertens(taken), mertens),
         }
@@ -117,11 +124,13 @@ def picture(seed: int, quick: bool) -> Figure:
     look = {"white_balance": scene.white_balance}
     raw = RawImage(reference.capture(scene, settings, seed).sample, settings, camera, **look)
     simulator = CameraSimulator.from_pretrained("large", cache=None)
-    right = [developed(replace(raw, data=unclipped), ev) for ev in bracket_exposures()]
+    right = [expose_and_develop(replace(raw, data=unclipped), ev) for ev in bracket_exposures()]
     return side_by_side(
         {
-            f"the raw, developed (ISO {iso})": developed(raw),
-            "its noise kept, fused": fuse([developed(raw, ev) for ev in bracket_exposures()]),
+            f"the raw, developed (ISO {iso})": expose_and_develop(raw),
+            "its noise kept, fused": fuse(
+                [expose_and_develop(raw, ev) for ev in bracket_exposures()]
+            ),
             "ae-env hdr": hdr_picture(raw, simulator=simulator).fused,
             "the map's own light, fused": fuse(right),
         }

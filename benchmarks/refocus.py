@@ -87,7 +87,7 @@ def _methods(
 
     def denoised() -> tuple[Any, Tensor]:
         prepared = simulator.prepare(raw, tolerance=0.0)
-        return prepared, prepared.denoised[-1].light
+        return prepared, prepared.denoised_lights[-1].light
 
     def plain(diameter: Tensor, light: Tensor) -> Tensor:
         return DiscBank(light).blurred(added_blur(diameter, source, target).float())

@@ -16,8 +16,7 @@ import numpy as np
 import torch.nn.functional as F
 
 from ae_env.scenes import load_scenes
-from agents.viewer.library import find_scenes
-from agents.viewer.viewed_scene import View, ViewedScene
+from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
 from benchmarks.harness import Benchmark, Part, Report, Row, table
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, write_dng
 

@@ -2,7 +2,7 @@
 
 First, on any machine: ae-env export regression -o policy.onnx
 The camera needs picamera2, numpy and onnxruntime, no torch. `run` takes anything with Picamera2's
-`set_controls` and `capture_request`; `agents.onboard.simulated_camera` has one to try it on.
+`set_controls` and `capture_request`; `examples/simulated_camera.py` has one to try it on.
 """
 
 import sys

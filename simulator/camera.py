@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.noise.read_noise import ReadNoise
+from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from simulator.utils.checks import check_integer, check_word
 
 

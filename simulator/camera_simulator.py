@@ -17,13 +17,16 @@ from typing import Any, Literal, TypedDict, Unpack, cast, get_args
 import torch
 from torch import nn
 
-from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.blurred_light import ApertureBlur
-from simulator.capture.denoised import Denoised
+from simulator.capture.blurred_light import (
+    ApertureBlur,
+    BlurredLight,
+    MapApertureBlur,
+    NetworkApertureBlur,
+)
 from simulator.capture.plan import SimulationPlan
 from simulator.capture.prepared_scene import HasPrepared, PreparedScene
-from simulator.capture.scene_blur import scene_light
-from simulator.capture.sensor import Transitions, record
+from simulator.capture.sensor import Transitions, exposed_light, record
+from simulator.capture.statistics import DenoisedLight
 from simulator.networks.aperture_module import ApertureModule, usable_defocus
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.network_cache import NetworkCache, Where
@@ -95,10 +98,9 @@ def prepared_of(source: Source, device: torch.device) -> PreparedScene:
         if source.light.device == device:
             return source
         saturated = None if source.saturated is None else source.saturated.to(device)
-        denoised = tuple(d.to(device) for d in source.denoised)
-        return replace(
-            source, light=source.light.to(device), denoised=denoised, saturated=saturated
-        )
+        denoised = tuple(d.to(device) for d in source.denoised_lights)
+        light = source.light.to(device)
+        return replace(source, light=light, denoised_lights=denoised, saturated=saturated)
     if hasattr(source, "prepared"):
         return prepared_of(source.prepared, device)
     raise ValueError(
@@ -127,7 +129,7 @@ def _for_the_map(prepared: PreparedScene) -> torch.Tensor | None:
     The smallest network is enough, whatever the tolerance: with it, the error of the blur of 24
     validation scenes was 2 % larger than with the largest at ISO 6400, and the same at ISO 100.
     """
-    return prepared.denoised[0].light if prepared.denoised else None
+    return prepared.denoised_lights[0].light if prepared.denoised_lights else None
 
 
 class CameraSimulator:
@@ -280,12 +282,12 @@ class CameraSimulator:
             noise = prepared.nlf.exposed(float(self.exposure.w))
             prepared = replace(prepared, light=self.exposure(prepared.light, 1.0), nlf=noise)
         whole = prepared.tolerance == 0.0  # what was found with another one may leave parts out
-        known, aperture_blur = prepared.denoised, prepared.aperture_blur
+        known, aperture_blur = prepared.denoised_lights, prepared.aperture_blur
         lacks = not known or (whole and not all(d.everywhere for d in known))
         if self.noises and not prepared.nlf.is_zero and lacks:
-            bare = replace(prepared, denoised=())
+            bare = replace(prepared, denoised_lights=())
             prepared = replace(
-                prepared, denoised=tuple(self._denoised(m, bare) for m in self.noises)
+                prepared, denoised_lights=tuple(self._denoised(m, bare) for m in self.noises)
             )
         if depth == "unknown" or (
             aperture_blur is not None and self.aperture and whole and not aperture_blur.everywhere
@@ -367,16 +369,20 @@ class CameraSimulator:
         assert self.aperture is not None
         f_number = prepared.reference.effective_f_number
         if not self.aperture.has_map:
-            denoised = prepared.denoised[-1] if prepared.denoised else Denoised(prepared.light)
+            denoised = (
+                prepared.denoised_lights[-1]
+                if prepared.denoised_lights
+                else DenoisedLight(prepared.light)
+            )
             opened = partial(self._results.called, "opened", self.aperture)
             return NetworkApertureBlur(denoised, opened, f_number)
         estimate, everywhere = partial(self._defocus_map, prepared), prepared.tolerance == 0.0
         return MapApertureBlur(prepared.light, estimate, f_number, everywhere=everywhere)
 
-    def _denoised(self, noise: NoiseModule, prepared: PreparedScene) -> Denoised:
+    def _denoised(self, noise: NoiseModule, prepared: PreparedScene) -> DenoisedLight:
         """`denoise` when it is first needed, cached."""
         pixels, make = prepared.light[0].numel(), partial(self.denoise, prepared, noise)
-        return Denoised(
+        return DenoisedLight(
             lambda: self._cached("denoised", noise, prepared, make, prepared.light.shape),
             name=noise.preset,
             residual=noise.residual,
@@ -507,7 +513,7 @@ class CameraSimulator:
         assert self.aperture is not None
         keys = sweep_keys(seed, [settings])  # a bad seed raises before any work
         # What networks found out about the scene is not used.
-        bare = replace(prepared, denoised=(), aperture_blur=None, tolerance=0.0)
+        bare = replace(prepared, denoised_lights=(), aperture_blur=None, tolerance=0.0)
         exposure = bare.exposure(settings)
         exposed = module(prepared.light[None], exposure.ratio)
         if not self.noise.commutes:
@@ -524,7 +530,8 @@ class CameraSimulator:
                 )
                 opened = self.aperture(denoised, deviation, *f_numbers)
         at_target = replace(exposure, ratio=1.0, source=NoiseLevelFunction.zero())
-        light = scene_light(opened[0], at_target)
+        lights = BlurredLight(opened[0], (), at_target.source, None)
+        light = exposed_light(lights.blurred(at_target), at_target)
         capture = torch.empty_like(light)[None]
         record(Transitions.of([light], [at_target]), prepared.camera, keys=keys, signals=capture)
         return Stages(exposed[0], denoised[0], opened[0], light, capture[0])
@@ -563,7 +570,9 @@ class CameraSimulator:
             stages = self.stages(source, settings, seed=seed, **scene)
             data, excess_noise = stages.capture, 0.0
             prepared = prepared_of(source, self.device)
-            clean = replace(prepared, nlf=prepared.nlf.zero(), denoised=(), aperture_blur=None)
+            clean = replace(
+                prepared, nlf=prepared.nlf.zero(), denoised_lights=(), aperture_blur=None
+            )
             output_noise = clean.output_noise(settings)
         else:  # without networks nothing is shared, and tolerance 0 is the full run
             exact = 0.0 if tolerance is None else tolerance

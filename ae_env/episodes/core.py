@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -399,7 +399,7 @@ class EpisodeCore:
         return prepared
 
     def _with_tolerance(self, prepared: PreparedScene) -> PreparedScene:
-        return replace(prepared, tolerance=self.options.tolerance)
+        return prepared.changed(tolerance=self.options.tolerance)
 
     # -- what is known of an episode ----------------------------------------------------------
 

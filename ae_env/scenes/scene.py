@@ -12,13 +12,10 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
-from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.denoised import Denoised
+from simulator.capture.blurred_light import BlurredLight, MapApertureBlur
 from simulator.capture.layout import Layout
-from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.residual import Residual
+from simulator.capture.statistics import DenoisedLight, LightStatistics, Residual
 from simulator.noise.noise_level_function import NoiseLevelFunction
 from simulator.radiance.light import DEFAULT_EV100, camera_light, mean_anchor
 from simulator.raw.develop import neutral_highlights
@@ -118,9 +115,9 @@ class Scene:
     @property
     def prepared(self) -> PreparedScene:
         """The light, ready to be exposed: at rest, by the scene's own camera."""
-        denoised: tuple[Denoised, ...] = ()
+        denoised: tuple[DenoisedLight, ...] = ()
         if self.denoised is not None:
-            denoised = (Denoised(self.denoised, residual=self.residual),)
+            denoised = (DenoisedLight(self.denoised, residual=self.residual),)
         aperture_blur = None
         if self.defocus_map is not None:
             f_number = self.reference.effective_f_number
@@ -133,7 +130,7 @@ class Scene:
             saturated=self.saturated,
             white_balance=self.white_balance,
             box_factor=self.box_factor,
-            denoised=denoised,
+            denoised_lights=denoised,
             aperture_blur=aperture_blur,
             layout=self.layout,
             blurred_light=BlurredLight(

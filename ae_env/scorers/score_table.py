@@ -104,7 +104,7 @@ def in_episode(
 ) -> PreparedScene:
     """A scene's `prepared` in an episode; the arguments are those of `prepare_scene`."""
     pixels = defocus * prepared.light.shape[-2] / 64.0
-    return replace(prepared, image_speed=speed, defocus=pixels, movement=movement)
+    return prepared.changed(image_speed=speed, defocus=pixels, movement=movement)
 
 
 def source_noises(
@@ -190,7 +190,7 @@ class ScoreTables:
             prepared = prepare_scene(
                 scene, self.camera, speed=speed, defocus=defocus, movement=movement
             )
-            prepared = replace(prepared, tolerance=self.tolerance)
+            prepared = prepared.changed(tolerance=self.tolerance)
         parts = self.closed_form_terms(scene, prepared, gain=gain, row_gain=row_gain)
         if scene.recorded is not None:
             return self._recorded_table(scene, prepared, parts)
@@ -302,7 +302,7 @@ class ScoreTables:
     ) -> np.ndarray:
         """`TermScores.expected` of all states, (S, 3)."""
         gains = np.broadcast_to(gain, len(self.grid)).tolist()
-        prepared = replace(prepared, blurred_light=prepared.blurred_light.copy(_LIGHT_BYTES))
+        prepared = prepared.changed(blurred_light=prepared.blurred_light.copy(_LIGHT_BYTES))
         exposures = [
             prepared.exposure(state, noise=self.noise, gain=factor)
             for state, factor in zip(self.grid, gains, strict=True)

@@ -7,14 +7,26 @@ stays in focus, and has nothing blurred before it, keeps its pixels as they were
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from PIL import Image
 
+from agents.applications.hdr import import_openexr
 from simulator import CameraSettings, CameraSimulator, Lens, NoiseLevelFunction, RawImage, defocus
 from simulator.optics.thin_lens import SHARP
+from simulator.training.scenes import fill_from_nearest
+from simulator.utils.checks import check_word
+
+#: The numbers of a depth map: distances, or inverse distances.
+DepthKind = Literal["distance", "disparity"]
+#: Metres for each unit of a PNG, as depth cameras write them.
+PNG_METRES = 1e-3
 
 
 def refocus(
@@ -64,14 +76,14 @@ def refocus(
     opened = source.effective_f_number / target.effective_f_number
     known = None if depth is None or lens is None else _known_blur(raw, depth, lens)
     prepared = simulator.prepare(raw, tolerance=0.0)
-    clean = prepared.denoised[-1].light if prepared.denoised else prepared.light
+    clean = prepared.denoised_lights[-1].light if prepared.denoised_lights else prepared.light
     diameter = simulator.estimate_defocus(prepared) if known is None else known
     # Second moments add: the blur that is there already is not added again.
     added = diameter.double().cpu() * float(np.sqrt(opened**2 - 1.0))
     blurred = defocus(clean, added)
     settings = replace(target, exposure_time=source.exposure_time / opened**2)
     scene = replace(
-        prepared, light=blurred, denoised=(), nlf=NoiseLevelFunction.zero(), saturated=None
+        prepared, light=blurred, denoised_lights=(), nlf=NoiseLevelFunction.zero(), saturated=None
     )
     frame, _ = scene.capture(settings, seed)
     kept = (added.abs().to(clean.device) <= SHARP) & (blurred == clean).all(dim=0)
@@ -125,3 +137,74 @@ def _known_blur(raw: RawImage, depth: np.ndarray, lens: Lens) -> torch.Tensor:
     metres = torch.from_numpy(np.ascontiguousarray(depth, np.float64))
     blur = lens.circle_of_confusion(metres, raw.settings.effective_f_number) / pitch
     return F.avg_pool2d(blur[None], len(blur) // raw.data.shape[-2])[0]
+
+
+def read_depth(
+    path: str | Path, *, kind: DepthKind = "distance", scale: float | None = None
+) -> np.ndarray:
+    """Distances from the lens, of a depth camera's, a stereo matcher's or a network's file.
+
+    Args:
+        path: A PNG of one channel (8 or 16 bit), an EXR (channel Z, Y or R) or a ``.npy`` array
+            (H, W).
+        kind: ``"disparity"`` where larger numbers are nearer: 1 / metres, times a constant.
+        scale: Metres for each unit, or 1 / metres for each unit of disparity. By default
+            a PNG of distances is in millimetres, an EXR or ``.npy`` in metres; a disparity has
+            no default.
+
+    Returns:
+        (H, W) float64 [m], all > 0. Where the file has no number (0 in a PNG, NaN, infinite or
+        negative elsewhere; 0 is infinitely far in a disparity of floats), the nearest pixel's.
+
+    Raises:
+        ImportError: If an EXR is given and OpenEXR is not installed.
+        ValueError: If the file is no such map, or `kind` or `scale` is wrong.
+    """
+    path = Path(path)
+    check_word("kind", kind, get_args(DepthKind))
+    if scale is not None and not 0.0 < scale < math.inf:
+        raise ValueError(f"`scale` (={scale!r}) must be finite and > 0")
+    if scale is None and kind == "disparity":
+        raise ValueError("`scale` (=None) must be given for a disparity: 1 / metres for each unit")
+    if path.suffix.lower() not in (".png", ".exr", ".npy"):
+        raise ValueError(f"`depth` (={str(path)!r}) must end in .png, .exr or .npy")
+    if not path.is_file():
+        raise ValueError(f"`depth` (={str(path)!r}): there is no such file")
+    values = _read_map(path)
+    if values.ndim != 2 or not values.size:
+        raise ValueError(f"`depth` (={str(path)!r}, shape {values.shape}) must be one map (H, W)")
+    of_png = path.suffix.lower() == ".png"
+    zero_counts = kind == "disparity" and not of_png  # infinitely far
+    known = np.isfinite(values) & ((values > 0) | ((values == 0) & zero_counts))
+    if not (known & (values > 0)).any():
+        raise ValueError(f"`depth` (={str(path)!r}) must hold a number above 0")
+    filled = fill_from_nearest(np.where(known, values, np.nan))
+    if kind == "disparity":
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / (filled * scale))
+    return filled * (scale or (PNG_METRES if of_png else 1.0))
+
+
+def _read_map(path: Path) -> np.ndarray:
+    """The numbers of a file, float64."""
+    try:
+        match path.suffix.lower():
+            case ".png":
+                with Image.open(path, formats=["PNG"]) as picture:
+                    if picture.mode not in ("L", "I;16", "I;16B", "I"):
+                        raise ValueError(f"{picture.mode}, not one channel of 8 or 16 bit")
+                    values = np.asarray(picture)
+            case ".npy":
+                values = np.load(path, allow_pickle=False)
+                if not isinstance(values, np.ndarray) or values.dtype.kind not in "uif":
+                    raise ValueError("not one array of numbers")
+            case _:
+                with import_openexr().File(str(path), separate_channels=True) as file:
+                    channels = {name: channel.pixels for name, channel in file.channels().items()}
+                found = [channels[name] for name in ("Z", "Y", "R") if name in channels]
+                if not found:
+                    raise ValueError(f"channels {sorted(channels)}, none of Z, Y and R")
+                values = found[0]
+    except (OSError, SyntaxError, RuntimeError, EOFError, ValueError) as error:
+        raise ValueError(f"`depth` (={str(path)!r}) cannot be read: {error}") from error
+    return np.asarray(values, np.float64)

@@ -262,11 +262,9 @@ def _use_rest() -> None:
     import torch
 
     from agents.cli.show import DEFAULT_SCENES
-    from agents.viewer.library import find_scenes
-    from agents.viewer.viewed_scene import View, ViewedScene
+    from agents.viewer.viewed_scene import View, ViewedScene, find_scenes
     from simulator import CameraSimulator, RawImage, estimate_nlf, read_raw
-    from simulator.optics.blur import disc_blur, motion_blur
-    from simulator.optics.blur_kernels import Blur, blur_many
+    from simulator.optics.blur import Blur, blur_many, disc_blur, motion_blur
     from simulator.radiance.procedural import draw
 
     library = find_scenes(DEFAULT_SCENES)

@@ -67,8 +67,8 @@ def view(
             "`ae-env view` needs the extra view: pip install 'ae-env[view]'"
         ) from None
     from ae_env.scorers import make_scorer
-    from agents.viewer.library import find_scenes
     from agents.viewer.page import Options
+    from agents.viewer.viewed_scene import find_scenes
     from simulator.capture.plan import check_tolerance
 
     check_depth(depth, weights)
@@ -80,10 +80,10 @@ def view(
         library = find_scenes(what)
         task(1, 1)
     options = Options(library, simulator, depth, tolerance, scorer)  # type: ignore[arg-type]
-    serve(options, port, open_browser, _tell)
+    serve(options, port, open_browser, _announce)
 
 
-def _tell(address: str) -> None:
+def _announce(address: str) -> None:
     print_line(f"open {address}")
     print_line("Ctrl-C stops")
     console.file.flush()

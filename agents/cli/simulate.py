@@ -230,7 +230,7 @@ def refocus(
     """
     import numpy as np
 
-    from agents.applications.depth_map import read_depth
+    from agents.applications.refocus import read_depth
     from agents.applications.refocus import refocus as refocused
     from simulator.raw.develop import quarter_turns
 

@@ -25,9 +25,6 @@ from agents.cli.console import (
 if TYPE_CHECKING:
     from agents.learning.training import AgentConfig
 
-#: Evaluations of the tasks; that of still light is the command's own default.
-_PRESETS = {"ae_env/AutoExposureVideo-v0": "video"}
-
 
 def train(
     config: Annotated[Path, typer.Argument(help="YAML such as configs/regression.yaml.")],
@@ -73,10 +70,9 @@ def _evaluation(agent: AgentConfig, out: Path) -> list[str]:
     if agent.agent == "forecaster":
         return ["--preset", "video", "--policy", f"regression:video?foresight={out}"]
     words = ["--policy", f"{agent.agent}:{out}"]
-    preset = _PRESETS.get(agent.task)
-    if preset is not None:
-        words = ["--preset", preset, *words]
-    if preset is None and isinstance(agent.environment.get("grid"), str):
+    if agent.task == "ae_env/AutoExposureVideo-v0":
+        words = ["--preset", "video", *words]
+    elif isinstance(agent.environment.get("grid"), str):
         words += ["--grid", agent.environment["grid"]]
     for name in ("observation", "resolution"):
         if name in agent.environment:

@@ -592,8 +592,11 @@ def scores_by_kind(result: EvaluationResult) -> dict[str, dict[str, float]]:
     """Normalised score by kind of scene and policy; of a kind, ``groups`` counts source groups."""
     found: dict[str, dict[str, float]] = {}
     for kind in dict.fromkeys(result.kinds.tolist()):
+        own = result.kinds == kind
+        span = metrics.group_means((result.oracle - result.random)[own], result.groups[own])[0]
+        found[kind] = {"groups": len(span)}
         for name in result.tracks:
-            gains, span = result.group_gains(name, result.kinds == kind)
-            scores = found.setdefault(kind, {"groups": len(span)})
-            scores[name] = float(gains.mean(axis=0).sum() / span.sum())
+            score = result.episode_metrics(name)["score"].mean(axis=0)
+            gain = metrics.group_means((score - result.random)[own], result.groups[own])[0]
+            found[kind][name] = float(gain.sum() / span.sum())
     return found

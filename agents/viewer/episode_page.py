@@ -2,38 +2,90 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from nicegui import run, ui
-from PIL import Image
 
+import ae_env  # noqa: F401  (registers the environments)
 from ae_env.grid import ExposureGrid
-from agents.report.plots import FRAME_RATE, Recording
-from agents.viewer.drawings import BEST, POLICIES, chart
-from agents.viewer.playing import LIGHTS, STILL, play
-from agents.viewer.viewed_scene import ViewedScene
+from ae_env.lighting.moving import KIND_SETS, MOVES
+from ae_env.rendering import PATH_COLOURS
+from ae_env.scenes import Scene
+from agents.evaluation.engine import fit_policies
+from agents.policy import PolicyContext
+from agents.policy_names import make_policy
+from agents.report.plots import FRAME_RATE, Recording, record
+from agents.viewer.tab import Tab, curves, loading
+from agents.viewer.viewed_scene import ViewedScene, encoded
 
+#: Kinds of moving light, and light that stays.
+STILL = "still"
+LIGHTS = (STILL, *MOVES, *KIND_SETS)
+#: Frames after which a policy has settled in still light.
+SETTLED = 8
 #: Policies that are offered; others are typed.
 NAMES = (
     *("average:tuned", "average:tuned?foresight=model", "regression:video?foresight=learnt"),
     *("regression:video", "ppo:video", "rpi_agc", "average", "matrix", "regression", "ppo"),
 )
 _FRAMES = 64
+#: Colour of the best state, and of each policy.
+_BEST, _POLICIES = "#a0a0a0", PATH_COLOURS[:2]
 
 
-class EpisodePage:
-    """The tab.
+def play(
+    names: Sequence[str], scene: Scene, *, light: str = STILL, frames: int = 64, seed: int = 0
+) -> list[Recording]:
+    """One episode of each policy in `scene`, all in the same light.
 
     Args:
-        address: Gives a picture an address that the browser can fetch it from.
-    """
+        names: Of the policies, as `make_policy` takes them.
+        scene: At most 64 pixels a side.
+        light: One of `LIGHTS`; `AutoExposure-v0` where it stays, else `AutoExposureVideo-v0`.
+        frames: Actions.
+        seed: Decides the light and the start.
 
-    def __init__(self, address: Callable[[bytes], str]) -> None:
-        self._address = address
-        self._viewed: ViewedScene | None = None
+    Raises:
+        ValueError: If there is no such policy, or it cannot drive this camera.
+    """
+    task: dict[str, Any] = {"id": "ae_env/AutoExposure-v0"}
+    fitted_on: dict[str, Any] = {"scenes": "bundled"}
+    if light != STILL:
+        moving = {"kind": "moving", "kinds": light}
+        task = {"id": "ae_env/AutoExposureVideo-v0", "lighting": moving}
+        fitted_on["grid"] = "video"
+    envs = gym.make_vec(
+        **task,
+        num_envs=1,
+        scenes=[scene],
+        camera=scene.camera,
+        resolution=scene.light.shape[-1],
+        max_episode_steps=frames + 1,
+        render_mode="rgb_array",
+        with_oracle=True,
+    )
+    with closing(envs):
+        context = PolicyContext.from_envs(envs)
+        policies = {name: make_policy(name, context) for name in names}
+        fit_policies(policies, fitted_on)
+        return [record(name, policy, envs, frames, seed) for name, policy in policies.items()]
+
+
+def settled(names: Sequence[str], scene: Scene) -> dict[str, int]:
+    """State of the default grid that each policy holds after `SETTLED` frames of still light."""
+    return {r.name: r.states[-1] for r in play(names, scene, frames=SETTLED)}
+
+
+class EpisodePage(Tab):
+    """The tab, see `Tab`."""
+
+    def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
+        super().__init__(address, folder)
         self._recordings: list[Recording] = []
         self._grid = ExposureGrid.video()
 
@@ -63,7 +115,7 @@ class EpisodePage:
     def _build_player(self) -> None:
         with ui.element("div").classes("players"):
             self._images, self._facts = [], []
-            for colour in POLICIES:
+            for colour in _POLICIES:
                 with ui.element("div").classes("column"):
                     self._images.append(ui.element("img").props('alt="frame"'))
                     self._facts.append(ui.label().classes("note").style(f"color:{colour}"))
@@ -83,18 +135,18 @@ class EpisodePage:
 
     def show_scene(self, viewed: ViewedScene) -> None:
         """Takes another scene for the next episode."""
-        self._viewed, self._recordings = viewed, []
+        self.viewed, self._recordings = viewed, []
         self._timer.active = False
         self._shown.set_visibility(False)
 
     async def _record(self) -> None:
-        if self._viewed is None:
+        if self.viewed is None:
             return
-        viewed, names = self._viewed, [str(field.value) for field in self._policies]
+        viewed, names = self.viewed, [str(field.value) for field in self._policies]
         names = list(dict.fromkeys(names))  # a policy beside itself is shown once
         light = str(self._light.value)
-        self._run.props("loading")
-        try:
+        found: list[Recording] | None = None
+        with loading(self._run, Exception):  # whatever a policy of the user's raises
             found = await run.io_bound(
                 play,
                 names,
@@ -103,35 +155,32 @@ class EpisodePage:
                 frames=int(self._frames.value or _FRAMES),
                 seed=int(self._seed.value or 0),
             )
-        except Exception as error:  # whatever a policy of the user's raises
-            ui.notify(" ".join(str(error).split()), type="negative", multi_line=True)
-            return
-        finally:
-            self._run.props(remove="loading")
-        if found is None or viewed is not self._viewed:
+        if found is None or viewed is not self.viewed:
             return
         self._grid = ExposureGrid.default() if light == STILL else ExposureGrid.video()
-        self._show(found)
+        self._show_recordings(found)
 
-    def _show(self, recordings: list[Recording]) -> None:
+    def _show_recordings(self, recordings: list[Recording]) -> None:
         self._recordings = recordings
-        count = len(recordings[0].states)
-        lines = dict(zip(POLICIES, recordings, strict=False))
-        ev100 = {BEST: recordings[0].best} | {c: r.ev100 for c, r in lines.items()}
-        values = np.concatenate([np.asarray(v) for v in ev100.values()])
+        lines = list(zip(_POLICIES, recordings, strict=False))
+        ev100 = [(_BEST, recordings[0].best), *((c, r.ev100) for c, r in lines)]
+        values = np.concatenate([np.asarray(v) for _, v in ev100])
         self._draw("EV100", ev100, float(values.min()) - 0.5, float(values.max()) + 0.5)
-        self._draw("Score", {c: r.scores for c, r in lines.items()}, 0.0, 1.0)
-        regrets = {c: r.regrets for c, r in lines.items()}
-        self._draw("Regret", regrets, 0.0, max(0.1, *(max(v) for v in regrets.values())))
-        self._frame.props(f"max={count - 1}")
+        self._draw("Score", [(c, r.scores) for c, r in lines], 0.0, 1.0)
+        regrets = [(c, r.regrets) for c, r in lines]
+        self._draw("Regret", regrets, 0.0, max(0.1, *(max(v) for _, v in regrets)))
+        self._frame.props(f"max={len(recordings[0].states) - 1}")
         self._frame.value = 0
         self._show_frame()
         self._shown.set_visibility(True)
         self._timer.active = True
         self._play.props("icon=pause")
 
-    def _draw(self, name: str, lines: Any, low: float, high: float) -> None:
-        self._charts[name][1].content = chart(lines, low, high)
+    def _draw(
+        self, name: str, lines: Sequence[tuple[str, Sequence[float]]], low: float, high: float
+    ) -> None:
+        ends = f'<span class="high">{high:.3g}</span><span class="low">{low:.3g}</span>'
+        self._charts[name][1].content = curves(lines, low, high, 110) + ends
 
     def _show_frame(self) -> None:
         if not self._recordings:
@@ -147,8 +196,7 @@ class EpisodePage:
                 continue
             one = self._recordings[i]
             image.set_visibility(True)
-            image.props["src"] = self._address(_jpeg(one.pictures[frame]))
-            image.update()
+            self.show(image, encoded(one.pictures[frame]))
             facts.text = (
                 f"{'AB'[i]} {one.name}: {self._grid[one.states[frame]]}, score "
                 f"{one.scores[frame]:.3f}, regret {one.regrets[frame]:.3f}; mean score so far "
@@ -168,9 +216,3 @@ class EpisodePage:
             self._play.props("icon=play_arrow")
             return
         self._frame.value = int(self._frame.value) + 1
-
-
-def _jpeg(picture: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="JPEG", quality=90)
-    return buffer.getvalue()

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import matplotlib
+import numpy as np
 from nicegui import run, ui
 
 from ae_env.grid import ExposureGrid
 from agents.policy_names import METERS, PROGRAMS
-from agents.viewer.drawings import histogram, score_colour
-from agents.viewer.playing import SETTLED, settled
-from agents.viewer.stage import Stage
+from agents.viewer.episode_page import SETTLED, settled
+from agents.viewer.tab import Stage, Tab, complain, curves
 from agents.viewer.viewed_scene import Picture, Readout, View, ViewedScene
 from simulator import CameraSettings
 from simulator.settings import format_exposure_time
@@ -32,20 +35,17 @@ F_NUMBERS = (4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.0)
 #: Policies whose states can be marked; others are typed.
 POLICIES = (*METERS, *(f"matrix:{name}" for name in PROGRAMS), "rpi_agc", "regression", "ppo")
 _LETTERS = "ABCDEFGH"
+#: Colours of the planes R, G1, G2, B in a histogram.
+_PLANES = ("#ff5c5c", "#4fd36b", "#b6f0a0", "#6aa5ff")
 
 
-class ExposurePage:
-    """The tab.
+class ExposurePage(Tab):
+    """The tab, see `Tab`."""
 
-    Args:
-        address: Gives a picture an address that the browser can fetch it from.
-    """
-
-    def __init__(self, address: Callable[[bytes], str]) -> None:
-        self._address = address
-        self._viewed: ViewedScene | None = None
-        self._done: Any = None
-        self._busy = self._silent = False
+    def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
+        super().__init__(address, folder)
+        self._refreshing = asyncio.Lock()
+        self._shown: tuple[ViewedScene, View] | None = None
         self._centre: tuple[float, float] | None = None
         self._marks: dict[str, int] = {}
         self._rows: dict[str, ui.element] = {}
@@ -60,12 +60,16 @@ class ExposurePage:
             with ui.element("div").classes("column looked-at"):
                 self._build_picture()
             with ui.element("div").classes("column controls"):
-                self._iso = self._setting("ISO", ISOS, lambda v: f"{v:g}")
-                self._time = self._setting("Shutter", TIMES, format_exposure_time)
-                self._f_number = self._setting("Aperture", F_NUMBERS, lambda v: f"f/{v:g}")
+                self._iso = self._slider("ISO", len(ISOS) - 1, 1, lambda i: f"{ISOS[int(i)]:g}")
+                self._time = self._slider(
+                    "Shutter", len(TIMES) - 1, 1, lambda i: format_exposure_time(TIMES[int(i)])
+                )
+                self._f_number = self._slider(
+                    "Aperture", len(F_NUMBERS) - 1, 1, lambda i: f"f/{F_NUMBERS[int(i)]:g}"
+                )
                 self._build_map()
-                self._speed = self._amount("Motion", 2.0, 0.05, "{:.2f} H/s")
-                self._defocus = self._amount("Defocus", 8.0, 0.25, "{:.2f} px")
+                self._speed = self._slider("Motion", 2.0, 0.05, "{:.2f} H/s".format)
+                self._defocus = self._slider("Defocus", 8.0, 0.25, "{:.2f} px".format)
                 ui.label(
                     "Motion of the image in frame heights a second; defocus at f/4, in pixels of a "
                     "frame 64 pixels high."
@@ -75,7 +79,7 @@ class ExposurePage:
         ui.keyboard(on_key=self._on_key)
 
     def _build_picture(self) -> None:
-        self._stage = Stage(self._address, "simulated capture", "divider between the two states")
+        self._stage = Stage(self, "simulated capture", "divider between the two states")
         for image in self._stage.images:
             image.on(
                 "click",
@@ -89,8 +93,8 @@ class ExposurePage:
             self._compare = ui.switch("Compare with this (P)", on_change=self._pin)
             self._spinner = ui.spinner(size="sm")
             self._spinner.visible = False
-        self._across = self._amount("Across", 1.0, 0.01, "{:.0%}", self._move)
-        self._down = self._amount("Down", 1.0, 0.01, "{:.0%}", self._move)
+        self._across = self._slider("Across", 1.0, 0.01, "{:.0%}".format, self._move)
+        self._down = self._slider("Down", 1.0, 0.01, "{:.0%}".format, self._move)
         self._pinned = ui.label().classes("note")
         self._show_window()
 
@@ -98,39 +102,31 @@ class ExposurePage:
         self._histogram = ui.html(sanitize=False).props(
             'role=img aria-label="histogram of the raw planes"'
         )
-        ui.label("Raw planes R, G1, G2, B from black to white; root of the share.").classes("note")
+        ui.label(
+            "Raw histogram of R, G1, G2 and B, black to white level (height: square root of the "
+            "pixel share)."
+        ).classes("note")
         with ui.element("div").classes("facts"):
             for name in ("Score", "Noise", "Blur", "Clipped", "Time"):
                 ui.label(name).classes("name")
                 self._facts[name] = ui.label()
         self._plan = ui.label().classes("plan")
 
-    def _setting(self, name: str, values: Any, show: Callable[[Any], str]) -> Any:
-        with ui.element("div").classes("setting"):
-            ui.label(name)
-            slider = ui.slider(min=0, max=len(values) - 1, step=1, value=0, on_change=self._refresh)
-            slider.props(f'aria-label="{name}" dense')
-            ui.label().classes("value").bind_text_from(
-                slider, "value", lambda i: show(values[int(i)])
-            )
-        return slider
-
-    def _amount(
+    def _slider(
         self,
         name: str,
         most: float,
         step: float,
-        text: str,
+        text: Callable[[float], str],
         on_change: Callable[[], Any] | None = None,
-    ) -> Any:
-        with ui.element("div").classes("setting") as row:
+    ) -> ui.slider:
+        with ui.element("div").classes("setting") as self._rows[name]:
             ui.label(name)
             slider = ui.slider(
                 min=0, max=most, step=step, value=0, on_change=on_change or self._refresh
             )
             slider.props(f'aria-label="{name}" dense')
-            ui.label().classes("value").bind_text_from(slider, "value", lambda v: text.format(v))
-        self._rows[name] = row
+            ui.label().classes("value").bind_text_from(slider, "value", text)
         return slider
 
     def _build_map(self) -> None:
@@ -183,19 +179,15 @@ class ExposurePage:
             viewed: The scene.
             before: Settings on the page when it was asked for.
         """
-        self._viewed, self._marks, self._centre = viewed, {}, None
-        self._silent = True
-        try:
-            self._names.value = []
-            self._pixels.value = self._compare.value = False
-            self._speed.value = self._defocus.value = 0.0
-        finally:
-            self._silent = False
+        self.viewed, self._marks, self._centre = viewed, {}, None
+        self._names.value = []
+        self._pixels.value = self._compare.value = False
+        self._speed.value = self._defocus.value = 0.0
         self._legend.text = ""
         self._show_compared(None)
         self._show_window()
         best = await run.io_bound(viewed.best)
-        if best is None or viewed is not self._viewed:
+        if best is None or viewed is not self.viewed:
             return
         if self.view.settings == before:
             await self._set(best)
@@ -203,52 +195,45 @@ class ExposurePage:
             await self._refresh()
 
     async def _set(self, settings: CameraSettings) -> None:
-        self._silent = True
-        try:
-            self._iso.value = ISOS.index(round(settings.iso))
-            self._time.value = TIMES.index(settings.exposure_time)
-            self._f_number.value = F_NUMBERS.index(settings.f_number)
-        finally:
-            self._silent = False
+        self._iso.value = ISOS.index(round(settings.iso))
+        self._time.value = TIMES.index(settings.exposure_time)
+        self._f_number.value = F_NUMBERS.index(settings.f_number)
         await self._refresh()
 
     async def _refresh(self) -> None:
-        """Shows what the page asks for; what was asked for meanwhile comes next, alone."""
-        if self._silent or self._busy or self._viewed is None:
+        """Shows the view that the page asks for; a view asked for meanwhile comes next, alone."""
+        if self._refreshing.locked():
             return
-        self._busy = True
-        self._spinner.visible = True
-        try:
-            while self._viewed is not None and (self._viewed, self.view) != self._done:
-                viewed, view = self._viewed, self.view
-                picture = await run.io_bound(viewed.picture, view)
-                if picture is None:  # the program ends
-                    return
-                self._stage.show(picture.jpeg, picture.aspect, "pixels" if view.centre else "whole")
-                self._done = viewed, view
-                if self.view != view:
-                    continue
-                readout = await run.io_bound(viewed.readout, view, picture.capture)
-                if self.view == view and readout is not None:
-                    self._show_readout(readout, picture)
-                    await self._show_scores(viewed, view)
-        except (ValueError, OSError, RuntimeError) as error:
-            ui.notify(" ".join(str(error).split()), type="negative", multi_line=True)
-        finally:
-            self._busy = False
-            self._spinner.visible = False
+        async with self._refreshing:
+            self._spinner.visible = True
+            try:
+                while self.viewed is not None and (self.viewed, self.view) != self._shown:
+                    await self._show_view(self.viewed, self.view)
+            except (ValueError, OSError, RuntimeError) as error:
+                complain(error)
+            finally:
+                self._spinner.visible = False
+
+    async def _show_view(self, viewed: ViewedScene, view: View) -> None:
+        picture = await run.io_bound(viewed.picture, view)
+        self._shown = viewed, view
+        if picture is None:  # the program ends
+            return
+        self._stage.show(picture.jpeg, picture.aspect, "pixels" if view.centre else "whole")
+        if self.view != view:
+            return
+        readout = await run.io_bound(viewed.readout, view, picture.capture)
+        if self.view == view and readout is not None:
+            self._show_readout(readout, picture)
+            await self._show_scores(viewed, view)
 
     def _show_readout(self, readout: Readout, picture: Picture) -> None:
         self._histogram.content = histogram(readout.histogram)
-        plan = readout.plan
-        facts = self._facts
+        plan, facts = readout.plan, self._facts
         facts["Score"].text = f"{readout.score:.3f}"
-        excess = (
-            f", {plan.excess_noise:.0%} more variance than the camera's"
-            if plan.excess_noise
-            else ""
-        )
-        facts["Noise"].text = f"mid grey {readout.snr:.1f} dB above its noise, a photosite{excess}"
+        facts["Noise"].text = f"SNR at mid grey: {readout.snr:.1f} dB per photosite"
+        if plan.excess_noise:
+            facts["Noise"].text += f", {plan.excess_noise:.0%} more variance than the camera's"
         facts["Blur"].text = f"motion {readout.motion:.1f} px, defocus {readout.defocus:.1f} px"
         facts["Clipped"].text = f"{readout.white:.2%} at white, {readout.black:.2%} at black"
         capture, developing = picture.milliseconds
@@ -273,10 +258,7 @@ class ExposurePage:
             size = 12 if len(label.text) <= 6 else 9
             button.style(f"background:{background};color:{ink};font-size:{size}px")
             button.props["aria-label"] = f"{_GRID[state]}: score {score:.2f}"
-            if _GRID[state] == view.settings:
-                button.classes(add="shown")
-            else:
-                button.classes(remove="shown")
+            button.classes(replace="state shown" if _GRID[state] == view.settings else "state")
             button.update()
 
     # -- events -----------------------------------------------------------------------------------
@@ -296,8 +278,6 @@ class ExposurePage:
         self._pixels.value = not self._pixels.value
 
     async def _zoom(self) -> None:
-        if self._silent:
-            return
         if not self._pixels.value:
             self._centre = None
         elif self._centre is None:
@@ -307,28 +287,22 @@ class ExposurePage:
         await self._refresh()
 
     async def _move(self) -> None:
-        if not self._silent and self._pixels.value:
+        if self._pixels.value:
             self._centre = (self._down.value, self._across.value)
             await self._refresh()
 
     def _show_window(self) -> None:
-        self._silent = True
-        try:
-            for slider, name, place in ((self._down, "Down", 0), (self._across, "Across", 1)):
-                self._rows[name].set_visibility(self._centre is not None)
-                if self._centre is not None:
-                    slider.value = round(self._centre[place], 2)
-        finally:
-            self._silent = False
+        for slider, name, place in ((self._down, "Down", 0), (self._across, "Across", 1)):
+            self._rows[name].set_visibility(self._centre is not None)
+            if self._centre is not None:
+                slider.value = round(self._centre[place], 2)
 
     async def _pin(self) -> None:
-        if self._silent:
-            return
-        if not self._compare.value or self._viewed is None:
+        if not self._compare.value or self.viewed is None:
             self._show_compared(None)
             return
         view = replace(self.view, clipping=False)
-        picture = await run.io_bound(self._viewed.picture, view)
+        picture = await run.io_bound(self.viewed.picture, view)
         if picture is not None:
             self._show_compared(picture, f"right of the divider: {view.settings}")
 
@@ -337,23 +311,23 @@ class ExposurePage:
         self._pinned.text = text
 
     async def _mark(self) -> None:
-        if self._silent or self._viewed is None:
+        if self.viewed is None:
             return
         names = [str(name) for name in self._names.value or []][: len(_LETTERS)]
         missing = [name for name in names if name not in self._marks]
-        viewed = self._viewed
+        viewed = self.viewed
         self._spinner.visible = True
         try:
             if missing:
                 found = await run.io_bound(settled, missing, viewed.scored)
                 self._marks |= found or {}
         except Exception as error:  # whatever a policy of the user's raises
-            ui.notify(" ".join(str(error).split()), type="negative", multi_line=True)
+            complain(error)
             self._names.value = [name for name in names if name not in missing]
             return
         finally:
             self._spinner.visible = False
-        if viewed is not self._viewed:
+        if viewed is not self.viewed:
             return
         chosen = [str(name) for name in self._names.value or []]  # more may have come meanwhile
         self._marks = {name: self._marks[name] for name in chosen if name in self._marks}
@@ -362,3 +336,17 @@ class ExposurePage:
             for letter, (name, state) in zip(_LETTERS, self._marks.items(), strict=False)
         )
         await self._show_scores(viewed, self.view)
+
+
+def score_colour(score: float) -> tuple[str, str]:
+    """Background and ink of a score in [0, 1]."""
+    red, green, blue, _ = matplotlib.colormaps["viridis"](min(max(score, 0.0), 1.0))
+    ink = "#000" if 0.3 * red + 0.59 * green + 0.11 * blue > 0.45 else "#fff"
+    return matplotlib.colors.to_hex((red, green, blue)), ink
+
+
+def histogram(shares: np.ndarray) -> str:
+    """Histogram of the raw planes, an SVG: black level on the left, white level on the right."""
+    tallest = float(np.sqrt(shares[:, 1:-1].max())) or 1.0  # clipped samples would hide the rest
+    heights = np.minimum(np.sqrt(shares) / tallest, 1.0)
+    return curves(zip(_PLANES, heights, strict=True), 0.0, 1.0, 96)

@@ -3,42 +3,120 @@
 from __future__ import annotations
 
 import asyncio
-import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from nicegui import run, ui
+from PIL import Image
 
-from agents.viewer.from_one_raw import Made, fused, opened, recorded, wider_f_numbers
-from agents.viewer.stage import Stage
-from agents.viewer.viewed_scene import ViewedScene
-from simulator import CameraSimulator, RawImage
+from agents.applications.hdr import hdr_picture, linear_rgb, write_exr
+from agents.applications.refocus import refocus
+from agents.report.plots import upright_picture
+from agents.viewer.tab import Stage, Tab, complain
+from agents.viewer.viewed_scene import ViewedScene, encoded
+from simulator import CameraSimulator, RawImage, render_srgb, write_dng
+from simulator.utils.files import write_atomically
 
+#: F-numbers as cameras mark them, in third stops.
+_MARKED = (
+    *(1.4, 1.6, 1.8, 2.0, 2.2, 2.5, 2.8, 3.2, 3.5, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0),
+    *(11.0, 13.0, 14.0, 16.0, 18.0, 20.0, 22.0),
+)
+#: Largest picture on the page, longer side [pixel of the sensor].
+_LONGEST = 1536
 _NO_RAW = "Only a raw can be opened or fused: this scene is no photograph. Open a raw."
 
 
-class OneRawPage:
+@dataclass(frozen=True)
+class RenderedImage:
+    """A picture of a raw, or of a result from it.
+
+    Args:
+        jpeg: The picture on the page.
+        aspect: Its width by its height.
+        text: A line about it.
+        files: By ending, functions that write it to a path.
+    """
+
+    jpeg: bytes
+    aspect: float
+    text: str
+    files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, image: Image.Image, text: str, **files: Callable[[Path], object]) -> RenderedImage:
+        """`image`, averaged down for the page."""
+        small = image.reduce(max(1, -(-max(image.size) // _LONGEST)))
+        return cls(encoded(small), small.width / small.height, text, files)
+
+
+def wider_f_numbers(raw: RawImage) -> tuple[float, ...]:
+    """The marked f-numbers that are wider than the raw's, the nearest first; down to f/1.4."""
+    own = raw.settings.effective_f_number  # what is marked 5.6 may be recorded as 5.66
+    settings = (replace(raw.settings, f_number=n) for n in reversed(_MARKED))
+    return tuple(s.f_number for s in settings if s.effective_f_number < own)
+
+
+def recorded(raw: RawImage) -> RenderedImage:
+    """The raw itself, developed."""
+    image = upright_picture(raw, render_srgb(raw))
+    return RenderedImage.of(image, f"{raw.camera.name}, {raw.settings}")
+
+
+def opened(raw: RawImage, f_number: float, simulator: CameraSimulator) -> RenderedImage:
+    """The raw as a wider aperture would have recorded it; the blur is estimated."""
+    result = refocus(raw, f_number, simulator=simulator)
+    largest = result.metadata["largest_disc_px"]
+    text = f"f/{f_number:g}, blur estimated: the widest disc has {largest:.1f} packed pixels"
+    if largest == 0.0:
+        text = (
+            "nothing was found out of focus, so nothing changed: blur below 1.5 pixels cannot be "
+            "told from sharpness"
+        )
+    image = upright_picture(result, render_srgb(result))
+    return RenderedImage.of(image, text, dng=lambda path: write_dng(path, result))
+
+
+def fused(raw: RawImage, simulator: CameraSimulator) -> RenderedImage:
+    """The simulated bracket of the raw, fused."""
+    hdr = hdr_picture(raw, simulator=simulator)
+    image = upright_picture(raw, (hdr.fused * 255.0).round().byte())
+    darkest, brightest = hdr.exposures[0], hdr.exposures[-1]
+    text = f"{len(hdr.exposures)} simulated pictures, {darkest:+g} to {brightest:+g} EV, fused"
+    saturated = float(raw.saturated.float().mean())
+    if saturated >= 5e-5:
+        text += f"; {saturated:.2%} of the raw is saturated: its light is estimated"
+    return RenderedImage.of(
+        image,
+        text,
+        png=lambda path: write_atomically(path, encoded(image, "PNG")),
+        exr=lambda path: write_exr(path, linear_rgb(raw, hdr.radiance)),
+    )
+
+
+class OneRawPage(Tab):
     """The tab.
 
     Args:
-        address: Gives a picture an address that the browser can fetch it from.
+        address: See `Tab`.
+        folder: See `Tab`.
         simulator: Reduces noise, and estimates the blur.
-        folder: For downloads.
     """
 
     def __init__(
-        self, address: Callable[[bytes], str], simulator: CameraSimulator, folder: Path
+        self, address: Callable[[bytes], str], folder: Path, simulator: CameraSimulator
     ) -> None:
-        self._address, self._simulator, self._folder = address, simulator, folder
-        self._viewed: ViewedScene | None = None
+        super().__init__(address, folder)
+        self._simulator = simulator
         self._f_numbers: tuple[float, ...] = ()
-        self._busy = self._shown = False
+        self._busy = False
         self._begun, self._doing = 0.0, ""
-        self._made: dict[str, Made] = {}
+        self._results: dict[str, RenderedImage] = {}
         self._saves: dict[str, ui.button] = {}
 
     # -- the page ---------------------------------------------------------------------------------
@@ -47,13 +125,11 @@ class OneRawPage:
         """Puts the tab together."""
         with ui.element("div").classes("columns"):
             with ui.element("div").classes("column looked-at"):
-                self._stage = Stage(
-                    self._address, "the raw", "divider between the raw and what was made of it"
-                )
+                self._stage = Stage(self, "the raw", "divider between the raw and the result")
                 self._raw_text = ui.label().classes("note")
                 with ui.element("div").classes("bar"):
                     self._spinner = ui.spinner(size="sm")
-                    self._told = ui.label().props("role=status")
+                    self._status = ui.label().props("role=status")
             with ui.element("div").classes("column controls"):
                 ui.label("Shallow depth of field").classes("title")
                 with ui.element("div").classes("setting"):
@@ -65,17 +141,17 @@ class OneRawPage:
                     )
                 with ui.element("div").classes("bar"):
                     self._open = ui.button("Open the aperture", icon="camera", on_click=self._opens)
-                    self._save_button(".dng")
+                    self._save_button("dng")
                 ui.label(
-                    "Wider than the lens of the raw. What is soft is taken to lie behind what is "
-                    "sharp; a raw that is sharp throughout stays as it is. A depth map does more: "
-                    "ae-env refocus --depth."
+                    "Wider than the lens of the raw. Blurred areas are assumed to be background; a "
+                    "raw that is sharp throughout stays as it is. A depth map does more: ae-env "
+                    "refocus --depth."
                 ).classes("note")
                 ui.label("HDR").classes("title")
                 with ui.element("div").classes("bar"):
                     self._fuse = ui.button("Fuse a bracket", icon="hdr_on", on_click=self._fuses)
-                    self._save_button(".png")
-                    self._save_button(".exr")
+                    self._save_button("png")
+                    self._save_button("exr")
                 ui.label(
                     "A bracket is simulated from the raw with its noise reduced, and fused: PNG. "
                     "The EXR holds the light, 1 at the raw's white."
@@ -84,120 +160,109 @@ class OneRawPage:
         self._update()
 
     def _save_button(self, ending: str) -> None:
-        button = ui.button(ending[1:].upper(), icon="download", on_click=lambda: self._save(ending))
-        button.props(f'dense aria-label="save {ending[1:].upper()}"')
+        button = ui.button(ending.upper(), icon="download", on_click=lambda: self._save(ending))
+        button.props(f'dense aria-label="save {ending.upper()}"')
         self._saves[ending] = button
 
     def _marked(self, place: int) -> str:
         return f"f/{self._f_numbers[place]:g}" if place < len(self._f_numbers) else ""
 
-    @property
-    def _raw(self) -> RawImage | None:
-        return None if self._viewed is None else self._viewed.photograph
-
     def _update(self) -> None:
-        """What can be done now is enabled."""
-        ready = self._raw is not None and not self._busy
+        """Enables what can be done now."""
+        ready = self.viewed is not None and self.viewed.photograph is not None and not self._busy
         self._open.set_enabled(ready and bool(self._f_numbers))
         self._slider.set_enabled(ready and bool(self._f_numbers))
         self._fuse.set_enabled(ready)
         for ending, button in self._saves.items():
-            button.set_enabled(ending in self._made and not self._busy)
-        self._spinner.visible = self._busy
-        self._clock.active = self._busy
+            button.set_enabled(ending in self._results and not self._busy)
+        self._spinner.visible = self._clock.active = self._busy
 
     def take_scene(self, viewed: ViewedScene) -> None:
         """Takes another scene; `show_raw` shows it."""
-        self._viewed, self._made = viewed, {}
+        self.viewed, self._results = viewed, {}
         self._f_numbers = () if viewed.photograph is None else wider_f_numbers(viewed.photograph)
         self._slider.props(f"max={max(len(self._f_numbers) - 1, 1)}")
         self._slider.value = max(len(self._f_numbers) - 1, 0)  # the widest
         self._stage.clear()
         self._raw_text.text = ""
-        self._shown = viewed.photograph is None
         if not self._busy:
             open_already = "" if self._f_numbers else "The aperture of this raw is open already."
-            self._told.text = _NO_RAW if viewed.photograph is None else open_already
+            self._status.text = _NO_RAW if viewed.photograph is None else open_already
         self._update()
 
     async def show_raw(self) -> None:
         """Shows the raw of the scene, once: a large one takes seconds."""
-        viewed, raw = self._viewed, self._raw
-        if self._shown or raw is None:
+        viewed = self.viewed
+        if viewed is None or viewed.photograph is None or self._raw_text.text:
             return
-        self._shown = True
-        made = await run.io_bound(recorded, raw)
-        if made is not None and viewed is self._viewed:
-            self._stage.show(made.jpeg, made.aspect)
-            self._raw_text.text = f"left of the divider: the raw, {made.told}"
+        self._raw_text.text = "left of the divider: the raw ..."
+        image = await run.io_bound(recorded, viewed.photograph)
+        if image is not None and viewed is self.viewed:
+            self._stage.show(image.jpeg, image.aspect)
+            self._raw_text.text = f"left of the divider: the raw, {image.text}"
 
     # -- events -----------------------------------------------------------------------------------
 
     async def _opens(self) -> None:
-        await self._make("opening the aperture", opened, self._f_numbers[int(self._slider.value)])
+        await self._render("opening the aperture", opened, self._f_numbers[int(self._slider.value)])
 
     async def _fuses(self) -> None:
-        await self._make("fusing", fused)
+        await self._render("fusing", fused)
 
-    async def _make(self, doing: str, function: Callable[..., Made], *options: Any) -> None:
-        """Shows what `function` makes of the raw; it may take minutes, and the page lives."""
-        viewed, raw = self._viewed, self._raw
-        if raw is None or self._busy:
+    async def _render(
+        self, doing: str, function: Callable[..., RenderedImage], *options: Any
+    ) -> None:
+        """Shows the result of `function` for the raw; it may take minutes, and the page lives."""
+        viewed = self.viewed
+        if viewed is None or viewed.photograph is None or self._busy:
             return
+        raw = viewed.photograph
         self._busy, self._begun = True, perf_counter()
         self._doing = f"{doing}, {4e-6 * raw.data[0].numel():.1f} megapixels"
         self._tick()
         self._update()
-        told = ""
+        status = ""
         try:
-            made = await _in_background(function, raw, *options, self._simulator)
-            if viewed is self._viewed:
-                self._made |= dict.fromkeys(made.files, made)
-                self._stage.compare(made.jpeg)
-                told = f"right: {made.told}, in {perf_counter() - self._begun:.0f} s"
+            image = await _in_background(function, raw, *options, self._simulator)
+            if viewed is self.viewed:
+                self._results |= dict.fromkeys(image.files, image)
+                self._stage.compare(image.jpeg)
+                status = f"right: {image.text}, in {perf_counter() - self._begun:.0f} s"
         except (ValueError, OSError, RuntimeError, MemoryError) as error:
-            told = f"{doing} failed: {' '.join(str(error).split())}"
-            ui.notify(told, type="negative", multi_line=True, timeout=10_000)
+            status = f"{doing} failed: {' '.join(str(error).split())}"
+            complain(status)
         finally:
             self._busy = False
-            self._told.text = told
+            self._status.text = status
             self._update()
 
     def _tick(self) -> None:
-        self._told.text = f"{self._doing} ... {perf_counter() - self._begun:.0f} s"
+        self._status.text = f"{self._doing} ... {perf_counter() - self._begun:.0f} s"
 
     async def _save(self, ending: str) -> None:
-        if self._viewed is None or ending not in self._made:
-            return
-        what = "opened" if ending == ".dng" else "hdr"
-        name = f"{Path(self._viewed.scene.scene_id).stem}-{what}{ending}"
-        path = Path(tempfile.mkdtemp(dir=self._folder), name)
-        self._saves[ending].props("loading")
-        try:
-            await run.io_bound(self._made[ending].files[ending], path)
-            ui.download.file(path)
-        except (ValueError, OSError, ImportError) as error:
-            ui.notify(" ".join(str(error).split()), type="negative", multi_line=True)
-        finally:
-            self._saves[ending].props(remove="loading")
+        if self.viewed is not None and ending in self._results:
+            result = "opened" if ending == "dng" else "hdr"
+            name = f"{Path(self.viewed.scene.scene_id).stem}-{result}.{ending}"
+            write = self._results[ending].files[ending]
+            await self.download(self._saves[ending], name, write)
 
 
-async def _in_background(function: Callable[..., Made], *arguments: Any) -> Made:
-    """The result of `function`, made in a thread that the end of the program does not wait for."""
+async def _in_background(function: Callable[..., RenderedImage], *arguments: Any) -> RenderedImage:
+    """The result of `function`, in a thread that the end of the program does not wait for."""
     loop = asyncio.get_running_loop()
-    result: asyncio.Future[Made] = loop.create_future()
+    result: asyncio.Future[RenderedImage] = loop.create_future()
 
-    def tell(how: Callable[[Any], None], what: Any) -> None:
+    def settle(how: Callable[[Any], None], value: Any) -> None:
         with suppress(RuntimeError):  # the program has ended
-            loop.call_soon_threadsafe(lambda: None if result.done() else how(what))
+            loop.call_soon_threadsafe(lambda: None if result.done() else how(value))
 
     def work() -> None:
         try:
-            made = function(*arguments)
+            image = function(*arguments)
         except Exception as error:  # raised where it is awaited
-            tell(result.set_exception, error)
+            settle(result.set_exception, error)
         else:
-            tell(result.set_result, made)
+            settle(result.set_result, image)
 
     threading.Thread(target=work, daemon=True).start()
     return await result

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import uuid
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from nicegui import app, run, ui
 
 from agents.viewer.episode_page import EpisodePage
 from agents.viewer.exposure_page import ExposurePage
-from agents.viewer.library import Library
 from agents.viewer.one_raw_page import OneRawPage
-from agents.viewer.viewed_scene import ViewedScene
+from agents.viewer.tab import complain
+from agents.viewer.viewed_scene import Library, ViewedScene
 from simulator import CameraSimulator
 from simulator.camera_simulator import Depth
 
@@ -29,39 +30,6 @@ _WAITING = 256
 #: Name of the tab of refocusing and HDR.
 _ONE_RAW = "Refocus, HDR"
 _STYLE = Path(__file__).with_name("page.css")
-
-
-@dataclass
-class Options:
-    """What `ae-env view` was asked for.
-
-    Args:
-        library: The scenes.
-        simulator: Shared by all tabs of the browser.
-        depth: See `ViewedScene`.
-        tolerance: See `ViewedScene`.
-        scorer: See `ViewedScene`.
-        thumbnails: JPEGs of scenes that were asked for, by name.
-        folder: For uploads and downloads; None for the system's.
-    """
-
-    library: Library
-    simulator: CameraSimulator
-    depth: Depth
-    tolerance: float
-    scorer: str
-    thumbnails: dict[str, bytes] = field(default_factory=dict)
-    folder: str | None = None
-
-    def viewed(self, library: Library, name: str) -> ViewedScene:
-        """The scene called `name`, to be shown."""
-        return ViewedScene(
-            library.open(name),
-            self.simulator,
-            depth=self.depth,
-            tolerance=self.tolerance,
-            scorer=self.scorer,
-        )
 
 
 class PictureStore:
@@ -88,16 +56,45 @@ class PictureStore:
         )
 
 
-_pictures: PictureStore | None = None
+@dataclass
+class Options:
+    """What `ae-env view` was asked for.
+
+    Args:
+        library: The scenes.
+        simulator: Shared by all tabs of the browser.
+        depth: See `ViewedScene`.
+        tolerance: See `ViewedScene`.
+        scorer: See `ViewedScene`.
+        thumbnails: JPEGs of scenes that were asked for, by name.
+        folder: For uploads and downloads; None for the system's.
+        pictures: Where the browser fetches pictures.
+    """
+
+    library: Library
+    simulator: CameraSimulator
+    depth: Depth
+    tolerance: float
+    scorer: str
+    thumbnails: dict[str, bytes] = field(default_factory=dict)
+    folder: str | None = None
+    pictures: PictureStore = field(default_factory=PictureStore)
+
+    def viewed(self, library: Library, name: str) -> ViewedScene:
+        """The scene called `name`, to be shown."""
+        return ViewedScene(
+            library.open(name),
+            self.simulator,
+            depth=self.depth,
+            tolerance=self.tolerance,
+            scorer=self.scorer,
+        )
 
 
 async def show_page(options: Options) -> None:
     """Puts the page together, for one tab of the browser."""
-    global _pictures
-    if _pictures is None:
-        _pictures = PictureStore()
     ui.add_css(_STYLE.read_text())
-    await Page(options, _pictures).build()
+    await Page(options).build()
 
 
 class Page:
@@ -105,18 +102,16 @@ class Page:
 
     Args:
         options: What is shown.
-        pictures: Where pictures are fetched from.
     """
 
-    def __init__(self, options: Options, pictures: PictureStore) -> None:
-        self._options, self._pictures = options, pictures
-        # Uploads belong to their tab.
-        self._library = Library(list(options.library.entries.values()), options.library.first)
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        # Uploads belong to their tab of the browser.
+        self._library = Library(options.library.readers, options.library.first)
         self._folder = Path(tempfile.mkdtemp(dir=options.folder))
-        self._exposure = ExposurePage(pictures.address)
-        self._episode = EpisodePage(pictures.address)
-        self._one_raw = OneRawPage(pictures.address, options.simulator, self._folder)
-        self._viewed: ViewedScene | None = None
+        shared = options.pictures.address, self._folder
+        self._exposure, self._episode = ExposurePage(*shared), EpisodePage(*shared)
+        self._one_raw = OneRawPage(*shared, options.simulator)
 
     async def build(self) -> None:
         """Builds the page, and opens the first scene."""
@@ -138,18 +133,17 @@ class Page:
                 "Open raw", icon="upload", on_click=lambda: upload.run_method("pickFiles")
             ).props("dense")
             self._save = ui.button("DNG", icon="download", on_click=self._download).props("dense")
+        pages = {"Exposure": self._exposure, "Episode": self._episode, _ONE_RAW: self._one_raw}
         with ui.tabs().props("dense align=left") as tabs:
-            exposure, episode, one_raw = map(ui.tab, ("Exposure", "Episode", _ONE_RAW))
+            for name in pages:
+                ui.tab(name)
         self._panels = ui.tab_panels(
-            tabs, value=exposure, animated=False, on_change=self._show_raw
+            tabs, value="Exposure", animated=False, on_change=self._show_raw
         ).classes("w-full bg-transparent")
         with self._panels:
-            with ui.tab_panel(exposure).classes("p-0"):
-                self._exposure.build()
-            with ui.tab_panel(episode).classes("p-0"):
-                self._episode.build()
-            with ui.tab_panel(one_raw).classes("p-0"):
-                self._one_raw.build()
+            for name, page in pages.items():
+                with ui.tab_panel(name).classes("p-0"):
+                    page.build()
         await client.connected()
         await self._open(self._library.first)
 
@@ -163,7 +157,7 @@ class Page:
     async def _open_picker(self) -> None:
         self._picker.open()
         with self._thumbs:
-            for name in self._library.names:
+            for name in self._library.readers:
                 if name in self._listed:
                     continue
                 self._listed.add(name)
@@ -176,18 +170,15 @@ class Page:
 
     async def _fill(self, image: ui.element, name: str) -> None:
         """Puts the thumbnail of the scene called `name` into `image`."""
-        shared = name in self._options.library.entries
+        shared = name in self._options.library.readers
         known = self._options.thumbnails if shared else {}
-        try:
-            if name not in known:
-                found = await run.io_bound(self._thumbnail, name)
-                if found is None:  # the program ends
-                    return
-                known[name] = found
-        except (ValueError, OSError):
-            return  # a file that cannot be read says so when it is opened
-        image.props["src"] = self._pictures.address(known[name])
-        image.update()
+        jpeg = known.get(name)
+        if jpeg is None:
+            with suppress(ValueError, OSError):  # such a file says so when it is opened
+                jpeg = await run.io_bound(self._thumbnail, name)
+        if jpeg is not None:  # else the program ends
+            known[name] = jpeg
+            self._exposure.show(image, jpeg)
 
     def _thumbnail(self, name: str) -> bytes:
         return self._options.viewed(self._library, name).thumbnail()
@@ -197,21 +188,20 @@ class Page:
         await self._open(name)
 
     async def _open(self, name: str) -> None:
-        self._title.text = f"{name} ..."
+        title, self._title.text = self._title.text, f"{name} ..."
         before = self._exposure.view.settings
         try:
             viewed = await run.io_bound(self._options.viewed, self._library, name)
         except (ValueError, OSError) as error:
-            self._title.text = self._viewed.scene.scene_id if self._viewed else "ae-env view"
-            _complain(error)
+            self._title.text = title
+            complain(error)
             return
-        if viewed is None:
+        if viewed is None:  # the program ends
             return
-        self._viewed = viewed
         self._episode.show_scene(viewed)
         self._one_raw.take_scene(viewed)
         await self._exposure.show_scene(viewed, before)
-        if viewed is self._viewed:  # no other was opened meanwhile
+        if viewed is self._exposure.viewed:  # no other was opened meanwhile
             self._title.text = name
         await self._show_raw()
 
@@ -228,26 +218,15 @@ class Page:
             own = await run.io_bound(self._library.add, path, name)
         except (ValueError, OSError) as error:
             path.unlink(missing_ok=True)
-            _complain(error)
+            complain(error)
             return
         if own is not None:
             await self._open(own)
 
     async def _download(self) -> None:
-        if self._viewed is None:
-            return
-        view = self._exposure.view
-        name = Path(self._viewed.scene.scene_id).stem
-        path = Path(tempfile.mkdtemp(dir=self._folder), f"{name}-simulated.dng")
-        self._save.props("loading")
-        try:
-            await run.io_bound(self._viewed.write_dng, path, view)
-            ui.download.file(path)
-        except (ValueError, OSError) as error:
-            _complain(error)
-        finally:
-            self._save.props(remove="loading")
-
-
-def _complain(error: Exception) -> None:
-    ui.notify(" ".join(str(error).split()), type="negative", multi_line=True, timeout=10_000)
+        viewed, view = self._exposure.viewed, self._exposure.view
+        if viewed is not None:
+            name = f"{Path(viewed.scene.scene_id).stem}-simulated.dng"
+            await self._exposure.download(
+                self._save, name, lambda path: viewed.write_dng(path, view)
+            )

@@ -7,6 +7,7 @@ import hmac
 import secrets
 import socket
 import tempfile
+from collections.abc import Callable
 from http.cookies import SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -20,14 +21,15 @@ _COOKIE = "ae-env-view"
 
 
 class TokenGuard:
-    """Refuses every request that does not bring the token of this start.
+    """Refuses every request without the token of this start.
 
-    The address that is printed brings it in its query; a cookie keeps it for what the page loads.
-    Other names for this machine are refused, too: a foreign page may make its own name lead here.
+    The printed address contains the token in its query; a cookie keeps it for later requests of
+    the page. Requests to or from other names are refused, too: a foreign page may make its own
+    name lead here, and whoever reaches the page can name a Python file as a policy.
 
     Args:
         app: The application behind it (ASGI).
-        token: What has to be brought.
+        token: The token.
         port: Where the page is served.
     """
 
@@ -42,12 +44,12 @@ class TokenGuard:
             await self._app(scope, receive, send)
             return
         headers = {key.decode().lower(): value.decode("latin-1") for key, value in scope["headers"]}
-        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        in_query = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
         cookie = SimpleCookie(headers.get("cookie", "")).get(self._cookie)
         origin = headers.get("origin")
         own = headers.get("host") in self._hosts
         own = own and (origin is None or urlsplit(origin).netloc in self._hosts)
-        by_query = own and self._is_token(given)
+        by_query = own and self._is_token(in_query)
         if not (by_query or (own and cookie is not None and self._is_token(cookie.value))):
             await _refuse(scope, receive, send)
             return
@@ -63,8 +65,8 @@ class TokenGuard:
 
         await self._app(scope, receive, with_cookie)
 
-    def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode(), self._token.encode())
+    def _is_token(self, text: str) -> bool:
+        return hmac.compare_digest(text.encode(), self._token.encode())
 
 
 async def _refuse(scope: Any, receive: Any, send: Any) -> None:
@@ -72,7 +74,7 @@ async def _refuse(scope: Any, receive: Any, send: Any) -> None:
         await receive()
         await send({"type": "websocket.close", "code": 1008})
         return
-    text = b"Open the address that `ae-env view` printed: it brings the token."
+    text = b"Open the address that `ae-env view` printed: it contains the token."
     headers = [(b"content-type", b"text/plain; charset=utf-8")]
     await send({"type": "http.response.start", "status": 403, "headers": headers})
     await send({"type": "http.response.body", "body": text})
@@ -95,28 +97,36 @@ def free_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def serve(options: Options, port: int, open_browser: bool, tell: Any) -> None:
+def serve(options: Options, port: int, open_browser: bool, announce: Callable[[str], None]) -> None:
     """Serves the page until it is stopped.
 
     Args:
         options: What the page shows.
         port: From `free_port`.
         open_browser: Whether to open the page in the default browser.
-        tell: Called with the address once it is served.
+        announce: Called with the address once it is served.
     """
     token = secrets.token_urlsafe(16)
     path = f"/?token={token}"
     app.add_middleware(TokenGuard, token=token, port=port)
     address = f"http://{HOST}:{port}{path}"
-    app.on_startup(lambda: background_tasks.create(_tell_when_served(tell, address, port)))
+    app.on_startup(lambda: background_tasks.create(_announce_when_served(announce, address, port)))
     ui.page("/", title="ae-env view", dark=True)(lambda: show_page(options))
     # Uploads and downloads are gone with the program, however its pages were left.
     with tempfile.TemporaryDirectory(prefix="ae-env-view-") as options.folder:
-        _run(port, path if open_browser else False)
+        ui.run(
+            host=HOST,
+            port=port,
+            reload=False,
+            show=path if open_browser else False,
+            show_welcome_message=False,
+            uvicorn_logging_level="error",
+            reconnect_timeout=10.0,
+        )
 
 
-async def _tell_when_served(tell: Any, address: str, port: int) -> None:
-    """Calls `tell` as soon as the port answers: the program starts before it listens."""
+async def _announce_when_served(announce: Callable[[str], None], address: str, port: int) -> None:
+    """Calls `announce` as soon as the port answers: the program starts before it listens."""
     while True:
         try:
             _, writer = await asyncio.open_connection(HOST, port)
@@ -124,17 +134,5 @@ async def _tell_when_served(tell: Any, address: str, port: int) -> None:
             await asyncio.sleep(0.05)
             continue
         writer.close()
-        tell(address)
+        announce(address)
         return
-
-
-def _run(port: int, show: str | bool) -> None:
-    ui.run(
-        host=HOST,
-        port=port,
-        reload=False,
-        show=show,
-        show_welcome_message=False,
-        uvicorn_logging_level="error",
-        reconnect_timeout=10.0,
-    )

@@ -1,29 +1,50 @@
-"""What the page shows of one scene: captures, histograms, readouts, plans and scores."""
+"""The scenes that the page offers, and what it shows of one: captures, readouts and scores."""
 
 from __future__ import annotations
 
 import io
 import math
 import threading
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
 from PIL import Image
 
 from ae_env.grid import ExposureGrid
-from ae_env.scenes import Scene
+from ae_env.scenes import Scene, load_scenes
+from ae_env.scenes.folder import find_files
+from ae_env.scenes.recorded import PREFIX
 from ae_env.scorers.registry import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
-from agents.viewer.library import Shown
-from simulator import CameraSettings, CameraSimulator, PreparedScene, RawImage, write_dng
+from simulator import (
+    CameraSettings,
+    CameraSimulator,
+    PreparedScene,
+    RawImage,
+    get_camera,
+    read_raw,
+    write_dng,
+)
 from simulator.camera_simulator import Depth
 from simulator.capture.plan import SimulationPlan
-from simulator.raw.develop import render_srgb
+from simulator.radiance.maps import RADIANCE_SUFFIXES
+from simulator.raw.develop import quarter_turns, render_srgb
+from simulator.utils.checks import did_you_mean
+from simulator.utils.files import RAW_SUFFIXES
 
+#: Camera in whose colours named scenes and radiance maps are made, as the environment's default.
+CAMERA = "nikon_z6"
+#: Scenes kept in memory: a raw of 24 megapixels takes 0.1 GB, with its noise reduced twice that.
+_KEPT = 4
+#: Most files that an error names.
+_MOST_NAMED = 8
 #: Largest picture of a whole frame, height and width [packed pixel].
 FRAME_SIZE = (512, 768)
 #: Part of the frame that is shown pixel by pixel, height and width [packed pixel].
@@ -39,6 +60,139 @@ _WHITE_MARK, _BLACK_MARK = (255, 0, 200), (0, 120, 255)
 #: Share of the planes' span above which a sample counts as white, below which as black.
 _AT_WHITE, _AT_BLACK = 1.0 - 1e-4, 1e-6
 _THUMBNAIL = (96, 64)
+
+
+@dataclass(frozen=True)
+class OpenedScene:
+    """A scene to look at.
+
+    Args:
+        scene: At its finest resolution.
+        turns: Quarter turns to the left that turn its picture upright.
+        raw: The photograph that it is; None for a scene that is none.
+    """
+
+    scene: Scene
+    turns: int = 0
+    raw: RawImage | None = None
+
+
+class Library:
+    """Scenes by name, each read when it is opened.
+
+    Args:
+        readers: By the name of each scene, a function that reads it; at least one.
+        first: Name of the one to open first; that of the first one by default.
+    """
+
+    def __init__(
+        self, readers: Mapping[str, Callable[[], OpenedScene]], first: str | None = None
+    ) -> None:
+        self.readers = dict(readers)
+        self.first = next(iter(self.readers)) if first is None else first
+        self._lock = threading.Lock()
+        self._read: OrderedDict[str, OpenedScene] = OrderedDict()
+
+    def add(self, path: Path, name: str) -> str:
+        """Adds the raw at `path`; returns the name it got, `name` with a number where taken.
+
+        Raises:
+            ValueError: If the file is no raw that can be read.
+        """
+        scene = _read_raw(path, name)
+        own, number = name, 1
+        while own in self.readers:
+            number += 1
+            own = f"{name} ({number})"
+        self.readers[own] = partial(_read_raw, path, name)
+        self._keep(own, scene)
+        return own
+
+    def open(self, name: str) -> OpenedScene:
+        """The scene called `name`."""
+        with self._lock:
+            scene = self._read.get(name)
+        if scene is None:
+            scene = self.readers[name]()
+        self._keep(name, scene)
+        return scene
+
+    def _keep(self, name: str, scene: OpenedScene) -> None:
+        with self._lock:
+            self._read[name] = scene
+            self._read.move_to_end(name)
+            while len(self._read) > _KEPT:
+                self._read.popitem(last=False)
+
+
+def _read_raw(path: Path, name: str) -> OpenedScene:
+    raw = read_raw(path)
+    return OpenedScene(Scene.from_raw(raw, scene_id=name), quarter_turns(raw), raw)
+
+
+def find_scenes(what: str) -> Library:
+    """The library of what ``ae-env view`` was asked to show.
+
+    Args:
+        what: A raw or radiance map, a folder or glob of them, scenes as `load_scenes` takes them
+            (of a recorded grid the light that its captures tell together), or the id of a bundled
+            scene.
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+    known = (*RAW_SUFFIXES, *RADIANCE_SUFFIXES)
+    looks_like_files = Path(what).suffix.lower() in known or any(s in what for s in "/*?")
+    if Path(what).exists() or (looks_like_files and not what.startswith(PREFIX)):
+        base, files = find_files(what)
+        readers: dict[str, Callable[[], OpenedScene]] = {}
+        for path in files:
+            if path.suffix.lower() in RADIANCE_SUFFIXES:
+                readers |= _loaded(str(path))
+            else:
+                name = str(path.relative_to(base)) if path.is_relative_to(base) else path.name
+                name = path.name if name == "." else name
+                readers[name] = partial(_read_raw, path, name)
+        return Library(readers, _first_readable(what, readers))
+    try:
+        return Library(_loaded(what))
+    except ValueError:
+        if what.startswith(PREFIX):
+            raise
+    bundled = _loaded("bundled")
+    if what not in bundled:
+        raise ValueError(
+            f"`what` (={what!r}) must be a raw, a radiance map, a folder, scenes such as bundled, "
+            f"or the id of a bundled scene, such as {next(iter(bundled))}"
+            f"{did_you_mean(what, bundled)}"
+        )
+    return Library(bundled, what)
+
+
+def _first_readable(what: str, readers: Mapping[str, Callable[[], OpenedScene]]) -> str:
+    """Name of the first scene that can be read: files are refused here, not on an empty page.
+
+    Raises:
+        ValueError: If none can; names them.
+    """
+    broken: list[str] = []
+    for name, read in readers.items():
+        try:
+            read()
+        except (ValueError, OSError) as error:
+            broken.append(f"{name}: {error}")
+            continue
+        return name
+    named = "; ".join(broken[:_MOST_NAMED])
+    if len(broken) > _MOST_NAMED:
+        named += f"; and {len(broken) - _MOST_NAMED} more"
+    raise ValueError(f"`what` (={what!r}) must hold a raw that can be read, but none can: {named}")
+
+
+def _loaded(spec: Any) -> dict[str, Callable[[], OpenedScene]]:
+    """The scenes that `load_scenes` makes of `spec`, by id."""
+    scenes = load_scenes(spec, "all", camera=get_camera(CAMERA), resolution=None)
+    return {scene.scene_id: partial(OpenedScene, scene) for scene in scenes}
 
 
 @dataclass(frozen=True)
@@ -107,7 +261,7 @@ class ViewedScene:
     """One scene, ready to be shown at any settings.
 
     Args:
-        shown: The scene.
+        opened: The scene.
         simulator: The simulator; its networks run where a plan asks for them.
         depth: See `CameraSimulator.prepare`.
         tolerance: See `CameraSimulator.prepare`.
@@ -116,14 +270,14 @@ class ViewedScene:
 
     def __init__(
         self,
-        shown: Shown,
+        opened: OpenedScene,
         simulator: CameraSimulator,
         *,
         depth: Depth = "far",
         tolerance: float = 0.1,
         scorer: str = "balanced",
     ) -> None:
-        self.scene, self.turns, self.photograph = shown.scene, shown.turns, shown.raw
+        self.scene, self.turns, self.photograph = opened.scene, opened.turns, opened.raw
         self._simulator, self._depth, self._tolerance = simulator, depth, tolerance
         self._scorer = make_scorer(scorer)
         self._prepared: dict[object, PreparedScene] = {}
@@ -153,8 +307,8 @@ class ViewedScene:
             prepared = self._part(view)
             (capture,) = prepared.expose([view.settings])
             taken = perf_counter()
-            image = self._developed(capture, view)
-            jpeg = _jpeg(image, quality=88 if view.centre is None else 95)
+            image = self._to_srgb(capture, view)
+            jpeg = encoded(image, quality=88 if view.centre is None else 95)
             times = 1e3 * (taken - begun), 1e3 * (perf_counter() - taken)
             return Picture(jpeg, image.shape[1] / image.shape[0], capture, times)
 
@@ -216,13 +370,13 @@ class ViewedScene:
         small = self.scene.averaged(factor)
         capture = replace(small, denoised=None).prepared.expected(settings)
         image = render_srgb(_raw(small, settings, capture.clamp(0.0, 1.0)), "half")
-        return _jpeg(self._upright(image.permute(1, 2, 0).numpy()), quality=80)
+        return encoded(self._upright(image.permute(1, 2, 0).numpy()), quality=80)
 
     def _prepare(self, scene: Scene) -> PreparedScene:
         return self._simulator.prepare(scene.prepared, depth=self._depth, tolerance=self._tolerance)
 
     def _part(self, view: View) -> PreparedScene:
-        """What `view` looks at, prepared: the networks run once for the frame and once a window."""
+        """The part that `view` shows, prepared: networks run once a frame and once a window."""
         if view.centre is None:
             key: object = None
             scene = self.small
@@ -253,7 +407,7 @@ class ViewedScene:
             found.append(slice(start, min(start + size, side)))
         return found[0], found[1]
 
-    def _developed(self, capture: torch.Tensor, view: View) -> np.ndarray:
+    def _to_srgb(self, capture: torch.Tensor, view: View) -> np.ndarray:
         raw = _raw(self.scene, view.settings, capture)
         whole = view.centre is None
         image = render_srgb(raw, "half" if whole else "malvar").permute(1, 2, 0).numpy()
@@ -284,7 +438,9 @@ def _unturned(point: tuple[float, float], turns: int) -> tuple[float, float]:
     return down, right
 
 
-def _jpeg(image: np.ndarray, quality: int) -> bytes:
+def encoded(picture: Image.Image | np.ndarray, kind: str = "JPEG", quality: int = 90) -> bytes:
+    """The file of a picture, an image or (H, W, 3) uint8."""
+    image = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="JPEG", quality=quality, subsampling=0)
+    image.save(buffer, format=kind, quality=quality, subsampling=0)
     return buffer.getvalue()

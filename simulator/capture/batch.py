@@ -17,13 +17,13 @@ import numpy as np
 import torch
 
 from simulator.camera import CameraProfile
+from simulator.capture.blurred_light import Pool
 from simulator.capture.exposure import LIGHT_LIMIT, Exposure, exposure_table
-from simulator.capture.light_statistics import LightStatistics
 from simulator.capture.prepared_scene import PreparedScene
-from simulator.capture.scene_light import SceneLight
 from simulator.capture.sensor import Transitions, noise_balance, record
+from simulator.capture.statistics import LightStatistics
 from simulator.noise.generator import Noise, noise_keys, single_normals
-from simulator.optics.blur_kernels import Blur, blur_many
+from simulator.optics.blur import Blur, blur_many
 from simulator.settings import CameraSettings
 from simulator.utils.compute import parallel_ranges
 
@@ -49,7 +49,7 @@ class FrameStatistics:
         predicted_error: `SimulationPlan.predicted_error`, in units of the target's noise; of a
             light without noise only what is left out.
         modules: (B,) int64 index into `MODULES`: the steps that ran.
-        source_noise: (B, 2, 4) shot and read noise that the source brings to the frame.
+        source_noise: (B, 2, 4) shot and read noise of the source in the frame.
         keys: Keys of the noise, uint64.
     """
 
@@ -146,15 +146,14 @@ class CaptureBatch:
         self._forget_all()
 
     def _forget_all(self) -> None:
-        self._rows = _Rows(self.num_scenes * len(self.states))
-        self._lights: dict[int, SceneLight] = {}
-        # Images that are used again: new memory costs more than what is written to it.
-        self._free: list[torch.Tensor] = []
+        self._table = FrameTable(self.num_scenes * len(self.states))
+        self._scenes: dict[int, PreparedScene] = {}
+        self._pool = Pool(self._cache_light)
         # Row of the blurred light that each scene has at present.
         self._blurred_row = np.full(self.num_scenes, -1)
 
     def __getstate__(self) -> dict[str, Any]:
-        cached = ("_rows", "_lights", "_free", "_blurred_row")
+        cached = ("_table", "_scenes", "_pool", "_blurred_row")
         return {name: value for name, value in vars(self).items() if name not in cached}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -165,29 +164,29 @@ class CaptureBatch:
         """See `FrameSource`; the memory is used again."""
         count = len(self.states)
         for index in indices.tolist():
-            self._rows.forget(slice(index * count, (index + 1) * count))
-            light = self._lights.pop(index, None)
-            if light is not None:
-                light.give_back()
+            self._table.forget(slice(index * count, (index + 1) * count))
+            scene = self._scenes.pop(index, None)
+            if scene is not None:
+                scene.blurred_light.release()
             self._blurred_row[index] = -1
 
     def prepare(self, indices: np.ndarray, states: np.ndarray, gains: np.ndarray) -> None:
         """See `FrameSource`."""
         rows = indices * len(self.states) + states
-        stale = self._rows.gain[rows] != gains
+        stale = self._table.gain[rows] != gains
         if stale.any():
             self._plan(indices[stale], rows[stale], gains[stale])
-        if self._rows.any_blurs:
-            missing = self._rows.blurs[rows] & (self._blurred_row[indices] != rows)
+        if self._table.any_blurs:
+            missing = self._table.blurs[rows] & (self._blurred_row[indices] != rows)
             if missing.any():
                 self._blur(indices[missing], rows[missing])
 
     def transitions(self, indices: np.ndarray, states: np.ndarray) -> Transitions:
         """Light and exposures of the frames of scenes that are prepared; see `record`."""
         rows, remaining = indices * len(self.states) + states, None
-        if self._rows.any_blurs:  # else all of the source's variance remains
-            remaining = self._rows.remaining_variance[rows]
-        return Transitions(self._rows.light[rows], self._rows.table[rows], remaining)
+        if self._table.any_blurs:  # else all of the source's variance remains
+            remaining = self._table.remaining_variance[rows]
+        return Transitions(self._table.light[rows], self._table.table[rows], remaining)
 
     def record(
         self,
@@ -202,12 +201,12 @@ class CaptureBatch:
         signals: np.ndarray | None = None,
     ) -> FrameStatistics:
         """See `FrameSource`."""
-        rows, columns = indices * len(self.states) + states, self._rows
+        rows, columns = indices * len(self.states) + states, self._table
         keys, transitions = noise_keys(seeds, frames), self.transitions(indices, states)
         read_noise = None
         if self.noise == "sensor":
             pairs = zip(indices.tolist(), states.tolist(), strict=True)
-            read_noise = [self._light(i).prepared.read_noise(self.states[s]) for i, s in pairs]
+            read_noise = [self.prepared_scene(i).read_noise(self.states[s]) for i, s in pairs]
         counts = record(
             transitions,
             self.camera,
@@ -233,56 +232,52 @@ class CaptureBatch:
 
     def prepared_scene(self, index: int) -> PreparedScene:
         """See `FrameSource`."""
-        return self._light(index).prepared
+        scene = self._scenes.get(index)
+        if scene is None:
+            scene = self._prepared(index)
+            # Scenes that are shown several times share their light, but not what is blurred of it.
+            light = scene.blurred_light.copy(pool=self._pool)
+            scene = self._scenes[index] = scene.changed(blurred_light=light)
+        return scene
 
     # -- planning -----------------------------------------------------------------------------
 
     def _plan(self, indices: np.ndarray, rows: np.ndarray, gains: np.ndarray) -> None:
         """Works out `rows` (K,) for scenes `indices` in the light `gains`."""
-        columns, noisy, exposures = self._rows, self.noise is not None, []
+        columns, noisy, exposures = self._table, self.noise is not None, []
         for index, row, gain in zip(indices.tolist(), rows.tolist(), gains.tolist(), strict=True):
-            prepared = self._light(index).prepared
-            settings = self.states[row % len(self.states)]
-            exposure = prepared.exposure(settings, gain=gain)
+            scene, settings = self.prepared_scene(index), self.states[row % len(self.states)]
+            exposure = scene.exposure(settings, gain=gain)
             blurs = exposure.defocus_px or exposure.motion_px or exposure.opened_to is not None
             columns.blurs[row], columns.exposure[row] = blurs, exposure if blurs else None
             columns.remaining_variance[row] = None  # `_begin_blur` knows it
             columns.any_blurs |= bool(blurs)
             if not blurs:
-                columns.light[row] = prepared.source_light(exposure).contiguous()
-            excess = _excess_variance(prepared.statistics, exposure) if noisy else 0.0
+                columns.light[row] = scene.blurred_light.source(exposure).contiguous()
+            excess = _excess_variance(scene.statistics, exposure) if noisy else 0.0
             columns.excess_variance[row] = excess
-            if prepared.nlf.is_zero:  # a whole plan takes longer than a step may
-                left_out = [step.error for step in exposure.steps if not step.runs]
-                columns.predicted_error[row] = math.hypot(*left_out)
-            else:
-                plan = prepared.plan(settings, noise=noisy, gain=gain)
-                columns.predicted_error[row] = plan.predicted_error
+            error = exposure.left_out
+            if not scene.nlf.is_zero:
+                shown = exposure if noisy else scene.exposure(settings, noise=False, gain=gain)
+                error = math.hypot(*scene.predicted_errors(settings, shown).values())
+            columns.predicted_error[row] = error
             columns.modules[row] = _modules(exposure, noisy)
             exposures.append(exposure)
         columns.table[rows] = exposure_table(exposures)
         columns.gain[rows] = gains  # last: what is interrupted stays unknown
         self._blurred_row[indices] = -1
 
-    def _light(self, index: int) -> SceneLight:
-        light = self._lights.get(index)
-        if light is None:
-            light = SceneLight(self._prepared(index), self._free, self._cache_light)
-            self._lights[index] = light
-        return light
-
     def _blur(self, indices: np.ndarray, rows: np.ndarray) -> None:
         """Makes the light of `rows`, on as many threads as torch may use."""
         planned = list(zip(indices.tolist(), rows.tolist(), strict=True))
-        exposures = self._rows.exposure
+        exposures = self._table.exposure
         try:
             opened = [pair for pair in planned if exposures[pair[1]].opened_to is not None]
-            _in_shares(self._open, opened)
+            _each(self._open, opened)
             begun = [self._begin_blur(index, row) for index, row in planned]
             blur_many([blur for blur in begun if isinstance(blur, Blur)], limit=LIGHT_LIMIT)
-            tasks = [task for task in begun if callable(task)]
-            parallel_ranges(lambda first, last: [task() for task in tasks[first:last]], len(tasks))
-            _in_shares(self._balance, planned)
+            _each(lambda task: task(), [(task,) for task in begun if callable(task)])
+            _each(self._balance, planned)
         except BaseException:  # some of the light is not made
             self.forget(indices)
             raise
@@ -290,11 +285,11 @@ class CaptureBatch:
 
     def _open(self, index: int, row: int) -> None:
         """Opens the aperture, which caches its result."""
-        self._light(index).prepared.source_light(self._rows.exposure[row])
+        self._scenes[index].blurred_light.source(self._table.exposure[row])
 
     def _begin_blur(self, index: int, row: int) -> Blur | Callable[[], None] | None:
-        columns, exposure = self._rows, self._rows.exposure[row]
-        columns.light[row], blur = self._light(index).blurred(exposure)
+        columns, exposure = self._table, self._table.exposure[row]
+        columns.light[row], blur = self._scenes[index].blurred_light.begin(exposure)
         remaining = exposure.remaining_variance
         if remaining is not None:
             remaining = remaining.float().contiguous()
@@ -303,24 +298,17 @@ class CaptureBatch:
 
     def _balance(self, index: int, row: int) -> None:
         """Computes the excess variance where it depends on the pixels."""
-        columns = self._rows
+        columns = self._table
         if np.isnan(columns.excess_variance[row]):
             balance = noise_balance(columns.light[row], columns.exposure[row])
             columns.excess_variance[row] = balance.relative_excess_variance
-        opened = columns.exposure[row].opened_to is not None
-        if opened and not self._cache_light:  # an aperture blur caches the light of each f-number
-            self._light(index).prepared = self._prepared(index)
+        if columns.exposure[row].opened_to is not None and not self._cache_light:
+            self._scenes[index].blurred_light.forget_opened()
 
 
-def _in_shares(task: Callable[[int, int], None], planned: Sequence[tuple[int, int]]) -> None:
-    if not planned:
-        return
-
-    def run(first: int, last: int) -> None:
-        for index, row in planned[first:last]:
-            task(index, row)
-
-    parallel_ranges(run, len(planned))
+def _each(task: Callable[..., object], arguments: Sequence[tuple[Any, ...]]) -> None:
+    """Calls `task` with each of `arguments`, on as many threads as torch may use."""
+    parallel_ranges(lambda a, b: [task(*each) for each in arguments[a:b]], len(arguments))
 
 
 def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
@@ -329,7 +317,7 @@ def _excess_variance(statistics: LightStatistics, exposure: Exposure) -> float:
         return 0.0
     source, target = exposure.source_noise, exposure.target
     pairs = zip((*source.shot, *source.read), (*target.shot, *target.read), strict=True)
-    if all(brought <= wanted for brought, wanted in pairs):
+    if all(present <= wanted for present, wanted in pairs):
         return 0.0
     if exposure.remaining_variance is not None:
         return math.nan
@@ -344,7 +332,7 @@ def _modules(exposure: Exposure, noise: bool) -> int:
     return found
 
 
-class _Rows:
+class FrameTable:
     """Planned captures: all that a frame depends on except for its noise, as columns.
 
     A row takes some 40 bytes from the start, the rest of its memory when it is used.

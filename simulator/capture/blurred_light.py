@@ -1,128 +1,405 @@
-"""The lights of one scene: as recorded, denoised, with the aperture opened, and blurred."""
+"""The lights of one scene: as recorded, denoised, with the aperture opened, and blurred.
+
+Defocus comes first, by one disc or by each pixel's circle of confusion. Then the background moves
+along the camera's path, with what is nearest in place of the subject, and the subject in front of
+it along its own: what its smeared mask leaves uncovered shows the background. Uniform light stays
+uniform. Blur and exposure are linear: one light per f-number, and one per f-number and motion,
+serve every ISO.
+"""
 
 from __future__ import annotations
 
+import functools
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Protocol
+from dataclasses import replace
+from typing import Any
 
 import torch
+from torch import Tensor
 
-from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import Exposure
-from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.residual import ResidualStatistics
-from simulator.capture.scene_blur import SceneBlur, moved
+from simulator.capture.exposure import LIGHT_LIMIT, Exposure
+from simulator.capture.layout import Layout
+from simulator.capture.statistics import DenoisedLight, LightStatistics, ResidualStatistics
 from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.optics import disc_bank
+from simulator.optics.blur import Blur, disc_blur, kernel_energy, motion_blur
+from simulator.optics.disc_bank import HALO, DiscBank
+from simulator.optics.motion_path import Path, Taps, path_blur, path_blur_apart, path_taps
 from simulator.utils.cache import LruCache
+from simulator.utils.tiles import TILE, Tile, make_tiles
 
-#: Memory that the cached blurred light of one scene may take [byte].
-CACHE_BYTES = 512 * 2**20
+#: Memory that the cached blurred light of one scene may take, and that its cached opened light may
+#: [byte].
+CACHE_BYTES, OPENED_BYTES = 512 * 2**20, 256 * 2**20
 
 
-class ApertureBlur(Protocol):
+# -- opening the aperture ---------------------------------------------------------------------
+
+
+class ApertureBlur(ABC):
     """Opens the aperture of one scene's light; results are cached, as f-numbers are few.
 
-    `simulator.capture.aperture_blur` has the two that there are.
+    Args:
+        f_number: Effective f-number at which the light was recorded.
+        everywhere: Whether it opens also where a positive tolerance needs no network.
     """
 
-    f_number: float
-    """Effective f-number at which the light was recorded."""
+    #: Whether it works on the noise-reduced light only.
+    needs_denoised = False
 
-    needs_denoised: bool
-    """Whether it works on the noise-reduced light only."""
+    def __init__(self, f_number: float, everywhere: bool = True) -> None:
+        self.f_number, self.everywhere = f_number, everywhere
+        self.forget()
 
-    everywhere: bool
-    """Whether it opens also where a positive tolerance needs no network."""
-
-    @property
-    def mean_square_diameter(self) -> float:
-        """Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown."""
+    def forget(self) -> None:
+        """Drops what is cached."""
+        self._opened: LruCache[Tensor] = LruCache(OPENED_BYTES)
+        self._extents: dict[float, float] = {}
 
     def extent(self, f_number: float) -> float:
-        """Largest diameter of the blur that opening to `f_number` adds [pixel]."""
+        """Largest diameter of the blur that opening to `f_number` adds [pixel]; 0 for none."""
+        if f_number >= self.f_number:
+            return 0.0
+        if f_number not in self._extents:
+            self._extents[f_number] = self._largest(f_number)
+        return self._extents[f_number]
 
-    def opened(self, f_number: float, denoised: Denoised | None) -> torch.Tensor:
+    def opened(self, f_number: float, denoised: DenoisedLight | None = None) -> Tensor:
         """Light (4, H, W) at the wider aperture, at unchanged exposure.
 
         Args:
             f_number: Effective f-number wanted, smaller than the source's.
             denoised: The noise-reduced light that is opened; None for the light as recorded.
         """
+        key = f_number, None if self.needs_denoised else denoised
+        result = self._opened.get(key)
+        if result is None:
+            result = self._open(f_number, denoised)
+            self._opened.put(key, result, result.nbytes)
+        return result
 
-    def remaining_variance(self, f_number: float) -> torch.Tensor | None:
+    @property
+    def mean_square_diameter(self) -> float:
+        """Mean square of the circle of confusion in the light itself [pixel^2]; 0 if unknown."""
+        return 0.0
+
+    @abstractmethod
+    def remaining_variance(self, f_number: float) -> Tensor | None:
         """(H, W) share of the recorded noise's variance that the blur leaves; None for all."""
 
+    @abstractmethod
+    def _largest(self, f_number: float) -> float: ...
 
-class BlurredLight:
-    """Blurs a scene's light, each blur when it is first asked for, and caches the latest.
+    @abstractmethod
+    def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor: ...
 
-    Blur and exposure are linear: one light per f-number, and one per f-number and length of the
-    streak, serve every ISO.
+
+class MapApertureBlur(ApertureBlur):
+    """Blurs by the estimated circle of confusion of each pixel (preset ``"compact"``).
+
+    Only the parts of the frame that are out of focus are blurred, tile by tile; the rest is copied.
 
     Args:
         light: (4, H, W) as recorded.
-        denoised: The same with little noise, by each network.
-        nlf: Noise of `light`.
-        aperture_blur: Blur that wider apertures add, or None.
-        statistics: Statistics of `light`, where they are at hand.
-        cache_bytes: Memory of the cache; the light that was used longest ago goes first.
+        diameter: (H, W) circle of confusion at `f_number` [pixel of `light`], or a function that
+            estimates it, called when an aperture first opens.
+        f_number: See `ApertureBlur`.
+        everywhere: See `ApertureBlur`.
     """
 
     def __init__(
         self,
-        light: torch.Tensor,
-        denoised: tuple[Denoised, ...],
+        light: Tensor,
+        diameter: Tensor | Callable[[], Tensor],
+        f_number: float,
+        *,
+        everywhere: bool = True,
+    ) -> None:
+        super().__init__(f_number, everywhere)
+        self._recorded, self._diameter = light, diameter
+
+    def forget(self) -> None:
+        """Drops what is cached; the map stays."""
+        super().forget()
+        self._banks: dict[tuple[Tile, DenoisedLight | None], DiscBank] = {}
+
+    @functools.cached_property
+    def diameter(self) -> Tensor:
+        """(H, W) circle of confusion at the light's own f-number [pixel]."""
+        return self._diameter if isinstance(self._diameter, Tensor) else self._diameter()
+
+    def remaining_variance(self, f_number: float) -> Tensor:
+        """See `ApertureBlur`."""
+        return disc_bank.remaining_variance(self._added(self.diameter, f_number))
+
+    @functools.cached_property
+    def mean_square_diameter(self) -> float:
+        """See `ApertureBlur`."""
+        return float(self.diameter.square().mean())
+
+    def _largest(self, f_number: float) -> float:
+        return float(self._added(self.diameter.max(), f_number))
+
+    def _added(self, diameter: Tensor, f_number: float) -> Tensor:
+        return disc_bank.added_blur(diameter, self.f_number, f_number)
+
+    @functools.cached_property
+    def _tiles(self) -> list[Tile]:
+        """The parts of the frame that are out of focus."""
+        return make_tiles(*self.diameter.shape, halo=HALO, needed=self.diameter > 0)
+
+    def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:
+        light = self._recorded if denoised is None else denoised.light
+
+        def blurred(tile: Tile) -> Tensor:
+            added = self._added(self.diameter[tile.outer], f_number)
+            # Close f-numbers share most of their discs; on large frames they take too much memory.
+            cache = self._banks if self.diameter.numel() <= TILE**2 else {}
+            return _bank(cache, (tile, denoised), light[tile.outer]).blurred(added)[tile.core]
+
+        tiles = self._tiles
+        if len(tiles) == 1 and light[tiles[0].inner].shape == light.shape:
+            return blurred(tiles[0])
+        result = light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT)
+        for tile in tiles:
+            result[tile.inner] = blurred(tile)
+        return result
+
+
+class NetworkApertureBlur(ApertureBlur):
+    """Runs the paper's attention U-Net for every f-number (presets ``"paper"``, ``"ncs"``).
+
+    Args:
+        denoised: Light (4, H, W) with little noise.
+        module: The trained network, called as `ApertureModule` is.
+        f_number: Effective f-number of the light.
+    """
+
+    needs_denoised = True
+
+    def __init__(
+        self,
+        denoised: DenoisedLight,
+        module: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor],
+        f_number: float,
+    ) -> None:
+        super().__init__(f_number)
+        self._denoised, self._module = denoised, module
+
+    def remaining_variance(self, f_number: float) -> None:
+        """None: the recorded noise is gone, there is nothing to account for."""
+
+    def _largest(self, f_number: float) -> float:
+        return float("inf")  # unknown before the network ran
+
+    @torch.no_grad()
+    def _open(self, f_number: float, denoised: DenoisedLight | None) -> Tensor:
+        image = self._denoised.light[None]
+        f_numbers = (torch.tensor([n], device=image.device) for n in (self.f_number, f_number))
+        return self._module(image, torch.zeros_like(image), *f_numbers)[0]
+
+
+# -- all blur ---------------------------------------------------------------------------------
+
+
+class Pool:
+    """Memory for the light of a batch's scenes: new memory costs more than what is written to it.
+
+    Args:
+        keeps: Whether the defocused light of every f-number is kept until its scene is forgotten;
+            else only that of the latest.
+    """
+
+    def __init__(self, keeps: bool) -> None:
+        self.keeps, self.free = keeps, list[Tensor]()
+
+    def take(self, like: Tensor) -> Tensor:
+        """Memory of the shape of `like`."""
+        return self.free.pop() if self.free else torch.empty(like.shape)
+
+
+class BlurredLight:
+    """Blurs a scene's light, each blur when it is first needed, and caches the latest.
+
+    Sweeps call `blurred`. In a batch `begin` says what has to be done, so that many scenes are
+    blurred side by side, into memory that is used again.
+
+    Args:
+        light: (4, H, W) as recorded.
+        denoised_lights: The same with little noise, by each network.
+        nlf: Noise of `light`.
+        aperture_blur: Blur that wider apertures add, or None.
+        statistics: Statistics of `light`, where they are at hand.
+        cache_bytes: Memory of the cache; the light that was used longest ago goes first.
+        pool: Memory of a batch.
+    """
+
+    def __init__(
+        self,
+        light: Tensor,
+        denoised_lights: tuple[DenoisedLight, ...],
         nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
         statistics: LightStatistics | None = None,
         cache_bytes: int = CACHE_BYTES,
+        pool: Pool | None = None,
     ) -> None:
-        self.light, self.denoised, self.aperture_blur = light, denoised, aperture_blur
+        self.light, self.denoised_lights = light, denoised_lights
+        self.aperture_blur = aperture_blur
         self.statistics = LightStatistics(light) if statistics is None else statistics
         self.residuals = ResidualStatistics(light, nlf)
-        self._added: dict[float, float] = {}
-        self._cache: LruCache[torch.Tensor] = LruCache(cache_bytes)
-        self._scene_blur = SceneBlur()
+        self._cache: LruCache[Tensor] = LruCache(cache_bytes)
+        self._banks: dict[object, DiscBank] = {}
+        self._pool = Pool(keeps=True) if pool is None else pool
+        self._defocused: dict[tuple[object, ...], Tensor] = {}  # by `Exposure.lens_blur`
+        self._streak: Tensor | None = None
+        self._latest: tuple[tuple[object, ...], Tensor] | None = None  # by `Exposure.blur`
 
-    def copy(self, cache_bytes: int) -> BlurredLight:
+    def copy(self, cache_bytes: int = CACHE_BYTES, pool: Pool | None = None) -> BlurredLight:
         """One of the same light with an empty cache of its own."""
-        nlf, statistics = self.residuals.nlf, self.statistics
-        copied = BlurredLight(
-            self.light, self.denoised, nlf, self.aperture_blur, statistics, cache_bytes
-        )
+        known = self.denoised_lights, self.residuals.nlf, self.aperture_blur, self.statistics
+        copied = BlurredLight(self.light, *known, cache_bytes, pool)
         copied.residuals = self.residuals
         return copied
 
     def is_of(
         self,
-        light: torch.Tensor,
-        denoised: tuple[Denoised, ...],
+        light: Tensor,
+        denoised_lights: tuple[DenoisedLight, ...],
         nlf: NoiseLevelFunction,
         aperture_blur: ApertureBlur | None,
     ) -> bool:
         """Whether it was made for exactly these objects."""
         return (
             self.light is light
-            and self.denoised == denoised
+            and self.denoised_lights == denoised_lights
             and self.residuals.nlf == nlf
             and self.aperture_blur is aperture_blur
         )
 
-    def added_blur(self, f_number: float) -> float:
-        """Largest diameter of the blur that opening to `f_number` adds [pixel]; 0 for none."""
-        if self.aperture_blur is None or f_number >= self.aperture_blur.f_number:
-            return 0.0
-        if f_number not in self._added:
-            self._added[f_number] = self.aperture_blur.extent(f_number)
-        return self._added[f_number]
+    def source(self, exposure: Exposure) -> Tensor:
+        """The light (4, H, W) that `exposure` starts from: as recorded, denoised or opened."""
+        if exposure.opened_to is not None and self.aperture_blur is not None:
+            return self.aperture_blur.opened(exposure.opened_to, exposure.denoised)
+        return self.light if exposure.denoised is None else exposure.denoised.light
 
-    def remaining_variance(self, f_number: float, energy: float) -> torch.Tensor | None:
+    def blurred(self, exposure: Exposure) -> Tensor:
+        """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""
+        if not exposure.motion_px:
+            return self._behind_lens(exposure) if exposure.defocus_px else self.source(exposure)
+        light = self._cache.get(exposure.blur)
+        if light is None:
+            light = motion_blurred(self._behind_lens(exposure), exposure)
+            self._cache.put(exposure.blur, light, light.nbytes)
+        return light
+
+    def _behind_lens(self, exposure: Exposure) -> Tensor:
+        light = self._cache.get(exposure.lens_blur) if exposure.defocus_px else None
+        if light is None:
+            light = self._defocus(self.source(exposure), exposure)
+            if exposure.defocus_px:
+                self._cache.put(exposure.lens_blur, light, light.nbytes)
+        return light
+
+    def _defocus(self, source: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
+        """`source` (4, H, W) behind the lens of `exposure`; written to `out` on the CPU."""
+        if exposure.layout is None or not exposure.defocus_px:
+            light = disc_blur(source.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), exposure.defocus_px)
+            return light if out is None else out.copy_(light)
+        # Exposures share most of their discs; on large frames they take too much memory.
+        banks = self._banks if source.shape[-2] * source.shape[-1] <= TILE**2 else {}
+        diameter = exposure.layout.defocus.to(source.device) * exposure.defocus_px
+        key = exposure.denoised, exposure.opened_to
+        return _bank(banks, key, source).blurred(diameter, out)
+
+    # -- batches ------------------------------------------------------------------------------
+
+    def begin(self, exposure: Exposure) -> tuple[Tensor, Blur | Callable[[], None] | None]:
+        """The light (4, H, W) with every blur of `exposure`, valid until the next call.
+
+        The latest light is cached, because an agent that has settled repeats its state.
+
+        Returns:
+            The light, and the blur (`simulator.optics.blur.blur_many`) or the function that fills
+            it; None where that was done before.
+        """
+        if self._latest is not None and self._latest[0] == exposure.blur:
+            return self._latest[1], None
+        light = self._defocused.get(exposure.lens_blur)
+        source = lens = streak = None
+        if light is None:
+            light = source = self.source(exposure).contiguous()
+            if exposure.defocus_px:
+                if not self._pool.keeps:
+                    self._drop_defocused()
+                light = lens = self._defocused[exposure.lens_blur] = self._pool.take(light)
+        if exposure.motion_px:
+            source = light if source is None else source
+            if self._streak is None:
+                self._streak = self._pool.take(light)
+            light = streak = self._streak
+        self._latest = (exposure.blur, light)
+        if source is None or (lens is None and streak is None):
+            return light, None
+        if exposure.is_uniform:
+            return light, Blur(source, exposure.defocus_px, lens, exposure.motion_px, streak)
+        return light, functools.partial(self._fill, exposure, source, lens, streak)
+
+    def _fill(
+        self, exposure: Exposure, source: Tensor, lens: Tensor | None, streak: Tensor | None
+    ) -> None:
+        """Blurs `source` into `lens` by the lens and into `streak` by motion, where given."""
+        if lens is not None:
+            source = self._defocus(source, exposure, lens)
+            if not self._pool.keeps:
+                self._banks.clear()
+        if streak is not None:
+            motion_blurred(source, exposure, streak)
+
+    def release(self) -> None:
+        """Puts all memory back into the pool; the light of `begin` must not be used afterwards."""
+        self._drop_defocused()
+        if self._streak is not None:
+            self._pool.free.append(self._streak)
+        self._streak = self._latest = None
+
+    def _drop_defocused(self) -> None:
+        self._pool.free.extend(self._defocused.values())
+        self._defocused.clear()
+        self._banks.clear()
+
+    def forget_opened(self) -> None:
+        """Drops the light of every opened aperture, but not that of `begin`."""
+        self._cache = LruCache(self._cache.max_bytes)
+        if self.aperture_blur is not None:
+            self.aperture_blur.forget()
+
+    # -- noise of the source ------------------------------------------------------------------
+
+    def with_remaining_noise(self, exposure: Exposure) -> Exposure:
+        """`exposure` with the shares of the source's noise variance that its blurs leave."""
+        left: Tensor | None = None
+        if exposure.is_uniform:
+            energy = kernel_energy(exposure.motion_px, exposure.defocus_px)
+        else:
+            energy, left = _remaining_noise(exposure, *self.light.shape[-2:])
+            left = None if left is None else left.to(self.light.device)
+        if exposure.opened_to is not None:
+            # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
+            # it further. Both together leave about what the larger leaves alone.
+            opened = self._left_by_aperture(exposure.opened_to, energy)
+            if left is None or opened is None:
+                left = opened if left is None else left
+            else:
+                left = torch.minimum(left, opened)
+        return replace(exposure, energy=energy, remaining_variance=left)
+
+    def _left_by_aperture(self, f_number: float, energy: float) -> Tensor | None:
         """(H, W) `Exposure.remaining_variance` where other blurs left a share `energy`."""
-        if self.aperture_blur is None:
-            return None
         key = ("remaining_variance", f_number, energy)
         left = self._cache.get(key)
-        if left is None:
+        if left is None and self.aperture_blur is not None:
             share = self.aperture_blur.remaining_variance(f_number)
             if share is None:
                 return None
@@ -130,27 +407,65 @@ class BlurredLight:
             self._cache.put(key, left, left.nbytes)
         return left
 
-    def source(self, exposure: Exposure) -> torch.Tensor:
-        """The light (4, H, W) that `exposure` starts from: as recorded, denoised or opened."""
-        if exposure.opened_to is not None and self.aperture_blur is not None:
-            return self.aperture_blur.opened(exposure.opened_to, exposure.denoised)
-        return self.light if exposure.denoised is None else exposure.denoised.light
 
-    def blurred(self, exposure: Exposure) -> torch.Tensor:
-        """The light (4, H, W) with every blur of `exposure`, not exposed yet; not to be changed."""
-        if exposure.motion_px:
-            return self._cached(exposure.blur, lambda: moved(self._defocused(exposure), exposure))
-        return self._defocused(exposure) if exposure.defocus_px else self.source(exposure)
+def motion_blurred(light: Tensor, exposure: Exposure, out: Tensor | None = None) -> Tensor:
+    """`light` (4, H, W), behind the lens already, as it moves in `exposure`.
 
-    def _defocused(self, exposure: Exposure) -> torch.Tensor:
-        def make() -> torch.Tensor:
-            return self._scene_blur.defocused(self.source(exposure), exposure)
+    Args:
+        light: Light; limited to `LIGHT_LIMIT`.
+        exposure: The exposure; without a path, the motion is along the rows.
+        out: Contiguous tensor to write to, instead of a new one, where `light` is on the CPU.
+    """
+    if exposure.path is None:
+        return motion_blur(light, exposure.motion_px, out, limit=LIGHT_LIMIT)
+    height, width = light.shape[-2:]
+    taps = path_taps(exposure.path, height, width)
+    if exposure.subject_path is None or exposure.layout is None:
+        return path_blur(light, taps, out, limit=LIGHT_LIMIT)
+    own, layout = path_taps(exposure.subject_path, height, width), exposure.layout
+    return path_blur_apart(light, layout.mask, layout.behind, taps, own, out, limit=LIGHT_LIMIT)
 
-        return self._cached(exposure.lens_blur, make) if exposure.defocus_px else make()
 
-    def _cached(self, key: tuple[object, ...], make: Callable[[], torch.Tensor]) -> torch.Tensor:
-        light = self._cache.get(key)
-        if light is None:
-            light = make()
-            self._cache.put(key, light, light.nbytes)
-        return light
+def _bank(banks: dict[Any, DiscBank], key: object, light: Tensor) -> DiscBank:
+    """The bank of `key`; beyond the limit sums would no longer resolve the shadows."""
+    if key not in banks:
+        banks[key] = DiscBank(light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT))
+    return banks[key]
+
+
+def _remaining_noise(exposure: Exposure, height: int, width: int) -> tuple[float, Tensor | None]:
+    """Share of a source's noise variance that a blur with a path or a layout leaves.
+
+    Returns:
+        That of the whole frame, and (H, W) that of each pixel relative to it; None for 1.
+    """
+    path = exposure.path
+    if path is None and exposure.motion_px:
+        path = Path(exposure.motion_px)
+    if exposure.layout is None:
+        return _uniform_energy(path, exposure.defocus_px, height, width), None
+    return 1.0, _noise_map(exposure.layout, path, exposure.subject_path, exposure.defocus_px)
+
+
+@functools.lru_cache(maxsize=2)  # a plan needs the same again
+def _noise_map(layout: Layout, path: Path | None, own: Path | None, defocus_px: float) -> Tensor:
+    height, width = layout.defocus.shape
+    diameter = layout.defocus * defocus_px
+    if path is None:
+        return disc_bank.remaining_variance(diameter)
+    taps = path_taps(path, height, width)
+    left = disc_bank.remaining_variance(diameter, taps)
+    if own is None:
+        return path_blur(left[None], taps)[0]
+    # Taps of pixels that differ leave the mean of what each of these would leave alone.
+    taps_own = path_taps(own, height, width)
+    left = path_blur(left.flatten()[layout.behind][None], taps)
+    subject = path_blur(layout.mask * disc_bank.remaining_variance(diameter, taps_own), taps_own)
+    seen = 1.0 - path_blur(layout.mask, taps_own)
+    return (seen.square() * left + subject)[0].clamp(max=1.0)
+
+
+@functools.lru_cache(maxsize=4096)
+def _uniform_energy(path: Path | None, defocus_px: float, height: int, width: int) -> float:
+    taps: Taps | None = None if path is None else path_taps(path, height, width)
+    return float(disc_bank.remaining_variance(torch.full((1, 1), defocus_px), taps))

@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 
+from simulator.utils.checks import check_number
+
 #: Levels that `Layout.shares` counts defocus in.
 _LEVELS = 255
 
@@ -51,20 +53,16 @@ class Layout:
         found, mask = self.defocus, self.subject
         for name, value in (("defocus", found), ("subject", mask)):
             if not isinstance(value, torch.Tensor) and (name == "defocus" or value is not None):
-                kind = type(value).__name__
-                raise ValueError(f"`{name}` (={kind}) of a layout must be a torch tensor")
+                raise ValueError(f"`{name}` (={type(value).__name__}) must be a torch tensor")
         if found.ndim != 2 or not bool(((found >= 0.0) & (found <= 1.0)).all()):
-            raise ValueError(
-                f"`defocus` (shape {tuple(found.shape)}, {float(found.min()):g} to "
-                f"{float(found.max()):g}) of a layout must be (H, W) in [0, 1]"
-            )
+            raise ValueError(f"`defocus` (shape {tuple(found.shape)}) must be (H, W) in [0, 1]")
         object.__setattr__(self, "defocus", found.detach().float().cpu().contiguous())
         if mask is None:
             return
         if mask.dtype != torch.bool or mask.shape != found.shape:
             raise ValueError(
-                f"`subject` ({mask.dtype}, shape {tuple(mask.shape)}) of a layout must be bool of "
-                f"shape {tuple(found.shape)}"
+                f"`subject` ({mask.dtype}, shape {tuple(mask.shape)}) must be bool of the shape of "
+                f"`defocus`, {tuple(found.shape)}"
             )
         count = int(mask.count_nonzero())
         known = mask.cpu().contiguous() if 0 < count < mask.numel() else None
@@ -88,8 +86,7 @@ class Layout:
             raise ValueError("`depth` must be a torch tensor with every value above 0 and not NaN")
         if not 0.0 < distance < math.inf:
             raise ValueError(f"`distance` (={distance}) must be above 0 and finite")
-        if not 0.0 <= in_focus <= 1.0:
-            raise ValueError(f"`in_focus` (={in_focus}) must be in [0, 1]")
+        check_number("in_focus", in_focus, 0.0, 1.0)
         apart = (1.0 / depth.double() - 1.0 / distance).abs()
         relative = (apart / apart.max().clamp(min=1e-12)).float()
         return cls(relative, relative <= in_focus)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
+import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from numbers import Real
+from dataclasses import dataclass, field
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -14,30 +15,23 @@ import torch
 
 from simulator.camera import CameraProfile
 from simulator.capture.blurred_light import ApertureBlur, BlurredLight
-from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import RATIO_LIMIT, Exposure
-from simulator.capture.layout import Layout
-from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.plan import (
-    DEFAULT_TOLERANCE,
-    DEPTH_ERROR,
-    KEPT_BLUR_ERROR,
-    MISSED_BLUR,
-    SimulationPlan,
-    Situation,
-    check_tolerance,
+from simulator.capture.exposure import (
+    RATIO_LIMIT,
+    Exposure,
+    TransitionInputs,
     decide,
-    make_plan,
+    predict_errors,
 )
-from simulator.capture.scene_blur import remaining_noise
+from simulator.capture.layout import Layout
+from simulator.capture.plan import DEFAULT_TOLERANCE, SimulationPlan, check_tolerance
 from simulator.capture.sensor import Transitions, exposed_light, noise_balance, record
+from simulator.capture.statistics import DenoisedLight, LightStatistics
 from simulator.noise.generator import Noise, check_noise, sweep_keys
-from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
-from simulator.noise.read_noise import ReadNoise
-from simulator.optics.motion_path import ALONG_ROWS, Movement
-from simulator.optics.shapes import kernel_energy
+from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise, noise_variance
+from simulator.optics.motion_path import ALONG_ROWS, Movement, Path
 from simulator.raw.image import check_packed, new_frame
 from simulator.settings import CameraSettings, exposure_ratio
+from simulator.utils.checks import check_number
 
 #: Blurred light of a sweep that may be held at once [byte], to record all of its frames together.
 _TOGETHER_BYTES = 2**26
@@ -46,6 +40,10 @@ MAX_IMAGE_SPEED = 1000.0
 #: Discs of defocus may be as wide as the frame, on small frames this wide [pixel]: the memory that
 #: a blur takes grows with the square of it.
 MAX_DISC_PX = 512.0
+#: Errors of the estimated map of defocus: its relative error of the blur that it adds, the blur
+#: that it cannot see [pixel of diameter], and the factor by which what a blurred picture changes
+#: when it is blurred again understates what it would change if it were sharpened.
+DEPTH_ERROR, MISSED_BLUR, KEPT_BLUR_ERROR = 0.6, 0.7, 3.0
 
 
 class HasPrepared(Protocol):
@@ -77,14 +75,17 @@ class PreparedScene:
         movement: In which directions the image moves, and the subject of `layout` of its own.
         layout: What is out of focus, and what is the subject; None for one disc everywhere.
         gain: Light relative to `light`, where it changes over time.
-        denoised: `light` with its noise removed by each noise module, the cheapest first, for
-            targets that are cleaner than the source; none where there is no module or no noise.
+        denoised_lights: `light` with its noise removed by each noise module, the cheapest first,
+            for targets that are cleaner than the source; none where there is no module or no noise.
         aperture_blur: Adds the blur of apertures wider than the reference's to a scene whose depth
             is not known; None takes it as far.
         tolerance: Error that a capture may have, in units of the target's noise: the cheapest
             steps that keep it are taken, or else, as at 0, those with the least error.
         blurred_light: Blurs the light and caches what it has blurred. It is made here, and copies
             with the same light (`dataclasses.replace`) share it.
+
+    Raises:
+        ValueError: If a value has the wrong shape or lies outside its range.
     """
 
     light: torch.Tensor
@@ -97,7 +98,7 @@ class PreparedScene:
     image_speed: float = 0.0
     defocus: float = 0.0
     gain: float = 1.0
-    denoised: tuple[Denoised, ...] = ()
+    denoised_lights: tuple[DenoisedLight, ...] = ()
     aperture_blur: ApertureBlur | None = None
     movement: Movement = ALONG_ROWS
     layout: Layout | None = None
@@ -106,32 +107,28 @@ class PreparedScene:
 
     def __post_init__(self) -> None:
         cached = cast(BlurredLight | None, self.blurred_light)
-        if cached is None or not cached.is_of(
-            self.light, self.denoised, self.nlf, self.aperture_blur
-        ):
+        known = self.denoised_lights, self.nlf, self.aperture_blur
+        if cached is None or not cached.is_of(self.light, *known):
             same_light = cached is not None and cached.light is self.light
             if not same_light:  # a copy's light was checked before
                 object.__setattr__(self, "light", check_packed("light", self.light))
-            self._check_denoised()
+            for denoised in self.denoised_lights:
+                if not isinstance(denoised, DenoisedLight):
+                    found = type(denoised).__name__
+                    raise ValueError(f"`denoised_lights` (={found}) must be DenoisedLight")
+                if denoised.shape not in (None, self.light.shape):
+                    raise ValueError(
+                        f"`denoised_lights` (shape {tuple(denoised.shape)}) must have the shape of "
+                        f"`light`, {tuple(self.light.shape)}"
+                    )
             statistics = cached.statistics if cached is not None and same_light else None
-            lights = BlurredLight(
-                self.light, self.denoised, self.nlf, self.aperture_blur, statistics
-            )
+            lights = BlurredLight(self.light, *known, statistics)
             object.__setattr__(self, "blurred_light", lights)
-        for name in ("image_speed", "defocus", "gain"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, Real):
-                raise ValueError(f"`{name}` (={value!r}) must be a number")
-        if not 0.0 <= self.image_speed <= MAX_IMAGE_SPEED:
-            raise ValueError(
-                f"`image_speed` (={self.image_speed!r}) must be in [0, {MAX_IMAGE_SPEED:g}] frame "
-                "heights per second"
-            )
-        if not self.defocus >= 0.0:
-            raise ValueError(f"`defocus` (={self.defocus!r}) must be finite and >= 0")
+        unit = " frame heights per second"
+        check_number("image_speed", self.image_speed, 0.0, MAX_IMAGE_SPEED, more=unit)
+        check_number("defocus", self.defocus, 0.0, math.inf)
         self._disc(4.0)
-        if not 0.0 <= self.gain < float("inf"):
-            raise ValueError(f"`gain` (={self.gain!r}) must be finite and >= 0")
+        check_number("gain", self.gain, 0.0, sys.float_info.max)
         if self.layout is not None and self.layout.defocus.shape != self.light.shape[-2:]:
             raise ValueError(
                 f"`layout` (shape {tuple(self.layout.defocus.shape)}) must have the height and "
@@ -139,15 +136,14 @@ class PreparedScene:
             )
         object.__setattr__(self, "tolerance", check_tolerance(self.tolerance))
 
-    def _check_denoised(self) -> None:
-        for denoised in self.denoised:
-            if not isinstance(denoised, Denoised):
-                raise ValueError(f"`denoised` (={type(denoised).__name__}) must be Denoised")
-            if denoised.shape not in (None, self.light.shape):
-                raise ValueError(
-                    f"`denoised` (shape {tuple(denoised.shape)}) must have the shape of `light`, "
-                    f"{tuple(self.light.shape)}"
-                )
+    def changed(self, **values: Any) -> PreparedScene:
+        """A copy of the same light with other values, which are known to be right.
+
+        Nothing is checked, as `dataclasses.replace` would: an environment makes one an episode.
+        """
+        copied = copy.copy(self)
+        vars(copied).update(values)
+        return copied
 
     def __repr__(self) -> str:
         _, height, width = self.light.shape
@@ -179,37 +175,36 @@ class PreparedScene:
                 part of the target's.
             gain: Light relative to this scene's.
         """
-        return self._exposure(settings, self._situation(settings, noise, gain))
+        exposure = decide(self._inputs(settings, noise, gain))
+        if exposure.source.is_zero:
+            return exposure
+        return self.blurred_light.with_remaining_noise(exposure)
 
-    def _situation(self, settings: CameraSettings, noise: bool, gain: float) -> Situation:
+    def _inputs(self, settings: CameraSettings, noise: bool, gain: float) -> TransitionInputs:
         if not isinstance(settings, CameraSettings):
             raise ValueError(f"`settings` (={settings!r}) must be CameraSettings")
-        f_number = settings.effective_f_number
-        defocus_px = motion_px = 0.0  # where there is none, this is called in sweeps for each state
-        if self.defocus:
-            defocus_px = self._disc(f_number)
+        f_number, blur = settings.effective_f_number, self.aperture_blur
+        motion_px, path, subject_path = 0.0, None, None
         if self.image_speed or self._subject_moves:
-            motion_px = self._motion(settings)
-        aperture_px, opens, opens_denoised = None, False, False
-        if self.aperture_blur is not None:
-            aperture_px = self.blurred_light.added_blur(f_number)
-            opens = f_number < self.aperture_blur.f_number
-            opens_denoised = self.aperture_blur.needs_denoised
-        return Situation(
-            min(self.gain * gain * exposure_ratio(self.reference, settings), RATIO_LIMIT),
-            self.nlf,
-            _averaged_nlf(self.camera, settings.iso, self.box_factor),
-            self.tolerance,
-            noise,
-            self.blurred_light.statistics,
-            self.blurred_light.residuals,
-            self.denoised,
-            defocus_px,
-            motion_px,
-            aperture_px,
-            opens,
-            opens_denoised,
-            self.movement.along_rows and not self._subject_moves,
+            motion_px, path, subject_path = self._motion(settings.exposure_time)
+        return TransitionInputs(
+            ratio=min(self.gain * gain * exposure_ratio(self.reference, settings), RATIO_LIMIT),
+            source=self.nlf,
+            target=_averaged_nlf(self.camera, settings.iso, self.box_factor),
+            tolerance=self.tolerance,
+            noise=noise,
+            statistics=self.blurred_light.statistics,
+            residuals=self.blurred_light.residuals,
+            networks=self.denoised_lights,
+            defocus_px=self._disc(f_number) if self.defocus else 0.0,
+            motion_px=motion_px,
+            layout=self.layout,
+            path=path,
+            subject_path=subject_path,
+            f_number=f_number,
+            aperture_px=None if blur is None else blur.extent(f_number),
+            opens=blur is not None and f_number < blur.f_number,
+            opens_denoised=blur is not None and blur.needs_denoised,
         )
 
     @property
@@ -218,14 +213,18 @@ class PreparedScene:
         subject = None if self.layout is None else self.layout.subject
         return subject is not None and self.movement.subject_speed > 0.0
 
-    def _motion(self, settings: CameraSettings) -> float:
-        """Length of the longest path at `settings` [pixel]."""
-        height = self.light.shape[-2]
-        length = self.image_speed * settings.exposure_time * height
-        if not self._subject_moves:
-            return length
-        own = self.movement.subject_path(self.image_speed, settings.exposure_time, height)
-        return max(length, own.length)
+    def _motion(self, time: float) -> tuple[float, Path | None, Path | None]:
+        """Length of the longest path in an exposure [pixel], and both paths.
+
+        That of the background is None for a streak along the rows, that of the subject where it
+        does not move on its own.
+        """
+        moment = self.image_speed, time, self.light.shape[-2]
+        length = self.image_speed * time * self.light.shape[-2]
+        if self._subject_moves:
+            own = self.movement.subject_path(*moment)
+            return max(length, own.length), self.movement.path(*moment), own
+        return length, None if self.movement.along_rows else self.movement.path(*moment), None
 
     def _disc(self, f_number: float) -> float:
         """Diameter of the defocus disc at `f_number` [pixel]."""
@@ -239,60 +238,6 @@ class PreparedScene:
             )
         return diameter
 
-    def _exposure(self, settings: CameraSettings, given: Situation) -> Exposure:
-        steps = noise_reduction, aperture, defocus, motion_blur = decide(given)
-        defocus_px = defocus.extent if defocus.runs else 0.0
-        motion_px = motion_blur.extent if motion_blur.runs else 0.0
-        opened_to = settings.effective_f_number if aperture.runs else None
-        denoised = noise_reduction.network
-        exposure = Exposure(
-            ratio=given.ratio,
-            source=self.nlf if denoised is None else NoiseLevelFunction.zero(),
-            target=given.target,
-            motion_px=motion_px,
-            defocus_px=defocus_px,
-            denoised=denoised,
-            opened_to=opened_to,
-            steps=steps,
-            **self._paths(settings, motion_px, defocus_px),
-        )
-        if exposure.source.is_zero:
-            return exposure
-        return self._with_remaining_noise(exposure)
-
-    def _paths(
-        self, settings: CameraSettings, motion_px: float, defocus_px: float
-    ) -> dict[str, Any]:
-        """Layout and paths of an exposure that has these blurs; what it does not need is None."""
-        if not motion_px and (self.layout is None or not defocus_px):
-            return {}
-        given = self.image_speed, settings.exposure_time, self.light.shape[-2]
-        own = motion_px > 0.0 and self._subject_moves
-        follows = motion_px > 0.0 and (own or not self.movement.along_rows)
-        return {
-            "layout": self.layout if own or defocus_px else None,
-            "path": self.movement.path(*given) if follows else None,
-            "subject_path": self.movement.subject_path(*given) if own else None,
-        }
-
-    def _with_remaining_noise(self, exposure: Exposure) -> Exposure:
-        """`exposure` with the shares of the source's noise variance that its blurs leave."""
-        left: torch.Tensor | None = None
-        if exposure.is_uniform:
-            energy = kernel_energy(exposure.motion_px, exposure.defocus_px)
-        else:
-            energy, left = remaining_noise(exposure, *self.light.shape[-2:])
-            left = None if left is None else left.to(self.light.device)
-        if exposure.opened_to is not None:
-            # Noise that one blur has smeared is correlated: a second, smaller one hardly averages
-            # it further. Both together leave about what the larger leaves alone.
-            opened = self.blurred_light.remaining_variance(exposure.opened_to, energy)
-            if left is None or opened is None:
-                left = opened if left is None else left
-            else:
-                left = torch.minimum(left, opened)
-        return replace(exposure, energy=energy, remaining_variance=left)
-
     def plan(
         self, settings: CameraSettings, *, noise: bool = True, gain: float = 1.0
     ) -> SimulationPlan:
@@ -303,13 +248,22 @@ class PreparedScene:
             noise: False plans `expected`, the light without noise, instead of a capture.
             gain: Light relative to this scene's.
         """
-        given = self._situation(settings, noise, gain)
-        exposure = self._exposure(settings, given)
+        exposure = self.exposure(settings, noise=noise, gain=gain)
         # A clean source lacks all of the noise: its light need not be made to see that.
-        light = self.light if exposure.source.is_zero else self.source_light(exposure)
-        balance = noise_balance(light, exposure)
+        light = self.light if exposure.source.is_zero else self.blurred_light.source(exposure)
+        return SimulationPlan(
+            settings=settings,
+            exposure=exposure,
+            errors=self.predicted_errors(settings, exposure),
+            balance=noise_balance(light, exposure),
+            clipped_source=self.saturated_share,
+        )
+
+    def predicted_errors(self, settings: CameraSettings, exposure: Exposure) -> dict[str, float]:
+        """`SimulationPlan.errors` of the exposure that `exposure` returned for `settings`."""
+        noise = exposure.inputs is None or exposure.inputs.noise
         depth = self._depth_error(settings, exposure, noise)
-        return make_plan(settings, exposure, given, balance, self.saturated_share, depth)
+        return predict_errors(exposure, self.saturated_share, depth)
 
     def _depth_error(self, settings: CameraSettings, exposure: Exposure, noise: bool) -> float:
         """Error due to a depth that is not known, in units of the target's noise.
@@ -332,14 +286,10 @@ class PreparedScene:
         if exposure.opened_to is None:
             return 0.0
         light = self.light if exposure.denoised is None else exposure.denoised.light
-        lights, white = (light, self.source_light(exposure)), 1.0 if noise else float("inf")
+        lights, white = (light, self.blurred_light.source(exposure)), 1.0 if noise else float("inf")
         sharp, opened = ((part * exposure.ratio).clamp_(max=white) for part in lights)
         wanted = noise_variance(sharp, exposure.target).clamp_(min=1e-30)
         return float(((opened - sharp).square_() / wanted).double().mean().sqrt())
-
-    def source_light(self, exposure: Exposure) -> torch.Tensor:
-        """The light (4, H, W) that `exposure` starts from, still at the reference's exposure."""
-        return self.blurred_light.source(exposure)
 
     def output_noise(self, settings: CameraSettings) -> NoiseLevelFunction:
         """Noise of a native pixel of the capture: the camera's, or the source's where that is more.
@@ -463,33 +413,28 @@ class PreparedScene:
             )
         return frames
 
-    def _frames(self, count: int, given: torch.Tensor | None) -> torch.Tensor:
-        """Memory for `count` frames, `given` if that fits."""
+    def _frames(self, count: int, out: torch.Tensor | None) -> torch.Tensor:
+        """Memory for `count` frames, `out` if that fits."""
         wanted = self.light.expand(count, *self.light.shape)
-        if given is None:
+        if out is None:
             return new_frame(wanted)
-        if not isinstance(given, torch.Tensor):
-            raise ValueError(f"`out` (={type(given).__name__}) must be a torch tensor")
-        if given.untyped_storage().data_ptr() == self.light.untyped_storage().data_ptr():
-            raise ValueError("`out` must not be the memory of the light that is exposed")
-        if (
-            given.shape != wanted.shape
-            or (given.dtype, given.device) != (torch.float32, wanted.device)
-            or not given.is_contiguous()
-            or given.requires_grad
-        ):
+        fits = isinstance(out, torch.Tensor) and out.shape == wanted.shape
+        fits = fits and (out.dtype, out.device) == (torch.float32, wanted.device)
+        if not fits or not out.is_contiguous() or out.requires_grad:
             raise ValueError(
-                f"`out` ({given.dtype}, shape {tuple(given.shape)}, on {given.device}) must be "
-                f"contiguous float32 {tuple(wanted.shape)} on {wanted.device}, without gradient"
+                f"`out` (={type(out).__name__}) must be a contiguous float32 tensor of shape "
+                f"{tuple(wanted.shape)} on {wanted.device}, without gradient"
             )
-        return given
+        if out.untyped_storage().data_ptr() == self.light.untyped_storage().data_ptr():
+            raise ValueError("`out` must not be the memory of the light that is exposed")
+        return out
 
     def stream(
         self, states: Iterable[CameraSettings], *, seed: int = 0, noise: Noise = "exact"
     ) -> Iterator[torch.Tensor]:
         """The sweep one capture (4, H, W) at a time, for frames too large to hold all at once.
 
-        A state is asked for when its frame is: the next one may depend on the last frame.
+        Each state is taken when its frame is: the next one may depend on the last frame.
 
         Args:
             states: Settings to simulate.

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from simulator.capture.residual import Residual
+from simulator.capture.statistics import Residual
 from simulator.networks.unet import UNet
 from simulator.noise.generator import frame_normals, noise_keys
 from simulator.optics.blur import box_mean

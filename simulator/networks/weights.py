@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from simulator.capture.residual import Residual
+from simulator.capture.statistics import Residual
 from simulator.networks.aperture_module import ApertureModule
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.noise_module import NoiseModule

@@ -13,7 +13,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
-from numbers import Integral
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -21,23 +20,23 @@ import torch
 from scipy.special import ndtri
 
 from simulator.settings import CameraSettings
+from simulator.utils.checks import check_integer, check_word
 from simulator.utils.compute import kernel, parallel_ranges
 
 #: How the noise of a frame is made: drawn, looked up in a bank of normals, or drawn with the rows
-#: and tails of the camera's read noise (`simulator.noise.read_noise`).
+#: and tails of the camera's read noise (`simulator.noise.noise_level_function`).
 Noise = Literal["exact", "bank", "sensor"]
 
 
 def check_noise(noise: str) -> None:
     """Raises a `ValueError` unless `noise` is a kind of noise."""
-    if noise not in get_args(Noise):
-        raise ValueError(f"`noise` (={noise!r}) must be one of {list(get_args(Noise))}")
+    check_word("noise", noise, get_args(Noise))
 
 
 def frame_normals(key: int, shape: tuple[int, ...], noise: Noise = "exact") -> np.ndarray:
     """Standard normals of a frame of `shape` (P, H, W), float32.
 
-    They are what `simulator.capture.kernels` adds, as an array: for other devices and for tests.
+    They are what `simulator.capture.sensor` adds, as an array: for other devices and for tests.
 
     Args:
         key: 64 bits, from `noise_keys`.
@@ -58,9 +57,7 @@ def noise_generator(seed: int, *key: int | float) -> torch.Generator:
         seed: Integer >= 0.
         key: Numbers that the noise differs by: the step of a training, the settings of a capture.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0")
-    words = [int(seed), *(int(np.float64(k).view(np.uint64)) for k in key)]
+    words = [check_integer("seed", seed, 0), *(int(np.float64(k).view(np.uint64)) for k in key)]
     state = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state >> np.uint64(1)))
 
@@ -126,10 +123,9 @@ def sweep_keys(seed: int, states: Sequence[CameraSettings]) -> np.ndarray:
     Raises:
         ValueError: Unless `seed` is an integer >= 0 of at most 64 bits.
     """
-    if isinstance(seed, bool) or not isinstance(seed, Integral) or not 0 <= seed < 2**64:
-        raise ValueError(f"`seed` (={seed!r}) must be an integer >= 0, below 2**64")
+    seed = check_integer("seed", seed, 0, 2**64 - 1)
     numbers = np.array([(s.iso, s.exposure_time, s.f_number) for s in states], np.float64)
-    return noise_keys(int(seed), *numbers.reshape(-1, 3).T)
+    return noise_keys(seed, *numbers.reshape(-1, 3).T)
 
 
 # -- the bank ---------------------------------------------------------------------------------

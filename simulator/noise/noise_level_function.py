@@ -1,4 +1,23 @@
-"""The noise level function: how much noise a pixel has at each signal."""
+"""Noise of a pixel: its variance at each signal, the variance that is missing, its distribution.
+
+*The missing variance*: a pixel of signal x whose source has the noise (shot1, read1) carries
+``a shot1 x + a^2 read1`` after the exposure ratio a (`NoiseLevelFunction.exposed`). To carry the
+target's noise (shot2, read2) it lacks the variance
+
+    D(x) = (read2 - a^2 read1) + (shot2 - a shot1) max(x, 0).
+
+Where D is positive, noise of that variance is added, and mean and variance are exact. Where D is
+negative the source is noisier than the target: nothing is added, and -D is the excess variance.
+A blur averages the source's noise: where it leaves only a share r of the variance, the other share
+``(1 - r) (a shot1 max(x, 0) + a^2 read1)`` is missing, too. The fused kernel for the CPU
+(`simulator.capture.sensor`) computes the same, from the same table.
+
+*The distribution of read noise*: normal and independent from pixel to pixel, unless captures ask
+for ``noise="sensor"``. Real read noise has a part that is the same along a row of the sensor, and
+tails that a Tukey-lambda distribution describes (Wei et al., "A physics-based noise formation model
+for extreme low-light raw denoising", CVPR 2020). The variance of a sensor pixel stays that of the
+noise level function: the row part is taken out of the read noise, not added.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +29,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 #: Larger variances are limited to this: float32 holds their sums over a frame of any signals.
 VARIANCE_LIMIT = 1e24
+#: Tukey's lambda whose excess kurtosis is 0, that of the normal distribution.
+_NORMAL_SHAPE = 0.13491
+#: The planes R, G1 lie in one row of the sensor, G2, B in the other.
+_ROW_OF_PLANE = (0, 0, 1, 1)
 
 
 @dataclass(frozen=True)
@@ -91,17 +115,133 @@ def _four_variances(name: str, given: Any) -> tuple[float, ...]:
 
 def nlf_tensors(
     nlf: NoiseLevelFunction, device: torch.device | str = "cpu"
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor]:
     """(shot, read), each (4, 1, 1) float32: variances reach 5e-9, so never a narrower dtype."""
     return plane_tensor(nlf.shot, device), plane_tensor(nlf.read, device)
 
 
-def plane_tensor(values: Sequence[float] | np.ndarray, device: torch.device | str) -> torch.Tensor:
+def plane_tensor(values: Sequence[float] | np.ndarray, device: torch.device | str) -> Tensor:
     """One number for each plane as (4, 1, 1) float32."""
     return torch.tensor(values, dtype=torch.float32, device=device)[:, None, None]
 
 
-def noise_variance(signal: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
+def noise_variance(signal: Tensor, nlf: NoiseLevelFunction) -> Tensor:
     """Variance ``read + shot * max(signal, 0)`` of each pixel, (..., 4, H, W) float32."""
     shot, read = nlf_tensors(nlf, signal.device)
     return signal.float().clamp(min=0.0) * shot + read
+
+
+# -- the variance that is missing -------------------------------------------------------------
+
+
+def top_up_table(
+    sources: Sequence[NoiseLevelFunction], targets: Sequence[NoiseLevelFunction]
+) -> np.ndarray:
+    """Coefficients of D for B pairs of noises, on the target's scale.
+
+    Returns:
+        (B, 4, 4) float64, columns are the planes R, G1, G2, B. The rows: shot and read noise that
+        is missing (negative where the source has more); shot and read noise of the source.
+    """
+    pairs = zip(sources, targets, strict=True)
+    rows = [t.shot + t.read + s.shot + s.read for s, t in pairs]  # flat: numpy reads them faster
+    table = np.array(rows).reshape(-1, 4, 4)
+    table[:, :2] -= table[:, 2:]  # in float64: both may be nearly the same
+    return table
+
+
+def missing_variance(
+    signal: Tensor, table: np.ndarray, remaining_variance: Tensor | None = None
+) -> Tensor:
+    """D(x) of each pixel; negative where the source is noisier.
+
+    Args:
+        signal: (..., 4, H, W) on the target's scale, or one plane of it, (..., H, W).
+        table: (4, 4), one entry of `top_up_table`, or (4,), its column for that plane.
+        remaining_variance: (H, W) share of the source's variance that a blur has left; None for
+            all of it.
+
+    Returns:
+        float32, of the shape of `signal`.
+    """
+    shot, read, source_shot, source_read = (
+        plane_tensor(row, signal.device) if row.ndim else row.item() for row in table
+    )
+    bright = signal.float().clamp(min=0.0)
+    missing = (bright * shot).add_(read)
+    if remaining_variance is not None:
+        missing += (1.0 - remaining_variance) * (bright * source_shot + source_read)
+    return missing
+
+
+# -- the distribution of read noise -----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ReadNoise:
+    """Distribution of the read noise of averages of k x k sensor pixels.
+
+    Args:
+        row: Standard deviation of the part that a row shares, relative to that of all read noise of
+            one sensor pixel; in [0, 1).
+        shape: Tukey's lambda of the rest; 0.135 is nearly normal, less has longer tails. In
+            (-0.25, 1], where the kurtosis is finite.
+        box_factor: k.
+    """
+
+    row: float
+    shape: float
+    box_factor: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.row < 1.0:
+            raise ValueError(f"`row` (={self.row!r}) must be in [0, 1)")
+        if not -0.25 < self.shape <= 1.0:
+            raise ValueError(f"`shape` (={self.shape!r}) must be in (-0.25, 1]")
+
+    def row_part(self, variance: Tensor, normals: Tensor) -> Tensor:
+        """The part that rows share, (..., 4, H, 1).
+
+        An average over k x k pixels has k rows: it keeps 1/k of their variance, where independent
+        noise keeps 1/k^2. The larger k, the more the rows show.
+
+        Args:
+            variance: (4, 1, 1) of all read noise of the averages, as independent noise has it.
+            normals: (..., 2, H) standard normals.
+        """
+        return (variance * self.box_factor).sqrt() * self.row * normals[..., _ROW_OF_PLANE, :, None]
+
+    def pixel_part(self, variance: Tensor, normals: Tensor) -> Tensor:
+        """The part of each pixel, (..., 4, H, W).
+
+        Args:
+            variance: Its variance: ``1 - row ** 2`` of that of all read noise.
+            normals: (..., 4, H, W) standard normals.
+        """
+        return variance.sqrt() * tukey_lambda(normals, averaged_shape(self.shape, self.box_factor))
+
+
+def tukey_lambda(normals: Tensor, shape: float) -> Tensor:
+    """Standard normals as draws of a Tukey-lambda distribution of mean 0 and variance 1."""
+    from scipy.stats import tukeylambda  # not above: it takes half a second
+
+    x = normals.double()
+    below, above = torch.special.log_ndtr(x), torch.special.log_ndtr(-x)
+    if shape != 0.0:  # Q(p) = (p^lambda - (1 - p)^lambda) / lambda, log(p / (1 - p)) at its limit
+        below, above = torch.expm1(shape * below) / shape, torch.expm1(shape * above) / shape
+    return ((below - above) / math.sqrt(tukeylambda.var(shape))).to(normals.dtype)
+
+
+@functools.cache
+def averaged_shape(shape: float, k: int) -> float:
+    """Tukey's lambda of the mean of k x k draws: that of its excess kurtosis, 1/k^2 of one's."""
+    from scipy.optimize import brentq
+    from scipy.stats import tukeylambda
+
+    def kurtosis(value: float) -> float:
+        return float(tukeylambda.stats(value, moments="k"))
+
+    wanted = kurtosis(shape) / k**2
+    if k == 1 or abs(wanted) < 1e-3:
+        return shape if k == 1 else _NORMAL_SHAPE
+    return float(brentq(lambda value: kurtosis(value) - wanted, shape, _NORMAL_SHAPE))

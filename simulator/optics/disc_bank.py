@@ -18,9 +18,8 @@ import torch
 from scipy.signal import fftconvolve
 from torch import Tensor
 
-from simulator.optics.blur import disc_blur
+from simulator.optics.blur import Blur, blur_many, disc_blur, disc_kernel
 from simulator.optics.motion_path import Taps
-from simulator.optics.shapes import disc_kernel
 from simulator.raw.image import new_frame
 from simulator.utils.compute import addresses, as_pointer, kernel, parallel_ranges
 
@@ -60,17 +59,6 @@ class DiscBank:
             self._levels[index] = disc_blur(self._levels[0], DIAMETERS[index])
         return self._levels[index]
 
-    def _blur(self, indices: list[int]) -> None:
-        """Makes several levels side by side, which wakes the other threads once."""
-        if not indices:
-            return
-        from simulator.optics.blur_kernels import Blur, blur_many
-
-        image = self._levels[0].contiguous()
-        made = {index: torch.empty_like(image) for index in indices}
-        blur_many([Blur(image, DIAMETERS[index], level) for index, level in made.items()])
-        self._levels |= made
-
     def blurred(self, diameter: Tensor, out: Tensor | None = None) -> Tensor:
         """The image blurred by `diameter`, differentiable in it.
 
@@ -82,9 +70,13 @@ class DiscBank:
         """
         image, frame = self._levels[0], _frame_of(diameter)
         if frame is not None and frame.shape == image.shape[-2:] and _has_kernels(image):
-            indices = needed(frame, _KNOTS)
-            self._blur([index for index in indices if index not in self._levels])
-            return blend({index: self._levels[index] for index in indices}, frame, _KNOTS, out)
+            indices = needed(frame)
+            light = image.contiguous()
+            made = {i: torch.empty_like(light) for i in indices if i not in self._levels}
+            # Several levels side by side wake the other threads once.
+            blur_many([Blur(light, DIAMETERS[index], level) for index, level in made.items()])
+            self._levels |= made
+            return blend({index: self._levels[index] for index in indices}, frame, out)
         return self._blended(diameter.square().clamp(max=DIAMETERS[-1] ** 2))
 
     def _blended(self, squared: Tensor) -> Tensor:
@@ -108,24 +100,16 @@ def remaining_variance(diameter: Tensor, taps: Taps | None = None) -> Tensor:
         taps: Of a motion behind the discs; None for none.
     """
     products = _kernel_products() if taps is None else _moved_products(taps, diameter)
-    frame = _frame_of(diameter)
-    if frame is not None:
-        return piecewise(frame, _KNOTS, products).reshape(diameter.shape)
-    return _remaining(diameter, products)
-
-
-def _remaining(diameter: Tensor, products: np.ndarray) -> Tensor:
-    """`remaining_variance` on any device."""
-    energy = torch.from_numpy(products).to(diameter)
-    knots = torch.from_numpy(_KNOTS).to(diameter)
-    squared = diameter.square().clamp(max=DIAMETERS[-1] ** 2)
-    index = torch.searchsorted(knots[1:-1], squared, right=True)  # of the smaller disc
-    same, both = energy.diagonal(), energy.diagonal(1)
-    share = (squared - knots[index]) / knots.diff()[index]
-    rest = 1.0 - share
-    return rest.square() * same[index] + share * (
-        2.0 * rest * both[index] + share * same[index + 1]
+    ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
+    frame = diameter.detach().float().cpu().reshape(-1, *diameter.shape[-1:] or (1,))
+    out = torch.empty(frame.shape)
+    fixed = (frame.contiguous().numpy(), _KNOTS.astype(np.float32), ends.astype(np.float32))
+    parallel_ranges(
+        lambda first, last: _evaluate(first, last, *fixed, out.numpy()),
+        len(frame),
+        least=1 + _WORTH_A_THREAD // frame.shape[1],
     )
+    return out.reshape(diameter.shape).to(diameter)
 
 
 def _has_kernels(image: Tensor) -> bool:
@@ -319,63 +303,30 @@ def _sum_products(correlations, rows, columns, weights, products):  # type: igno
                         products[i, i + 1] += both * correlations[i, 1, y, x]
 
 
-def needed(diameter: torch.Tensor, knots: np.ndarray) -> list[int]:
-    """Indexes of the images that a blend reads, ascending: none far from every pixel's diameter.
-
-    Args:
-        diameter: (H, W) float32 on the CPU [pixel].
-        knots: (K,) squared diameters of the images, ascending.
-    """
-    used = np.zeros(len(knots), np.bool_)
-    _mark(diameter.contiguous().numpy(), knots.astype(np.float32), used)
+def needed(diameter: Tensor) -> list[int]:
+    """Indexes of the images that a blend by `diameter` (H, W) reads, ascending."""
+    used = np.zeros(len(_KNOTS), np.bool_)
+    _mark(diameter.contiguous().numpy(), _KNOTS.astype(np.float32), used)
     return [int(index) for index in np.flatnonzero(used)]
 
 
-def blend(
-    images: Mapping[int, torch.Tensor],
-    diameter: torch.Tensor,
-    knots: np.ndarray,
-    out: torch.Tensor | None = None,
-) -> torch.Tensor:
+def blend(images: Mapping[int, Tensor], diameter: Tensor, out: Tensor | None = None) -> Tensor:
     """Interpolates between images in the squared diameter; see `DiscBank.blurred`.
 
     Args:
         images: (..., H, W) float32 on the CPU, by index, as many as are `needed`.
         diameter: (H, W) float32 [pixel].
-        knots: (K,) squared diameters of the images, ascending.
         out: See `DiscBank.blurred`.
     """
     whole = {index: image.contiguous() for index, image in images.items()}
     anything = next(iter(whole.values()))  # images without a share are read too, times 0
-    table = addresses([whole.get(index, anything) for index in range(len(knots))])
+    table = addresses([whole.get(index, anything) for index in range(len(_KNOTS))])
     out = new_frame(anything) if out is None else out
-    fixed = (diameter.contiguous().numpy(), knots.astype(np.float32), table, out.numel())
+    fixed = (diameter.contiguous().numpy(), _KNOTS.astype(np.float32), table, out.numel())
     result = out.numpy().reshape(-1, *out.shape[-2:])
     parallel_ranges(
         lambda first, last: _blend(first, last, *fixed, result),
         out.shape[-2],
         least=1 + _WORTH_A_THREAD // out.shape[-1],
-    )
-    return out
-
-
-def piecewise(diameter: torch.Tensor, knots: np.ndarray, products: np.ndarray) -> torch.Tensor:
-    """Sum of squared weights of blended kernels; see `remaining_variance`.
-
-    Args:
-        diameter: (H, W) float32 on the CPU [pixel].
-        knots: (K,) squared diameters of the kernels, ascending.
-        products: (K, K) sums of products of the weights of each kernel and itself or its successor.
-
-    Returns:
-        (H, W) float32.
-    """
-    ends = np.stack([products.diagonal()[:-1], products.diagonal(1), products.diagonal()[1:]], 1)
-    out = torch.empty(diameter.shape)
-    fixed = (diameter.contiguous().numpy(), knots.astype(np.float32), ends.astype(np.float32))
-    parallel_ranges(
-        lambda first, last: _evaluate(first, last, *fixed, out.numpy()),
-        len(diameter),
-        least=1 + _WORTH_A_THREAD // diameter.shape[1],
     )
     return out

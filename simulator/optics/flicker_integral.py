@@ -14,6 +14,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike
 
+from simulator.utils.checks import check_integer, check_number
+
 #: Shortest and longest exposure [s], and how far from 0 a moment may lie [s]: periods are counted
 #: in whole numbers, and no product of the following leaves the range of float64.
 _SHORTEST, _LONGEST = 1e-12, 1e9
@@ -35,13 +37,7 @@ class Lamp:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not number or not math.isfinite(value):
-                raise ValueError(f"`{field.name}` (={value!r}) must be a finite number")
-            low, high = _RANGES[field.name]
-            if not low <= value <= high:
-                raise ValueError(f"`{field.name}` (={value!r}) must be in [{low:g}, {high:g}]")
+            check_number(field.name, getattr(self, field.name), *_RANGES[field.name])
 
     def mean_light(self, start: ArrayLike, exposure_time: float) -> np.ndarray:
         """Mean light of exposures.
@@ -54,13 +50,9 @@ class Lamp:
             (...) float64, relative to the lamp's long-term mean.
         """
         start = np.asarray(start, np.float64)
-        time = float(exposure_time)
+        time = check_number("exposure_time", exposure_time, _SHORTEST, _LONGEST, more=" s")
         if not (np.abs(start) <= _LONGEST).all():
             raise ValueError(f"`start` must be finite, in [{-_LONGEST:g}, {_LONGEST:g}] s")
-        if not _SHORTEST <= time <= _LONGEST:
-            raise ValueError(
-                f"`exposure_time` (={exposure_time!r}) must be in [{_SHORTEST:g}, {_LONGEST:g}] s"
-            )
         return self._mean(start, time)
 
     def _mean(self, start: np.ndarray, time: float) -> np.ndarray:
@@ -84,11 +76,9 @@ class Lamp:
         Raises:
             ValueError: If there are no rows, or too many, or time goes backwards.
         """
-        for name, value, most in (("rows", rows, 2**20), ("sensor_rows", sensor_rows, 2**12)):
-            if not isinstance(value, int | np.integer) or not 1 <= value <= most:
-                raise ValueError(f"`{name}` (={value!r}) must be an integer in [1, {most}]")
-        if not 0.0 <= row_time <= _LONGEST:
-            raise ValueError(f"`row_time` (={row_time!r}) must be in [0, {_LONGEST:g}] s")
+        check_integer("rows", rows, 1, 2**20)
+        check_integer("sensor_rows", sensor_rows, 1, 2**12)
+        check_number("row_time", row_time, 0.0, _LONGEST, more=" s")
         begins = start + row_time * np.arange(rows * sensor_rows)
         return self.mean_light(begins, exposure_time).reshape(rows, sensor_rows).mean(axis=1)
 

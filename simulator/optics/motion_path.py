@@ -2,7 +2,7 @@
 
 The shake of a camera has a direction that turns; a subject may move on its own besides. The part of
 the path that is traversed during an exposure is rasterised into a few weighted shifts (taps), whose
-sum is the blurred image. Taps are widened as the streaks of `simulator.optics.shapes` are: along
+sum is the blurred image. Taps are widened as the streaks of `simulator.optics.blur` are: along
 both axes their second moment is that of the path. Borders are replicated.
 """
 
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from simulator.optics.shapes import streak_share
+from simulator.optics.blur import streak_share
 from simulator.utils.compute import kernel, parallel_ranges
 
 #: Points of a path, per pixel of its length and at most: longer ones are sampled more coarsely.
@@ -158,7 +158,7 @@ def path_taps(path: Path, height: int, width: int) -> Taps:
 
 
 def _streak_taps(extent_px: float, width: int) -> Taps:
-    """The taps of a streak along the rows, as `simulator.optics.shapes.motion_kernel` has them."""
+    """The taps of a streak along the rows, as `simulator.optics.blur.motion_kernel` has them."""
     n, end = streak_share(abs(extent_px))
     weights = np.ones(2 * n + 3)
     weights[0] = weights[-1] = end
@@ -309,15 +309,13 @@ def path_blur(
     """Motion along a path; the borders are replicated.
 
     Args:
-        light: (P, H, W) float32.
+        light: (P, H, W) float32; on another device than the CPU, it is blurred here all the same.
         taps: Of the path on frames of H x W.
-        out: Contiguous tensor like `light` to write to, instead of a new one; on the CPU only.
+        out: Contiguous tensor on the CPU to write to, instead of a new one.
         limit: Light beyond it, on either side of 0, is clipped before it is blurred.
     """
-    if not light.is_cpu:
-        return _shifted_sum(light.clamp(-limit, limit), taps)
     out = torch.empty(light.shape) if out is None else out
-    planes, result = light.contiguous().numpy(), out.numpy()
+    planes, result = light.cpu().contiguous().numpy(), out.numpy()
     parallel_ranges(
         lambda first, last: _blur_rows(
             planes[first:last], *taps, np.float32(limit), result[first:last]
@@ -325,7 +323,7 @@ def path_blur(
         len(planes),
         least=1 + _WORTH_A_THREAD // planes[0].size,
     )
-    return out
+    return out.to(light.device)
 
 
 def path_blur_apart(
@@ -352,28 +350,12 @@ def path_blur_apart(
         out: See `path_blur`.
         limit: See `path_blur`.
     """
-    if not light.is_cpu:
-        light, mask = light.clamp(-limit, limit), mask.to(light.device)
-        background = light.flatten(1)[:, behind.to(light.device).flatten()].reshape(light.shape)
-        seen = (1.0 - _shifted_sum(mask, own)).clamp(min=0.0)
-        return seen * _shifted_sum(background, taps) + _shifted_sum(mask * light, own)
     out = torch.empty(light.shape) if out is None else out
-    planes, result = light.contiguous().numpy(), out.numpy()
+    planes, result = light.cpu().contiguous().numpy(), out.numpy()
     fixed = (mask.numpy(), behind.numpy(), tuple(taps), tuple(own), np.float32(limit))
     parallel_ranges(
         lambda first, last: _blur_apart(planes[first:last], *fixed, result[first:last]),
         len(planes),
         least=1 + _WORTH_A_THREAD // planes[0].size,
     )
-    return out
-
-
-def _shifted_sum(light: torch.Tensor, taps: Taps) -> torch.Tensor:
-    """`path_blur` on any device."""
-    height, width = light.shape[-2:]
-    y, x = (torch.arange(size, device=light.device) for size in (height, width))
-    total = torch.zeros_like(light)
-    for row, column, weight in zip(*(values.tolist() for values in taps), strict=True):
-        shifted = light[..., (y + row).clamp(0, height - 1), :]
-        total += weight * shifted[..., (x + column).clamp(0, width - 1)]
-    return total
+    return out.to(light.device)

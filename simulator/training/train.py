@@ -25,7 +25,7 @@ from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from simulator.camera import get_camera, list_cameras
-from simulator.capture.residual import BLOCK, Residual, ResidualStatistics, wiener_error
+from simulator.capture.statistics import BLOCK, Residual, ResidualStatistics, wiener_error
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.networks.weights import build_modules, load_modules, save_modules
 from simulator.noise.noise_level_function import NoiseLevelFunction

@@ -13,8 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from simulator.camera import BayerPattern, CameraProfile, get_camera, list_cameras
-from simulator.noise.noise_level_function import NoiseLevelFunction
-from simulator.noise.read_noise import ReadNoise
+from simulator.noise.noise_level_function import NoiseLevelFunction, ReadNoise
 from tests.simulator.z6_noise import z6_noise
 from tests.strategies import log_uniform
 

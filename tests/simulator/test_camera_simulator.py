@@ -27,8 +27,8 @@ from simulator import (
     exposure_ratio,
     get_camera,
 )
-from simulator.capture.aperture_blur import MapApertureBlur, NetworkApertureBlur
-from simulator.capture.residual import Residual
+from simulator.capture.blurred_light import MapApertureBlur, NetworkApertureBlur
+from simulator.capture.statistics import Residual
 from simulator.networks.exposure_module import ExposureModule
 from simulator.networks.weights import save_modules
 from simulator.optics.blur import disc_blur, motion_blur
@@ -293,7 +293,7 @@ def test_preparing_runs_each_network_once(
     for settings in (CLEANER, SOURCE, OPENER, CLEANER):
         assert made.simulate(prepared, settings).data.isfinite().all()
     assert calls == ["denoise", "estimate_defocus"][: 2 if preset == "compact" else 1]
-    (denoised,) = prepared.denoised
+    (denoised,) = prepared.denoised_lights
     assert (denoised.name, denoised.operations) == (preset, 18 * 21 * made.noise.operations)
     assert denoised.seconds() > 0
     assert not torch.equal(denoised.light, prepared.light)
@@ -312,7 +312,7 @@ def test_frames_are_denoised_and_mapped_in_tiles(
 
     monkeypatch.setattr(camera_simulator, "in_tiles", partial(in_tiles, tile=64))
     denoised = compact.denoise(prepared)
-    torch.testing.assert_close(denoised, prepared.denoised[0].light, atol=1e-4, rtol=0)
+    torch.testing.assert_close(denoised, prepared.denoised_lights[0].light, atol=1e-4, rtol=0)
     torch.testing.assert_close(compact.estimate_defocus(prepared), defocus, atol=1e-3, rtol=0)
 
 
@@ -340,7 +340,7 @@ def test_saturated_and_black_parts_need_no_network(
     off, change = ((a - expected)[:, ~clipped].std() for a in (result, data))
     assert 0 < float(off) < 0.25 * float(change)
     assert not torch.equal(expected[:, clipped], data[:, clipped])
-    tolerant = replace(tolerant, denoised=everywhere.denoised)
+    tolerant = replace(tolerant, denoised_lights=everywhere.denoised_lights)
     found = [compact.estimate_defocus(prepared) for prepared in (everywhere, tolerant)]
     assert float(found[1][:544, :704].max()) == 0.0  # no disc of 32 px reaches anything from here
     torch.testing.assert_close(found[1][~clipped], found[0][~clipped], rtol=0, atol=1e-3)

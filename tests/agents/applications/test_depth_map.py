@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from agents.applications.depth_map import read_depth
+from agents.applications.refocus import read_depth
 
 MAP = np.array([[500, 1000, 0], [2000, 4000, 65535]], np.uint16)
 

@@ -5,8 +5,15 @@ import numpy as np
 import pytest
 import torch
 
-from agents.applications.exposure_fusion import _weight, fuse
-from agents.applications.hdr import bracket_exposures, developed, hdr_picture, linear_rgb, write_exr
+from agents.applications.hdr import (
+    _weight,
+    bracket_exposures,
+    expose_and_develop,
+    fuse,
+    hdr_picture,
+    linear_rgb,
+    write_exr,
+)
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 
 CAMERA = get_camera("nikon_z6")
@@ -87,9 +94,9 @@ def test_shadows_and_highlights_of_a_raw_show_their_detail() -> None:
 
 def test_the_sensor_clips_each_picture() -> None:
     raw = RawImage(torch.full((4, 8, 8), 0.5), SETTINGS, CAMERA)
-    assert developed(raw, 2.0).min() == 1.0
-    assert developed(raw, -2.0).equal(
-        developed(RawImage(torch.full((4, 8, 8), 0.125), SETTINGS, CAMERA))
+    assert expose_and_develop(raw, 2.0).min() == 1.0
+    assert expose_and_develop(raw, -2.0).equal(
+        expose_and_develop(RawImage(torch.full((4, 8, 8), 0.125), SETTINGS, CAMERA))
     )
 
 

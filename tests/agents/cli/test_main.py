@@ -1,30 +1,26 @@
+"""The program as a whole: help, errors, exit statuses, and the two commands about itself."""
+
 import importlib.metadata
 import re
-import runpy
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from agents.cli import bench, console
 from agents.cli import main as cli
+from simulator.capture.plan import DEFAULT_TOLERANCE
+from tests.simulator.training.captures import write_dataset
 
-COMMANDS = [
-    "bench",
-    "cache",
-    "evaluate",
-    "export",
-    "film",
-    "quickstart",
-    "record",
-    "scenes",
-    "scorers",
-    "simulate",
-    "sweep",
-    "train",
-]
-COMMANDS += ["hdr", "refocus", "train-simulator", "score-tables", "view"]
-COMMANDS += ["warm-up"]
+COMMANDS = (
+    *("bench", "cache", "evaluate", "export", "film", "hdr"),
+    *("quickstart", "record", "refocus", "scenes", "score-tables", "scorers", "simulate", "sweep"),
+    *("train", "train-simulator", "view", "warm-up"),
+)
 #: Those that write no folder of results, and those that draw nothing at random.
 NO_OUT = ("cache", "scenes", "scorers", "view", "warm-up")
 NO_SEED = (*NO_OUT, "export", "hdr")
@@ -62,26 +58,49 @@ def test_help_has_an_example_and_out(command: str) -> None:
     assert ("--seed" in text) == (command not in NO_SEED)
 
 
-def test_the_version_is_that_of_the_distribution(ae_env) -> None:
-    code, out, _ = ae_env("--version")
-    assert (code, out.strip()) == (0, f"ae-env {importlib.metadata.version('ae-env')}")
+def test_help_and_usage_errors_load_nothing_heavy(tmp_path: Path) -> None:
+    """One fresh interpreter answers them all and says what it has loaded."""
+    asked = [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)]
+    wrong = [["nonsense"], ["simulate", "a.dng"], ["sweep", "a.dng", "--nonsense"]]
+    wrong += [["evaluate", "--frames", "0"], ["bench", "throughput", "--seed", str(2**63)]]
+    code = f"""
+import sys
+from agents.cli.main import main
+for arguments in {asked + wrong}:
+    sys.argv = ["ae-env", *arguments]
+    try:
+        main()
+    except SystemExit as stop:
+        print("status", stop.code or 0)
+print("loaded", *sys.modules)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    statuses = re.findall(r"^status (\d)$", run.stdout, re.MULTILINE)
+    assert statuses == ["0"] * len(asked) + ["2"] * len(wrong)
+    assert run.stderr.count("Usage: ae-env") == len(wrong)
+    listed = run.stdout.partition("status")[0]
+    assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", listed, re.MULTILINE)) == list(COMMANDS)
+    assert f"ae-env {importlib.metadata.version('ae-env')}\n" in run.stdout
+    loaded = run.stdout.rpartition("\nloaded ")[2].split()
+    heavy = {"torch", "numba", "gymnasium", "numpy", "pandas", "matplotlib", "scipy", "nicegui"}
+    assert not heavy & set(loaded)
 
 
-def test_the_package_runs_as_the_program(ae_env, capsys, monkeypatch) -> None:
-    code, out, _ = ae_env("--help")
-    assert code == 0
-    assert sorted(re.findall(r"^. ([a-z][a-z-]*) ", out, re.MULTILINE)) == sorted(COMMANDS)
-    monkeypatch.setattr("sys.argv", ["agents.cli", "--help"])
-    with pytest.raises(SystemExit):
-        runpy.run_module("agents.cli", run_name="__main__")
-    assert capsys.readouterr().out == out
+def test_the_package_runs_as_the_program() -> None:
+    command = [sys.executable, "-m", "agents.cli", "--version"]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert run.stdout.startswith("ae-env ")
+
+
+def test_the_default_tolerance_is_the_simulator_s() -> None:
+    assert console.TOLERANCE == DEFAULT_TOLERANCE
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("simulate", "none.dng", *SIMULATE), "`path` (='none.dng') does not exist"),
-        (("simulate", "picture.png", *SIMULATE), "PNG"),
+        (("simulate", "picture.png", *SIMULATE), "must be a camera raw"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--iso", "-3"), "`iso` (=-3.0) must be"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
@@ -161,13 +180,85 @@ def test_failures_while_running(ae_env, dng, monkeypatch, raised, status, messag
     assert message in error
 
 
-def test_usage_errors(ae_env) -> None:
-    for arguments in (
-        ("simulate", "a.dng"),
-        ("simulate", "a.dng", *SIMULATE, "--seed", 2**63),
-        ("evaluate", "--policy", "random", "--frames", 0),
-        ("nonsense",),
-    ):
-        code, _, error = ae_env(*arguments)
-        assert code == 2
-        assert "Usage: ae-env" in error
+# -- bench and cache ------------------------------------------------------------------------------
+
+OURS = """
+def run(out, *, seed, quick):
+    out.mkdir()
+    (out / 'ours').write_text(f'{seed} {quick}')
+"""
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    for folder, code in (("checkout", OURS), ("mine", "raise RuntimeError('not ours')")):
+        (tmp_path / folder / "benchmarks").mkdir(parents=True)
+        (tmp_path / folder / "benchmarks" / "__init__.py").write_text("")
+        (tmp_path / folder / "benchmarks" / "convergence.py").write_text(code)
+    loaded = {name: sys.modules.pop(name) for name in list(sys.modules) if "benchmarks" in name}
+    monkeypatch.syspath_prepend(tmp_path / "mine")  # takes back what is added to the path, too
+    monkeypatch.setattr(bench, "CHECKOUT", tmp_path / "checkout")
+    yield
+    for name in [name for name in sys.modules if "benchmarks" in name]:
+        del sys.modules[name]
+    sys.modules.update(loaded)
+
+
+def test_the_working_folder_does_not_matter(ae_env, folders, tmp_path):
+    code, _, _ = ae_env("bench", "convergence", "--quick", "--seed", 3, "--out", "here")
+    assert code == 0
+    assert (tmp_path / "here" / "ours").read_text() == "3 True"
+
+
+def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "CHECKOUT", tmp_path / "site-packages")
+    code, _, error = ae_env("bench", "throughput")
+    assert code == 2
+    assert "the benchmarks are not part of the installed package" in error
+    assert "pip install -e ." in error
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "words"),
+    [("throughput", "agents", "an option of transfer only"), ("transfer", "table", "tables")],
+)
+def test_parts_are_those_of_transfer(ae_env, name, part, words):
+    code, _, error = ae_env("bench", name, "--part", part)
+    assert code == 2
+    assert words in error
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("recorded", "nope"), ("paper", "nope"), ("paper", "data", "--weights", "nope")],
+    ids=" ".join,
+)
+def test_what_is_refused_leaves_no_folder(ae_env, arguments, tmp_path):
+    write_dataset(tmp_path / "data")
+    for out in ((), ("--out", "here")):
+        code, _, error = ae_env("bench", *arguments, *out)
+        assert code == 2, error
+        assert "nope" in error
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_cache_is_shown_and_cleared(ae_env, tmp_path: Path, monkeypatch) -> None:
+    folder = tmp_path / "kept [1]"
+    monkeypatch.setenv("AE_ENV_CACHE", str(folder))
+    (folder / "scenes").mkdir(parents=True)
+    for i in range(2):
+        (folder / "scenes" / f"bundled-train-64-{i:024d}.safetensors").write_bytes(b"x" * 1000)
+    (folder / "denoised").mkdir()
+    (folder / "denoised" / f"{5:024d}.safetensors").write_bytes(b"x" * 123)
+    (folder / "denoised" / "mine.safetensors").write_bytes(b"x")
+    expected = {"scenes": ["2", "2,000"], "denoised": ["1", "123"]}
+    for arguments in ((), ("--clear",)):
+        code, out, _ = ae_env("cache", *arguments)
+        assert code == 0
+        for kind, numbers in expected.items():
+            (line,) = (text for text in out.splitlines() if f" {kind} " in text)
+            assert re.findall(r"[\d,]+", line) == numbers
+        assert str(folder) in out.replace("\n", "")
+    assert [p.name for p in folder.rglob("*.safetensors")] == ["mine.safetensors"]
+    code, out, _ = ae_env("cache")
+    assert "1 " not in out.replace("kept [1]", "")

@@ -1,3 +1,6 @@
+"""One raw in: simulate, sweep, refocus and hdr."""
+
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,3 +143,107 @@ def test_networks_run_once_for_a_raw(
     for written in ("{}.dng", "{}/contact_sheet.png"):
         first, second = (Path(written.format(run)) for run in ("first", "second"))
         assert first.read_bytes() == second.read_bytes()
+
+
+def test_refocus_with_a_depth_map(ae_env, raw: RawImage, dng: Path, tmp_path: Path) -> None:
+    depth = np.full(raw.data.shape[-2:], 9.0, np.float32)
+    depth[:, :60] = 2.0
+    np.save(tmp_path / "depth.npy", depth)
+    given = ("--depth", tmp_path / "depth.npy", "--focal-length", 50, "--focus", "2.0")
+    given = (*given, "--weights", "none")
+    out, png = tmp_path / "new" / "out.dng", tmp_path / "out.png"
+    code, text, _ = ae_env("refocus", dng, "--aperture", 1.4, *given, "-o", out, "--png", png)
+    assert code == 0
+    assert "depth given" in text
+    back = read_raw(out)
+    assert back.settings.f_number == 1.4
+    assert back.settings.exposure_time == pytest.approx(raw.settings.exposure_time / 16, rel=1e-3)
+    assert np.array_equal(back.to_mosaic()[:, :120], read_raw(dng).to_mosaic()[:, :120])
+    assert not np.array_equal(back.to_mosaic()[:, 120:], read_raw(dng).to_mosaic()[:, 120:])
+    with Image.open(png) as picture:
+        assert picture.size == (240, 200)
+    before = out.read_bytes()
+    ae_env("refocus", dng, "--aperture", 1.4, *given[:-4], "--focus", "5,5", *given[-2:], "-o", out)
+    assert out.read_bytes() == before  # the pixel lies at 2 m
+
+
+def test_a_depth_map_is_upright_as_the_picture(ae_env, raw: RawImage, tmp_path: Path) -> None:
+    depth = np.full(raw.data.shape[-2:], 9.0, np.float32)
+    depth[:40, :60] = 2.0
+    backs = []
+    for name, held, shown in (
+        ("level", raw, depth),
+        ("held", replace(raw, metadata={"flip": 6}), np.rot90(depth, -1)),  # a quarter, clockwise
+    ):
+        write_dng(tmp_path / f"{name}.dng", held)
+        np.save(tmp_path / f"{name}.npy", shown)
+        row, column = np.argwhere(shown == 2.0)[-1]
+        given = ("--depth", tmp_path / f"{name}.npy", "--focus", f"{column},{row}")
+        given = (*given, "--focal-length", 50, "--aperture", 1.4, "--weights", "none")
+        out = tmp_path / f"{name}-out.dng"
+        code, _, error = ae_env("refocus", tmp_path / f"{name}.dng", *given, "-o", out)
+        assert code == 0, error
+        backs.append(read_raw(out).to_mosaic())
+    assert np.array_equal(*backs)
+
+
+def test_hdr(ae_env, dng: Path, tmp_path: Path) -> None:
+    openexr = pytest.importorskip("OpenEXR")
+    out, png = tmp_path / "out.exr", tmp_path / "out.png"
+    code, text, _ = ae_env("hdr", dng, "-o", out, "--png", png, "--stops", 2, "--weights", "none")
+    assert code == 0
+    assert "fused 9 simulated pictures, -2 to +2 EV" in text
+    with openexr.File(str(out)) as file:
+        assert file.channels()["RGB"].pixels.shape == (100, 120, 3)
+    with Image.open(png) as picture:
+        assert picture.size == (240, 200)
+
+
+@pytest.fixture
+def others(raw: RawImage, tmp_path: Path) -> None:
+    """Files that do not fit `dng`: depth maps, a photo, and a raw of an unknown camera."""
+    Image.new("L", (8, 8), 9).save(tmp_path / "small.png")
+    Image.new("L", (120, 100), 9).save(tmp_path / "depth.png")
+    np.save(tmp_path / "fits.npy", np.ones((100, 120)))
+    Image.new("RGB", (8, 8)).save(tmp_path / "photo.jpg")
+    nameless = replace(raw, camera=replace(raw.camera, make="X", model="Y", pixel_pitch_um=None))
+    write_dng(tmp_path / "nameless.dng", nameless)
+
+
+OPEN = ("--aperture", "1.4")
+SMALL, FITS = (("--depth", name, "--focal-length", "3") for name in ("small.png", "fits.npy"))
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (("refocus", "IMG_1.dng", "--aperture", "8"), ["`aperture` (=8)", "5.6"]),
+        (("refocus", "IMG_1.dng", "--aperture", "wide"), ["`aperture`"]),
+        (("refocus", "IMG_1.dng", *OPEN, "--depth", "depth.png", "--png", "depth.png"), ["`png`"]),
+        (("refocus", "IMG_1.dng", *OPEN, "--depth-kind", "disparity"), ["`depth-kind`"]),
+        (("refocus", "IMG_1.dng", *OPEN, *SMALL, "--depth-kind", "far"), ["`depth-kind`"]),
+        (("refocus", "IMG_1.dng", *OPEN, *SMALL, "--focal-length", "-3"), ["`focal-length` (=-3)"]),
+        (("refocus", "IMG_1.dng", *OPEN, *SMALL[:2]), ["`focal-length` (=None)"]),
+        (("refocus", "IMG_1.dng", *OPEN, *FITS, "--focus", "0.001"), ["`focus` (=0.001)"]),
+        (("refocus", "IMG_1.dng", *OPEN, *SMALL, "--focus", "9,9"), ["`focus`", "8 x 8"]),
+        (("refocus", "IMG_1.dng", *OPEN, *SMALL, "--focus", "far"), ["`focus`", "8 x 8"]),
+        (("refocus", "IMG_1.dng", *OPEN, "--focus", "2"), ["`focus`", "`--depth`"]),
+        (("refocus", "IMG_1.dng", *OPEN, *SMALL), ["`depth`", "(100, 120) or (200, 240)"]),
+        (("refocus", "IMG_1.dng", *OPEN, "--depth", "no.png"), ["`depth`", "no.png"]),
+        (("refocus", "IMG_1.dng", *OPEN, "--weights", "none"), ["`depth`", "networks"]),
+        (("refocus", "nameless.dng", *OPEN, *FITS), ["`--pixel-pitch`"]),
+        (("refocus", "photo.jpg", *OPEN), ["photo.jpg"]),
+        (("hdr", "IMG_1.dng", "--stops", "0"), ["`stops`"]),
+        (("hdr", "IMG_1.dng", "--step", "9"), ["`step`"]),
+        (("hdr", "photo.jpg"), ["photo.jpg"]),
+    ],
+    ids=lambda value: " ".join(value),
+)
+def test_bad_input_writes_nothing(ae_env, dng, others, tmp_path, command, words) -> None:
+    if command[0] == "hdr":
+        pytest.importorskip("OpenEXR")
+    out = tmp_path / "nowhere" / f"out.{'exr' if command[0] == 'hdr' else 'dng'}"
+    code, _, error = ae_env(*command, "-o", out)
+    assert code == 2
+    assert all(word in error for word in words), error
+    assert not out.parent.exists()

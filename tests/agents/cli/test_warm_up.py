@@ -61,5 +61,5 @@ def test_nothing_is_compiled_or_drawn_afterwards(dng: Path, tmp_path: Path) -> N
     focused = ("--aperture", 1.4, "-o", tmp_path / "open.dng", "--weights", "compact")
     run(*command, "refocus", tmp_path / "out.dng", *focused)
     run(*command, "sweep", dng, "--out", tmp_path / "sweep")
-    view = "from agents.viewer.library import find_scenes; find_scenes('bundled:small')"
+    view = "from agents.viewer.viewed_scene import find_scenes; find_scenes('bundled:small')"
     assert "drawing" not in run("-c", view).stderr

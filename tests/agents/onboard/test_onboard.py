@@ -4,6 +4,7 @@ import importlib.util
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -17,7 +18,6 @@ from agents import PolicyContext, make_policy
 from agents.learning.regression import observation_tensors
 from agents.onboard.controller import Controller, ExposureState
 from agents.onboard.export import export_agent
-from agents.onboard.simulated_camera import SimulatedCamera
 from simulator.camera import get_camera
 
 ROOT = Path(__file__).parents[3]
@@ -26,6 +26,15 @@ ROOT = Path(__file__).parents[3]
 def make_envs(num_envs: int, **arguments: Any) -> gym.vector.VectorEnv:
     given = {"scenes": "bundled:small", "split": "test", "max_episode_steps": None, **arguments}
     return gym.make_vec("ae_env:ae_env/AutoExposure-v0", num_envs=num_envs, **given)
+
+
+def load_example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
@@ -105,18 +114,16 @@ def test_frames_and_settings_are_encoded_as_the_environment_does(exported: Any) 
 
 def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> None:
     """After each jump of 5 EV it settles, at the aperture that it has, where little is clipped."""
-    spec = importlib.util.spec_from_file_location("loop", ROOT / "examples" / "picamera2_ae.py")
-    assert spec is not None
-    assert spec.loader is not None
-    loop = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loop)
+    loop, simulated = load_example("picamera2_ae"), load_example("simulated_camera")
     body = get_camera("nikon_z6")
     scenes = load_scenes("bundled:small", "test", camera=body, resolution=64)
     scene = next(scene for scene in scenes if scene.kind == "indoor")
     gains = [2.0 ** (5 * (i >= 20) - 5 * (i >= 40)) for i in range(60)]
-    camera = SimulatedCamera(scene, body, 4.0, delay=2, gains=gains, dropped=(5, 6, 21, 43))
+    camera = simulated.SimulatedCamera(
+        scene, body, 4.0, delay=2, gains=gains, dropped=(5, 6, 21, 43)
+    )
     taken, asked, signal = [], [], []
-    make = camera._photograph
+    make = camera.photograph
 
     def seen(frame: int, given: dict[str, float]) -> Any:
         request = make(frame, given)
@@ -124,7 +131,7 @@ def test_a_camera_with_delays_and_dropped_frames_is_exposed(exported: Any) -> No
         signal.append(numbers.mean() / (body.white_level - body.black_level[0]))
         return request
 
-    camera._photograph = seen  # type: ignore[method-assign]
+    camera.photograph = seen
     levels = {"black": body.black_level[0], "white": body.white_level}
     for now, wanted in loop.run(camera, Controller(exported[1]), 56, 4.0, **levels):
         taken.append(now)

@@ -130,7 +130,7 @@ def picture(page):
     return page.locator(".stage img").first.get_attribute("src")
 
 
-def changed(page, source):
+def assert_another_picture(page, source):
     page.wait_for_function(
         "s => document.querySelector('.stage img').src.indexOf(s) < 0", arg=source
     )
@@ -144,14 +144,18 @@ def test_slides_by_keyboard_and_shows_another_picture(page):
     before = picture(page)
     slider(page, "ISO").focus()
     page.keyboard.press("ArrowRight")
-    changed(page, before)
-    page.get_by_text("ISO 125,").wait_for()  # in the plan
+    assert_another_picture(page, before)
+    expect(page.get_by_text("ISO 125,")).to_be_visible()  # in the plan
+
+
+def assert_shows_the_clicked_state(page):
+    page.locator("button[aria-label^='ISO 6400, 1/2 s, f/4']").click()
+    expect(page.locator("button.shown[aria-label^='ISO 6400, 1/2 s, f/4']")).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^\d+\.\d+% at white"))).to_be_visible()
 
 
 def test_shows_the_state_that_is_clicked(page):
-    page.locator("button[aria-label^='ISO 6400, 1/2 s, f/4']").click()
-    page.locator("button.shown[aria-label^='ISO 6400, 1/2 s, f/4']").wait_for()
-    page.get_by_text(re.compile(r"^\d+\.\d+% at white")).wait_for()
+    assert_shows_the_clicked_state(page)
 
 
 def test_starts_at_the_best_state(page):
@@ -168,16 +172,16 @@ def test_starts_at_the_best_state(page):
 def test_zooms_to_the_pixels_and_back(page):
     before = picture(page)
     page.locator(".stage img").first.click(position={"x": 100, "y": 100})
-    changed(page, before)
-    page.locator(".stage.pixels").wait_for()
+    assert_another_picture(page, before)
+    expect(page.locator(".stage.pixels")).to_be_visible()
     before = picture(page)
     slider(page, "Across").focus()
     for _ in range(20):
         page.keyboard.press("ArrowRight")
-    changed(page, before)
+    assert_another_picture(page, before)
     page.keyboard.press("Escape")
     page.locator("body").press("z")
-    page.locator(".stage.whole").wait_for()
+    expect(page.locator(".stage.whole")).to_be_visible()
 
 
 def test_compares_two_states_with_a_divider(page):
@@ -188,7 +192,7 @@ def test_compares_two_states_with_a_divider(page):
     before = picture(page)
     slider(page, "Shutter").focus()
     page.keyboard.press("ArrowRight")
-    changed(page, before)
+    assert_another_picture(page, before)
     assert over.get_attribute("src") == pinned
     page.locator("input.divider").focus()
     page.keyboard.press("Home")
@@ -198,7 +202,7 @@ def test_compares_two_states_with_a_divider(page):
 def test_marks_where_a_policy_stands(page):
     page.get_by_label(re.compile("Mark where policies")).click()
     page.get_by_role("option", name="average", exact=True).click()
-    page.get_by_text(re.compile(r"^A average: ISO")).wait_for()
+    expect(page.get_by_text(re.compile(r"^A average: ISO"))).to_be_visible()
     expect(page.locator(".state", has_text="A")).to_have_count(1)
 
 
@@ -208,21 +212,21 @@ def test_plays_an_episode_of_two_policies(page):
         page.get_by_label(label).fill(name)
     page.get_by_label("frames").fill("6")
     page.get_by_role("button", name="Run").click()
-    page.get_by_text("frame 6 of 6").wait_for()
+    expect(page.get_by_text("frame 6 of 6")).to_be_visible()
     expect(page.get_by_text(re.compile(r"^A average: .* regret"))).to_have_count(1)
     expect(page.get_by_text(re.compile(r"^B rpi_agc: .* regret"))).to_have_count(1)
     expect(page.locator(".chart polyline")).to_have_count(3 + 2 + 2)
     page.get_by_label("policy A").fill("averagee")
     page.get_by_role("button", name="Run").click()
-    page.get_by_text(re.compile("did you mean")).wait_for()
+    expect(page.get_by_text(re.compile("did you mean"))).to_be_visible()
 
 
 def test_a_bad_file_is_refused_and_the_page_lives(page, tmp_path):
     bad = tmp_path / "holiday.dng"
     bad.write_bytes(b"not a raw at all" * 100)
     page.locator("input[type=file]").set_input_files(bad)
-    page.locator(".q-notification", has_text="holiday.dng").wait_for()
-    test_shows_the_state_that_is_clicked(page)
+    expect(page.locator(".q-notification", has_text="holiday.dng")).to_be_visible()
+    assert_shows_the_clicked_state(page)
 
 
 def test_opens_a_raw_and_gives_a_dng_back(page, tmp_path):
@@ -269,7 +273,9 @@ def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
     page.keyboard.press("Enter")
     over = page.locator(".stage .over[src]")
     over.wait_for()
-    page.get_by_text(re.compile(r"^right: f/3.5, blur estimated: the widest disc has")).wait_for()
+    expect(
+        page.get_by_text(re.compile(r"^right: f/3.5, blur estimated: the widest disc has"))
+    ).to_be_visible()
     expect(over).not_to_have_attribute("src", picture(page))
     back = read_raw(saved(page, "dng", tmp_path))
     assert back.settings.f_number == 3.5
@@ -281,7 +287,7 @@ def test_opens_the_aperture_of_a_raw(soft_page, tmp_path):
         page.keyboard.press("ArrowRight")
         page.get_by_text(f"f/{f_number:g}", exact=True).wait_for()
     page.get_by_role("button", name="Open the aperture").click()
-    page.get_by_text(re.compile(r"^right: f/1.4, blur")).wait_for()
+    expect(page.get_by_text(re.compile(r"^right: f/1.4, blur"))).to_be_visible()
     expect(over).not_to_have_attribute("src", first)
     wider = read_raw(saved(page, "dng", tmp_path))
     assert wider.settings.f_number == 1.4
@@ -293,7 +299,9 @@ def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
     openexr = pytest.importorskip("OpenEXR")
     soft_page.get_by_role("button", name="Fuse a bracket").click()
     soft_page.locator(".stage .over[src]").wait_for()
-    soft_page.get_by_text(re.compile(r"^right: 17 simulated pictures, -4 to \+4 EV")).wait_for()
+    expect(
+        soft_page.get_by_text(re.compile(r"^right: 17 simulated pictures, -4 to \+4 EV"))
+    ).to_be_visible()
     with openexr.File(str(saved(soft_page, "exr", tmp_path))) as file:
         assert file.channels()["RGB"].pixels.shape == (96, 144, 3)
     with Image.open(saved(soft_page, "png", tmp_path)) as fused:
@@ -302,24 +310,28 @@ def test_fuses_a_bracket_of_a_raw(soft_page, tmp_path):
 
 def test_the_page_lives_while_the_aperture_opens(soft_page):
     soft_page.get_by_role("button", name="Open the aperture").click()
-    soft_page.get_by_text(re.compile(r"^opening the aperture, 0\.1 megapixels \.\.\. ")).wait_for()
+    expect(
+        soft_page.get_by_text(re.compile(r"^opening the aperture, 0\.1 megapixels \.\.\. "))
+    ).to_be_visible()
     soft_page.get_by_role("tab", name="Exposure").click()
-    test_shows_the_state_that_is_clicked(soft_page)
+    assert_shows_the_clicked_state(soft_page)
 
 
 def test_without_networks_the_aperture_stays_with_a_message(page, tmp_path):
     camera = get_camera("nikon_z6")
     raw = RawImage(torch.full((4, 32, 48), 0.2), CameraSettings(100, 1 / 64, 4), camera)
     page.get_by_role("tab", name="Refocus, HDR").click()
-    page.get_by_text("Only a raw can be opened or fused").wait_for()
+    expect(page.get_by_text("Only a raw can be opened or fused")).to_be_visible()
     for name in ("Open the aperture", "Fuse a bracket"):
         expect(page.get_by_role("button", name=name)).to_be_disabled()
     write_dng(tmp_path / "flat.dng", raw)
     page.locator("input[type=file]").set_input_files(tmp_path / "flat.dng")
     page.wait_for_selector(".stage img[src]")
     page.get_by_role("button", name="Open the aperture").click()
-    page.locator(".q-notification", has_text="networks: they estimate the blur").wait_for()
-    page.get_by_role("button", name="Open the aperture", disabled=False).wait_for()
+    expect(
+        page.locator(".q-notification", has_text="networks: they estimate the blur")
+    ).to_be_visible()
+    expect(page.get_by_role("button", name="Open the aperture")).to_be_enabled()
 
 
 def test_two_tabs_show_different_scenes(page, address):
@@ -331,7 +343,7 @@ def test_two_tabs_show_different_scenes(page, address):
     thumb.locator("img[src]").wait_for()
     name = thumb.inner_text()
     thumb.click()
-    other.locator(".title", has_text=name).first.wait_for()
+    expect(other.locator(".title", has_text=name).first).to_be_visible()
     expect(page.locator(".title").first).not_to_have_text(name)
 
 
@@ -342,6 +354,7 @@ def test_fits_the_width(page, width, tab):
     page.get_by_role("tab", name=tab).click()
     page.wait_for_timeout(200)
     page.wait_for_function("w => document.documentElement.scrollWidth <= w", arg=width)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,15 @@ import torch
 from PIL import Image
 
 from ae_env.scenes import Scene
-from agents.viewer.from_one_raw import wider_f_numbers
-from agents.viewer.library import Entry, Library, Shown, find_scenes
-from agents.viewer.viewed_scene import WINDOW_SIZE, View, ViewedScene
+from agents.viewer.one_raw_page import wider_f_numbers
+from agents.viewer.viewed_scene import (
+    WINDOW_SIZE,
+    Library,
+    OpenedScene,
+    View,
+    ViewedScene,
+    find_scenes,
+)
 from simulator import (
     CameraSettings,
     CameraSimulator,
@@ -30,7 +36,7 @@ SETTINGS = CameraSettings(100, 1 / 64, 4)
 
 def viewed(light, turns=0, camera=CAMERA):
     scene = Scene.from_array(light, SETTINGS, camera, scene_id="made")
-    return ViewedScene(Shown(scene, turns), CameraSimulator(device="cpu"))
+    return ViewedScene(OpenedScene(scene, turns), CameraSimulator(device="cpu"))
 
 
 def image(picture):
@@ -111,11 +117,11 @@ def test_a_library_reads_a_scene_when_it_is_opened_and_keeps_few():
             scene = Scene.from_array(
                 torch.zeros(4, 2, 2), SETTINGS, CAMERA, scene_id=name, nlf=NoiseLevelFunction.zero()
             )
-            return Shown(scene)
+            return OpenedScene(scene)
 
         return make
 
-    library = Library([Entry(name, read(name)) for name in "abcdef"])
+    library = Library({name: read(name) for name in "abcdef"})
     assert reads == []
     for name in "abcdefef":
         assert library.open(name).scene.scene_id == name
@@ -146,7 +152,7 @@ def test_a_folder_opens_at_its_first_readable_raw(tmp_path):
     write_dng(tmp_path / "IMG_2.dng", RawImage(torch.full((4, 8, 8), 0.1), SETTINGS, CAMERA))
     library = find_scenes(str(tmp_path))
     assert library.first == "IMG_2.dng"
-    assert library.names == ["IMG_0.dng", "IMG_1.dng", "IMG_2.dng"]
+    assert list(library.readers) == ["IMG_0.dng", "IMG_1.dng", "IMG_2.dng"]
 
 
 def test_a_recorded_grid_is_the_light_of_its_captures(tmp_path):
@@ -167,7 +173,7 @@ def test_what_is_soft_is_blurred_as_the_aperture_opens_where_depth_is_unknown():
     raw = RawImage(light, narrow, CAMERA, nlf=CAMERA.nlf(100))
     simulator = CameraSimulator.from_pretrained("nano", device="cpu", cache=None)
     far, unknown = (
-        ViewedScene(Shown(Scene.from_raw(raw, scene_id="made")), simulator, depth=depth)
+        ViewedScene(OpenedScene(Scene.from_raw(raw, scene_id="made")), simulator, depth=depth)
         .picture(View(CameraSettings(100, 1 / 256, 4)))
         .capture
         for depth in ("far", "unknown")
@@ -189,7 +195,7 @@ def test_only_wider_f_numbers_than_the_raw_s_are_offered():
 
 def test_a_scene_is_found_by_its_id():
     library = find_scenes("bundled:small")
-    other = library.names[5]
+    other = list(library.readers)[5]
     found = find_scenes(other)
     assert found.first == other
-    assert other in found.names
+    assert other in found.readers

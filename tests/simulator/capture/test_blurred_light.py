@@ -1,49 +1,176 @@
-"""Light behind apertures and streaks: made once, kept within bounds, the same either way."""
+"""Light behind apertures and in motion: against sums by hand, cached within bounds, in batches."""
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import correlate
+from torch import Tensor
 
-from simulator.capture import scene_blur as optics_module
-from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.blurred_light import BlurredLight
-from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import LIGHT_LIMIT, Exposure
-from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, get_camera
+from simulator.capture import blurred_light as module
+from simulator.capture.batch import CaptureBatch
+from simulator.capture.blurred_light import BlurredLight, MapApertureBlur, NetworkApertureBlur
+from simulator.capture.exposure import Exposure
+from simulator.capture.layout import Layout
+from simulator.capture.statistics import DenoisedLight
+from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.blur import disc_blur, motion_blur
+from simulator.optics.disc_bank import DIAMETERS, HALO, DiscBank, added_blur
+from simulator.optics.motion_path import Movement, path_blur, path_taps
+from simulator.utils.tiles import make_tiles
 
+Z6 = get_camera("nikon_z6")
 ZERO = NoiseLevelFunction.zero()
+
+
+# -- opening the aperture ---------------------------------------------------------------------
+
+
+def light(seed: int = 0) -> Tensor:
+    values = np.random.default_rng(seed).random((4, 24, 24), dtype=np.float32)
+    return torch.from_numpy(values)
+
+
+def aperture_blur(diameter: float = 2.0 / math.sqrt(3)) -> MapApertureBlur:
+    """At f/4 the default adds exactly 2 px, a disc of the bank, to a picture at f/8."""
+    assert 2.0 in DIAMETERS
+    return MapApertureBlur(light(), torch.full((24, 24), diameter), 8.0)
+
+
+def test_each_light_is_blurred_by_its_own_bank_and_cached() -> None:
+    made, kernel = aperture_blur(), torch.zeros(9, 9)
+    for denoised in (None, DenoisedLight(light(1)), DenoisedLight(light(2))):
+        result = made.opened(4.0, denoised)
+        expected = disc_blur(light() if denoised is None else denoised.light, 2.0)
+        torch.testing.assert_close(result, expected, atol=1e-5, rtol=0)
+        assert made.opened(4.0, denoised) is result
+        assert not torch.equal(made.opened(5.6, denoised), result)
+    kernel[4, 4] = 1.0
+    energy = disc_blur(kernel, 2.0).square().sum()
+    remaining = made.remaining_variance(4.0)
+    torch.testing.assert_close(remaining, energy.expand(24, 24), rtol=1e-5, atol=0)
+
+
+def test_a_lamp_of_any_brightness_stays_finite() -> None:
+    opened = []
+    for lamp in (0.0, 1e30):
+        scene = light()
+        scene[:, 12, 12] = lamp
+        made = MapApertureBlur(scene, torch.full((24, 24), 3.0), 8.0)
+        opened.append(made.opened(4.0, None))
+    assert bool(opened[1].isfinite().all())
+    # A disc's 6 px away nothing of the lamp arrives, and nothing of the shadows is lost.
+    torch.testing.assert_close(opened[1][:, 3, 3], opened[0][:, 3, 3])
+
+
+def test_the_papers_network_runs_once_per_f_number_on_the_denoised_light() -> None:
+    torch.manual_seed(0)
+    module = ApertureModule("paper").eval().requires_grad_(False)
+    module.network.tail.weight.mul_(10)
+    made = NetworkApertureBlur(DenoisedLight(light()), module, 8.0)
+    assert made.needs_denoised
+    assert made.extent(4.0) == math.inf
+    assert made.extent(8.0) == made.extent(11.0) == 0.0
+    assert made.remaining_variance(4.0) is None
+    result = made.opened(4.0)
+    assert made.opened(4.0, DenoisedLight(light())) is result  # it has its own
+    f_source, f_target = torch.tensor([8.0]), torch.tensor([4.0])
+    image = light()[None]
+    expected = module(image, torch.zeros_like(image), f_source, f_target)[0]
+    assert torch.equal(result, expected)
+    assert not torch.equal(result, light())
+
+
+@pytest.mark.parametrize("size", [(1, 40), (40, 1), (35, 91), (150, 133)])
+@pytest.mark.parametrize("tile", [32, 768])
+def test_tiles_have_no_seams_and_what_is_in_focus_is_copied(
+    size: tuple[int, int], tile: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = torch.Generator().manual_seed(2)
+    image = torch.rand(4, *size, generator=generator) * 3
+    diameter = 12 * torch.rand(size, generator=generator)
+    diameter[: size[0] // 2, : 2 * size[1] // 3] = 0.0
+    monkeypatch.setattr(
+        "simulator.capture.blurred_light.make_tiles", functools.partial(make_tiles, tile=tile)
+    )
+    made = MapApertureBlur(image, diameter, 8.0)
+    for f_number in (5.6, 2.8):
+        result = made.opened(f_number, None)
+        whole = DiscBank(image).blurred(added_blur(diameter, 8.0, f_number))
+        torch.testing.assert_close(result, whole, rtol=0, atol=3e-6)
+        assert torch.equal(result[:, diameter == 0], image[:, diameter == 0])
+        assert not torch.equal(result, image) or min(size) == 1
+
+
+def test_only_what_is_out_of_focus_is_blurred(monkeypatch: pytest.MonkeyPatch) -> None:
+    pixels: list[int] = []
+
+    class Spy(DiscBank):
+        def blurred(self, diameter: Tensor) -> Tensor:
+            pixels.append(diameter.numel())
+            return super().blurred(diameter)
+
+    monkeypatch.setattr("simulator.capture.blurred_light.DiscBank", Spy)
+    image, diameter = torch.rand(4, 300, 400), torch.zeros(300, 400)
+    assert torch.equal(MapApertureBlur(image, diameter, 8.0).opened(4.0, None), image)
+    assert not pixels
+    diameter[-32:, -32:] = 5.0
+    MapApertureBlur(image, diameter, 8.0).opened(4.0, None)
+    assert (32 + HALO) ** 2 <= sum(pixels) <= (48 + HALO) ** 2  # in cells of 16 pixels
+
+
+def test_the_map_is_estimated_when_the_aperture_first_opens() -> None:
+    calls: list[int] = []
+
+    def estimate() -> Tensor:
+        calls.append(1)
+        return torch.full((24, 24), 2.0)
+
+    made = MapApertureBlur(light(), estimate, 8.0)
+    assert made.extent(8.0) == made.extent(16.0) == 0.0
+    assert not calls
+    assert made.extent(4.0) == pytest.approx(2 * math.sqrt(3))
+    made.opened(4.0, None)
+    made.remaining_variance(5.6)
+    assert calls == [1]
+
+
+# -- uniform blur in sweeps -------------------------------------------------------------------
+
 STILL = Exposure(2.0, ZERO, ZERO)
 LIGHT = torch.rand(4, 24, 20, generator=torch.Generator().manual_seed(0))
-CLEAN = Denoised(LIGHT * 0.5)
+CLEAN = DenoisedLight(LIGHT * 0.5)
 
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
-    """What is blurred, and by how much."""
+    """The blurs that are made, and their extents."""
     calls: list[tuple[str, float]] = []
 
-    def streak(light: torch.Tensor, extent: float) -> torch.Tensor:
+    def streak(light: Tensor, extent: float, *args: Any, **options: Any) -> Tensor:
         calls.append(("streak", extent))
-        return motion_blur(light, extent)
+        return motion_blur(light, extent, *args, **options)
 
-    def disc(light: torch.Tensor, diameter: float) -> torch.Tensor:
-        if diameter:
-            calls.append(("disc", diameter))
-        return disc_blur(light.clamp(-LIGHT_LIMIT, LIGHT_LIMIT), diameter)
+    def disc(light: Tensor, diameter: float) -> Tensor:
+        calls.extend([("disc", diameter)] * bool(diameter))
+        return disc_blur(light, diameter)
 
-    monkeypatch.setattr(optics_module, "motion_blur", streak)
-    monkeypatch.setattr(optics_module, "defocused_light", disc)
+    monkeypatch.setattr(module, "motion_blur", streak)
+    monkeypatch.setattr(module, "disc_blur", disc)
     return calls
 
 
 @pytest.mark.parametrize("denoised", [False, True])
 def test_disc_then_streak(denoised: bool) -> None:
     source = CLEAN.light if denoised else LIGHT
-    blurred_light = BlurredLight(LIGHT, (Denoised(LIGHT), CLEAN), ZERO, None)
+    blurred_light = BlurredLight(LIGHT, (DenoisedLight(LIGHT), CLEAN), ZERO, None)
     exposure = replace(STILL, denoised=CLEAN if denoised else None)
     assert blurred_light.blurred(exposure) is source  # what needs no blur is not copied
     exposure = replace(exposure, defocus_px=2.0, motion_px=3.0)
@@ -78,24 +205,176 @@ def test_a_bound_in_bytes_forgets_what_was_used_longest_ago(
 
 
 def test_the_opened_aperture_comes_first() -> None:
-    aperture_blur = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
-    blurred_light = BlurredLight(LIGHT, (CLEAN,), ZERO, aperture_blur)
+    aperture = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
+    blurred_light = BlurredLight(LIGHT, (CLEAN,), ZERO, aperture)
     exposure = replace(STILL, opened_to=4.0, denoised=CLEAN, motion_px=2.0)
-    expected = motion_blur(aperture_blur.opened(4.0, CLEAN), 2.0)
+    expected = motion_blur(aperture.opened(4.0, CLEAN), 2.0)
     assert torch.equal(blurred_light.blurred(exposure), expected)
     assert not torch.equal(expected, motion_blur(CLEAN.light, 2.0))
 
 
 def test_blur_that_opening_adds_and_noise_that_it_leaves() -> None:
     """Squared diameters add: 2 pixels at f/8 take sqrt(16 - 4) more at f/4."""
-    aperture_blur = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
-    blurred_light, none = (BlurredLight(LIGHT, (), ZERO, blur) for blur in (aperture_blur, None))
-    assert blurred_light.added_blur(4.0) == pytest.approx(12**0.5)
-    assert blurred_light.added_blur(8.0) == blurred_light.added_blur(16.0) == 0.0
-    assert none.added_blur(1.4) == 0.0
-    assert none.remaining_variance(4.0, 1.0) is None
-    alone = aperture_blur.remaining_variance(4.0)
-    assert torch.equal(blurred_light.remaining_variance(4.0, 1.0), alone)
-    half = blurred_light.remaining_variance(4.0, 0.5)
-    torch.testing.assert_close(half, (2 * alone).clamp(max=1.0))
-    assert blurred_light.remaining_variance(4.0, 0.5) is half
+    opens = MapApertureBlur(LIGHT, torch.full((24, 20), 2.0), 8.0)
+    assert opens.extent(4.0) == pytest.approx(12**0.5)
+    assert opens.extent(8.0) == opens.extent(16.0) == 0.0
+    alone = opens.remaining_variance(4.0)
+    noisy = Exposure(1.0, Z6.nlf(800), Z6.nlf(800), opened_to=4.0)
+    lights = BlurredLight(LIGHT, (), Z6.nlf(800), opens)
+    assert torch.equal(lights.with_remaining_noise(noisy).remaining_variance, alone)
+    moving = lights.with_remaining_noise(replace(noisy, motion_px=3.0))
+    left = (alone / moving.energy).clamp(max=1.0)
+    assert torch.equal(moving.remaining_variance, left)
+    assert 0.2 < moving.energy < 0.5  # of a streak of three pixels
+
+
+# -- scenes with a layout, in motion ------------------------------------------------------------
+
+REFERENCE = CameraSettings(800, 1 / 64, 4)
+SIZE = 32
+SCENE = torch.rand(4, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+MOVEMENT = Movement(0.6, 2.0, subject_speed=0.4, subject_direction=2.0)
+SLOW = CameraSettings(100, 1 / 2, 8)
+
+
+def _layout() -> Layout:
+    """Halves in and out of focus, and a subject across them."""
+    defocus = torch.zeros(SIZE, SIZE)
+    defocus[:, SIZE // 2 :] = 1.0
+    subject = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    subject[10:20, 12:24] = True
+    return Layout(defocus, subject)
+
+
+def _prepared(noisy: bool = False, **fields: Any) -> PreparedScene:
+    nlf = Z6.nlf(800) if noisy else ZERO
+    given = {"layout": _layout(), "movement": MOVEMENT, "tolerance": 0.0, **fields}
+    return PreparedScene(SCENE, REFERENCE, Z6, nlf, **given)
+
+
+def test_only_what_the_layout_has_out_of_focus_is_blurred() -> None:
+    """A disc of the bank's at f/8, which is no blend of two."""
+    light = _prepared(defocus=2.0 * DIAMETERS[6], movement=Movement()).expected(SLOW)
+    ratio = _prepared().exposure(SLOW).ratio
+    torch.testing.assert_close(light[..., :16], SCENE[..., :16] * ratio)
+    wanted = disc_blur(SCENE.double(), DIAMETERS[6])[..., 16:].float() * ratio
+    torch.testing.assert_close(light[..., 16:], wanted, rtol=1e-4, atol=1e-5 * ratio)
+
+
+def test_without_a_subject_the_frame_moves_as_a_whole() -> None:
+    whole = Layout(torch.zeros(SIZE, SIZE))
+    exposure = _prepared(layout=whole, image_speed=0.3).exposure(SLOW)
+    path = MOVEMENT.path(0.3, 0.5, SIZE)
+    assert (exposure.path, exposure.subject_path, exposure.layout) == (path, None, None)
+    assert exposure.motion_px == pytest.approx(0.3 * 0.5 * SIZE)
+    found = _prepared(layout=None, image_speed=0.3).expected(SLOW)
+    wanted = path_blur(SCENE, path_taps(path, SIZE, SIZE)) * exposure.ratio
+    torch.testing.assert_close(found, wanted)
+
+
+def test_the_largest_extent_decides() -> None:
+    """On a tripod only the subject moves: 0.4 frame heights a second."""
+    still = _prepared(movement=replace(MOVEMENT, turn=0.0))
+    assert still.exposure(SLOW).motion_px == pytest.approx(0.4 * 0.5 * SIZE)
+    assert not still.exposure(SLOW).is_uniform
+    light = still.expected(SLOW) / still.exposure(SLOW).ratio
+    assert torch.equal(light[:, :, :4], SCENE[:, :, :4])  # far from it all stays as it is
+    assert not torch.allclose(light[:, 12:18, 14:22], SCENE[:, 12:18, 14:22], atol=0.05)
+
+
+def test_a_movement_along_the_rows_changes_nothing() -> None:
+    plain = PreparedScene(SCENE, REFERENCE, Z6, ZERO, image_speed=0.3)
+    same = _prepared(layout=None, movement=Movement(subject_speed=2.0), image_speed=0.3)
+    assert torch.equal(plain.expected(SLOW), same.expected(SLOW))
+    assert same.exposure(SLOW).is_uniform
+
+
+@pytest.mark.parametrize("defocus", [0.0, 5.0])
+@pytest.mark.parametrize("speed", [0.0, 0.5])
+@pytest.mark.parametrize("movement", [MOVEMENT, Movement(0.6, 2.0), Movement()])
+def test_noise_that_blur_leaves(defocus: float, speed: float, movement: Movement) -> None:
+    """The variance of blurred white noise, over many draws."""
+    scene = _prepared(noisy=True, defocus=defocus, image_speed=speed, movement=movement)
+    exposure = scene.exposure(SLOW)
+    if exposure.is_uniform:
+        assert exposure.remaining_variance is None
+        return
+    left, share = exposure.remaining_variance, torch.full((SIZE, SIZE), exposure.energy)
+    share = share if left is None else left * share
+    draws = torch.randn(600, SIZE, SIZE, generator=torch.Generator().manual_seed(3))
+    blurred = []
+    for planes in draws.reshape(-1, 4, SIZE, SIZE):
+        made = PreparedScene(planes, REFERENCE, Z6, ZERO, tolerance=0.0)
+        same = replace(made, defocus=defocus, image_speed=speed, movement=movement)
+        same = replace(same, layout=scene.layout)
+        blurred.append(same.blurred_light.blurred(exposure))
+    measured = torch.cat(blurred).double().square().mean(dim=0)
+    ratio = (measured / share)[6:-6, 6:-6]  # replicated borders average less
+    assert float(ratio.min()) > 0.75
+    if exposure.subject_path is not None:
+        # What continues behind the subject repeats pixels, and their noise with them.
+        assert float(ratio.mean()) < 1.25
+        ratio = ratio[:, :4]
+    assert float(ratio.median()) == pytest.approx(1.0, abs=0.06)  # of the draws
+    assert float(ratio.quantile(0.95)) < 1.2
+
+
+@pytest.mark.parametrize("cache_light", [True, False])
+@pytest.mark.parametrize("noisy", [True, False])
+def test_batches_have_the_light_of_sweeps(cache_light: bool, noisy: bool) -> None:
+    scenes = [
+        _prepared(noisy, defocus=3.0, image_speed=0.2),
+        _prepared(noisy, defocus=3.0, movement=Movement(subject_speed=0.5)),
+        _prepared(noisy, image_speed=0.2, layout=None),
+        _prepared(noisy, defocus=4.0, image_speed=0.2, layout=None),
+        _prepared(noisy, defocus=3.0, image_speed=0.2, movement=Movement()),
+        _prepared(noisy),
+        _prepared(noisy, defocus=3.0, tolerance=0.1),
+    ]
+    states = [CameraSettings(iso, t, n) for iso in (100, 6400) for t in (0.5, 1e-3) for n in (4, 8)]
+    batch = CaptureBatch(
+        scenes.__getitem__, len(scenes), states, Z6, noise="bank", cache_light=cache_light
+    )
+    indices, rng = np.arange(len(scenes)), np.random.default_rng(0)
+    for step in range(8):
+        if step % 2 == 0:
+            chosen = rng.integers(len(states), size=len(scenes))
+        gain = (1.0, 1e-6)[step % 2]  # in little light, blur is left out where it may be
+        frames = np.empty((len(scenes), 4, SIZE, SIZE), np.float32)
+        batch.prepare(indices, chosen, np.full(len(scenes), gain))
+        found = batch.record(indices, chosen, indices, indices, signals=frames)
+        assert np.isfinite(found.excess_variance).all()
+        for i, scene in enumerate(scenes):
+            exposure = scene.exposure(states[chosen[i]], gain=gain)
+            one, expected = np.array([i]), exposure.remaining_variance
+            transitions = batch.transitions(one, chosen[one])
+            assert torch.equal(transitions.light[0], scene.blurred_light.blurred(exposure))
+            (left,) = transitions.shares()
+            assert (left is None) == (expected is None)
+            assert expected is None or torch.equal(left, expected.float())
+
+
+def test_whole_captures_by_hand() -> None:
+    """Defocus, then the background along its path, then the subject along its own, by SciPy."""
+    layout = _layout()
+    scene = _prepared(defocus=2.0 * DIAMETERS[5], image_speed=0.3)
+    sharp = SCENE.double().numpy()
+    soft = disc_blur(SCENE.double(), DIAMETERS[5]).numpy()
+    light = np.where(layout.defocus.numpy() > 0.0, soft, sharp)
+
+    def kernel(path: Any) -> np.ndarray:
+        taps, reach = path_taps(path, SIZE, SIZE), 16
+        dense = np.zeros((2 * reach + 1, 2 * reach + 1))
+        np.add.at(dense, (taps.rows + reach, taps.columns + reach), taps.weights)
+        return dense
+
+    shake = kernel(MOVEMENT.path(0.3, 0.5, SIZE))
+    own = kernel(MOVEMENT.subject_path(0.3, 0.5, SIZE))
+    mask, behind = layout.subject.numpy(), layout.behind.numpy()
+    cover = correlate(mask.astype(float), own, mode="nearest")
+    found = scene.expected(SLOW) / scene.exposure(SLOW).ratio
+    for plane, result in zip(light, found, strict=True):
+        wanted = (1.0 - cover) * correlate(plane.ravel()[behind], shake, mode="nearest")
+        wanted += correlate(mask * plane, own, mode="nearest")
+        np.testing.assert_allclose(result, wanted, atol=2e-5)
+    assert math.isclose(cover.sum(), mask.sum(), rel_tol=1e-5)

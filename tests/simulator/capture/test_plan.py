@@ -12,20 +12,19 @@ from scipy.integrate import quad
 
 from simulator import CameraSettings, NoiseLevelFunction, PreparedScene, exposure_ratio, get_camera
 from simulator.capture import plan as plan_module
-from simulator.capture.aperture_blur import MapApertureBlur
-from simulator.capture.denoised import Denoised
-from simulator.capture.exposure import Step
-from simulator.capture.light_statistics import LightStatistics
-from simulator.capture.plan import (
-    _BOUND,
-    _LEAST_BOUND,
-    DEFAULT_TOLERANCE,
-    HIDDEN_LIGHT,
-    Situation,
-    check_tolerance,
-    decide,
+from simulator.capture.blurred_light import MapApertureBlur
+from simulator.capture.exposure import HIDDEN_LIGHT, Exposure, Step, TransitionInputs, decide
+from simulator.capture.layout import Layout
+
+# The factors and the least bound were measured; the tests hold the arithmetic that uses them.
+from simulator.capture.plan import _BOUND, _LEAST_BOUND, DEFAULT_TOLERANCE, check_tolerance
+from simulator.capture.statistics import (
+    DenoisedLight,
+    LightStatistics,
+    Residual,
+    ResidualStatistics,
 )
-from simulator.capture.residual import Residual, ResidualStatistics
+from simulator.optics.motion_path import Path
 
 Z6 = get_camera("nikon_z6")
 SOURCE = CameraSettings(1600, 1 / 64, 8)
@@ -37,18 +36,18 @@ ZERO = NoiseLevelFunction.zero()
 LIGHT = torch.rand(4, 16, 20, generator=torch.Generator().manual_seed(0)) * 0.3
 
 
-def network(name: str, error: float, *, spread: float = 1.0, **known: object) -> Denoised:
+def network(name: str, error: float, *, spread: float = 1.0, **known: object) -> DenoisedLight:
     """One that errs by `error` standard deviations of the noise that it removes, everywhere."""
     residual = Residual(np.array([0.0, 9.0]), np.full(2, error**2), np.zeros(2), spread)
-    return Denoised(LIGHT, name=name, residual=residual, **known)  # type: ignore[arg-type]
+    return DenoisedLight(LIGHT, name=name, residual=residual, **known)  # type: ignore[arg-type]
 
 
 def prepared(*, networks: bool = True, diameter: float = 2.0, **changes: object) -> PreparedScene:
     made = PreparedScene(LIGHT, SOURCE, Z6, Z6.nlf(1600))
     if networks:
-        denoised = (Denoised(LIGHT, name="compact", operations=7, seconds=lambda: 0.25),)
+        denoised = (DenoisedLight(LIGHT, name="compact", operations=7, seconds=lambda: 0.25),)
         blur = MapApertureBlur(LIGHT, torch.full((16, 20), diameter), 8.0)
-        made = replace(made, denoised=denoised, aperture_blur=blur)
+        made = replace(made, denoised_lights=denoised, aperture_blur=blur)
     return replace(made, **changes)  # type: ignore[arg-type]
 
 
@@ -78,7 +77,7 @@ def test_every_step_runs_or_has_a_reason(
     if plan.predicted_error <= tolerance:
         assert lines[1].endswith(f"(tolerance {tolerance:g}: kept)")
     elif math.hypot(plan.errors["left out"], plan.errors["network"]) <= tolerance:
-        assert lines[1].endswith(("kept by what can be chosen)", "kept)"))
+        assert lines[1].endswith(("no module can fix)", "kept)"))
     else:
         assert lines[1].endswith("out of reach, the least of these networks)")
 
@@ -94,55 +93,40 @@ def test_the_networks_run_where_they_are_needed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "settings", "line"),
+    ("changes", "settings", "left_out", "word"),
     [
-        ({"networks": False}, CLEANER, "left out noise_reduction: the simulator has no noise"),
-        ({"nlf": ZERO}, CLEANER, "left out noise_reduction: the source carries no noise"),
-        ({}, OPENER, "left out noise_reduction: the target is at least as noisy: noise is added"),
-        (
-            {"tolerance": 9},
-            CLEANER,
-            "left out noise_reduction: the source's noise beyond the",
-        ),
-        (
-            {"tolerance": 9, "noise": False},
-            OPENER,
-            "left out noise_reduction: the source's noise is small against the target's",
-        ),
-        (
-            {"denoised": (network("bad", 9.0),)},
-            CLEANER,
-            "left out noise_reduction: no network would err less than the noise (error ",
-        ),
-        ({"networks": False}, OPENER, "left out aperture: the scene is taken as in focus: `dep"),
-        ({}, CLEANER, "left out aperture: the aperture does not open"),
-        ({"diameter": 0.0}, OPENER, "left out aperture: the picture was found to be in focus"),
-        ({"tolerance": 900}, OPENER, "left out aperture: the blur that opening adds (up to 3.5 "),
-        ({"aperture_blur": None}, CLEANER, "left out defocus: the scene is taken as far"),
-        ({}, CLEANER, "left out defocus: none is given for the whole frame: each pixel's was"),
-        ({"defocus": 1e-4}, CLEANER, "left out defocus: the defocus disc is 5e-05 pixel wide, "),
-        ({}, CLEANER, "left out motion_blur: the image does not move"),
-        ({"image_speed": 1e-6}, CLEANER, "left out motion_blur: the image moves by 4e-06 pixel "),
-        ({}, SOURCE, "left out noise: no pixel lacks noise: the source has the target's already"),
-        ({"noise": False}, SOURCE, "left out noise: only the light is asked for"),
-        ({"noise": False}, SOURCE, "left out clip_and_quantise: only the light is asked for"),
-        ({}, CameraSettings(12800, 1, 8), "the ISO is 1 stop beyond the noise calibration"),
-        ({"networks": False}, CameraSettings(1600, 1 / 32, 8), "noise variance 2"),  # times
-        ({}, CLEANER, "runs noise_reduction: the source is noisier than the target; leaving"),
-        ({"noise": False}, CLEANER, "runs noise_reduction: no noise of the target's is there"),
-        ({}, OPENER, "runs aperture: the aperture opens and adds blur (up to 3.5 pixel); lea"),
-        ({"defocus": 3}, CLEANER, "runs defocus: the defocus disc is 1.5 pixel wide; leaving"),
-        (
-            {"image_speed": 0.25, "tolerance": 0},
-            CLEANER,
-            "runs motion_blur: the image moves by 1 pixel during the exposure",
-        ),
+        ({"networks": False}, CLEANER, "noise_reduction", "no noise module"),
+        ({"nlf": ZERO}, CLEANER, "noise_reduction", "no noise"),
+        ({}, OPENER, "noise_reduction", "at least as noisy"),
+        ({"tolerance": 9}, CLEANER, "noise_reduction", "within the tolerance"),
+        ({"tolerance": 9, "noise": False}, OPENER, "noise_reduction", "small"),
+        ({"denoised_lights": (network("bad", 9.0),)}, CLEANER, "noise_reduction", "smaller error"),
+        ({"networks": False}, OPENER, "aperture", "`depth`"),
+        ({}, CLEANER, "aperture", "does not open"),
+        ({"diameter": 0.0}, OPENER, "aperture", "in focus throughout"),
+        ({"tolerance": 900}, OPENER, "aperture", "up to 3.5 pixel"),
+        ({"aperture_blur": None}, CLEANER, "defocus", "far"),
+        ({}, CLEANER, "defocus", "each pixel's"),
+        ({"defocus": 1e-4}, CLEANER, "defocus", "5e-05 pixel"),
+        ({}, CLEANER, "motion_blur", "does not move"),
+        ({"image_speed": 1e-6}, CLEANER, "motion_blur", "4e-06 pixel"),
+        ({}, SOURCE, "noise", "already, or more"),
+        ({"noise": False}, SOURCE, "noise", "only the light"),
+        ({"noise": False}, SOURCE, "clip_and_quantise", "only the light"),
+        ({}, CLEANER, None, "noisier than the target"),
+        ({"noise": False}, CLEANER, None, "without noise"),
+        ({}, OPENER, None, "adds blur (up to 3.5 pixel)"),
+        ({"defocus": 3}, CLEANER, None, "disc is 1.5 pixel"),
+        ({"image_speed": 0.25, "tolerance": 0}, CLEANER, None, "moves by 1 pixel"),
+        ({"networks": False}, CameraSettings(1600, 1 / 32, 8), None, "noise variance 2"),
+        ({}, CameraSettings(12800, 1, 8), None, "1 stop beyond"),
     ],
 )
-def test_reasons(changes: dict, settings: CameraSettings, line: str) -> None:
+def test_reasons(changes: dict, settings: CameraSettings, left_out: str | None, word: str) -> None:
+    """Whether a step is left out, and the fact that its reason states."""
     scene = {name: value for name, value in changes.items() if name != "noise"}
     plan = prepared(**scene).plan(settings, noise=changes.get("noise", True))
-    assert f"\n{line}" in f"\n{plan.details()}"
+    assert word in (plan.details() if left_out is None else plan.left_out[left_out])
 
 
 def test_excess_is_nought_with_a_noise_module_and_stated_without() -> None:
@@ -196,13 +180,13 @@ FLAT = ResidualStatistics(torch.ones(4, 16, 16), UNIT)
 
 
 def steps(
-    tolerance: float, found: Statistics, networks: tuple[Denoised, ...] = (), **given: object
+    tolerance: float, found: Statistics, networks: tuple[DenoisedLight, ...] = (), **given: object
 ) -> list[Step]:
     """What is decided where the noise's variance is 1; by default with a network without error."""
-    exact = Denoised(LIGHT)
+    exact = DenoisedLight(LIGHT)
     exact.statistics = found  # type: ignore[misc]
-    situation = Situation(1.0, UNIT, UNIT, tolerance, True, found, FLAT, networks or (exact,))
-    return list(decide(situation._replace(**given)))  # type: ignore[arg-type]
+    inputs = TransitionInputs(1.0, UNIT, UNIT, tolerance, True, found, FLAT, networks or (exact,))
+    return list(decide(inputs._replace(**given)).steps)  # type: ignore[arg-type]
 
 
 def left_out(made: list[Step]) -> list[str]:
@@ -246,7 +230,7 @@ def test_a_larger_network_or_any_may_be_the_worse_one() -> None:
         assert chosen.name == name
     for tolerance in (0.0, 0.04, 0.06):  # noise that errs by less than all of them stays
         assert steps(tolerance, Statistics(0.05), odd)[0].network is None
-    assert "no network would err less" in steps(0.04, Statistics(0.05), odd)[0].reason
+    assert "no network would make" in steps(0.04, Statistics(0.05), odd)[0].reason
 
 
 def test_noise_and_blur_add_as_squares() -> None:
@@ -293,18 +277,18 @@ def test_tolerance_0_leaves_nothing_out() -> None:
 def test_no_network_runs_for_the_errors_of_blur_that_nobody_asks_for() -> None:
     """The paper's aperture module needs the denoised light; its own blur is not known before."""
     nlf, found = (Z6.nlf(6400), Z6.nlf(100)), Statistics(5.0, disc=0.01)
-    lazy = Denoised(lambda: pytest.fail("it ran"))
-    situation = Situation(1.0, *nlf, 0.1, True, found, FLAT, (lazy,))
-    opens = situation._replace(aperture_px=math.inf, opens=True, opens_denoised=True)
-    made = decide(opens)
+    lazy = DenoisedLight(lambda: pytest.fail("it ran"))
+    inputs = TransitionInputs(1.0, *nlf, 0.1, True, found, FLAT, (lazy,))
+    opens = inputs._replace(aperture_px=math.inf, opens=True, opens_denoised=True)
+    made = decide(opens).steps
     assert [step.runs for step in made] == [True, True, False, False]
     assert "works on the noise-reduced light only" in made[0].reason
     assert made[1].reason == "the aperture opens and adds blur"
     assert made[1].error == math.inf
-    assert decide(situation)[0].runs
+    assert decide(inputs).steps[0].runs
     lazy.statistics = Statistics(disc=0.02)  # type: ignore[misc]
-    asked = opens._replace(defocus_px=2.0)
-    assert decide(asked)[2].error == pytest.approx(0.08)  # of the light that is blurred
+    blurred = opens._replace(defocus_px=2.0)
+    assert decide(blurred).steps[2].error == pytest.approx(0.08)  # of the light that is blurred
 
 
 def test_tolerances() -> None:
@@ -313,8 +297,29 @@ def test_tolerances() -> None:
         assert check_tolerance(value) == value
         assert isinstance(check_tolerance(value), float)
     for wrong in (-1e-9, math.inf, math.nan, None, "0.1", True):
-        with pytest.raises(ValueError, match=r"`tolerance` \(=.*\) must be a finite number >= 0"):
+        with pytest.raises(ValueError, match="`tolerance`"):
             check_tolerance(wrong)  # type: ignore[arg-type]
+
+
+def test_the_exposure_has_what_runs() -> None:
+    """Of blur that is left out, neither extent nor path nor layout stays."""
+    where, layout = {"path": Path(3.0, 0.5), "subject_path": Path(4.0)}, Layout(torch.zeros(16, 16))
+    blurs = {"defocus_px": 2.0, "motion_px": 4.0, "layout": layout, **where}
+    inputs = TransitionInputs(2.0, UNIT, UNIT, 0.1, True, Statistics(), FLAT, (network("a", 0.0),))
+    for disc, streak in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.0, 0.0)):
+        found = Statistics(disc=disc, streak=3 / 4 * streak)  # a path's bound is that of a disc
+        made = decide(inputs._replace(statistics=found, **blurs))
+        moves = disc > 0.0
+        assert (made.defocus_px, made.motion_px) == (2.0 * (disc > 0.0), 4.0 * moves)
+        assert (made.path, made.subject_path) == ((*where.values(),) if moves else (None, None))
+        assert made.layout is (layout if moves else None)
+        assert (made.ratio, made.source, made.denoised, made.opened_to) == (2.0, UNIT, None, None)
+    opened = inputs._replace(aperture_px=9.0, opens=True, f_number=2.8, statistics=Statistics(9, 9))
+    made = decide(opened)
+    assert (made.opened_to, made.source.is_zero) == (2.8, True)
+    assert made.denoised is inputs.networks[0]
+    assert made.left_out == 0.0
+    assert Exposure(1.0, UNIT, UNIT).left_out == 0.0
 
 
 # Steps and errors
@@ -341,7 +346,9 @@ def test_each_decision_says_what_it_costs() -> None:
     nlf = NoiseLevelFunction((0.0,) * 4, (25e-6,) * 4)
     light, settings = torch.full((4, 16, 20), 0.2), CameraSettings(100, 1, 8)
     denoised = (network("nano", 0.08, spread=1.5),)
-    made = PreparedScene(light, settings, replace(camera, segments=()), nlf, denoised=denoised)
+    made = PreparedScene(
+        light, settings, replace(camera, segments=()), nlf, denoised_lights=denoised
+    )
     tiny, strict, loose = (replace(made, tolerance=t).plan(settings) for t in (0.09, 0.2, 0.3))
     assert "leaving it out would be an error of 0.25" in strict.steps[1].reason
     network_bound, loose_bound = 0.1 * 1.5 * _BOUND["network"], 0.25 * _BOUND["left out"]
@@ -357,7 +364,7 @@ def test_each_decision_says_what_it_costs() -> None:
     assert "left out 0.25 (tolerance 0.3: kept)" in loose.explain()
     assert "within the tolerance" in loose.left_out["noise_reduction"]
     assert "(error 0.25)" in loose.details()
-    alone = replace(made, denoised=()).plan(settings)
+    alone = replace(made, denoised_lights=()).plan(settings)
     assert alone.errors["left out"] == pytest.approx(0.25)
 
 

@@ -43,7 +43,7 @@ def _simulator(**options: Any) -> CameraSimulator:
 
 
 def _denoised(simulator: CameraSimulator, source: RawImage | PreparedScene) -> torch.Tensor:
-    (found,) = simulator.prepare(source).denoised
+    (found,) = simulator.prepare(source).denoised_lights
     return found.light
 
 
@@ -63,7 +63,7 @@ def test_what_is_found_again_is_the_same_bit_by_bit(folder: Path, depth: Any) ->
     found.append(later.prepare(raw, depth=depth))
     assert not runs
     for prepared in found:
-        light, expected = prepared.denoised[0].light, made.denoised[0].light
+        light, expected = prepared.denoised_lights[0].light, made.denoised_lights[0].light
         assert torch.equal(light, expected)
         assert light.stride() == expected.stride()
         if depth == "unknown":

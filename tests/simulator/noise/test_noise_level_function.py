@@ -1,55 +1,62 @@
-"""Noise level functions: their arithmetic, and the variance of images."""
+"""Noise of a pixel: its variance, what of it is missing, and the rows and tails of read noise."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import FrozenInstanceError
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import quad
+from scipy.stats import norm
 
-from simulator.noise.noise_level_function import NoiseLevelFunction, noise_variance
+from simulator.camera import CameraProfile, get_camera
+from simulator.camera_simulator import CameraSimulator
+from simulator.capture.prepared_scene import PreparedScene
+from simulator.capture.sensor import Transitions, record
+from simulator.noise.noise_level_function import (
+    NoiseLevelFunction,
+    ReadNoise,
+    averaged_shape,
+    missing_variance,
+    noise_variance,
+    top_up_table,
+    tukey_lambda,
+)
+from simulator.reference.camera import ReferenceCamera
+from simulator.settings import CameraSettings
 
 CLEAN = NoiseLevelFunction((1e-5, 2e-5, 3e-5, 4e-5), (1e-8, 2e-8, 3e-8, 4e-8))
+NOISY = NoiseLevelFunction((5e-4, 4e-4, 4e-4, 3e-4), (5e-7, 4e-7, 4e-7, 3e-7))
+ZERO = NoiseLevelFunction.zero()
 
 
 def signal(*levels: float) -> torch.Tensor:
     return torch.tensor(levels, dtype=torch.float32).expand(4, 1, len(levels))
 
 
-def test_variance_is_read_plus_shot_times_signal() -> None:
-    variance = noise_variance(signal(0.0, 0.5, 2.0), CLEAN)
-    expected = [[r, r + 0.5 * s, r + 2 * s] for s, r in zip(CLEAN.shot, CLEAN.read, strict=True)]
-    np.testing.assert_allclose(variance[:, 0].numpy(), expected, rtol=1e-6)
-
-
-def test_negative_signals_carry_read_noise_only() -> None:
-    """The square root of a negative variance is the classic NaN."""
-    variance = noise_variance(signal(-0.07, -1e-9, -1e6), CLEAN)
-    np.testing.assert_allclose(variance[:, 0].numpy(), np.array([CLEAN.read] * 3).T, rtol=1e-6)
-    assert torch.isfinite(variance.sqrt()).all()
-
-
-def test_variances_below_half_precision_are_kept() -> None:
+def test_variance_is_read_plus_shot_times_signal_in_float32() -> None:
+    """Below black read noise alone; variances of 5e-9 are kept of a signal in half precision."""
+    levels = np.array([-1e6, -1e-9, 0.0, 0.5, 2.0])
+    variance = noise_variance(signal(*levels), CLEAN)[:, 0]
+    expected = np.array(CLEAN.read)[:, None] + np.outer(CLEAN.shot, levels.clip(0))
+    np.testing.assert_allclose(variance.numpy(), expected, rtol=1e-6)
     tiny = NoiseLevelFunction((0.0,) * 4, (5e-9,) * 4)
-    half = signal(0.0, 0.1).to(torch.float16)
-    assert noise_variance(half, tiny).dtype == torch.float32
-    np.testing.assert_allclose(noise_variance(half, tiny).numpy(), 5e-9, rtol=1e-6)
+    found = noise_variance(signal(0.0, 0.1).half(), tiny)
+    assert found.dtype == torch.float32
+    np.testing.assert_allclose(found.numpy(), 5e-9, rtol=1e-6)
 
 
-def test_noise_level_function_arithmetic() -> None:
+def test_arithmetic() -> None:
     nlf = NoiseLevelFunction((4e-5, 3e-5, 3e-5, 2e-5), (4e-8, 3e-8, 3e-8, 2e-8))
     assert nlf.exposed(8).shot == pytest.approx((32e-5, 24e-5, 24e-5, 16e-5))
     assert nlf.exposed(8).read == pytest.approx((256e-8, 192e-8, 192e-8, 128e-8))
     assert nlf.scaled(1 / 16).shot == pytest.approx((2.5e-6, 1.875e-6, 1.875e-6, 1.25e-6))
     assert nlf.scaled(1 / 16).read == pytest.approx((2.5e-9, 1.875e-9, 1.875e-9, 1.25e-9))
-    assert NoiseLevelFunction.zero().is_zero
-    assert nlf.zero().is_zero
-    assert not nlf.is_zero
+    assert ZERO.is_zero
     assert not NoiseLevelFunction((0,) * 4, (0, 0, 0, 1e-12)).is_zero
-    with pytest.raises(FrozenInstanceError):
-        nlf.source = "other"  # type: ignore[misc]
     most = NoiseLevelFunction((1.0,) * 4, (1.0,) * 4).exposed(1e30)
     assert (most.shot, most.read) == ((1e24,) * 4, (1e24,) * 4)
     larger = nlf.at_least(NoiseLevelFunction((3e-5,) * 4, (1e-8, 4e-8, 3e-8, 3e-8)))
@@ -59,20 +66,164 @@ def test_noise_level_function_arithmetic() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [
-        (1e-5,) * 3,
-        (-1e-9,) * 4,
-        (math.nan,) * 4,
-        (math.inf,) * 4,
-        1,
-        "abcd",
-        None,
-        (1e-5,) * 5,
-        (1e-5, 1e-5, -1e-5, 1e-5),
-    ],
+    [(1e-5,) * 3, (1e-5,) * 5, (math.nan,) * 4, (math.inf,) * 4, 1, "abcd", (1e-5, 0, -1e-9, 0)],
 )
 @pytest.mark.parametrize("name", ["shot", "read"])
-def test_bad_noise_level_function(name: str, value: object) -> None:
+def test_bad_noise_level_functions_are_refused(name: str, value: object) -> None:
     arguments = {"shot": (1e-5,) * 4, "read": (1e-8,) * 4, name: value}
-    with pytest.raises(ValueError, match=rf"`{name}` \(=.*\) must be 4 finite values >= 0"):
+    with pytest.raises(ValueError, match=f"`{name}`"):
         NoiseLevelFunction(**arguments)  # type: ignore[arg-type]
+
+
+# -- the variance that is missing -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("source", "target"), [(CLEAN, NOISY), (NOISY, CLEAN), (NOISY, NOISY)])
+def test_what_is_missing_is_the_difference_of_the_two_noises(
+    source: NoiseLevelFunction, target: NoiseLevelFunction
+) -> None:
+    """A quarter of the source's variance is left of the second pixels: the rest is missing, too."""
+    levels, share = signal(-0.05, 0.0, 0.2, 0.9, 0.5), torch.tensor([[1.0, 0.25, 1.0, 0.25, 0.0]])
+    (table,) = top_up_table([source], [target])
+    given, wanted = (noise_variance(levels, nlf).double() for nlf in (source, target))
+    plain, blurred = missing_variance(levels, table), missing_variance(levels, table, share)
+    np.testing.assert_allclose(plain, wanted - given, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(blurred, wanted - share * given, rtol=1e-5, atol=1e-12)
+    for plane in range(4):  # one plane alone, by its column of the table
+        alone = missing_variance(levels[plane], table[:, plane], share)
+        assert torch.equal(alone, blurred[plane])
+
+
+def test_the_table_has_the_differences_in_float64() -> None:
+    nearly = NoiseLevelFunction((1e-4 * (1 + 1e-12),) * 4, CLEAN.read)
+    table = top_up_table([NoiseLevelFunction((1e-4,) * 4, CLEAN.read), CLEAN], [nearly, NOISY])
+    assert table.shape == (2, 4, 4)
+    assert table[0, 0] == pytest.approx(1e-16, rel=1e-3)
+    assert table[0, 1].tolist() == [0.0] * 4
+    np.testing.assert_allclose(table[1, 0], np.subtract(NOISY.shot, CLEAN.shot))
+    assert table[1, 2:].tolist() == [list(CLEAN.shot), list(CLEAN.read)]
+    assert top_up_table([], []).shape == (0, 4, 4)
+
+
+# -- rows and tails of read noise -------------------------------------------------------------
+
+BASE = CameraSettings(100, 1 / 64, 4)
+READ, SHOT, SPAN, ROW = 1e-4, 2e-3, 12000.0, 0.5  # a read noise of 120 digital numbers
+HEIGHT, WIDTH = 512, 256
+
+
+def quantile(p: float, shape: float) -> float:
+    """Of Tukey's lambda distribution."""
+    return (p**shape - (1 - p) ** shape) / shape if shape else math.log(p / (1 - p))
+
+
+def moment(shape: float, power: int) -> float:
+    """Over the normal score, where the integrand has no singularity."""
+    return quad(
+        lambda z: quantile(norm.cdf(z), shape) ** power * norm.pdf(z), -8, 8, epsabs=0, limit=200
+    )[0]
+
+
+def kurtosis(shape: float) -> float:
+    return moment(shape, 4) / moment(shape, 2) ** 2 - 3
+
+
+@pytest.mark.parametrize("shape", [-0.2, -0.1, 0.0, 0.05, 0.135, 0.3])
+def test_draws_are_quantiles_of_variance_one(shape: float) -> None:
+    z = np.array([-4.0, -1.5, 0.0, 0.3, 2.0])
+    deviation = math.sqrt(moment(shape, 2))
+    expected = [quantile(norm.cdf(x), shape) / deviation for x in z]
+    drawn = tukey_lambda(torch.from_numpy(z), shape).numpy()
+    np.testing.assert_allclose(drawn, expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize(("shape", "k"), [(-0.1, 1), (-0.1, 3), (0.05, 2), (0.3, 2), (0.13, 4)])
+def test_kurtosis_falls_with_the_number_of_averaged_pixels(shape: float, k: int) -> None:
+    """Cumulants of a mean of n independent draws: the fourth falls as n^3, the variance as n."""
+    assert kurtosis(averaged_shape(shape, k)) == pytest.approx(kurtosis(shape) / k**2, abs=2e-3)
+
+
+def camera(row: float = ROW, shape: float = -0.05) -> CameraProfile:
+    nlf = NoiseLevelFunction((SHOT,) * 4, (READ,) * 4)
+    tables = {"nlf_by_iso": {100.0: nlf}, "read_noise_by_iso": {100.0: ReadNoise(row, shape)}}
+    return CameraProfile("round", "RGGB", 3000, 3000 + SPAN, 14, **tables)  # type: ignore[arg-type]
+
+
+def by_engine(level: float, k: int, source: NoiseLevelFunction = ZERO) -> np.ndarray:
+    light = torch.full((4, HEIGHT, WIDTH), level)
+    scene = PreparedScene(light, BASE, camera(), source, box_factor=k)
+    return scene.expose([BASE], seed=5, noise="sensor")[0].double().numpy()
+
+
+def by_reference(level: float, k: int) -> np.ndarray:
+    signal = torch.full((4, k * HEIGHT, k * WIDTH), level)  # averaged after it was recorded
+    generator = torch.Generator().manual_seed(5)
+    body = ReferenceCamera(camera(), box_factor=k, sensor_noise=True)
+    return body.record(signal, 100.0, generator).double().numpy()
+
+
+@pytest.mark.parametrize("capture", [by_engine, by_reference])
+@pytest.mark.parametrize(("level", "k"), [(0.0, 1), (0.2, 1), (0.0, 3)])
+def test_rows_and_pixels_share_the_variance(
+    capture: Callable[[float, int], np.ndarray], level: float, k: int
+) -> None:
+    frame = capture(level, k) - level
+    rows, pixels = ROW**2 * READ / k, (1 - ROW**2) * READ / k**2 + SHOT * level / k**2
+    sampling = 5 * math.sqrt(2 / HEIGHT)
+    within = frame.var(axis=2, ddof=1).mean(axis=1)
+    np.testing.assert_allclose(within, pixels, rtol=0.02)
+    means = frame.mean(axis=2)
+    covariance = np.cov(means)
+    expected = np.kron(np.eye(2), np.full((2, 2), rows)) + np.eye(4) * pixels / WIDTH
+    np.testing.assert_allclose(covariance, expected, atol=sampling * expected[0, 0])
+    if k == 1:  # the noise level function is that of a sensor pixel
+        np.testing.assert_allclose(frame.var(), READ + SHOT * level, rtol=sampling)
+    elsewhere = frame - means[..., None]
+    found = (elsewhere**4).mean() / (elsewhere**2).mean() ** 2 - 3
+    share = (1 - ROW**2) * READ / k**2 / pixels  # fourth cumulants: shot noise has hardly any
+    assert found == pytest.approx(kurtosis(-0.05) / k**2 * share**2, abs=0.15)
+
+
+def test_a_noisy_source_lacks_a_part_of_each() -> None:
+    source = NoiseLevelFunction((0.0,) * 4, (0.6 * READ,) * 4)
+    frame = by_engine(0.0, 1, source)  # its light has no noise: only what is added shows
+    between = frame.mean(axis=2).var(axis=1) - frame.var(axis=2).mean(axis=1) / WIDTH
+    assert between.mean() == pytest.approx(0.4 * READ * ROW**2, rel=5 / math.sqrt(HEIGHT))
+    assert frame.var() == pytest.approx(0.4 * READ, rel=5 * math.sqrt(2 / HEIGHT))
+
+
+def test_off_it_changes_no_bit_and_every_output_shows_the_same_frame() -> None:
+    known, light = camera(), torch.rand(4, 9, 70, generator=torch.Generator().manual_seed(0)) * 1.1
+    plain = replace(known, read_noise_by_iso={})
+    scenes = [PreparedScene(light, BASE, body, ZERO) for body in (known, plain)]
+    for noise in ("exact", "bank"):
+        first, second = (scene.expose([BASE], noise=noise) for scene in scenes)  # type: ignore[arg-type]
+        assert torch.equal(first, second)
+    drawn = [
+        ReferenceCamera(body).record(light, 100.0, torch.Generator().manual_seed(1))
+        for body in (known, plain)
+    ]
+    assert torch.equal(*drawn)
+    simulated = CameraSimulator().simulate(scenes[0], BASE, seed=3, noise="sensor").data
+    assert torch.equal(simulated, scenes[0].expose([BASE], seed=3, noise="sensor")[0])
+    transitions = Transitions.of([light], [scenes[0].exposure(BASE)])
+    signals, numbers = torch.empty(1, 4, 9, 70), np.empty((1, 4, 9, 70), np.uint16)
+    given = {"keys": np.array([7], np.uint64), "read_noise": [ReadNoise(ROW, -0.05)]}
+    ((low, high),) = record(
+        transitions, known, signals=signals, numbers=numbers, count=True, **given
+    )
+    np.testing.assert_array_equal(numbers, np.rint(signals.numpy() * SPAN + 3000))
+    assert (low, high) == ((signals <= 2**-10).sum(), (signals >= 1 - 1e-6).sum())
+
+
+def test_what_is_not_calibrated_is_refused() -> None:
+    z6, light = get_camera("nikon_z6"), torch.zeros(4, 8, 8)
+    for call in (
+        lambda: PreparedScene(light, BASE, z6, ZERO).expose([BASE], noise="sensor"),
+        lambda: ReferenceCamera(z6, sensor_noise=True),
+    ):
+        with pytest.raises(ValueError, match="nikon_z6"):
+            call()
+    for wrong, message in (((1.0, 0.0), "`row`"), ((0.1, -0.25), "`shape`")):
+        with pytest.raises(ValueError, match=message):
+            ReadNoise(*wrong)

@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from simulator.optics.blur import disc_blur
-from simulator.optics.disc_bank import (
-    DIAMETERS,
-    DiscBank,
-    blend,
-    needed,
-    piecewise,
-    remaining_variance,
-)
+from simulator.optics.blur import disc_blur, disc_kernel
+from simulator.optics.disc_bank import DIAMETERS, DiscBank, blend, needed, remaining_variance
 
 BETWEEN = [0.35, 0.85, 1.2, 1.7, 2.4, 3.3, 5.0, 6.5, 9.7, 14.0, 19.0, 27.0]
 KNOTS = np.array(DIAMETERS) ** 2
@@ -65,7 +58,6 @@ def test_gradient_is_finite_everywhere_and_right():
     assert image.grad is None
     assert bool(diameter.grad.isfinite().all())
     assert bool((diameter.grad[:, 0] == 0).all())  # d(diameter^2) is 0 there
-    assert remaining_variance(diameter).requires_grad
     with torch.no_grad():
         assert not DiscBank(image).blurred(diameter).requires_grad
 
@@ -85,10 +77,10 @@ def test_it_is_the_blend_of_whole_frames(size, high):
 def test_only_the_discs_in_use_are_computed():
     image, diameter = uniform(4, 40, 600), torch.full((40, 600), 0.3)
     diameter[20:] = 9.0
-    assert needed(diameter, KNOTS) == [0, 1, *(DIAMETERS.index(d) for d in (8.0, 11.3))]
+    assert needed(diameter) == [0, 1, *(DIAMETERS.index(d) for d in (8.0, 11.3))]
     bank = DiscBank(image)
     found = bank.blurred(diameter)
-    assert sorted(bank._levels) == needed(diameter, KNOTS)
+    assert sorted(bank._levels) == needed(diameter)
     torch.testing.assert_close(found, through_torch(image, diameter), rtol=1e-6, atol=1e-6)
 
 
@@ -97,12 +89,20 @@ def test_interpolation_is_linear_in_the_squared_diameter():
     images = {i: torch.full((2, 3, 200), float(i * i)) for i in range(len(DIAMETERS))}
     diameter = uniform(3, 200, high=35.0)
     expected = np.interp(diameter.double().numpy() ** 2, KNOTS, [float(i * i) for i in images])
-    found = blend(images, diameter, KNOTS)
+    found = blend(images, diameter)
     np.testing.assert_allclose(found.numpy(), np.stack([expected] * 2), rtol=1e-5, atol=1e-5)
 
 
-def test_remaining_variance_is_that_of_torch():
-    diameter = uniform(70, 130, high=35.0)
-    found, expected = (remaining_variance(d) for d in (diameter, diameter.double()))  # no kernel
-    torch.testing.assert_close(found, expected.float(), rtol=2e-5, atol=1e-6)
-    assert float(piecewise(torch.zeros(1, 1), KNOTS, np.eye(len(KNOTS)))) == 1.0
+def test_remaining_variance_is_that_of_each_pixels_kernel():
+    """Of the blend of two discs by NumPy, in frames of any shape."""
+    diameter = uniform(70, 30, high=35.0)
+    found = remaining_variance(diameter)
+    assert torch.equal(remaining_variance(diameter.double()[None])[0].float(), found)
+    for y, x in np.ndindex(7, 3):
+        squared = min(float(diameter[10 * y, 10 * x]) ** 2, KNOTS[-1])
+        index = min(int(np.searchsorted(KNOTS, squared, side="right")), len(KNOTS) - 1)
+        share = (squared - KNOTS[index - 1]) / (KNOTS[index] - KNOTS[index - 1])
+        small, large = (disc_kernel(d) for d in DIAMETERS[index - 1 : index + 1])
+        small = np.pad(small, (len(large) - len(small)) // 2)
+        wanted = (((1 - share) * small + share * large) ** 2).sum()
+        assert float(found[10 * y, 10 * x]) == pytest.approx(wanted, rel=2e-5)

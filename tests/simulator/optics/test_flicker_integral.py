@@ -1,7 +1,6 @@
 """Light integrated in closed form against SciPy's adaptive quadrature and exact fractions."""
 
 import math
-import re
 from collections.abc import Callable
 from fractions import Fraction
 
@@ -96,23 +95,23 @@ def test_extremes_stay_finite_and_in_range(time):
 
 
 @pytest.mark.parametrize(
-    ("make", "rule"),
+    ("make", "name"),
     [
-        (lambda: MainsLamp(0.0), "`frequency` (=0.0) must be in"),
-        (lambda: MainsLamp(depth=1.5), "`depth` (=1.5) must be in"),
-        (lambda: MainsLamp(phase=math.nan), "`phase` (=nan) must be a finite number"),
-        (lambda: PulsedLamp(duty=0.0), "`duty` (=0.0) must be in"),
-        (lambda: PulsedLamp("100"), "`frequency` (='100') must be a finite number"),
-        (lambda: Flash(decay=0.0), "`decay` (=0.0) must be in"),
-        (lambda: Flash(energy=-1.0), "`energy` (=-1.0) must be in"),
-        (lambda: Lamp().mean_light(0.0, 0.0), "`exposure_time` (=0.0) must be in"),
-        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "`rows` (=0) must be an integer"),
-        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "`row_time` (=-1e-05) must be in"),
-        (lambda: Lamp().mean_light(math.inf, 1.0), "`start` must be finite"),
+        (lambda: MainsLamp(0.0), "frequency"),
+        (lambda: MainsLamp(depth=1.5), "depth"),
+        (lambda: MainsLamp(phase=math.nan), "phase"),
+        (lambda: PulsedLamp(duty=0.0), "duty"),
+        (lambda: PulsedLamp("100"), "frequency"),
+        (lambda: Flash(decay=0.0), "decay"),
+        (lambda: Flash(energy=-1.0), "energy"),
+        (lambda: Lamp().mean_light(0.0, 0.0), "exposure_time"),
+        (lambda: Lamp().row_light(0.0, 1.0, 0, 1e-5), "rows"),
+        (lambda: Lamp().row_light(0.0, 1.0, 4, -1e-5), "row_time"),
+        (lambda: Lamp().mean_light(math.inf, 1.0), "start"),
     ],
 )
-def test_bad_values_are_refused(make, rule):
-    with pytest.raises(ValueError, match=re.escape(rule)):
+def test_bad_values_are_refused(make, name):
+    with pytest.raises(ValueError, match=f"`{name}`"):
         make()
 
 

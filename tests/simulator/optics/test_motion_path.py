@@ -8,7 +8,7 @@ import torch
 from scipy.integrate import quad
 from scipy.ndimage import correlate
 
-from simulator.optics.blur import motion_blur
+from simulator.optics.blur import motion_blur, motion_kernel
 from simulator.optics.motion_path import (
     Movement,
     Path,
@@ -17,7 +17,6 @@ from simulator.optics.motion_path import (
     path_blur_apart,
     path_taps,
 )
-from simulator.optics.shapes import motion_kernel
 
 PATHS = [
     Path(0.3, 0.4),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from simulator import get_camera
-from simulator.capture.residual import Residual
+from simulator.capture.statistics import Residual
 from simulator.networks.noise_module import NoiseModule, variance_map
 from simulator.training.data import DetailCrops, DetailPicture
 from simulator.training.train import calibrate

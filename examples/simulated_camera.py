@@ -90,9 +90,10 @@ class SimulatedCamera:
             given = self._pending.popleft()
             self._pending.append(self._pending[-1] if self._pending else given)
             if frame not in self.dropped:
-                return self._photograph(frame, given)
+                return self.photograph(frame, given)
 
-    def _photograph(self, frame: int, asked: dict[str, float]) -> _Request:
+    def photograph(self, frame: int, asked: dict[str, float]) -> _Request:
+        """Frame number `frame` with the controls `asked`."""
         lines = max(1, round(asked["ExposureTime"] / 1e6 / self.line_time))
         steps = self.gain_steps
         gain = steps / (steps - round(steps - steps / max(asked["AnalogueGain"], 1.0)))

@@ -1,3 +1,8 @@
+"""Trainings from YAML files: agents, and the networks of the simulator."""
+
+import json
+import re
+import shlex
 from functools import partialmethod
 from pathlib import Path
 
@@ -8,6 +13,7 @@ from simulator.networks.weights import load_modules
 from simulator.training import scenes as pictures
 from simulator.training import train
 from simulator.training.data import DetailCrops, ReferencePairs
+from simulator.utils.files import sibling
 
 TINY = """\
 preset: compact
@@ -59,3 +65,29 @@ def test_train_stop_and_go_on(ae_env, tmp_path: Path, monkeypatch: pytest.Monkey
     assert [stage["steps"] for stage in card["stages"].values()] == [2, 2, 2]
     assert {"leaves": 2, "chart": 2, "smooth": 2, "depth": 3}.items() <= card["scenes"].items()
     assert isinstance(CameraSimulator.from_pretrained(weights), CameraSimulator)
+
+
+def test_train_then_evaluate(ae_env, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(
+        "agent: regression\nnum_envs: 4\nenvironment: {scenes: 'bundled:small', resolution: 36}\n"
+        "training: {frames: 24, width: 8}\n"
+    )
+    out = Path("runs/a-0.5")
+    code, text, _ = ae_env("train", "tiny.yaml", "--out", out, "--seed", 2)
+    assert code == 0
+    (following,) = re.findall("next: ae-env (.*)", text)
+    card = json.loads(sibling(tmp_path / out, ".json").read_text())
+    assert card["training"]["training"]["seed"] == 2
+    few = ("--scenes", "bundled:small", "--frames", 2, "--episodes", 1)
+    code, text, _ = ae_env(*shlex.split(following), *few)
+    assert code == 0
+    assert f"regression:{out}" in text
+
+
+def test_a_forecaster_is_evaluated_on_video(ae_env, tmp_path: Path) -> None:
+    (tmp_path / "tiny.yaml").write_text(
+        "agent: forecaster\ntraining: {steps: 2, width: 4, batch_size: 2, traces: 5}\n"
+    )
+    code, text, _ = ae_env("train", "tiny.yaml", "--out", "a")
+    assert code == 0
+    assert "next: ae-env evaluate --preset video --policy 'regression:video?foresight=a'" in text

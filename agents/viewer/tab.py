@@ -1,0 +1,140 @@
+"""What the tabs of the page share: the scene, work in the background, pictures and charts."""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from nicegui import run, ui
+
+from agents.viewer.viewed_scene import ViewedScene
+
+_CHART_WIDTH = 640
+_DIVIDE = (
+    "(e) => e.target.closest('.columns').querySelector('.stage')"
+    ".style.setProperty('--cut', e.target.value + '%')"
+)
+
+
+class Tab(ABC):
+    """One tab of the page.
+
+    Args:
+        address: Gives a picture an address that the browser can fetch it from.
+        folder: For files that are downloaded.
+    """
+
+    def __init__(self, address: Callable[[bytes], str], folder: Path) -> None:
+        self.address, self.folder = address, folder
+        self.viewed: ViewedScene | None = None
+
+    @abstractmethod
+    def build(self) -> None:
+        """Puts the tab together, where it is called."""
+
+    def show(self, image: ui.element, jpeg: bytes | None) -> None:
+        """Shows a picture in an ``img``, or none."""
+        if jpeg is None:
+            image.props.pop("src", None)
+        else:
+            image.props["src"] = self.address(jpeg)
+        image.update()
+
+    async def download(self, button: ui.button, name: str, write: Callable[[Path], object]) -> None:
+        """Sends the browser the file called `name` that `write` writes to a path."""
+        path = Path(tempfile.mkdtemp(dir=self.folder), name)
+        with loading(button):
+            await run.io_bound(write, path)
+            ui.download.file(path)
+
+
+@contextmanager
+def loading(button: ui.button, errors: Any = (ValueError, OSError, ImportError)) -> Iterator[None]:
+    """Shows that work of `button` is under way; `errors` become notices."""
+    button.props("loading")
+    try:
+        yield
+    except errors as error:
+        complain(error)
+    finally:
+        button.props(remove="loading")
+
+
+def complain(error: Exception | str) -> None:
+    """Shows an error as a notice."""
+    ui.notify(" ".join(str(error).split()), type="negative", multi_line=True, timeout=10_000)
+
+
+class Stage:
+    """A picture, and another one over it on the right of a divider.
+
+    It is put together where it is made, within an element of class ``columns``.
+
+    Args:
+        tab: The tab that it is on.
+        alt: What the picture is.
+        divider: What the divider divides.
+    """
+
+    def __init__(self, tab: Tab, alt: str, divider: str) -> None:
+        self._tab = tab
+        with ui.element("div").classes("stage whole") as self._holder:
+            self._image = ui.element("img").props(f'alt="{alt}" draggable=false')
+            self._over = ui.element("img").classes("over").props('alt="" draggable=false')
+            self._edge = ui.element("div").classes("edge")
+        self._divider = ui.element("input").classes("divider")
+        self._divider.props(f'type=range min=0 max=100 value=50 step=1 aria-label="{divider}"')
+        self._divider.on("input", js_handler=_DIVIDE)
+        self.compare(None)
+
+    @property
+    def images(self) -> tuple[ui.element, ui.element]:
+        """The picture, and the one over it."""
+        return self._image, self._over
+
+    def show(self, jpeg: bytes, aspect: float, kind: str = "whole") -> None:
+        """Shows a picture: ``"whole"``, or its ``"pixels"``."""
+        self._tab.show(self._image, jpeg)
+        self._holder.classes(replace=f"stage {kind}")
+        self._holder.style(f"--aspect: {aspect:.4f}")
+
+    def compare(self, jpeg: bytes | None) -> None:
+        """Shows a picture right of the divider, or none."""
+        for element in (self._over, self._edge, self._divider):
+            element.set_visibility(jpeg is not None)
+        if jpeg is not None:
+            self._tab.show(self._over, jpeg)
+
+    def clear(self) -> None:
+        """Shows no picture."""
+        self.compare(None)
+        self._tab.show(self._image, None)
+
+
+def curves(
+    lines: Iterable[tuple[str, Sequence[float] | np.ndarray]],
+    low: float,
+    high: float,
+    height: int,
+) -> str:
+    """An SVG of lines, pairs of a colour and values from `low` to `high`: numbers alone."""
+    scale, drawn = (height - 4) / max(high - low, 1e-9), []
+    for colour, values in lines:
+        step = _CHART_WIDTH / max(len(values) - 1, 1)
+        points = " ".join(
+            f"{i * step:.1f},{height - 2 - (float(value) - low) * scale:.1f}"
+            for i, value in enumerate(values)
+        )
+        drawn.append(
+            f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2" '
+            'vector-effect="non-scaling-stroke"/>'
+        )
+    return (
+        f'<svg viewBox="0 0 {_CHART_WIDTH} {height}" preserveAspectRatio="none" '
+        f'style="width:100%;height:{height}px;display:block">{"".join(drawn)}</svg>'
+    )

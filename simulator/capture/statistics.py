@@ -1,0 +1,603 @@
+"""Statistics of a light, from which the errors of a capture are predicted.
+
+Errors are in units of the target's noise: the root mean square over the pixels of
+``sqrt(dm^2 + ds^2) / s``, where dm and ds are what a pixel's mean and standard deviation move by
+and s is the standard deviation that it should have.
+
+`LightStatistics` predicts the errors of steps that are left out. `ResidualStatistics` predicts
+those of a denoising network: the noise that it leaves, and the detail that it takes for noise. Both
+are, in units of the noise, functions of how well noise and detail can be told apart: of the error
+that the best linear filter would make. They are measured once for each network, on pictures that it
+was not trained on, and are part of its weights' card.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from simulator.noise.noise_level_function import NoiseLevelFunction
+from simulator.raw.image import check_packed
+from simulator.utils.compute import kernel, parallel_ranges
+
+#: Bins of about equal population per plane, and pixels of a plane that are sampled, at most.
+BINS = 64
+SAMPLES = 65_536
+#: Pixels of a plane that are sorted to find the bins, at most about this many.
+_SORTED = 4096
+#: Pixels from which another thread is worth waking.
+_WORTH_A_THREAD = 2**16
+#: Variance of the Laplacian of noise of variance 1: 4^2 + 4.
+_LAPLACIAN = 20.0
+#: Light is above white for sure where it is so by this many standard deviations of its noise.
+SURE = 4.0
+_FLOOR = 1e-30  # variance below which a target counts as noise-free: every change is seen
+#: Side of a block, over which light is averaged, and of a window, over which detail is [packed
+#: pixel]; blocks that are sampled, at most about this many.
+BLOCK, _WINDOW, _BLOCKS = 8, 32, 16384
+#: Relative variance of its square: twice the squared autocorrelation, over as many samples.
+_CHANCE = 2.0 * (20.0**2 + 4 * 8.0**2 + 4 * 2.0**2 + 4 * 1.0**2) / 20.0**2
+#: Shares of white noise in octaves of detail, from the finest: 3/4, 3/16, ..., and what is coarser.
+_OCTAVES = (0.75, 0.1875, 0.046875, 0.015625)
+#: What the Wiener error of a window of noise alone comes to by chance.
+_LEAST = 0.003
+#: A frame of n pixels keeps at least this many nths of its noise, however smooth it is.
+_FEW = 2.0
+#: Levels of light that blocks are gathered into, for quick answers.
+_LEVELS = 24
+_TABLES = ("wiener_error", "bias", "variance")
+#: Floating-point rules of sums over bins.
+_SUMS = {"reassoc", "nnan", "nsz", "contract"}
+
+
+# -- sums over pixels, and over bins of pixels ------------------------------------------------
+
+
+@kernel()
+def _find(values, limits, indices):  # type: ignore[no-untyped-def]
+    """Number of `limits` that each value reaches; they are a full tree, ascending.
+
+    Values come in any order: a branch would be mispredicted half of the time.
+    """
+    indices[:] = 0
+    step = (len(limits) + 1) // 2
+    while step:
+        for x in range(len(values)):
+            reached = values[x] >= limits[indices[x] + np.uint32(step - 1)]
+            indices[x] += np.uint32(step) * np.uint32(reached)
+        step //= 2
+
+
+@kernel()
+def _accumulate(first, last, light, rows, edges, sums, levels):  # type: ignore[no-untyped-def]
+    """Adds each pixel of some rows of light (P, H, W) to the bin of its light, by `edges` (P, B-1).
+
+    `sums` (4, P, B): number, light of at least 0, square of the Laplacian, square of the second
+    difference along the row; `levels` (2, P, B): least and most light, at least 0.
+    """
+    _, height, width = light.shape
+    half = 1
+    while 2 * half <= edges.shape[1]:
+        half *= 2
+    limits = np.full(2 * half - 1, np.inf, np.float32)
+    indices = np.empty(width, np.uint32)
+    bins = np.empty((2 * half, 6))
+    for plane in range(first, last):
+        for index in range(edges.shape[1]):  # an array's copy takes a second more to compile
+            limits[index] = edges[plane, index]
+        bins[:] = 0.0  # what is known of a bin lies together
+        bins[:, 4] = np.inf
+        for y in rows:
+            centre = light[plane, y]
+            above, below = light[plane, max(y - 1, 0)], light[plane, min(y + 1, height - 1)]
+            _find(centre, limits, indices)
+            for x in range(width):
+                value = centre[x]
+                found = bins[indices[x]]
+                twice = 2.0 * np.float64(value)
+                left, right = centre[max(x - 1, 0)], centre[min(x + 1, width - 1)]
+                along = np.float64(left) + np.float64(right) - twice
+                across = np.float64(above[x]) + np.float64(below[x]) - twice
+                level = max(np.float64(value), 0.0)
+                found[0] += 1.0
+                found[1] += level
+                found[2] += (along + across) ** 2
+                found[3] += along * along
+                found[4] = min(found[4], level)
+                found[5] = max(found[5], level)
+        for index in range(sums.shape[2]):
+            for kind in range(4):
+                sums[kind, plane, index] += bins[index, kind]
+            levels[0, plane, index] = min(levels[0, plane, index], bins[index, 4])
+            levels[1, plane, index] = max(levels[1, plane, index], bins[index, 5])
+
+
+@kernel(fastmath=_SUMS, boundscheck=False)
+def _excess_error(share, edges, ratio, source, target, floor, sure):  # type: ignore[no-untyped-def]
+    """`LightStatistics.excess_error` of bins; `source` and `target` are (2, P) shot and read."""
+    total = 0.0
+    for plane in range(share.shape[0]):
+        source_shot, source_read = (
+            source[0, plane] * ratio * ratio,
+            source[1, plane] * ratio * ratio,
+        )
+        shot, read = target[0, plane] * ratio, target[1, plane]
+        for edge in range(2):
+            light, shares = edges[edge, plane], share[plane]
+            for index in range(len(shares)):
+                wanted = read + shot * light[index]
+                given = source_read + source_shot * light[index]
+                shows = ratio * light[index] - sure * np.sqrt(given) <= 1.0
+                beyond = np.sqrt(given / (wanted if wanted > floor else floor)) - 1.0
+                beyond = beyond if beyond > 0.0 and shows else 0.0
+                total += shares[index] * beyond * beyond
+    return np.sqrt(total / 2.0)
+
+
+@kernel(fastmath=_SUMS, boundscheck=False)
+def _curvature(share, light, disc, row, ratio, target, floor):  # type: ignore[no-untyped-def]
+    """Root mean squares over bins of second differences in units of a target's noise (2, P)."""
+    discs, rows = 0.0, 0.0
+    for plane in range(share.shape[0]):
+        shot, read = target[0, plane], target[1, plane]
+        for index in range(share.shape[1]):
+            wanted = read + shot * ratio * light[plane, index]
+            wanted = wanted if wanted > floor else floor
+            # What the mean moves by, and with it the deviation of shot noise.
+            weight = share[plane, index] * (1.0 + shot * shot / wanted) / wanted
+            discs += weight * disc[plane, index]
+            rows += weight * row[plane, index]
+    return np.sqrt(discs), np.sqrt(rows)
+
+
+# -- the statistics ---------------------------------------------------------------------------
+
+
+class _Bins(NamedTuple):
+    """Pixels of each plane in bins of similar light, (4, B) float64 each."""
+
+    share: np.ndarray  # of all pixels
+    light: np.ndarray  # mean, at least 0
+    edges: np.ndarray  # (2, 4, B) least and most light, at least 0
+    disc: np.ndarray  # mean square of the Laplacian
+    row: np.ndarray  # mean square of the second difference along the rows
+
+
+class LightStatistics:
+    """Noise and curvature of a light, by its levels; each value is computed when first needed.
+
+    The first answer takes a pass over the pixels, the others a few microseconds each.
+
+    Args:
+        light: (4, H, W) linear light at the reference exposure.
+    """
+
+    def __init__(self, light: torch.Tensor) -> None:
+        self.light = light
+
+    def __reduce__(self) -> tuple[type[LightStatistics], tuple[torch.Tensor]]:
+        return LightStatistics, (self.light,)
+
+    def excess_error(
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+    ) -> float:
+        """Error of leaving a source's noise where it exceeds the target's, rather too high.
+
+        Args:
+            ratio: Exposure ratio from the light to the target.
+            source: Noise of the light, at its own exposure.
+            target: Noise that the capture should have.
+        """
+        if source.is_zero:
+            return 0.0
+        bins = self._bins
+        # Mean of the squares at both edges of a bin: in between it is monotonic, mostly convex.
+        noises = noise_numbers(source), noise_numbers(target)
+        return float(_excess_error(bins.share, bins.edges, float(ratio), *noises, _FLOOR, SURE))
+
+    def curvature(self, ratio: float, target: NoiseLevelFunction) -> tuple[float, float]:
+        """Bounds on the errors of leaving out a disc, and a streak along the rows, of one pixel.
+
+        Others go with the square of their extent. A symmetric kernel with second moment m per axis
+        moves the light by at most m / 2 times its discrete Laplacian, in the root mean square:
+        ``1 - cos(k t) <= k^2 (1 - cos t)``.
+
+        Args:
+            ratio: Exposure ratio from the light to the target.
+            target: Noise that the capture should have.
+        """
+        bins = self._bins
+        # The darkest pixel of a bin stands for all of it: errors are stated too high, not too low.
+        squares = bins.edges[0], bins.disc, bins.row
+        disc, row = _curvature(bins.share, *squares, float(ratio), noise_numbers(target), _FLOOR)
+        return abs(ratio) / 32.0 * disc, abs(ratio) / 24.0 * row  # m = d^2 / 16 and e^2 / 12
+
+    def blur_change(
+        self,
+        ratio: float,
+        source: NoiseLevelFunction,
+        target: NoiseLevelFunction,
+        *,
+        noise: bool = True,
+    ) -> float:
+        """What a disc of one pixel changes, in units of the target's noise; other than in
+        `curvature` estimated, not bounded: the noise of the light itself is taken out.
+
+        Args:
+            ratio: Exposure ratio from the light to the target.
+            source: Noise of the light, at its own exposure.
+            target: Noise that the capture should have.
+            noise: Whether a capture is wanted, in which what is surely white shows no change.
+        """
+        bins = self._bins
+        own = _variance(bins.light, source)
+        wanted = self._signal(ratio, target)[1]
+        detail = np.maximum(bins.disc - _LAPLACIAN * own, 0.0)
+        if noise:
+            detail = np.where(ratio * (bins.light - SURE * np.sqrt(own)) > 1.0, 0.0, detail)
+        return abs(ratio) / 32.0 * _root_mean(bins.share, detail / wanted)
+
+    def relative_level(self, ratio: float, target: NoiseLevelFunction) -> float:
+        """Root mean square of the signal in units of the target's noise."""
+        signal, wanted = self._signal(ratio, target)
+        return _root_mean(self._bins.share, signal**2 / wanted)
+
+    def relative_noise(
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+    ) -> float:
+        """Root mean square of the exposed source's noise in units of the target's."""
+        signal, wanted = self._signal(ratio, target)
+        return _root_mean(self._bins.share, _variance(signal, source.exposed(ratio)) / wanted)
+
+    def relative_excess_variance(
+        self, ratio: float, source: NoiseLevelFunction, target: NoiseLevelFunction
+    ) -> float:
+        """Mean over the pixels of the variance of `source` beyond the target's.
+
+        Relative to the target's. Other than in `excess_error`, `source` is on the target's scale,
+        averaged by what blur there is.
+        """
+        signal, wanted = self._signal(ratio, target)
+        beyond = np.maximum(_variance(signal, source) / wanted - 1.0, 0.0)
+        return float(np.vdot(self._bins.share, beyond))
+
+    def _signal(self, ratio: float, target: NoiseLevelFunction) -> tuple[np.ndarray, np.ndarray]:
+        """Signal of each bin in the capture, and the variance that it should have."""
+        signal = self._bins.light * ratio
+        return signal, np.maximum(_variance(signal, target), _FLOOR)
+
+    @property
+    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Light (4, R, W): sampled rows and their neighbours; and the indices of the sampled ones.
+
+        Whole rows: every column counts alike whatever the width, and a row is read at once.
+        """
+        height, width = self.light.shape[-2:]
+        step = max(1, math.ceil(height * width / SAMPLES))
+        if step == 1:
+            return self.light.cpu().numpy(), np.arange(height)
+        rows = torch.arange(min(step, height) // 2, height, step)
+        around = torch.stack([(rows - 1).clamp(min=0), rows, (rows + 1).clamp(max=height - 1)], 1)
+        picked = self.light[:, around.flatten().to(self.light.device)].cpu().numpy()
+        return picked, np.arange(1, picked.shape[1], 3)
+
+    @functools.cached_property
+    def _sorted(self) -> np.ndarray:
+        """(4, S) light of some pixels of each plane, ascending; every column counts alike."""
+        light, rows = self._rows
+        seen = light[:, rows].reshape(4, -1)
+        step = max(1, seen.shape[1] // _SORTED)
+        while math.gcd(step, light.shape[-1]) > 1:
+            step += 1
+        return np.sort(seen[:, ::step], axis=1)
+
+    @functools.cached_property
+    def _bins(self) -> _Bins:
+        light, rows = self._rows
+        samples = len(rows) * light.shape[-1]
+        edges = self._sorted[:, np.arange(1, BINS) * self._sorted.shape[1] // BINS]
+        sums, levels = np.zeros((4, 4, BINS)), np.zeros((2, 4, BINS))
+        levels[0] = np.inf
+        least = 1 + _WORTH_A_THREAD // samples
+        fixed = (light, rows, np.ascontiguousarray(edges), sums, levels)
+        parallel_ranges(lambda first, last: _accumulate(first, last, *fixed), 4, least=least)
+        counts = np.maximum(sums[0], 1.0)  # equal light leaves bins empty: they have no share
+        return _Bins(
+            share=sums[0] / (4.0 * samples),
+            light=sums[1] / counts,
+            edges=np.where(sums[0] > 0, levels, 0.0),
+            disc=sums[2] / counts,
+            row=sums[3] / counts,
+        )
+
+
+def _variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
+    shot, read = noise_numbers(nlf)[..., None]
+    return read + shot * signal
+
+
+@functools.lru_cache(maxsize=256)
+def noise_numbers(nlf: NoiseLevelFunction) -> np.ndarray:
+    """(2, 4) shot and read noise of the planes."""
+    return np.array([nlf.shot, nlf.read])
+
+
+def _root_mean(weight: np.ndarray, square: np.ndarray) -> float:
+    return math.sqrt(float(np.vdot(weight, square)))
+
+
+# -- errors of networks -----------------------------------------------------------------------
+
+
+def wiener_error(light: torch.Tensor, nlf: NoiseLevelFunction) -> torch.Tensor:
+    """Mean square error of the best linear filter, in units of the noise's variance.
+
+    Where detail has S times the energy of the noise, the Wiener filter's error is S / (1 + S) of
+    the noise. S is estimated for each octave from the energy of the Laplacian of the light averaged
+    over 1, 2, 4 and 8 pixels, all planes together, in windows of 32 x 32 pixels.
+
+    Args:
+        light: (4, H, W) as recorded.
+        nlf: Its noise, not zero.
+
+    Returns:
+        (H // 8, W // 8) in [0, 1], alike within a window; one block for a frame of fewer pixels.
+    """
+    size = light.shape[-2:]
+    window = tuple(min(_WINDOW, n) for n in size)
+    shot, read = (torch.tensor(v)[:, None, None].to(light) for v in (nlf.shot, nlf.read))
+    noise = F.avg_pool2d(light, window).clamp_(min=0.0).mul_(shot).add_(read).clamp_(min=_FLOOR)
+    error = torch.zeros_like(noise[0])
+    for octave, share in enumerate(_OCTAVES):
+        if octave:
+            if min(light.shape[-2:]) < 2:
+                break
+            light, window = F.avg_pool2d(light, 2), tuple(max(1, n // 2) for n in window)
+        energy = F.avg_pool2d(_laplacian(light).square_(), window)
+        excess = (energy / noise).mean(dim=0) * (4.0**octave / _LAPLACIAN) - 1.0
+        chance = _CHANCE / (len(light) * window[0] * window[1])
+        mean, spread = excess.mean(), excess.var(correction=0).clamp(min=chance)
+        excess = mean + (1.0 - chance / spread) * (excess - mean)
+        error += share * (1.0 - 1.0 / (1.0 + excess.clamp_(min=0.0)))
+    error.clamp_(min=min(1.0, _FEW / (size[0] * size[1])))
+    rows, columns = (
+        (torch.arange(max(1, n // BLOCK)) * BLOCK // _WINDOW).clamp(max=windows - 1)
+        for n, windows in zip(size, error.shape, strict=True)
+    )
+    return error[rows][:, columns]
+
+
+def _laplacian(light: torch.Tensor) -> torch.Tensor:
+    padded = F.pad(light[None], (1, 1, 1, 1), mode="replicate")[0]
+    around = padded[:, 2:, 1:-1] + padded[:, :-2, 1:-1] + padded[:, 1:-1, 2:] + padded[:, 1:-1, :-2]
+    return around.sub_(light, alpha=4.0)
+
+
+def _blocks(image: torch.Tensor) -> torch.Tensor:
+    """Means of a picture (C, H, W) over blocks."""
+    return F.avg_pool2d(image, tuple(min(BLOCK, n) for n in image.shape[-2:]))
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Error of one network in units of the standard deviation of the noise that it removes.
+
+    Args:
+        wiener_error: (K,) ascending values of `wiener_error`.
+        bias: (K,) mean square of the systematic error there: detail that is taken for noise.
+        variance: (K,) mean variance of what comes out: noise that is left.
+        spread: Factor on a predicted error below which 90 % of the measured ones are.
+    """
+
+    wiener_error: np.ndarray
+    bias: np.ndarray
+    variance: np.ndarray
+    spread: float
+
+    @classmethod
+    def from_card(cls, values: Mapping[str, Any]) -> Residual:
+        """Of the numbers in a model card.
+
+        Raises:
+            ValueError: If they are not such numbers.
+        """
+        try:
+            tables = tuple(np.asarray(values[n], np.float64) for n in _TABLES)
+            spread = float(values["spread"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"`residual` (={values!r}) must be a calibration: {error}") from None
+        if len({t.shape for t in tables}) != 1 or tables[0].ndim != 1 or len(tables[0]) < 2:
+            raise ValueError(f"`residual` (={values!r}) must be three lists of one length")
+        finite = all(np.isfinite(t).all() and (t >= 0).all() for t in tables)
+        if not finite or not 1.0 <= spread < math.inf:
+            raise ValueError(f"`residual` (={values!r}) must be finite and >= 0, its spread >= 1")
+        return cls(tables[0], tables[1], tables[2], spread)
+
+    def to_card(self) -> dict[str, Any]:
+        """JSON values of a model card."""
+        tables = {n: getattr(self, n) for n in _TABLES}
+        rounded = {n: [float(f"{v:.4g}") for v in t] for n, t in tables.items()}
+        return {**rounded, "spread": round(self.spread, 3)}
+
+    def at(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Squared bias and variance where the Wiener filter has this `error`."""
+        place, knots = np.log2(error + _LEAST), np.log2(self.wiener_error + _LEAST)
+        return np.interp(place, knots, self.bias), np.interp(place, knots, self.variance)
+
+
+@kernel(fastmath=_SUMS, boundscheck=False)
+def _error(bias, variance, level, share, ratio, source, target, noise, sure):  # type: ignore[no-untyped-def]
+    """`ResidualStatistics.error`, over levels of light; bias and variance are the network's."""
+    total = 0.0
+    for plane in range(level.shape[0]):
+        for index in range(level.shape[1]):
+            light = level[plane, index]
+            own = source[0, plane] * light + source[1, plane]
+            wanted = target[0, plane] * light * ratio + target[1, plane]
+            relative = own * ratio * ratio / (wanted if wanted > _FLOOR else _FLOOR)
+            left = variance[plane, index] * relative
+            if noise:
+                if ratio * (light - sure * np.sqrt(own)) > 1.0:
+                    continue
+                beyond = np.sqrt(1.0 + left) - 1.0
+                left = beyond * beyond
+            total += share[plane, index] * (bias[plane, index] * relative + left)
+    return np.sqrt(total)
+
+
+class ResidualStatistics:
+    """Predicts the errors of networks on one recorded light, for any target.
+
+    Each value is computed when it is first needed; the first answer takes a pass over the pixels
+    (over some rows of blocks, where the frame is large), later ones a few microseconds.
+
+    Args:
+        light: (4, H, W) as recorded.
+        nlf: Its noise.
+    """
+
+    def __init__(self, light: torch.Tensor, nlf: NoiseLevelFunction) -> None:
+        self.light, self.nlf = light, nlf
+        self._gathered: dict[Residual, tuple[np.ndarray, np.ndarray]] = {}
+
+    def __reduce__(self) -> tuple[type[ResidualStatistics], tuple[Any, ...]]:
+        return ResidualStatistics, (self.light, self.nlf)
+
+    def error(
+        self,
+        residual: Residual,
+        ratio: float,
+        target: NoiseLevelFunction,
+        *,
+        noise: bool = True,
+    ) -> float:
+        """Error of a capture that starts from the light which a network has denoised.
+
+        Args:
+            residual: Of the network.
+            ratio: Exposure ratio to the target.
+            target: Noise that the capture should have.
+            noise: Whether a capture is wanted; else the light alone, in which noise that is left
+                is an error in full.
+        """
+        level, share = self._levels
+        noises = noise_numbers(self.nlf), noise_numbers(target)
+        return float(_error(*self._of(residual), level, share, float(ratio), *noises, noise, SURE))
+
+    def _of(self, residual: Residual) -> tuple[np.ndarray, np.ndarray]:
+        """Squared bias and variance of a network by plane and level of light, (4, L) each."""
+        found = self._gathered.get(residual)
+        if found is None:
+            error, _, place, counts = self._measured
+            sums = [
+                np.stack([np.bincount(p, v, _LEVELS) for p in place]) for v in residual.at(error)
+            ]
+            found = sums[0] / np.maximum(counts, 1), sums[1] / np.maximum(counts, 1)
+            self._gathered[residual] = found
+        return found
+
+    @functools.cached_property
+    def _levels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean light, and share of all samples, by plane and level, (4, L) each."""
+        _, light, place, counts = self._measured
+        sums = [np.bincount(p, v, _LEVELS) for p, v in zip(place, light, strict=True)]
+        return np.stack(sums) / np.maximum(counts, 1), counts / counts.sum()
+
+    @functools.cached_property
+    def _measured(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Wiener error (N,) and light (4, N) of blocks, their levels, and how many each has."""
+        rows = _some_rows(self.light)
+        parts = [self.light[:, top:bottom] for top, bottom in rows]
+        error = torch.cat([wiener_error(part, self.nlf).flatten() for part in parts])
+        light = torch.cat([_blocks(part).flatten(1) for part in parts], dim=1).clamp_(min=0.0)
+        values = light.double().cpu().numpy()
+        order = np.argsort(np.argsort(values, axis=1), axis=1)
+        place = order * _LEVELS // values.shape[1]
+        counts = np.stack([np.bincount(p, minlength=_LEVELS) for p in place])
+        return error.double().cpu().numpy(), values, place, counts
+
+
+def _some_rows(light: torch.Tensor) -> Sequence[tuple[int, int]]:
+    """First row, and row after the last, of the bands that are sampled."""
+    height, width = light.shape[-2:]
+    blocks = max(1, height // BLOCK) * max(1, width // BLOCK)
+    if blocks <= _BLOCKS or height < 2 * _WINDOW:
+        return [(0, height)]
+    step = _WINDOW * math.ceil(blocks / _BLOCKS)
+    return [(top, top + _WINDOW) for top in range(0, height - _WINDOW + 1, step)]
+
+
+# -- denoised light ---------------------------------------------------------------------------
+
+
+class DenoisedLight:
+    """Light with its noise removed by a noise module.
+
+    A network is the most expensive step there is, and many transitions need none: it runs when
+    `light` is first read, and only then.
+
+    Args:
+        light: (4, H, W) float32, or a function that works it out.
+        name: Of the network.
+        residual: Its error; None where that was not measured.
+        operations: Arithmetic operations that it takes, all pixels together.
+        seconds: Estimates how long that takes on this machine.
+        everywhere: Whether the noise is also removed where a positive tolerance needs no network.
+    """
+
+    def __init__(
+        self,
+        light: torch.Tensor | Callable[[], torch.Tensor],
+        *,
+        name: str = "network",
+        residual: Residual | None = None,
+        operations: int = 0,
+        seconds: Callable[[], float] = float,
+        everywhere: bool = True,
+    ) -> None:
+        if isinstance(light, torch.Tensor):
+            light = check_packed("denoised", light)
+        self._light, self.everywhere = light, everywhere
+        self.name, self.residual, self.operations = name, residual, operations
+        self.seconds = seconds
+        self._lock = threading.RLock()
+
+    def __reduce__(self) -> tuple[Callable[..., DenoisedLight], tuple[torch.Tensor]]:
+        return functools.partial(DenoisedLight, **self._known()), (self.light,)
+
+    def _known(self) -> dict[str, Any]:
+        names = ("name", "residual", "operations", "everywhere")
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def light(self) -> torch.Tensor:
+        """(4, H, W) at the exposure of the source."""
+        with self._lock:
+            if not isinstance(self._light, torch.Tensor):
+                self._light = self._light()
+            return self._light
+
+    @property
+    def shape(self) -> torch.Size | None:
+        """Shape of `light`, where it is known already."""
+        return self._light.shape if isinstance(self._light, torch.Tensor) else None
+
+    @functools.cached_property
+    def statistics(self) -> LightStatistics:
+        """Statistics of `light`."""
+        return LightStatistics(self.light)
+
+    def to(self, device: torch.device) -> DenoisedLight:
+        """The same on `device`; itself where it is there already."""
+        light = self._light
+        if isinstance(light, torch.Tensor) and light.device == device:
+            return self
+        return DenoisedLight(lambda: self.light.to(device), seconds=self.seconds, **self._known())
