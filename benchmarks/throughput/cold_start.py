@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from statistics import median
 
-from benchmarks.harness import Part, Row, quartiles
+from benchmarks.harness import Row, quartiles
 from benchmarks.isolated import CORES
 from benchmarks.throughput.steps import ID
 from simulator.utils.cache import CACHE_VARIABLE
@@ -44,11 +44,6 @@ print(json.dumps([after - before for before, after in zip(times, times[1:])] + [
 """
 
 
-def parts(quick: bool) -> list[Part]:
-    """One part: fresh processes with empty caches, and with those that these have filled."""
-    return [Part("cold start", measure_cold_start, {"quick": quick})]
-
-
 def measure_cold_start(quick: bool) -> list[Row]:
     """A row for each of `CASES`: medians of the `TIMES` of fresh processes, and of their sum."""
     found: dict[str, list[dict[str, float]]] = {case: [] for case in CASES}
@@ -56,7 +51,13 @@ def measure_cold_start(quick: bool) -> list[Row]:
         with tempfile.TemporaryDirectory() as folder:
             for case in CASES:
                 found[case].append(_episode(Path(folder)))
-    return [_row(case, runs) for case, runs in found.items()]
+    rows = []
+    for case, runs in found.items():
+        low, middle, high = quartiles([sum(run[name] for name in TIMES[:-1]) for run in runs])
+        times = {f"{name}_s": median(run[name] for run in runs) for name in (*TIMES, "cpu")}
+        row = {"case": case, "threads": CORES, "total_s": middle, **times}
+        rows.append(row | {"spread": (high - low) / middle})
+    return rows
 
 
 def _episode(folder: Path) -> dict[str, float]:
@@ -69,11 +70,3 @@ def _episode(folder: Path) -> dict[str, float]:
         check=True,
     )
     return dict(zip((*TIMES, "cpu"), json.loads(done.stdout.splitlines()[-1]), strict=True))
-
-
-def _row(case: str, runs: list[dict[str, float]]) -> Row:
-    totals = [sum(run[name] for name in TIMES[:-1]) for run in runs]
-    low, middle, high = quartiles(totals)
-    times = {f"{name}_s": median(run[name] for run in runs) for name in (*TIMES, "cpu")}
-    spread = (high - low) / middle
-    return {"case": case, "threads": CORES, "total_s": middle, **times, "spread": spread}

@@ -72,7 +72,7 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
     torch.set_num_threads(1)  # while children are forked: threads would not come along
     cases = [_copies(8 if quick else 64, size, seed)] if threads > 1 else []
     torch.set_num_threads(threads)
-    cases += [*_limits(threads, size, seed), *_environments(size, seed, quick, threads > 1)]
+    cases += [*_limits(threads, size, seed), *_environments(size, seed, threads > 1)]
     try:
         _measure(cases, *(QUICK if quick else FULL))
     finally:
@@ -85,20 +85,15 @@ def measure_steps(threads: int, size: int, seed: int, quick: bool) -> list[Row]:
 
 
 def _limits(threads: int, size: int, seed: int) -> Iterator[Case]:
-    lights = _lights(size)
+    scenes: Any = gym.make(ID, scenes=SCENES, resolution=size).unwrapped
+    lights = np.stack([scene.light.numpy() for scene in scenes.scenes])
     for noise, name in KERNEL.items():
         kernel = KernelLimit(lights, 64, noise=noise, threads=threads, seed=seed)
         yield Case(name, 64, kernel.step, noise)
     yield Case(LOOKUP, 64, lookup((4, size, size), 64, seed))
 
 
-def _lights(size: int) -> np.ndarray:
-    """(S, 4, H, W) float32 light of the scenes of the environment, as many as it has."""
-    env = gym.make(ID, scenes=SCENES, resolution=size).unwrapped
-    return np.stack([scene.light.numpy() for scene in env.scenes])  # type: ignore[attr-defined]
-
-
-def _environments(size: int, seed: int, quick: bool, full: bool) -> Iterator[Case]:
+def _environments(size: int, seed: int, full: bool) -> Iterator[Case]:
     """Cases of the environment itself; without `full` only the chief ones."""
     live, exact = {"scorer": f"{__name__}:LiveScore"}, {"noise": "exact"}
     # An episode of 8 steps takes 9 frames; the kernel takes one per step.
@@ -128,10 +123,7 @@ def _environments(size: int, seed: int, quick: bool, full: bool) -> Iterator[Cas
 
 
 def _single(name: str, make: dict[str, Any], seed: int) -> Case:
-    env = gym.make(ID, **make)
-    for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
-        env.reset(seed=seed, options={"scene": number})
-    rng = np.random.default_rng(seed)
+    env, rng = warm_environment(make, seed), np.random.default_rng(seed)
 
     def step() -> None:
         if env.step(rng.integers(64))[3]:
@@ -157,7 +149,7 @@ def _copies(count: int, size: int, seed: int) -> Case:
     may have run on several threads before.
     """
     options: dict[str, Any] = {"scenes": SCENES, "resolution": size, **CACHED}
-    make = functools.partial(_prepared, options)
+    make = functools.partial(_copy, options)
     make().close()
     context = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
     mode = AutoresetMode.SAME_STEP
@@ -166,12 +158,16 @@ def _copies(count: int, size: int, seed: int) -> Case:
     return Case(name, count, _stepper(envs, seed), error=error, close=envs.close)
 
 
-def _prepared(options: dict[str, Any]) -> gym.Env:
-    """An environment on one thread that has seen every scene."""
+def _copy(options: dict[str, Any]) -> gym.Env:
     torch.set_num_threads(1)
-    env = gym.make(ID, **options)
+    return warm_environment(options, 0)
+
+
+def warm_environment(make: dict[str, Any], seed: int) -> gym.Env:
+    """An environment that has seen every scene."""
+    env = gym.make(ID, **make)
     for number in range(len(env.unwrapped.scenes)):  # type: ignore[attr-defined]
-        env.reset(seed=0, options={"scene": number})
+        env.reset(seed=seed, options={"scene": number})
     return env
 
 

@@ -100,7 +100,7 @@ def test_the_default_tolerance_is_the_simulator_s() -> None:
     ("arguments", "message"),
     [
         (("simulate", "none.dng", *SIMULATE), "`path` (='none.dng') does not exist"),
-        (("simulate", "picture.png", *SIMULATE), "PNG"),
+        (("simulate", "picture.png", *SIMULATE), "must be a camera raw"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--iso", "-3"), "`iso` (=-3.0) must be"),
         (("simulate", "IMG_1.dng", *SIMULATE, "--shutter", "1/0"), "`shutter` (='1/0')"),
         (("simulate", "IMG_1.dng", *SIMULATE, "-o", "a.tif"), "must end in .dng"),
