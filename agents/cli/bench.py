@@ -61,20 +61,9 @@ def bench(
 
     name = name.replace("-", "_")
     check_word("name", name, BENCHMARKS)
-    if against is not None and name != "throughput":
-        raise ValueError(f"`against` (={str(against)!r}) is an option of throughput only")
-    if against is not None and not (against / "simulator" / "__init__.py").is_file():
-        raise ValueError(f"`against` (={str(against)!r}) must be a checkout of this project")
-    if part is not None:
-        if name != "transfer":
-            raise ValueError(f"`part` (={part!r}) is an option of transfer only")
-        check_word("part", part, ("agents", "tables"))
-    if name == "paper" and folder is None:
-        raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")
-    if weights is not None and name not in ("paper", "features"):
-        raise ValueError(f"`weights` (={str(weights)!r}) is an option of paper and features only")
-    if folder is not None and name not in ("paper", "recorded"):
-        raise ValueError(f"`folder` (={str(folder)!r}) is an argument of paper and recorded only")
+    given = {"against": against, "folder": folder, "weights": weights, "part": part}
+    options: dict[str, Any] = {key: value for key, value in given.items() if value is not None}
+    _check_options(name, **options)
     if not (CHECKOUT / "benchmarks" / "__init__.py").is_file():
         raise ValueError(
             f"the benchmarks are not part of the installed package (there are none in {CHECKOUT}): "
@@ -85,11 +74,30 @@ def bench(
     make_folder(out, make=False)  # a benchmark makes it for its results
     sys.path.insert(0, str(CHECKOUT))  # before the working folder, which may have its own
     stem = {"simulator": "fidelity"}.get(name, name)
-    given: dict[str, Any] = {
-        "against": against,
-        "folder": folder,
-        "weights": weights,
-        "part": part,
-    }
-    options = {option: value for option, value in given.items() if value is not None}
     importlib.import_module(f"benchmarks.{stem}").run(out, seed=seed, quick=quick, **options)
+
+
+#: Benchmarks that take an option.
+_TAKES = {
+    "against": ("throughput",),
+    "folder": ("paper", "recorded"),
+    "part": ("transfer",),
+    "weights": ("paper", "features"),
+}
+
+
+def _check_options(name: str, **options: Any) -> None:
+    """Raises a `ValueError` if a benchmark takes no such option, or not its value."""
+    from simulator.utils.checks import check_word
+
+    for option, value in options.items():
+        if name not in _TAKES[option]:
+            rule = f"is for {' and '.join(_TAKES[option])} only"
+            raise ValueError(f"`{option}` (={str(value)!r}) {rule}")
+    against = options.get("against")
+    if against is not None and not (against / "simulator" / "__init__.py").is_file():
+        raise ValueError(f"`against` (={str(against)!r}) must be a checkout of this project")
+    if "part" in options:
+        check_word("part", options["part"], ("agents", "tables"))
+    if name == "paper" and "folder" not in options:
+        raise ValueError("`folder` (=None) must be given: ae-env bench paper FOLDER")

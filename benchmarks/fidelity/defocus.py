@@ -16,9 +16,8 @@ import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from benchmarks.captures import clipped
 from benchmarks.fidelity.models import load_models
-from benchmarks.harness import Row, data_root, pivot, sections
+from benchmarks.harness import Row, clipped, data_root, pivot, sections
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map

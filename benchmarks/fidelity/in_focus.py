@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.captures import cropped
 from benchmarks.fidelity.defocus import CAMERA, equal_exposure
-from benchmarks.harness import Row, data_root, table
+from benchmarks.harness import Row, cropped, data_root, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.camera import ReferenceCamera, ReferenceScene

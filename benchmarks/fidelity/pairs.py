@@ -19,9 +19,8 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.models import FULL, QUICK, Models, held_out_scenes, load_models
-from benchmarks.harness import Row, pivot, table
+from benchmarks.harness import Row, clipped, pivot, psnr, table
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceCapture

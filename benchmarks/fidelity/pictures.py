@@ -13,10 +13,9 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import load_models
-from benchmarks.harness import RUNS, Row, data_root, table, write_picture
+from benchmarks.harness import RUNS, Row, clipped, data_root, psnr, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
