@@ -117,9 +117,9 @@ def test_weights_that_are_not_finite(agent: Path, context: PolicyContext) -> Non
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"isos": (50, 200)}, "trained with isos from 100 to 6400, the environment has 50 to 200"),
+        ({"isos": (50, 200)}, "isos from 100 to 6400.* has 50 to 200"),
         ({"exposure_times": (0.01, 1.0)}, "exposure_times from 0.001 to 0.5.* has 0.01 to 1"),
-        ({"f_numbers": (4.0, 16.0)}, "trained with f_numbers from 4 to 11.* has 4 to 16"),
+        ({"f_numbers": (4.0, 16.0)}, "f_numbers from 4 to 11.* has 4 to 16"),
     ],
 )
 def test_a_grid_beyond_the_trained_range(

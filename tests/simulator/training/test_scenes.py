@@ -190,9 +190,6 @@ def test_softness_is_that_of_edges() -> None:
     assert _edge_ratio(smooth) == pytest.approx(0.25, abs=0.01)
 
 
-SPLITS = ("train", "validation", "test")
-
-
 def by_split(data: Path | None, drawn: int = 0) -> dict[str, list[DetailPicture]]:
     return {s: detail_pictures(s, data=data, drawn=drawn) for s in SPLITS}  # type: ignore[arg-type]
 
