@@ -66,17 +66,11 @@ def test_errors_and_files_of_ones_own(tmp_path: Path) -> None:
 
 
 def test_every_package_and_the_presets_are_installed() -> None:
-    """`packages` is a list, as `configs` is no folder of `ae_env`: nothing may be forgotten."""
+    """`configs` is no folder of `ae_env`: it must not be forgotten."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    setuptools = project["tool"]["setuptools"]
-    found = {
-        ".".join(file.parent.relative_to(ROOT).parts)
-        for package in ("simulator", "ae_env", "agents")
-        for file in (ROOT / package).rglob("__init__.py")
-    }
-    assert set(setuptools["packages"]) == found | {"ae_env.configs"}
-    assert setuptools["package-dir"] == {"ae_env.configs": "configs"}
-    assert setuptools["package-data"]["ae_env.configs"] == ["**/*.yaml"]
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert wheel["packages"] == ["simulator", "ae_env", "agents"]
+    assert wheel["force-include"] == {"configs": "ae_env/configs"}
 
 
 def test_a_config_of_the_package_is_found_from_anywhere(tmp_path, monkeypatch) -> None:

@@ -312,9 +312,7 @@ def shot(seconds: float | None, look: int, camera: str = "A") -> Shot:
 )
 def test_grouping_of_two_shots(first: Shot, second: Shot, same: bool) -> None:
     assert group_shots(["x", "y"], [first, second]) == (["x", "x"] if same else ["x", "y"])
-
-
-def test_shots_are_grouped_in_the_order_of_their_times() -> None:
+    # In the order of their times, not of their names.
     shots = [shot(1000, 0), shot(0, 1), shot(1010, 2), shot(20, 3)]
     assert group_shots(["a", "b", "c", "d"], shots) == ["a", "b", "a", "b"]
 

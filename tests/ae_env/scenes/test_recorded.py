@@ -160,20 +160,17 @@ def _one_state(path: Path) -> None:
         (_other_size, r"val_1.JPEG' \(\(40, 44\) packed"),
         (lambda path: path.parents[3].joinpath("grid-options-2x2x2.csv").unlink(), "val_0.JPEG"),
         (_sixteen_bits, r"val_1.png' cannot be read: must have 8 bits a sample, not mode 'I;16'"),
+        (None, r"val_0, ISO 100, 1/1000 s, f/4' \(40 x 40 packed\) must"),
         (_one_state, r"\(1 of 1 captures in the grid, .*param_3.*\) must have two states or more"),
     ],
 )
 def test_bad_files_get_one_line_that_names_them(tmp_path: Path, spoil, message: str) -> None:
     write_states(tmp_path)
-    spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
+    if spoil:
+        spoil(tmp_path / "l1" / "param_3" / "n00000001" / "val_1.JPEG")
     with pytest.raises(ValueError, match=message) as error:
-        load(f"recorded:{tmp_path}")
+        load(f"recorded:{tmp_path}", resolution=None if spoil else 64)
     assert "\n" not in str(error.value)
-
-
-def test_settings_can_stand_behind_the_folder() -> None:
-    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
-    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
 
 
 @pytest.mark.parametrize(
@@ -189,12 +186,8 @@ def test_settings_can_stand_behind_the_folder() -> None:
 def test_bad_options(spec: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         load(spec)
-
-
-def test_a_frame_smaller_than_asked_is_named(tmp_path: Path) -> None:
-    write_raws(tmp_path / "desk", tuple(GRID)[:2])
-    with pytest.raises(ValueError, match=r"'desk, ISO 100, 1/1000 s, f/4' \(40 x 40 packed\) must"):
-        load(f"recorded:{tmp_path}", resolution=64)
+    found = RecordedOptions.of("recorded:a/b?iso=100&exposure_time=1/8&f_number=f5.6")
+    assert found == RecordedOptions(Path("a/b"), iso=100, exposure_time=0.125, f_number=5.6)
 
 
 def touch(folder: Path, *names: str) -> Path:

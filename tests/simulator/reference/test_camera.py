@@ -147,6 +147,10 @@ def test_rounding_and_box_average_in_the_variance():
     even = ReferenceCamera(sensor(0.0, 0.0), box_factor=4)
     for averaged in (even.record(half, 100.0, torch.Generator()), even.clip(half, 100.0)):
         torch.testing.assert_close(averaged, flat(0.6, 2))
+    planes = torch.rand(4, 13, 17, generator=torch.Generator().manual_seed(0))
+    assert average_planes(planes, 1) is planes
+    expected = planes[:, :12, :15].reshape(4, 4, 3, 5, 3).mean(dim=(2, 4))
+    torch.testing.assert_close(average_planes(planes, 3), expected)
 
 
 def test_each_photosite_sees_its_own_colour_at_its_own_place():
@@ -338,10 +342,3 @@ def test_a_point_lands_in_the_plane_of_its_colour_and_place(cfa: BayerPattern) -
     assert "".join(seen) == cfa.name
     odd = torch.rand(3, 7, 9)
     assert torch.equal(sample_mosaic(odd, cfa), sample_mosaic(odd[:, :6, :8], cfa))
-
-
-def test_planes_are_averaged_one_by_one() -> None:
-    planes = torch.rand(4, 13, 17, generator=torch.Generator().manual_seed(0))
-    assert average_planes(planes, 1) is planes
-    expected = planes[:, :12, :15].reshape(4, 4, 3, 5, 3).mean(dim=(2, 4))
-    torch.testing.assert_close(average_planes(planes, 3), expected)

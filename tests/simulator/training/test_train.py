@@ -144,16 +144,12 @@ def test_baselines_in_any_precision_and_their_logs(tmp_path):
     assert entry.step == 2
 
 
-def test_a_noise_module_alone_needs_no_scenes(tmp_path):
-    file = save(tmp_path, "nano", scenes=lambda *_: pytest.fail("it asked for scenes"))
-    modules, card = load_modules(file)
-    assert list(modules) == list(card["stages"]) == ["noise"]
-    assert modules["noise"].residual.to_card() == card["residual"]
-
-
-def test_a_training_goes_on_from_other_weights(tmp_path):
-    first = save(tmp_path, "nano")
+def test_a_noise_module_alone_and_a_training_from_its_weights(tmp_path):
+    # A noise module alone needs no scenes.
+    first = save(tmp_path, "nano", scenes=lambda *_: pytest.fail("it asked for scenes"))
     weights, card = load_modules(first)
+    assert list(weights) == list(card["stages"]) == ["noise"]
+    assert weights["noise"].residual.to_card() == card["residual"]
     still = {**STAGE, "steps": 1, "learning_rate": 1e-12}
     (tmp_path / "on").mkdir()
     again, later = load_modules(save(tmp_path / "on", "nano", start=str(first), noise=still))
