@@ -128,23 +128,11 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         **{light: f"{{by_light[{light}]:.3f}}" for light in LIGHTS},
         "minutes to train": lambda row: f"{row['training_s'] / 60.0:.0f}",
     }
-    frames = FRAMES if not meta.get("quick") else QUICK_FRAMES
-    page = [
-        f"PPO on `AutoExposureVideo-v0` ({CONFIG.relative_to(ROOT)}), {frames:,} frames of each "
-        "variant, one seed, one core: a difference between two variants has the chance of one "
-        "training in it. Normalised score on unseen scenes in kinds of light that no training had; "
-        "intervals over source groups.",
-        table(rows, columns),
-        "![mean reward over the frames of each training](ablation.png)",
-        "An action shows two to three frames later, so without a discount nothing is learnt. "
-        "`statistics` are 12 x 16 zones, a histogram and the clipped shares, 18 times fewer "
-        "numbers than pixels. RecurrentPPO of sb3-contrib (examples/recurrent_ppo.py) has an LSTM "
-        "in place of the readings, and logits that are linear in it; its other hyperparameters "
-        "are PPO's.",
-    ]
+    frames = QUICK_FRAMES if meta["quick"] else FRAMES
     picture = learning_figure({row["variant"]: row["curve"] for row in rows})
     kept = [{k: v for k, v in row.items() if k != "curve"} for row in rows]
-    return Report(kept, page, {"frames": frames}, {"ablation.png": picture})
+    tables = {"variants": table(rows, columns)}
+    return Report(kept, tables, meta={"frames": frames}, figures={"ablation.png": picture})
 
 
 BENCHMARK = Benchmark(

@@ -135,43 +135,29 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by step of the light."""
     rows = [row for result in results.values() for row in result["rows"]]
     scenes, filtered = next(iter(results.values()))["scenes"], _filter_rows()
-    page = [
-        f"{scenes} small bundled test scenes with motion and defocus as in an episode, a grid of "
-        f"third stops (2128 states), {FRAMES} frames, the light jumps at frame {STEP}. *Settled*: "
-        "EV100 stays within a third of a stop of its mean over the last 12 frames. *Right*: it "
-        "stays within a third of a stop of a state whose expected score is within 0.01 of the "
-        "best; its frames are those of the scenes in which the policy is right at last. *Follows "
-        f"the whole step*: it ends within {_FOLLOWS_EV:g} EV of where the light went; in the other "
-        "scenes it meets the end of the grid or of its ladder, or bright and dark parts of the "
-        "scene count otherwise. Times per decision are in the [evaluation](evaluation/report.md).",
-        "![EV100 over time](convergence.png)",
-        table(
-            rows,
-            {
-                "light [EV]": "{stops:+g}",
-                "policy": "`{policy}`",
-                "frames to settle (median)": "{frames_to_settle_median:.0f}",
-                "P90": "{frames_to_settle_p90:.0f}",
-                "follows the whole step": "{follows:.0%}",
-                "frames to settle where it does": "{frames_to_settle_following:.0f}",
-                "right at last": "{right_at_last:.0%}",
-                "frames to be right (median)": "{frames_to_be_right_median:.0f}",
-                "final EV error": "{final_ev_error:.2f}",
-            },
-        ),
-        "## What the filter of the Raspberry Pi's AGC implies",
-        "Frames that the filter takes by itself, without a camera: speed 0.2, its square root "
-        "within 20 % of the target. `rpi_agc` above is to be compared with the frames to a third "
-        "of a stop.",
-        table(filtered, _FILTER_COLUMNS),
-    ]
+    columns = {
+        "light [EV]": "{stops:+g}",
+        "policy": "`{policy}`",
+        "frames to settle (median)": "{frames_to_settle_median:.0f}",
+        "P90": "{frames_to_settle_p90:.0f}",
+        "follows the whole step": "{follows:.0%}",
+        "frames to settle where it does": "{frames_to_settle_following:.0f}",
+        "right at last": "{right_at_last:.0%}",
+        "frames to be right (median)": "{frames_to_be_right_median:.0f}",
+        "final EV error": "{final_ev_error:.2f}",
+    }
+    filter_columns = {
+        "light [EV]": "{stops:+g}",
+        "published, to 2 %": "{published}",
+        "to 2 %": "{two}",
+        "to 1/3 EV": "{third}",
+    }
+    tables = {"settling": table(rows, columns), "filter": table(filtered, filter_columns)}
     more = {"grid": "third_stop", "frames": FRAMES, "step": STEP, "scenes": scenes}
     more["filter"] = filtered
-    return Report(rows, page, more, {"convergence.png": _draw(results)})
+    return Report(rows, tables, meta=more, figures={"convergence.png": _draw(results)})
 
 
-_FILTER_COLUMNS = {"light [EV]": "{stops:+g}", "published, to 2 %": "{published}"}
-_FILTER_COLUMNS |= {"to 2 %": "{two}", "to 1/3 EV": "{third}"}
 BENCHMARK = Benchmark(
     name="convergence",
     title="Convergence after a jump of the light",

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
@@ -19,11 +20,10 @@ from agents.applications.hdr import (
     fuse,
     hdr_picture,
 )
-from benchmarks.captures import psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums
-from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
-from simulator import CameraSimulator, RawImage, get_camera
+from benchmarks.harness import Benchmark, Part, Report, Row, data_root, psnr, side_by_side, table
+from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
 from simulator.training.scenes import reference_scenes
 
@@ -53,6 +53,15 @@ def _scenes(quick: bool) -> list[ReferenceScene]:
     return list(groups.values())[: 2 if quick else None]
 
 
+def _view(
+    reference: ReferenceCamera, scene: ReferenceScene, iso: int
+) -> tuple[CameraSettings, Tensor, Tensor]:
+    """Settings that expose `scene` properly, its light behind the lens, and that light exposed."""
+    settings = equal_exposure(scene.reference, iso, F_NUMBER)
+    light = reference.blurred_light(scene, F_NUMBER)
+    return settings, light, reference.expose(light, scene.reference, settings)
+
+
 @torch.no_grad()
 def measure(iso: int, seed: int, quick: bool) -> list[Row]:
     """All scenes at one ISO."""
@@ -61,9 +70,7 @@ def measure(iso: int, seed: int, quick: bool) -> list[Row]:
     simulator = CameraSimulator.from_pretrained("large", cache=None)
     exposures, rows = bracket_exposures(), []
     for scene in _scenes(quick):
-        settings = equal_exposure(scene.reference, iso, F_NUMBER)
-        light = reference.blurred_light(scene, F_NUMBER)
-        unclipped = reference.expose(light, scene.reference, settings)
+        settings, light, unclipped = _view(reference, scene, iso)
         look = {"white_balance": scene.white_balance}
         truth = RawImage(unclipped, settings, camera, **look)
         captures = [
@@ -114,13 +121,10 @@ def picture(seed: int, quick: bool) -> Figure:
     camera, iso = get_camera(CAMERA), ISOS[1]
     reference, found = ReferenceCamera(camera), []
     for scene in _scenes(quick):
-        settings = equal_exposure(scene.reference, iso, F_NUMBER)
-        light = reference.blurred_light(scene, F_NUMBER)
-        unclipped = reference.expose(light, scene.reference, settings)
-        dark = float((unclipped < 2.0**-6).double().mean())
-        found.append((min(dark, 10.0 * float((unclipped > 1.0).double().mean())), scene, unclipped))
-    _, scene, unclipped = max(found, key=lambda entry: entry[0])
-    settings = equal_exposure(scene.reference, iso, F_NUMBER)
+        settings, _, unclipped = _view(reference, scene, iso)
+        dark, bright = (float(s.double().mean()) for s in (unclipped < 2.0**-6, unclipped > 1.0))
+        found.append((min(dark, 10.0 * bright), scene, settings, unclipped))
+    _, scene, settings, unclipped = max(found, key=lambda entry: entry[0])
     look = {"white_balance": scene.white_balance}
     raw = RawImage(reference.capture(scene, settings, seed).sample, settings, camera, **look)
     simulator = CameraSimulator.from_pretrained("large", cache=None)
@@ -188,65 +192,31 @@ def parts(seed: int, quick: bool) -> list[Part]:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """Means over the scenes, by ISO, and by the range of the light."""
     rows: list[Row] = [row for part in results.values() for row in part]
-    means = []
-    for method, label in METHODS.items():
-        mean: Row = {"method": label}
-        for iso in sorted({row["iso"] for row in rows}):
-            for high in (False, True):
-                some = [
-                    row
-                    for row in rows
-                    if (row["method"], row["iso"]) == (method, iso)
-                    and (row["stops"] >= HIGH_RANGE) == high
-                ]
-                key = f"ISO {iso} {'high' if high else 'low'}"
-                for name in ("psnr", "ssim", "radiance_ev"):
-                    values = [row[name] for row in some if name in row]
-                    mean[f"{key} {name}"] = float(np.mean(values)) if values else None
-                mean[f"{key} scenes"] = len(some)
-        means.append(mean)
-    keys = [
-        f"ISO {iso} {level}"
-        for iso in sorted({r["iso"] for r in rows})
-        for level in ("low", "high")
-    ]
-    columns: dict[str, Any] = {"picture": "{method}"}
-    errors: dict[str, Any] = {"light": "{method}"}
-    for key in keys:
-        if means[0][f"{key} scenes"]:
-            columns[key] = _cell(key, "psnr", "ssim")
-            errors[key] = _cell(key, "radiance_ev")
-    seconds = float(np.median([row["seconds"] for row in rows if "seconds" in row]))
-    counts = {level: means[0][f"{keys[i]} scenes"] for i, level in enumerate(("low", "high"))}
-    page = [
-        "Views of held-out radiance maps, 256 x 256 sensor pixels, exposed for their incident "
-        "light by the reference camera. A picture is compared to the one that the map's own light, "
-        "without noise and not clipped by a sensor, gives in the same fusion (bracket of -4 to "
-        "+4 EV in half stops). 17 captures: a bracket that the reference camera really takes, "
-        "which knows the highlights that one raw has lost. Lee: of 2018, ours. Mertens: OpenCV's. "
-        f"High: {HIGH_RANGE:g} stops and more between the 0.1 and 99.9 % quantiles of the light "
-        f"({counts['high']} scenes; low {counts['low']}). PSNR [dB] / SSIM of the sRGB picture, "
-        f"means. `ae-env hdr`'s own part takes {seconds:.2f} s for such a view, on one core.",
-        table(means, columns),
-        f"Error of the radiance itself: root mean square of log2 [EV], where it is above "
-        f"2^{np.log2(DARKEST):.0f} of the raw's white:",
-        table([m for m in means if any(m[f"{k} radiance_ev"] is not None for k in keys)], errors),
-    ]
-    page.insert(2, "![a raw, fused with its noise, by ae-env hdr, and its light fused](hdr.webp)")
+    frame = pd.DataFrame(rows)
+    frame["method"] = pd.Categorical(frame["method"], list(METHODS))
+    frame["range"] = pd.cut(
+        frame["stops"], [-np.inf, HIGH_RANGE, np.inf], right=False, labels=["low", "high"]
+    )
+    means: dict[str, Row] = {label: {"method": label} for label in METHODS.values()}
+    groups = frame.groupby(["iso", "range", "method"], observed=True)
+    pictures: dict[str, Any] = {"picture": lambda row: row["method"]}
+    errors: dict[str, Any] = {"light": lambda row: row["method"]}
+    for (iso, level, method), own in groups:
+        key, mean = f"ISO {iso} {level}", means[METHODS[method]]
+        for name in ("psnr", "ssim", "radiance_ev"):
+            mean[f"{key} {name}"] = own[name].mean()
+        mean[f"{key} scenes"] = len(own)
+        pictures[key] = f"{{{key} psnr:.1f}} / {{{key} ssim:.3f}}"
+        errors[key] = f"{{{key} radiance_ev:.3f}}"
+    with_light = frame.dropna(subset="radiance_ev")["method"].unique()
+    seconds = {"seconds": frame["seconds"].median()}
+    tables = {
+        "pictures": table(means.values(), pictures),
+        "radiance": table((means[METHODS[method]] for method in with_light), errors),
+        "time": table([seconds], {"`ae-env hdr`'s own part, one core [s a view]": "{seconds:.2f}"}),
+    }
     figure = picture(meta["seed"], meta["quick"])
-    return Report([*rows, *means], page, figures={"hdr.webp": figure})
-
-
-def _cell(key: str, *names: str) -> Any:
-    digits = {"psnr": 1, "ssim": 3, "radiance_ev": 3}
-
-    def cell(row: Row) -> str:
-        values = [row[f"{key} {name}"] for name in names]
-        return " / ".join(
-            "-" if v is None else f"{v:.{digits[n]}f}" for n, v in zip(names, values, strict=True)
-        )
-
-    return cell
+    return Report([*rows, *means.values()], tables, figures={"hdr.webp": figure})
 
 
 BENCHMARK = Benchmark(

@@ -13,6 +13,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from agents.metering.rpi_agc import LADDERS, LibcameraAgc, signal_histogram
@@ -144,9 +145,16 @@ def traces(rows: list[Row]) -> Figure:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the rows of all recordings."""
     rows: list[Row] = results["recordings"]
-    worst = {name: max(row[name] for row in rows) for name in rows[0] if name.endswith("deviation")}
-    settled = max(abs(row["settling_ours"] - row["settling_theirs"]) for row in rows)
-    us = float(np.median([row["us_per_decision"] for row in rows]))
+    frame = pd.DataFrame(rows)
+    settling = (frame["settling_ours"] - frame["settling_theirs"]).abs()
+    summary = dict(frame[["exposure_deviation", "split_deviation"]].max())
+    summary |= {"settling": settling.max(), "us": frame["us_per_decision"].median()}
+    summary_columns = {
+        "exposure (time x gain) off by": "{exposure_deviation:.2%}",
+        "exposure time off by": "{split_deviation:.2%}",
+        "settling differs by [frames]": "{settling}",
+        "one decision, median [us]": "{us:.0f}",
+    }
     columns = {
         "scene": "{scene}",
         "light [EV]": "{step_ev:+g}",
@@ -159,20 +167,8 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "settling, libcamera": "{settling_theirs}",
         "ours": "{settling_ours}",
     }
-    page = [
-        f"{len(rows)} recordings of libcamera's own code for the Raspberry Pi (imx477) on a "
-        "simulated sensor, and `agents.metering.rpi_agc` on the same sensor and light, 160 "
-        "frames each, compared frame by frame. What `rpi_agc` adds to it is the choice of the "
-        "nearest state of a grid.",
-        f"Largest deviation of all frames of all recordings: {worst['exposure_deviation']:.2%} of "
-        f"the exposure (time x gain), {worst['split_deviation']:.2%} of the exposure time; "
-        f"settling differs by {settled} frames at most. One decision takes {us:.0f} us.",
-        "![exposure of six recordings, libcamera's and ours](libcamera.png)",
-        "*Settling*: frames after the step of the light until the exposure stays within 2 % of its "
-        "last value.",
-        table(rows, columns),
-    ]
-    return Report(rows, page, {"same": SAME}, {"libcamera.png": traces(rows)})
+    tables = {"summary": table([summary], summary_columns), "recordings": table(rows, columns)}
+    return Report(rows, tables, meta={"same": SAME}, figures={"libcamera.png": traces(rows)})
 
 
 BENCHMARK = Benchmark(

@@ -18,6 +18,7 @@ from agents.onboard.controller import Controller
 from agents.onboard.export import export_agent
 from benchmarks.harness import Benchmark, Part, Report, Row, table
 
+AGENTS = ("regression", "ppo")
 #: Episodes, in light that jumps by `STOPS` in the middle, and their frames.
 EPISODES, FRAMES, STOPS = 64, 16, 4.0
 #: Decisions whose time is measured, one camera alone, the two in turns.
@@ -28,23 +29,23 @@ FRAME_SIZES = ((64, 64), (240, 320), (760, 1014), (1520, 2028))
 SIDES = (64, 32, 16, 8, 4, 2)
 
 
-def _envs(count: int) -> Any:
-    """Episodes on unseen scenes, in light that jumps in the middle."""
-    return gym.make_vec(
+def _prepared(policy: str, quick: bool) -> tuple[int, Any, Any]:
+    """Episodes on unseen scenes, in light that jumps in the middle: how many; and the agent."""
+    torch.set_num_threads(1)
+    count = 8 if quick else EPISODES
+    envs = gym.make_vec(
         "ae_env:ae_env/AutoExposure-v0",
         num_envs=count,
         split="test",
         max_episode_steps=None,
         lighting={"kind": "step", "stops": STOPS, "at": FRAMES // 2},
     )
+    return count, envs, make_policy(policy, PolicyContext.from_envs(envs))
 
 
 def measure(policy: str, seed: int, quick: bool) -> Row:
     """One agent, over episodes on test scenes."""
-    torch.set_num_threads(1)
-    count = 8 if quick else EPISODES
-    envs = _envs(count)
-    agent = make_policy(policy, PolicyContext.from_envs(envs))
+    count, envs, agent = _prepared(policy, quick)
     with tempfile.TemporaryDirectory() as folder:
         file = export_agent(agent, Path(folder, "agent.onnx"))
         size, controller, alone = file.stat().st_size, Controller(file, count), Controller(file)
@@ -71,10 +72,7 @@ def measure(policy: str, seed: int, quick: bool) -> Row:
 
 def smaller(policy: str, seed: int, quick: bool) -> list[Row]:
     """Scores of an agent that sees its frame averaged to fewer pixels, in the same episodes."""
-    torch.set_num_threads(1)
-    count = 8 if quick else EPISODES
-    envs = _envs(count)
-    agent = make_policy(policy, PolicyContext.from_envs(envs))
+    count, envs, agent = _prepared(policy, quick)
     rows: list[Row] = []
     for side in SIDES:
         agent.reset(count)
@@ -135,23 +133,23 @@ def encoding(quick: bool) -> list[Row]:
 
 
 def parts(seed: int, quick: bool) -> list[Part]:
-    """Each agent, and the frames."""
-    agents = [
-        Part(name, measure, {"policy": name, "seed": seed, "quick": quick}, threads=1)
-        for name in ("regression", "ppo")
+    """Each agent, on whole and on smaller frames, and the frames."""
+    tasks = {"": measure, "smaller ": smaller}
+    return [
+        *(
+            Part(f"{name}{agent}", task, {"policy": agent, "seed": seed, "quick": quick}, threads=1)
+            for name, task in tasks.items()
+            for agent in AGENTS
+        ),
+        Part("frames", encoding, {"quick": quick}, threads=1),
     ]
-    smaller_frames = [
-        Part(f"smaller {name}", smaller, {"policy": name, "seed": seed, "quick": quick}, threads=1)
-        for name in ("regression", "ppo")
-    ]
-    return [*agents, *smaller_frames, Part("frames", encoding, {"quick": quick}, threads=1)]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the rows of both agents."""
     frames = results["frames"]
-    rows: list[Row] = [results[name] for name in ("regression", "ppo")]
-    less = [row for name in ("regression", "ppo") for row in results[f"smaller {name}"]]
+    rows: list[Row] = [results[name] for name in AGENTS]
+    less = [row for name in AGENTS for row in results[f"smaller {name}"]]
     for row in rows:
         row["speedup"] = row["us_torch"] / row["us_onnx"]
     columns = {
@@ -163,29 +161,18 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "Controller [us]": "{us_onnx:.0f}",
         "torch / Controller": "{speedup:.1f}",
     }
-    page = [
-        "The agents of the package, exported with `ae-env export` and run by "
-        "`agents.onboard.Controller` (NumPy and ONNX Runtime, no torch), beside themselves in "
-        f"torch: {EPISODES} episodes on unseen scenes, {FRAMES} frames each, in light that jumps "
-        f"by {STOPS:g} EV. Differences are of scores (regression) and logits (PPO). Times are of "
-        "one decision of one camera on one core, medians, measured in turns.",
-        table(rows, columns),
-        "What a camera's frame takes to become the 64 x 64 that the agents look at, before that:",
-        table(frames, {"planes": "4 x {height} x {width}", "ms": "{ms:.2f}"}),
-        "How small a frame is enough: the same episodes, the light of the agents' frame averaged "
-        "to fewer pixels (and repeated to 64 x 64, which the networks take). The score that this "
-        "loses is a mean over episodes with its standard error.",
-        table(
-            less,
-            {
-                "agent": "{policy}",
-                "pixels": "{side} x {side}",
-                "mean score": "{score:.4f}",
-                "lost": "{lost:.4f} +- {error:.4f}",
-            },
-        ),
-    ]
-    return Report([*rows, *less, *frames], page)
+    smaller_columns = {
+        "agent": "{policy}",
+        "pixels": "{side} x {side}",
+        "mean score": "{score:.4f}",
+        "lost": "{lost:.4f} +- {error:.4f}",
+    }
+    tables = {
+        "agents": table(rows, columns),
+        "frames": table(frames, {"planes": "4 x {height} x {width}", "ms": "{ms:.2f}"}),
+        "smaller": table(less, smaller_columns),
+    }
+    return Report([*rows, *less, *frames], tables)
 
 
 BENCHMARK = Benchmark(

@@ -24,10 +24,9 @@ from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.models import CONFIGS
 from benchmarks.fidelity.pairs import PUBLISHED
-from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, pivot, table
+from benchmarks.harness import RUNS, Benchmark, Part, Report, Row, clipped, pivot, psnr, table
 from simulator import CameraSimulator, RawImage, exposure_ratio
 from simulator.networks.weights import load_modules
 from simulator.noise.noise_level_function import noise_variance

@@ -30,14 +30,15 @@ from ae_env.scorers import make_scorer
 from ae_env.scorers.score_table import ScoreTable, ScoreTables
 from benchmarks import brackets
 from benchmarks.brackets import timed_result
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.models import checksums
 from benchmarks.harness import (
     Benchmark,
     Part,
     Report,
     Row,
+    clipped,
     data_root,
+    psnr,
     quartiles,
     table,
 )

@@ -7,17 +7,26 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
+import pandas as pd
 import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from agents.applications.refocus import refocus
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import checksums, weights
-from benchmarks.harness import Benchmark, Part, Report, Row, data_root, side_by_side, table
+from benchmarks.harness import (
+    Benchmark,
+    Part,
+    Report,
+    Row,
+    clipped,
+    data_root,
+    psnr,
+    side_by_side,
+    table,
+)
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera, render_srgb
 from simulator.networks.aperture_module import ApertureModule
 from simulator.optics.disc_bank import DiscBank, added_blur
@@ -165,39 +174,18 @@ def parts(seed: int, quick: bool) -> list[Part]:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """Means over the scenes."""
     rows: list[Row] = [row for part in results.values() for row in part]
-    means = []
-    for method, label in METHODS.items():
-        for iso in sorted({row["iso"] for row in rows}):
-            chosen = [r for r in rows if (r["method"], r["iso"]) == (method, iso)]
-            if not chosen:
-                continue
-            mean: Row = {"method": label, "iso": iso}
-            for f_number in sorted({row["f_number"] for row in chosen}, reverse=True):
-                some = [row for row in chosen if row["f_number"] == f_number]
-                for name in ("psnr", "edge_psnr"):
-                    mean[f"{name} {f_number:g}"] = float(np.mean([row[name] for row in some]))
-            mean["seconds"] = float(np.median([row["seconds"] for row in chosen]))
-            means.append(mean)
-    shown = sorted({row["f_number"] for row in rows}, reverse=True)
-    columns: dict[str, Any] = {"method": "{method}", "ISO": "{iso}"}
-    for f_number in shown:
+    frame, means = pd.DataFrame(rows), []
+    frame["method"] = pd.Categorical(frame["method"], list(METHODS))
+    for (method, iso), own in frame.groupby(["method", "iso"], observed=True):
+        mean: Row = {"method": METHODS[method], "iso": iso, "seconds": own["seconds"].median()}
+        for f_number, scores in own.groupby("f_number")[["psnr", "edge_psnr"]].mean().iterrows():
+            mean |= {f"{name} {f_number:g}": float(value) for name, value in scores.items()}
+        means.append(mean)
+    columns: dict[str, Any] = {"method": lambda row: row["method"], "ISO": "{iso}"}
+    for f_number in sorted(set(frame["f_number"]), reverse=True):
         columns[f"f/{f_number:g}"] = _cell(f_number)
-    columns["seconds"] = lambda row: f"{row['seconds']:.2f}"
-    page = [
-        "Two photographs with measured depth (Middlebury Cones, scikit-image's motorcycle), each "
-        "focused on its front and on its middle, photographed by the reference camera at f/11, "
-        "and opened to each f-number at the same exposure. The truth is the reference camera's "
-        "thin lens at that f-number, without noise; what a method returns has the noise of its "
-        "own. Means over the four: PSNR [dB] of the whole raw, and after the slash within "
-        f"{EDGE_MARGIN} packed pixels of a step of depth. Plain blur: each pixel is a blend of "
-        "discs of its own diameter, whatever lies before it, up to 32 pixels. Seconds are the "
-        "median for one picture on one core, noise reduction included.",
-        table(means, columns),
-        "The paper's module is trained by `configs/simulator/paper.yaml` (on f/11 to f/4); it "
-        "stands here where `runs/simulator/paper` holds its weights.",
-    ]
-    page.insert(2, "![a scene at f/11, and opened to f/1.4](refocus.webp)")
-    return Report([*rows, *means], page, figures={"refocus.webp": picture(meta["seed"])})
+    tables = {"psnr": table(means, {**columns, "seconds": "{seconds:.2f}"})}
+    return Report([*rows, *means], tables, figures={"refocus.webp": picture(meta["seed"])})
 
 
 def _cell(f_number: float) -> Callable[[Row], str]:

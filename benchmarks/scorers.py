@@ -27,8 +27,7 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import prepare_scene
-from benchmarks.captures import recorded
-from benchmarks.harness import Benchmark, Part, Report, Row, cell, pivot, table
+from benchmarks.harness import Benchmark, Part, Report, Row, cell, pivot, recorded, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
 

@@ -313,8 +313,8 @@ def _read_files(
                 skipped.append(f"{path.name}: {error}")
             advance()
     if skipped:
-        more = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
-        text = "; ".join(skipped[:_MOST_NAMES] + more)
+        rest = [f"and {len(skipped) - _MOST_NAMES} more"] if len(skipped) > _MOST_NAMES else []
+        text = "; ".join(skipped[:_MOST_NAMES] + rest)
         if not scenes:
             raise ValueError(
                 f"`scenes` (={str(spec)!r}) must hold a file that can be read, but all "

@@ -1,4 +1,23 @@
-"""From a name, a path or a list to scenes: `load_scenes`, and the scenes of an environment."""
+"""From a name, a path or a list to scenes: `load_scenes`, and the scenes of an environment.
+
+What `scenes=` may be:
+
+- ``"bundled"``; ``"bundled:small"``: the first two source groups of each kind;
+  ``"bundled:large"``: four times the training groups, the same test groups;
+  ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
+- ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`); ``"mixed"``:
+  such views and the procedural scenes of ``"bundled:large"``, as many of each;
+- a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
+- ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
+  given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
+- a list of `Scene`;
+- a mapping ``{"path": file, folder or glob, ...}`` with any fields of `FolderOptions`;
+- a mapping ``{"sequence": folder or glob, ...}`` likewise: the raws of each folder are
+  the frames of one scene over time (`ae_env.scenes.folder`);
+- ``"recorded:FOLDER"`` or a mapping ``{"recorded": folder, ...}``: grids whose every
+  state is a real capture (`ae_env.scenes.recorded` has the layouts), with the
+  ``iso``, ``exposure_time`` and ``f_number`` of files that do not state theirs.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +26,7 @@ import logging
 import os
 import re
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
@@ -81,24 +101,7 @@ def load_scenes(
     """The scenes that `spec` names, of one split, all at one resolution.
 
     Args:
-        spec: What to load:
-
-            - ``"bundled"``; ``"bundled:small"``: the first two source groups of each kind;
-              ``"bundled:large"``: four times the training groups, the same test groups;
-              ``"bundled:snow"``: those of one kind; ``"bundled:hard"``: the hard part;
-            - ``"polyhaven"``: views into real panoramas (`ae_env.scenes.polyhaven`); ``"mixed"``:
-              such views and the procedural scenes of ``"bundled:large"``, as many of each;
-            - a file, folder or glob of raws (any that LibRaw reads) or of ``.hdr`` / ``.exr`` maps;
-            - ``"pkg.mod:attr"``: a list of scenes or a callable that returns one. The callable is
-              given those of ``split``, ``camera`` and ``resolution`` that it has parameters for;
-            - a list of `Scene`;
-            - a mapping ``{"path": file, folder or glob, ...}`` with any fields of `FolderOptions`;
-            - a mapping ``{"sequence": folder or glob, ...}`` likewise: the raws of each folder are
-              the frames of one scene over time (`ae_env.scenes.folder`);
-            - ``"recorded:FOLDER"`` or a mapping ``{"recorded": folder, ...}``: grids whose every
-              state is a real capture (`ae_env.scenes.recorded` has the layouts), with the
-              ``iso``, ``exposure_time`` and ``f_number`` of files that do not state theirs.
-
+        spec: What to load; the head of this module lists it.
         split: ``"train"``, ``"test"`` or ``"all"``. Source groups never straddle splits. A folder
             of fewer than 15 groups is all test. Lists and attributes are used as they are: whoever
             made them has split them.
@@ -126,23 +129,13 @@ def load_scenes(
     recorded = RecordedOptions.of(spec)
     if recorded is not None:
         scenes = recorded_scenes(recorded, request, grid or recorded.grid)
-    elif isinstance(spec, Mapping):
-        load = sequence_scenes if "sequence" in spec else folder_scenes
-        path, options = _options(spec)
-        scenes = load(path, request, options)
-    elif isinstance(spec, Path):
-        scenes = folder_scenes(spec, request)
-    elif isinstance(spec, str):
-        scenes = _by_name(spec, request)
     else:
-        scenes = _sized_list(spec, "scenes", request)
+        scenes = _requested(spec, request)
     if not scenes:
         raise ValueError(f"`scenes` (={spec!r}) must hold at least one scene of split {split!r}")
-    seen: set[str] = set()
-    for scene in scenes:
-        if scene.scene_id in seen:
-            raise ValueError(f"`scene_id` (={scene.scene_id!r}) must be unique, but occurs twice")
-        seen.add(scene.scene_id)
+    name, count = Counter(scene.scene_id for scene in scenes).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"`scene_id` (={name!r}) must be unique, but occurs {count} times")
     return list(scenes)
 
 
@@ -150,6 +143,19 @@ def has_frames(spec: object) -> bool:
     """Whether the scenes of `spec` may be frames that follow each other."""
     sequence = isinstance(spec, Mapping) and "sequence" in spec
     return sequence or RecordedOptions.of(spec) is not None
+
+
+def _requested(spec: Any, request: SceneRequest) -> Sequence[Scene]:
+    """The scenes of anything but a recorded grid."""
+    if isinstance(spec, Mapping):
+        load = sequence_scenes if "sequence" in spec else folder_scenes
+        path, options = _options(spec)
+        return load(path, request, options)
+    if isinstance(spec, Path):
+        return folder_scenes(spec, request)
+    if isinstance(spec, str):
+        return _by_name(spec, request)
+    return _sized_list(spec, "scenes", request)
 
 
 def _by_name(spec: str, request: SceneRequest) -> Sequence[Scene]:
@@ -240,12 +246,7 @@ def environment_scenes(
     environment with the same arguments. Bundled ones that must be drawn are when they are needed.
 
     Args:
-        spec: See `load_scenes`.
-        split: See `load_scenes`.
-        camera: See `load_scenes`.
-        resolution: See `load_scenes`.
-        crop: See `load_scenes`.
-        grid: States of recorded grids; not used by others.
+        spec, split, camera, resolution, crop, grid: See `load_scenes`.
         from_raw: Whether a scene without noise is known through one raw of it only
             (`simulate_source_raw`).
         finds_defocus: Whether a defocus map is estimated where a scene has none.
@@ -258,17 +259,11 @@ def environment_scenes(
     """
     needs_networks = finds_defocus or from_raw
     recorded = RecordedOptions.of(spec)
-    content: Any = spec
-    cacheable = isinstance(spec, str) and spec in NAMED
-    if recorded is not None:
-        content = grid, tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files)
-        cacheable = True
-    key = (content, split, camera, resolution, crop, from_raw)
-    if needs_networks:
-        key = (*key, finds_defocus, simulator, noise)
-        # A user's weights may have other content next time.
-        cacheable &= simulator in (None, *SIZES)
-    known = _LOADED.get(key) if cacheable else None
+    own = (finds_defocus, simulator, noise) if needs_networks else ()
+    key = _memory_key(spec, recorded, grid, split, camera, resolution, crop, from_raw, *own)
+    if needs_networks and simulator not in (None, *SIZES):
+        key = None  # a user's weights may have other content next time
+    known = None if key is None else _LOADED.get(key)
     if known is not None:
         return known
     is_bundled = isinstance(spec, str) and (spec in BUNDLED or spec in BUNDLED_PARTS)
@@ -276,13 +271,14 @@ def environment_scenes(
         scenes = SceneSet.of(_bundled(str(spec), SceneRequest(split, camera, resolution, crop)))
     else:
         networks = None if simulator is None else SceneNetworks(simulator)
+        resize = networks.resized if networks is not None and finds_defocus else Scene.resized
         found = load_scenes(
             recorded or spec,
             split,
             camera=camera,
             resolution=resolution,
             crop=crop,
-            resize=networks.resized if networks is not None and finds_defocus else Scene.resized,
+            resize=resize,
             grid=grid,
         )
         if recorded is None and any(scene.recorded is not None for scene in found):
@@ -293,10 +289,20 @@ def environment_scenes(
         if from_raw:
             found = [simulate_source_raw(s) if s.noise_free else s for s in found]
         scenes = SceneSet(_prepare(scene, networks, finds_defocus, noise) for scene in found)
-    if cacheable:
+    if key is not None:
         tensors = [t for t in (scenes[0].light, scenes[0].recorded) if t is not None]
         _LOADED.put(key, scenes, len(scenes) * sum(tensor.nbytes for tensor in tensors))
     return scenes
+
+
+def _memory_key(
+    spec: SceneSpec, recorded: RecordedOptions | None, grid: ExposureGrid | None, *others: Any
+) -> tuple[Any, ...] | None:
+    """Key of scenes that stay in memory: with a name, or recorded; None for all others."""
+    if recorded is not None:
+        times = tuple((file, file.path.stat().st_mtime_ns) for file in recorded.files)
+        return (grid, times, *others)
+    return (spec, *others) if isinstance(spec, str) and spec in NAMED else None
 
 
 def _prepare(
@@ -364,11 +370,7 @@ def simulate_source_raw(
     unit = CameraSettings(iso, 1.0, F_NUMBER)
     exposure = scene.reference.log2_exposure + np.log2(ratio)
     settings = replace(unit, exposure_time=float(2.0 ** (exposure - unit.log2_exposure)))
-    k = scene.box_factor
-    light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
-    noise = noise_generator(seed, number, iso, ev)
-    taken = ReferenceCamera(scene.camera, box_factor=k).record(light, iso, noise)
-    raw = RawImage(taken, settings, scene.camera, white_balance=scene.white_balance, box_factor=k)
+    raw = _recorded_raw(scene, settings, ratio, noise_generator(seed, number, iso, ev))
     known = Scene.from_raw(raw, scene_id=scene.scene_id)
     return replace(
         scene,
@@ -379,6 +381,16 @@ def simulate_source_raw(
         defocus_map=None,  # of another f-number
         source=f"{scene.source}; photographed at {settings}",
     )
+
+
+def _recorded_raw(
+    scene: Scene, settings: CameraSettings, ratio: float, noise: torch.Generator
+) -> RawImage:
+    """What the reference camera records of a scene whose light is `ratio` times as much."""
+    k = scene.box_factor
+    light = (scene.light * ratio).repeat_interleave(k, -2).repeat_interleave(k, -1)
+    taken = ReferenceCamera(scene.camera, box_factor=k).record(light, settings.iso, noise)
+    return RawImage(taken, settings, scene.camera, white_balance=scene.white_balance, box_factor=k)
 
 
 # -- networks: noise and defocus of scenes, estimated once, before any episode --------------------

@@ -60,16 +60,7 @@ def describe_captures(
     own = [c.own_blur(s.effective_f_number) for c, s in zip(scenes, settings, strict=True)]
     blur = np.hypot(blur, own)  # exactly `blur` where they are 0
     moves = [ALONG_ROWS] * len(scenes) if movements is None else movements
-    parts: list[PixelBlur | None] = []
-    if discs.any() or any(move.subject_speed for move in moves):
-        numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
-        parts = [
-            layout_blur(scene, move, speed=v, times=t, discs=d, own=o)
-            for scene, move, v, (t, d, o) in zip(
-                scenes, moves, speed.tolist(), numbers, strict=True
-            )
-        ]
-    pixel_blur = stacked(parts, blur)
+    pixel_blur = _pixel_blur(scenes, moves, blur, speed=speed, times=times, discs=discs, own=own)
     nlfs = {iso: camera.nlf(iso) for iso in {s.iso for s in settings}}
     ratios = [exposure_ratio(c.reference, s) for c, s in zip(scenes, settings, strict=True)]
     return Captures(
@@ -87,6 +78,29 @@ def describe_captures(
         noisy=noisy,
         pixel_blur=pixel_blur,
     )
+
+
+def _pixel_blur(
+    scenes: Sequence[Scene],
+    moves: Sequence[Movement],
+    blur: np.ndarray,
+    *,
+    speed: np.ndarray,
+    times: np.ndarray,
+    discs: np.ndarray,
+    own: Sequence[float],
+) -> PixelBlur | None:
+    """How many pixels have which blur; None where all pixels of each capture have `blur`."""
+    parts: list[PixelBlur | None] = []
+    if discs.any() or any(move.subject_speed for move in moves):
+        numbers = np.stack([times, discs, own], axis=1)[:, :, None]  # (B, 3, 1)
+        parts = [
+            layout_blur(scene, move, speed=v, times=t, discs=d, own=o)
+            for scene, move, v, (t, d, o) in zip(
+                scenes, moves, speed.tolist(), numbers, strict=True
+            )
+        ]
+    return stacked(parts, blur)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 #: benchmark takes; and those that an evaluation of brackets takes.
 _ENVIRONMENT = ("scenes", "split", "grid", "observation", "sensors", "resolution", "scorer")
 _CONDITION = ("lighting", "delay")
-_OF_BENCHMARKS = ("observation",)
+_OF_BENCHMARKS: tuple[str, ...] = ("observation",)
 _OF_BRACKETS = (*_ENVIRONMENT[:2], *_ENVIRONMENT[3:6], "episodes", "seed")
 
 Preset = Annotated[

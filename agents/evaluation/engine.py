@@ -400,6 +400,8 @@ class EvaluationRun:
         """
         scenes = [self.scenes[i] for i in self.episodes.scene]
         table = np.arange(len(scenes)) % max(self.num_tables, 1)
+        names = ("speed", "defocus", "movement") if light else ()
+        drawn: dict[str, Any] = {name: light[name][table] for name in names}
         of_policy: dict[str, list[Track]] = {}
         for trained, track in tracks.items():
             of_policy.setdefault(trained.policy, []).append(track)
@@ -417,7 +419,7 @@ class EvaluationRun:
             delays=self.plan.options(condition).delays,
             plan=self.plan,
             scenes=scenes,
-            **{key: light[key][table] for key in ("speed", "defocus", "movement") if light},
+            **drawn,
         )
 
 

@@ -384,7 +384,7 @@ def bracket_rows(results: Results, ranking: Sequence[Rank]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    rows = []
+    rows: list[dict[str, Any]] = []
     for result in results.values():
         assert result.plan is not None
         assert result.plan.budgets is not None

@@ -22,7 +22,7 @@ from torch import nn
 
 from ae_env.grid import ExposureGrid
 from ae_env.observation import SETTINGS_RANGES
-from agents.foresight import Floats, Foresight, LightTracker, TrendTracker
+from agents.foresight import Foresight, LightTracker, TrendTracker
 from agents.learning.forecaster import HORIZON, LearntTracker, LightForecaster, load_forecaster
 from agents.learning.networks import (
     UNWATCHED,
@@ -34,7 +34,7 @@ from agents.learning.networks import (
 )
 from agents.learning.weights import MAX_WIDTH, NetworkPolicy, trained_grid
 from agents.metering.meters import make_meter
-from agents.metering.reading import Meter, Reading
+from agents.metering.reading import Floats, Meter, Reading
 from agents.policy import Observations, PolicyContext, masked_argmax
 from agents.policy_names import FORECASTERS, LEARNT, weight_files
 from simulator.utils.config_file import Configuration

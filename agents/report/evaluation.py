@@ -527,9 +527,9 @@ class _Report:
         rows = []
         for name in self.result.tracks:
             own = self.by[self.by.policy == name].set_index("condition")
-            row = {"policy": name}
+            row: dict[str, Any] = {"policy": name}
             for key in ("clipped_high", "clipped_low"):
-                worst = own[key].idxmax()
+                worst: Any = own[key].idxmax()
                 row[key] = own.loc[self.static, key]
                 row[f"{key}_worst"] = f"{own.loc[worst, key]:.2%} ({worst})"
             rows.append(row)

@@ -55,8 +55,8 @@ def plot_scores(path: Path, rows: pd.DataFrame, title: str = "") -> Path:
         title: Text above the figure.
     """
     parts = {name: own for name, own in rows.groupby("condition") if name in _PARTS}
-    names = parts["all"].sort_values("normalised_score", kind="stable").policy
-    names = [name for name in names if name != "oracle"]
+    ordered = parts["all"].sort_values("normalised_score", kind="stable").policy
+    names = [name for name in ordered if name != "oracle"]
     figure = _figure(7.5, 1.6 + 0.42 * len(names))
     axes = figure.add_subplot()
     shown = [part for part in _PARTS if part in parts]

@@ -17,12 +17,12 @@ from benchmarks.fidelity import defocus, in_focus, pairs, pictures
 from benchmarks.fidelity.models import checksums, load_models, train_missing
 from benchmarks.harness import Benchmark, Part, Report, Row, data_root, table
 
-#: In the order of the report: module and heading.
-SECTIONS: dict[str, tuple[Any, str]] = {
-    "pairs": (pairs, "The paper's table"),
-    "defocus": (defocus, "Defocus: f/11 to f/4"),
-    "in focus": (in_focus, "Pictures in focus"),
-    "pictures": (pictures, "Pictures"),
+#: By the part of their rows, in the order of the report.
+MODULES: dict[str, Any] = {
+    "pairs": pairs,
+    "defocus": defocus,
+    "in focus": in_focus,
+    "pictures": pictures,
 }
 
 
@@ -36,9 +36,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
         for camera in pairs.CAMERAS
         for mix in pairs.PAIRS
     ]
-    found.append(Part("defocus", defocus.measure, arguments))
-    found.append(Part("in focus", in_focus.measure, arguments))
-    found.append(Part("pictures", pictures.measure, arguments))
+    found += [Part(name, module.measure, arguments) for name, module in list(MODULES.items())[1:]]
     weights = checksums()
     return [replace(part, threads=1, depends=weights) for part in found]
 
@@ -47,18 +45,10 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by name of the part."""
     rows = [row for own in results.values() for row in own]
     cards = load_models().cards
-    page = [
-        "One thread, float32. Ground truth is the reference camera "
-        "(`simulator/reference/camera.py`); every scene is from the test split, whose "
-        "source groups no training saw. A millisecond is that of one 4 x 128 x 128 raw unless "
-        "stated otherwise.",
-        table([{"name": name, **card} for name, card in cards.items()], _CARD_COLUMNS),
-    ]
-    if data_root() is None:
-        page.append("Without the real files (`AE_ENV_DATA`): what needs them is left out.")
-    for name, (module, heading) in SECTIONS.items():
-        page += [f"## {heading}", *module.section([r for r in rows if r["part"] == name])]
-    return Report(rows, page, {"models": cards, "real_files": data_root() is not None})
+    tables = {"models": table([{"name": name, **card} for name, card in cards.items()], _CARDS)}
+    for name, module in MODULES.items():
+        tables |= module.tables([r for r in rows if r["part"] == name])
+    return Report(rows, tables, meta={"models": cards, "real_files": data_root() is not None})
 
 
 def _stages(card: Row) -> str:
@@ -68,7 +58,7 @@ def _stages(card: Row) -> str:
     )
 
 
-_CARD_COLUMNS: dict[str, Any] = {
+_CARDS: dict[str, Any] = {
     "model": "`{name}`",
     "parameters": "{parameters:,}",
     "stage: steps in CPU time": _stages,

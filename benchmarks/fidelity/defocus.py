@@ -16,9 +16,8 @@ import torch
 from scipy.ndimage import maximum_filter
 from torch import Tensor
 
-from benchmarks.captures import clipped
 from benchmarks.fidelity.models import load_models
-from benchmarks.harness import Row, data_root, pivot, sections
+from benchmarks.harness import Row, clipped, data_root, pivot, sections
 from simulator import CameraSettings, CameraSimulator, RawImage, get_camera
 from simulator.networks.exposure_module import OVER_EXPOSED
 from simulator.networks.noise_module import smoothed, variance_map
@@ -210,8 +209,8 @@ class _Pool:
             }
 
 
-def section(rows: list[Row]) -> list[str]:
-    """The tables."""
+def tables(rows: list[Row]) -> dict[str, str]:
+    """A table for each set of scenes, below its name."""
     contents: dict[str, Any] = {
         "Full": "{relative_to_exp[full]:.2f}",
         "met": lambda r: "yes" if r["met"] else "no",
@@ -220,21 +219,9 @@ def section(rows: list[Row]) -> list[str]:
         "true depth": "{relative_to_exp[true_depth]:.2f}",
         "paper": "{relative_to_exp[paper]:.2f}",
     }
-    return [
-        "RMSE against the noise-free mean at f/4 and the same exposure, relative to EXP, which "
-        "keeps the source's blur. Classes are by true circle of confusion at f/11, in pixels of "
-        'the raw that the map is estimated on. "True depth" is the same blur by the true circle of '
-        "confusion, the most that a map can reach; only occlusion separates it from the truth. "
-        f"Pixels within {CLIP_MARGIN} of one at white in source or target and a border of {BORDER} "
-        "are left out; area is of all others.",
-        *sections(
-            rows,
-            "{set}",
-            lambda own: pivot(
-                own,
-                line=("circle of confusion (area; asked)", "{pixels} ({area:.1%}; {asked:g})"),
-                columns="ISO {iso}",
-                contents=contents,
-            ),
-        ),
-    ]
+    line = "circle of confusion (area; asked)", "{pixels} ({area:.1%}; {asked:g})"
+
+    def show(own: list[Row]) -> str:
+        return pivot(own, line=line, columns="ISO {iso}", contents=contents)
+
+    return {"defocus": "\n\n".join(sections(rows, "{set}", show))}

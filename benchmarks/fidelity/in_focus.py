@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.captures import cropped
 from benchmarks.fidelity.defocus import CAMERA, equal_exposure
-from benchmarks.harness import Row, data_root, table
+from benchmarks.harness import Row, cropped, data_root, table
 from simulator import CameraSimulator, RawImage, get_camera
 from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
@@ -60,14 +59,17 @@ def _change(simulator: CameraSimulator, scene: ReferenceScene, seed: int) -> flo
     return float(((unknown - far).square() / variance).double().mean().sqrt())
 
 
-def section(rows: list[Row]) -> list[str]:
+def tables(rows: list[Row]) -> dict[str, str]:
     """The share that stays, and the pictures that change most."""
     changes = np.array([row["change"] for row in rows])
+    share = {"pictures": len(rows), "small": np.mean(changes < ASKED), "asked": ASKED_SHARE}
     most = sorted(rows, key=lambda row: -row["change"])[:8]
-    return [
-        f"{len(rows)} held-out pictures in focus, ISO {ISO}, f/{F_SOURCE:g} opened to "
-        f"f/{F_TARGET:g}, depth unknown: {np.mean(changes < ASKED):.1%} change by less than "
-        f"{ASKED:g} of the noise (asked {ASKED_SHARE:.0%}). {_OUT_OF_FOCUS} is left out, since its "
-        "letters are blurred over five pixels. Those that change most:",
-        table(most, {"picture": "{picture}", "kind": "{kind}", "change [noise]": "{change:.2f}"}),
-    ]
+    columns = {"picture": "{picture}", "kind": "{kind}", "change [noise]": "{change:.2f}"}
+    return {"in-focus": table([share], _SHARE), "most-changed": table(most, columns)}
+
+
+_SHARE = {
+    "pictures": "{pictures}",
+    f"change by less than {ASKED:g} of the noise": "{small:.1%}",
+    "asked": "{asked:.0%}",
+}

@@ -19,9 +19,8 @@ import torch
 from skimage.metrics import structural_similarity
 from torch import Tensor, nn
 
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.models import FULL, QUICK, Models, held_out_scenes, load_models
-from benchmarks.harness import Row, cell, pivot, sections
+from benchmarks.harness import Row, clipped, pivot, psnr, table
 from simulator import CameraSettings, CameraSimulator, RawImage, exposure_ratio, get_camera
 from simulator.noise.noise_level_function import noise_variance
 from simulator.reference.camera import BodyError, ReferenceCamera, ReferenceCapture
@@ -279,12 +278,13 @@ def _standard_error(values: np.ndarray, subjects: list[str]) -> float | None:
 # -- report ---------------------------------------------------------------------------------------
 
 
-def section(rows: list[Row]) -> list[str]:
-    """The table, the margin by group, and the breakdown."""
+def tables(rows: list[Row]) -> dict[str, str]:
+    """The table, how many pairs there are, the margin by group, and the breakdown."""
     paper = [r for r in rows if (r["mix"], r["group"]) == ("all", "all")]
     whole = {r["camera"]: r["pairs"] for r in paper}
-    counts = [r for r in rows if r["method"] == "ceiling"]
-    counts = [r for r in counts if r["group"] == ("all" if r["mix"] == "all" else "aperture opens")]
+    ceiling = [r for r in rows if r["method"] == "ceiling"]
+    counts = [r for r in ceiling if r["group"] in ("all", "aperture opens")]
+    counts = [r for r in counts if (r["group"] == "all") == (r["mix"] == "all")]
     full = [
         r | {"share": r["pairs"] / whole[r["camera"]]}
         for r in rows
@@ -292,57 +292,42 @@ def section(rows: list[Row]) -> list[str]:
         and r["mix"] == "all"
         and r["group"] in (*PARTITION, "all")
     ]
-    plain = [r for r in rows if r["body_correction"] or not r["preset"]]
-    return [
-        "Pairs of captures as the paper took them (any two of a sequence of 20 to 25), "
-        "photographed by the reference camera. *Noisy*: against the target, before output noise is "
-        "added to the estimate, as the paper measures; its ceiling is the noise-free mean. *Mean*: "
-        "against that mean. PSNR [dB] is the mean over pairs of each pair's, as in the paper; "
-        "images that agree to 80 dB or better count as 80. EXP, NS and Full use the w and b learnt "
-        "on the Z6's body unless `w = 1, b = 0` is said. *No depth known*: photographs, radiance "
-        "maps and flat procedural scenes, which the reference camera takes as in focus throughout: "
-        "an aperture module that reads softness as defocus is wrong there.",
-        "Pairs of source groups: "
-        + "; ".join(cell(r, "{camera}, {mix}: {pairs} of {source_groups}") for r in counts)
-        + ".",
-        pivot(
-            paper,
-            line=("PSNR [dB] / SSIM", _label),
-            columns=lambda r: _NAMES[r["camera"]],
-            contents={
-                "noisy": "{noisy_db:.2f} / {noisy_ssim:.3f}",
-                "mean": "{mean_db:.2f} / {mean_ssim:.3f}",
-                "ms": "{milliseconds:.1f}",
-            },
+    paper_contents: dict[str, Any] = {
+        "noisy": "{noisy_db:.2f} / {noisy_ssim:.3f}",
+        "mean": "{mean_db:.2f} / {mean_ssim:.3f}",
+        "ms": "{milliseconds:.1f}",
+    }
+    margins: dict[str, Any] = {
+        "share": "{share:.0%}",
+        "over EXP [dB]": "{over_exp_noisy_db:+.2f} ± {over_exp_noisy_db_error:.2f}",
+        "over NS [dB]": "{over_before_noisy_db:+.2f} ± {over_before_noisy_db_error:.2f}",
+        "contribution [dB]": lambda r: f"{r['share'] * r['over_exp_noisy_db']:+.2f}",
+    }
+    found = {
+        "counts": table(counts, {"camera": "{camera}", "mix": "{mix}", **_COUNTS}),
+        "paper": pivot(
+            paper, line=("PSNR [dB] / SSIM", _label), columns=_camera, contents=paper_contents
         ),
-        "Published, of other photographs, so that only order and differences compare: "
-        + "; ".join(f"{_NAMES[camera]}: {text}" for camera, text in PUBLISHED.items())
-        + ".",
-        "### Where Full's margin over EXP comes from",
-        "Full `compact` against the noisy target, ± standard errors over source groups; the "
-        "contribution is share times gain.",
-        pivot(
-            full,
-            line=("pairs", "{group}"),
-            columns=lambda r: _NAMES[r["camera"]],
-            contents={
-                "share": "{share:.0%}",
-                "over EXP [dB]": "{over_exp_noisy_db:+.2f} ± {over_exp_noisy_db_error:.2f}",
-                "over NS [dB]": "{over_before_noisy_db:+.2f} ± {over_before_noisy_db_error:.2f}",
-                "contribution [dB]": lambda r: f"{r['share'] * r['over_exp_noisy_db']:+.2f}",
-            },
-        ),
-        *sections(
-            plain,
-            lambda r: f"{_NAMES[r['camera']]}: PSNR [dB] against the noisy target / its mean",
-            lambda own: pivot(
-                own,
-                line=("mix: pairs", "{mix}: {group} ({pairs})"),
-                columns=_label,
-                contents={"": "{noisy_db:.2f} / {mean_db:.2f}"},
-            ),
-        ),
-    ]
+        "margin": pivot(full, line=("pairs", "{group}"), columns=_camera, contents=margins),
+    }
+    for camera in CAMERAS:
+        own = [
+            r for r in rows if r["camera"] == camera and (r["body_correction"] or not r["preset"])
+        ]
+        found[f"groups-{camera}"] = pivot(
+            own,
+            line=("mix: pairs", "{mix}: {group} ({pairs})"),
+            columns=_label,
+            contents={"": "{noisy_db:.2f} / {mean_db:.2f}"},
+        )
+    return found
+
+
+_COUNTS = {"pairs": "{pairs}", "source groups": "{source_groups}"}
+
+
+def _camera(row: Row) -> str:
+    return _NAMES[row["camera"]]
 
 
 def _label(row: Row) -> str:

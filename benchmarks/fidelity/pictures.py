@@ -13,10 +13,9 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from benchmarks.captures import clipped, psnr
 from benchmarks.fidelity.defocus import equal_exposure
 from benchmarks.fidelity.models import load_models
-from benchmarks.harness import RUNS, Row, data_root, table, write_picture
+from benchmarks.harness import RUNS, Row, clipped, data_root, psnr, table, write_picture
 from benchmarks.isolated import ROOT
 from simulator import CameraSettings, RawImage, get_camera, render_srgb
 from simulator.reference.camera import ReferenceCamera, ReferenceScene
@@ -115,14 +114,9 @@ def _draw(axes: Any, row: Row, pictures: list[np.ndarray], middle: tuple[float, 
     axes[-1].set_xlabel(row["target"], fontsize=8)
 
 
-def section(rows: list[Row]) -> list[str]:
-    """The picture and its figures."""
+def tables(rows: list[Row]) -> dict[str, str]:
+    """Settings and PSNR of the pictures."""
     columns = {"situation": "{case}", "scene": "{scene}", "light [lux]": "{illuminance:g}"}
     columns |= {"input": "{source}", "simulated": "{target}"}
-    return [
-        f"![Input, EXP, NS, Full and ground truth](../images/{IMAGE.name})",
-        f"Crops of {CROP} x {CROP} packed pixels, developed alike and not corrected for exposure; "
-        "Full with the target's noise, the ground truth a noisy capture. PSNR [dB] of the whole "
-        "picture before output noise, against the noise-free mean.",
-        table(rows, columns | {n: f"{{psnr_db[{n}]:.2f}}" for n in ("EXP", "NS", "Full")}),
-    ]
+    columns |= {name: f"{{psnr_db[{name}]:.2f}}" for name in ("EXP", "NS", "Full")}
+    return {"pictures": table(rows, columns)}

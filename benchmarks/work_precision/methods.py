@@ -13,9 +13,9 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor, nn
 
-from benchmarks.captures import recorded
 from benchmarks.denoising import Denoiser, classical
 from benchmarks.fidelity.models import load_models, weights
+from benchmarks.harness import recorded
 from simulator import (
     CameraSettings,
     CameraSimulator,

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.captures import clipped, psnr
-from benchmarks.harness import Row, quartiles
+from benchmarks.harness import Row, clipped, psnr, quartiles
 from benchmarks.isolated import timed
 from benchmarks.work_precision.methods import Method, all_methods
 from benchmarks.work_precision.trials import GRID, Trial, trials

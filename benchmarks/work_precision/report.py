@@ -1,16 +1,16 @@
-"""The page: tables of the rows, and the pictures."""
+"""The tables of the rows, and the picture."""
 
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
-from benchmarks.harness import Report, Row, bullets, cell, data_root, sections, table
+from benchmarks.harness import Report, Row, data_root, sections, table
 from benchmarks.isolated import CORES, ROOT
 from benchmarks.work_precision.methods import DEFAULT
 
@@ -34,7 +34,7 @@ _MODULES = ("noise_reduction", "aperture", "defocus", "motion_blur", "noise")
 #: Methods whose PSNR is this far below the best [dB] sit at the lower end of the README's picture.
 _REACH = 6.0
 #: A part makes up nearly all of an error beyond this share of it; smaller errors are not sorted.
-_MOST, _LEAST, _QUANTILES = 0.9, 0.02, (0.1, 0.5, 0.9)
+_MOST, _LEAST, _QUANTILES = 0.9, 0.02, {"low": 0.1, "middle": 0.5, "high": 0.9}
 #: Least factor that a sweep is to be faster by, and by how much its PSNR may be lower [dB].
 TARGETS = {"paper, no repetition": (100.0, 0.0), "paper full": (200.0, 0.0)}
 
@@ -48,73 +48,26 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         [r for r in rows if r["part"] == part] for part in ("precision", "bound", "left_out")
     )
     tests, chosen = ([r for r in bounds if r["split"] == s] for s in ("test", "validation"))
-    targets, tolerances = list(_targets(precise)), _by_tolerance(tests)
-    single = [row for row in tests if row["tolerance"] == DEFAULT]
-    covered = float(np.mean([row["measured"] <= row["bound"] for row in single]))
-    scenes = len({row["scene"] for row in tests})
-    page = [
-        f"{CORES} threads. The truth is the reference camera "
-        "(`simulator/reference/camera.py`), here without hidden errors of its body. "
-        "Scenes are of the test split: procedural ones with and without depth, photographs and "
-        "views into radiance maps; the simulator is not told their depth. Sources are at f/8, "
-        "ISO 100 to 6400 and up to 2 EV less than incident light asks for, and exposed at the 64 "
-        "states of the default grid.",
-        "![Error against time](../images/work_precision.png)",
-        "## Findings",
-        bullets(
-            [
-                *(cell(row, _TARGET) for row in targets),
-                *_fronts(precise),
-                f"The plan's 90 % bound holds for {covered:.1%} of {len(single):,} transitions of "
-                f"{scenes} test scenes.",
-            ]
+    targets = list(_targets(precise))
+    tables = {
+        "targets": table(targets, _TARGET),
+        "precision": "\n\n".join(
+            sections(
+                precise,
+                "{height} x {width}: {scenes} scenes, {states_per_scene} states of each, two "
+                "photographs; floor of the noise: {noise_variance_floor:.1%}",
+                lambda own: table(own, _PRECISION),
+            )
         ),
-        "## Work against precision",
-        "All methods get the same photographs and are compared at the same states, those within "
-        "3 EV of the right exposure, evenly spread: few, because the slow methods would take hours "
-        "for all 64. *Shared* methods do once per photograph what does not depend on the target; "
-        "their time per state is that of the preparation and all 64 exposures, over 64. The others "
-        "start from the raw for every state; their sweep, in brackets, is 64 times the median "
-        "state. Nothing is cached. "
-        "Methods take turns, in another order every round; ± is half the distance between "
-        "quartiles.",
-        "PSNR and relative RMSE are of the expected value, without noise. *Noise*: mean absolute "
-        "deviation of the captures' variance from the noise level function, over 8 levels of "
-        "signal, the median over scenes and states; its floor, from the finite number of pixels, "
-        "is measured on the reference camera's own captures. **Bold**: on the Pareto front of time "
-        "and PSNR.",
-        *sections(
-            precise,
-            "{height} x {width}: {scenes} scenes, {states_per_scene} states of each, two "
-            "photographs; floor of the noise: {noise_variance_floor:.1%}",
-            lambda own: table(own, _PRECISION),
+        "bound": "\n\n".join(
+            sections(_by_tolerance(tests), "{kind}", lambda own: table(own, _BOUND))
         ),
-        "## Predicted and measured",
-        f"`large` on {scenes} test scenes of 128 x 128, each "
-        "photographed several times, at fair and at other states of the grid. Measured: the "
-        "distance between the distributions of the simulated capture and of the reference "
-        "camera's, given the scene, in units of the target's noise: the whole error. Pixels that "
-        "are white in the scene at these settings count as equal. Median over the cases of each "
-        "kind of scene, with the 95 % bootstrap interval over scenes. *Kept*: share of the cases "
-        "whose plan says that the tolerance is kept, and of those the share in which the measured "
-        "error is within it.",
-        *sections(tolerances, "{kind}", lambda own: table(own, _BOUND)),
-        "### The bound's factors",
-        "What the constants of the plan were chosen on: "
-        f"{len({r['scene'] for r in chosen})} scenes of the validation split, tolerance "
-        f"{DEFAULT:g}. Cases in which one part makes up nearly all of the predicted error, and the "
-        "measured error over the predicted.",
-        table(_by_part(chosen), _FACTORS),
-        "## What is left out",
-        f"`compact` at 128 x 128, tolerance 0.1, {max(r['scenes'] for r in kinds)} scenes of each "
-        "kind at most. Share of the 64 states in which a module runs; time of the sweep with the "
-        "rest left out and shared, and of 64 full runs, of which some are timed; the predicted "
-        "error, mean and largest over the states.",
-        table(kinds, _LEFT_OUT),
-    ]
+        "factors": table(_by_part(chosen), _FACTORS),
+        "left-out": table(kinds, _LEFT_OUT),
+    }
     figures: dict[Any, Figure] = {QUICK if meta["quick"] else HEADLINE: _headline(precise)}
     more = {"threads": CORES, "real_files": data_root() is not None, "targets": targets}
-    return Report(rows, page, more, figures)
+    return Report(rows, tables, meta=more, figures=figures)
 
 
 # -- tables ---------------------------------------------------------------------------------------
@@ -128,10 +81,16 @@ def _sweep(row: Row) -> str:
     return _ms(row["ms_per_sweep"]) if row["mode"] == "shared" else f"({row['ms_per_sweep']:,.0f})"
 
 
-_TARGET = (
-    "Sweep with `{method}` at {height} x {width}: {ratio:,.0f} times faster than `{against}` "
-    "(asked: {faster:g}), PSNR {gain_db:+.2f} dB (asked: at least -{lower:g}): {verdict}."
-)
+_TARGET: dict[str, Any] = {
+    "sweep with": "{method}",
+    "at": "{height} x {width}",
+    "against": "{against}",
+    "times faster": "{ratio:,.0f}",
+    "asked": "{faster:g}",
+    "PSNR [dB]": "{gain_db:+.2f}",
+    "asked at least": "-{lower:g}",
+    "verdict": "{verdict}",
+}
 _PRECISION: dict[str, Any] = {
     "method": lambda r: f"**{r['method']}**" if r["pareto"] else r["method"],
     "type": "{dtype}",
@@ -186,75 +145,44 @@ def _targets(rows: list[Row]) -> Iterator[Row]:
         yield target | {"lower": lower, "verdict": "reached" if met else "missed"}
 
 
-def _fronts(rows: list[Row]) -> list[str]:
-    lines = []
-    for height in dict.fromkeys(row["height"] for row in rows):
-        front = sorted(
-            (r for r in rows if r["pareto"] and r["height"] == height),
-            key=lambda r: r["ms_per_state"],
-        )
-        named = ", ".join(cell(row, "`{method}` ({dtype})") for row in front)
-        lines.append(f"Pareto front at height {height}, fastest first: {named}.")
-    return lines
-
-
 def _by_tolerance(rows: list[Row]) -> list[Row]:
-    found = []
-    for kind, tolerance in sorted({(row["kind"], row["tolerance"]) for row in rows}):
-        own = [r for r in rows if (r["kind"], r["tolerance"]) == (kind, tolerance)]
-        measured, bounds = (np.array([r[n] for r in own]) for n in ("measured", "bound"))
-        said = [r for r in own if _avoidable(r) <= tolerance]
-        counts = Counter(r["network"] or "none" for r in own)
-        found.append(
-            {
-                "kind": kind,
-                "tolerance": tolerance,
-                "cases": len(own),
-                "networks": ", ".join(f"{n} {c / len(own):.0%}" for n, c in counts.most_common()),
-                "predicted": np.median([r["predicted"] for r in own]),
-                "measured": np.median(measured),
-                "ci95": _interval(own),
-                "covered": np.mean(measured <= bounds),
-                "said": len(said) / len(own),
-                "kept": np.mean([r["measured"] <= tolerance for r in said]) if said else None,
-            }
-        )
+    """Predicted and measured errors of each kind of scene and tolerance."""
+    frame, found = pd.DataFrame(rows), []
+    frame["covered"] = frame["measured"] <= frame["bound"]
+    errors = frame["errors"].map(lambda own: np.hypot(own["left out"], own["network"]))
+    frame["said"] = errors <= frame["tolerance"]
+    for (kind, tolerance), own in frame.groupby(["kind", "tolerance"]):
+        shares = own["network"].fillna("none").value_counts(normalize=True)
+        kept = own["measured"][own["said"]] <= tolerance
+        row = {"kind": kind, "tolerance": tolerance, "cases": len(own)}
+        row["networks"] = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
+        row |= own[["predicted", "measured"]].median().to_dict()
+        row |= own[["covered", "said"]].mean().to_dict()
+        found.append(row | {"ci95": _interval(own), "kept": kept.mean() if len(kept) else None})
     return found
 
 
 def _by_part(rows: list[Row]) -> list[Row]:
     """Measured over predicted error by the part that the error is predicted from."""
+    cases = {
+        part: [r for r in rows if r["errors"][part] > max(_MOST * r["predicted"], _LEAST)]
+        for part in rows[0]["errors"]
+    }
+    small = f"less than {_LEAST:g} predicted: error measured"
+    cases[small] = [r for r in rows if r["predicted"] <= _LEAST]
     found = []
-    for part in dict.fromkeys(name for row in rows for name in row["errors"]):
-        own = [r for r in rows if r["errors"][part] > max(_MOST * r["predicted"], _LEAST)]
-        if own:
-            ratios = [r["measured"] / r["predicted"] for r in own]
-            quantiles = dict(
-                zip(("low", "middle", "high"), np.quantile(ratios, _QUANTILES), strict=True)
-            )
-            covered = np.mean([r["measured"] <= r["bound"] for r in own])
-            found.append({"part": part, "cases": len(own), "covered": covered, **quantiles})
-    small = [r["measured"] for r in rows if r["predicted"] <= _LEAST]
-    if small:
-        quantiles = dict(
-            zip(("low", "middle", "high"), np.quantile(small, _QUANTILES), strict=True)
-        )
-        covered = np.mean([r["measured"] <= r["bound"] for r in rows if r["predicted"] <= _LEAST])
-        name = f"less than {_LEAST:g} predicted: error measured"
-        found.append({"part": name, "cases": len(small), "covered": covered, **quantiles})
+    for part, own in ((part, own) for part, own in cases.items() if own):
+        ratios = [r["measured"] / (1.0 if part == small else r["predicted"]) for r in own]
+        row: Row = {"part": part, "cases": len(own)}
+        row |= {name: np.quantile(ratios, share) for name, share in _QUANTILES.items()}
+        found.append(row | {"covered": np.mean([r["measured"] <= r["bound"] for r in own])})
     return found
 
 
-def _avoidable(row: Row) -> float:
-    return float(np.hypot(row["errors"]["left out"], row["errors"]["network"]))
-
-
-def _interval(rows: list[Row]) -> list[float]:
+def _interval(rows: pd.DataFrame) -> list[float]:
     """95 % bootstrap interval of the median error over scenes."""
-    scenes: dict[str, list[float]] = {}
-    for row in rows:
-        scenes.setdefault(row["scene"], []).append(row["measured"])
-    groups, rng = list(scenes.values()), np.random.default_rng(0)
+    groups = [own.to_numpy() for _, own in rows.groupby("scene", sort=False)["measured"]]
+    rng = np.random.default_rng(0)
     medians = [
         np.median(np.concatenate([groups[i] for i in rng.integers(len(groups), size=len(groups))]))
         for _ in range(1000)
@@ -262,56 +190,36 @@ def _interval(rows: list[Row]) -> list[float]:
     return [float(q) for q in np.quantile(medians, [0.025, 0.975])]
 
 
-# -- pictures -------------------------------------------------------------------------------------
+# -- picture --------------------------------------------------------------------------------------
 
 
 def _headline(rows: list[Row]) -> Figure:
     """One panel for the README: error against time at 128 x 128 in float32, the front marked."""
     figure = Figure(figsize=(8.0, 5.0), dpi=100, layout="constrained")
-    axes = figure.add_subplot()
+    axes = figure.add_subplot(xscale="log")
     own = [row for row in rows if row["height"] == 128 and row["dtype"] == "float32"]
-    _scatter(axes, own, "psnr_db")
+    front = sorted((r["ms_per_state"], r["psnr_db"]) for r in own if r["pareto"])
+    axes.plot(*zip(*front, strict=True), color="0.75", lw=5, zorder=0)
     best = max(row["psnr_db"] for row in own)
     low = min(row["psnr_db"] for row in own if row["psnr_db"] > best - _REACH) - 0.5
     axes.set_ylim(low, best + 0.6)
     named: set[tuple[int, int]] = set()
     for row in own:
+        colour = next(c for start, c in _COLOURS.items() if row["method"].startswith(start))
+        mark = "o" if row["mode"] == "shared" else "s"
+        axes.plot(row["ms_per_state"], row["psnr_db"], mark, color=colour)
         x, y = row["ms_per_state"], max(row["psnr_db"], low)
         at = round(4 * float(np.log10(x))), round(4 * y)
         if at in named:  # marks that nearly coincide share a name
             continue
         named.add(at)
         text = row["method"] if y > low else f"{row['method']}: {row['psnr_db']:.0f} dB"
-        colour, weight = _colour(row["method"]), "bold" if row["pareto"] else "normal"
+        weight = "bold" if row["pareto"] else "normal"
         axes.annotate(text, (x, y), (7, 3), textcoords="offset points", color=colour, weight=weight)
+    axes.grid(color="0.92")
     axes.set_ylabel("PSNR against the noise-free truth [dB]  (better: up)")
     axes.set_xlabel("time per state, 4 x 128 x 128 raw, 64-state sweep [ms]")
     axes.set_title(f"Error against run time ({CORES} CPU threads, float32)", loc="left")
     marks = [axes.plot([], [], mark, color="0.4")[0] for mark in "os"]
     axes.legend(marks, ["shared by the 64 states", "per transition"], frameon=False)
     return figure
-
-
-def _colour(name: str) -> str:
-    return _COLOURS[next(start for start in _COLOURS if name.startswith(start))]
-
-
-def _scatter(axes: Any, rows: list[Row], field: str) -> None:
-    """A mark per method, filled in float32 and hollow in bfloat16, the front as a line."""
-    front = sorted((r["ms_per_state"], r[field]) for r in rows if r["pareto"])
-    axes.plot(*zip(*front, strict=True), color="0.75", lw=5, zorder=0, label="Pareto front")
-    shown: set[str] = set()
-    for row in rows:
-        colour = _colour(row["method"])
-        family = next(start for start in _COLOURS if row["method"].startswith(start))
-        axes.plot(
-            row["ms_per_state"],
-            row[field],
-            "o" if row["mode"] == "shared" else "s",
-            color=colour,
-            markerfacecolor="white" if row["dtype"] == "bfloat16" else colour,
-            label=None if family in shown else family,
-        )
-        shown.add(family)
-    axes.set_xscale("log")
-    axes.grid(color="0.92")

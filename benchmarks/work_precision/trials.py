@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from ae_env import ExposureGrid
-from benchmarks.captures import cropped
-from benchmarks.harness import data_root
+from benchmarks.harness import cropped, data_root
 from simulator import CameraSettings, RawImage, get_camera, incident_ev100
 from simulator.camera_simulator import Depth
 from simulator.reference.camera import ReferenceCamera, ReferenceScene

@@ -563,8 +563,7 @@ def train_on_captures(
             ],
             progress=None if progress is None else functools.partial(progress, name),
         )
-        seconds = round(clock.seconds, 1)
-        stages[name] = {"pairs": len(pairs.pairs), "steps": clock.step, "seconds": seconds}
+        stages[name] = clock.card(len(pairs.pairs))
     done = {"start": start, "sequences": len(sequences), "stages": stages}
     save_trained(path, made, config, command, **done)
     return sibling(path, ".safetensors")

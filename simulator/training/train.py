@@ -255,10 +255,8 @@ def train_and_save(
     folder = path.parent
     accelerator = make_accelerator(config, device, folder / "tensorboard" if tensorboard else None)
     modules, start = first_modules(config)
-    sources = {
-        split: _Source(config, make_scenes or scenes_of, make_pictures or pictures_of, split)
-        for split in _SPLITS
-    }
+    makers = make_scenes or scenes_of, make_pictures or pictures_of
+    sources = {split: _Source(config, *makers, split) for split in _SPLITS}
     if not accelerator.is_main_process:  # nobody looks at the bars of the other processes
         progress = None
     stages: dict[str, dict[str, Any]] = {}
@@ -277,22 +275,22 @@ def train_and_save(
             progress=None if progress is None else functools.partial(progress, f"{name}: training"),
         )
         held_out = sources["validation"].pairs(name, None)
-        stages[name] = {
-            "pairs": len(pairs.pairs),
-            "steps": clock.step,
-            "seconds": round(clock.seconds, 1),
-            "validation": validate(loss, held_out, stage.crop, accelerator),
-        }
+        values = validate(loss, held_out, stage.crop, accelerator)
+        stages[name] = clock.card(len(pairs.pairs)) | {"validation": values}
     is_main = accelerator.is_main_process
     accelerator.end_training()
     if is_main:
-        residual = None
-        if "noise" in modules:
-            module = cast(NoiseModule, modules["noise"].cpu().eval())
-            residual = calibrate(module, sources["validation"].crops).to_card()
         done = {"start": start, "scenes": sources["train"].kinds, "stages": stages}
+        residual = _calibration(modules, sources["validation"])
         save_trained(path, modules, config, command, **done, residual=residual)
     return sibling(path, ".safetensors")
+
+
+def _calibration(modules: nn.ModuleDict, source: _Source) -> dict[str, Any] | None:
+    """What the card says of the error that a noise module leaves, if there is one."""
+    if "noise" not in modules:
+        return None
+    return calibrate(cast(NoiseModule, modules["noise"].cpu().eval()), source.crops).to_card()
 
 
 def first_modules(config: SimulatorConfig) -> tuple[nn.ModuleDict, dict[str, Any] | None]:
@@ -508,15 +506,10 @@ def train_stage(
 
     device = accelerator.device
     loss.requires_grad_(False)
-    trained.requires_grad_(True)
     loss.to(device=device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer = torch.optim.AdamW(trained.parameters(), lr=stage.learning_rate, weight_decay=1e-4)
-    average = AveragedModel(trained, multi_avg_fn=get_ema_multi_avg_fn(stage.average))  # type: ignore[no-untyped-call]
     clock = Clock(stage, on_cpu=device.type == "cpu")
-    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer, "average": average}
-    if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
-        parts["scaler"] = accelerator.scaler
-
+    parts = _parts(trained, stage, accelerator)
+    optimizer, average = parts["optimizer"], parts["average"]
     writes = accelerator.is_main_process
     state = _resume(checkpoint, [name, identity], clock, parts, writes=writes)
     wrapped, stepper = accelerator.prepare(loss, optimizer)
@@ -532,10 +525,10 @@ def train_stage(
             accelerator.backward(values["loss"])
             accelerator.clip_grad_norm_(trained.parameters(), _GRADIENT_NORM)
             stepper.step()
+            stepper.zero_grad()
             average.update_parameters(trained)
             clock.tick()
             _share_clock(clock, accelerator)
-            stepper.zero_grad()
             if clock.step % _LOG_EVERY == 0 or clock.share >= 1.0:
                 accelerator.log({f"{name}/{k}": v for k, v in means.items()}, step=clock.step)
                 if progress is not None:
@@ -543,6 +536,17 @@ def train_stage(
             state.save_when_due()
     trained.load_state_dict(average.module.state_dict())
     return clock
+
+
+def _parts(trained: nn.Module, stage: StageConfig, accelerator: Accelerator) -> dict[str, Any]:
+    """What has a state while a module is trained: the module, its optimiser, its average."""
+    trained.requires_grad_(True)
+    optimizer = torch.optim.AdamW(trained.parameters(), lr=stage.learning_rate, weight_decay=1e-4)
+    average = AveragedModel(trained, multi_avg_fn=get_ema_multi_avg_fn(stage.average))  # type: ignore[no-untyped-call]
+    parts: dict[str, Any] = {"module": trained, "optimizer": optimizer, "average": average}
+    if accelerator.scaler is not None:  # float16: the factor that the loss is multiplied by
+        parts["scaler"] = accelerator.scaler
+    return parts
 
 
 def _resume(
@@ -596,6 +600,10 @@ class Clock:
             return min(self.step / self.stage.steps, 1.0)
         assert self.stage.minutes is not None
         return min(self.seconds / (60.0 * self.stage.minutes), 1.0)
+
+    def card(self, pairs: int) -> dict[str, Any]:
+        """What a model's card says of a stage, trained on so many pairs."""
+        return {"pairs": pairs, "steps": self.step, "seconds": round(self.seconds, 1)}
 
     def _now(self) -> float:
         return time.process_time() if self.on_cpu else time.monotonic()
