@@ -254,26 +254,21 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     lines = [row for own in results.values() for row in own["linearity"]]
     paper = {file: own["paper"] for file, own in results.items() if own["paper"]}
     more = {"summary": summaries, "linearity": lines, "paper": paper}
-    first = [row for row in rows if row["file"] == next(iter(FILES))]
-    page = [
-        "How to read it: [colour](../colour.md). Colour difference dE2000 of whole charts:",
-        _plain_table(summaries),
-        "Patches of the first file, L* a* b* by white balance:",
-        pivot(
-            first,
-            line=("patch", "{patch}"),
-            columns="{white_balance}",
-            contents={
-                "published": lambda row: " ".join(map(str, row["lab_published"])),
-                "measured": lambda row: " ".join(map(str, row["lab_measured"])),
-                "dE2000": "{delta_e_2000:.2f}",
-            },
-        ),
-        "Linearity of the neutral row:",
-        _plain_table(lines),
-        f"White paper around the chart, share of sensor white: {paper}.",
-    ]
-    return Report(rows, page, more)
+    first = (row for row in rows if row["file"] == next(iter(FILES)))
+    patches = pivot(
+        first,
+        line=("patch", "{patch}"),
+        columns="{white_balance}",
+        contents={
+            "published": lambda row: " ".join(map(str, row["lab_published"])),
+            "measured": lambda row: " ".join(map(str, row["lab_measured"])),
+            "dE2000": "{delta_e_2000:.2f}",
+        },
+    )
+    tables = {"patches": patches, "charts": _plain_table(summaries)}
+    tables["linearity"] = _plain_table(lines)
+    tables["paper"] = _plain_table([{"file": file, **ends} for file, ends in paper.items()])
+    return Report(rows, tables, meta=more)
 
 
 def _plain_table(rows: list[Row]) -> str:

@@ -64,13 +64,8 @@ def refocus(
             fit `raw`, if the camera's pixel pitch is needed and not known, or if neither depth nor
             networks are there; before any work.
     """
-    _check(raw, f_number, depth, lens)
+    _check(raw, f_number, depth, lens, simulator)
     simulator = CameraSimulator.from_pretrained() if simulator is None else simulator
-    if depth is None and simulator.aperture is None:
-        raise ValueError(
-            "`depth` (=None) must be given to a `simulator` without networks: they estimate the "
-            "blur, see CameraSimulator.from_pretrained"
-        )
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
     opened = source.effective_f_number / target.effective_f_number
@@ -96,7 +91,13 @@ def refocus(
     return replace(raw, data=data, settings=settings, metadata=metadata)
 
 
-def _check(raw: RawImage, f_number: float, depth: np.ndarray | None, lens: Lens | None) -> None:
+def _check(
+    raw: RawImage,
+    f_number: float,
+    depth: np.ndarray | None,
+    lens: Lens | None,
+    simulator: CameraSimulator | None,
+) -> None:
     """Raises the `ValueError` of `refocus` about these arguments."""
     source = raw.settings
     target = CameraSettings(source.iso, source.exposure_time, f_number)
@@ -106,6 +107,11 @@ def _check(raw: RawImage, f_number: float, depth: np.ndarray | None, lens: Lens 
             "closing the aperture would have to sharpen"
         )
     if depth is None and lens is None:
+        if simulator is not None and simulator.aperture is None:
+            raise ValueError(
+                "`depth` (=None) must be given to a `simulator` without networks: they estimate "
+                "the blur, see CameraSimulator.from_pretrained"
+            )
         return
     if depth is None or lens is None:
         given = "lens" if depth is None else "depth"

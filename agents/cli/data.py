@@ -120,6 +120,18 @@ def record(
     print_line(f'read it with: minari.load_dataset("{out}")')
 
 
+Engine = Annotated[
+    str,
+    typer.Option(
+        help="local: this process; ray: a Ray on this machine; or a cluster's address, such as "
+        "ray://head:10001 or auto."
+    ),
+]
+TakesNoiseOut = Annotated[
+    str, typer.Option(help="Networks that take the noise out of raws; none for none.")
+]
+
+
 def score_tables(
     what: Annotated[
         str, typer.Argument(help="A folder or glob of raws and radiance maps, or one of them.")
@@ -127,13 +139,7 @@ def score_tables(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the shards.")] = Path(
         "score_tables"
     ),
-    on: Annotated[
-        str,
-        typer.Option(
-            help="local: this process; ray: a Ray on this machine; or a cluster's address, such as "
-            "ray://head:10001 or auto."
-        ),
-    ] = "local",
+    on: Engine = "local",
     workers: Annotated[int, typer.Option(help="Processes on Ray.", min=1)] = 2,
     per_shard: Annotated[int, typer.Option(help="Files of a shard.", min=1)] = 16,
     resolution: Annotated[int, typer.Option(help="Packed pixels a side.", min=1)] = 64,
@@ -142,9 +148,7 @@ def score_tables(
     ] = "default",
     scorer: Annotated[str, typer.Option(help="Scorer, as for `evaluate`.")] = "balanced",
     camera: Annotated[str, typer.Option(help="Camera for radiance maps.")] = "nikon_z6",
-    weights: Annotated[
-        str, typer.Option(help="Networks that take the noise out of raws; none for none.")
-    ] = "compact",
+    weights: TakesNoiseOut = "compact",
     captures: Annotated[bool, typer.Option(help="Also write the captures.")] = False,
     seed: Seed = 0,
 ) -> None:
@@ -186,11 +190,19 @@ def score_tables(
     begun = perf_counter()
     with progress_bars() as progress, progress("shards") as task:
         made = run(plan, on, task, workers)
+    _print_shards(made, out, perf_counter() - begun)
+
+
+def _print_shards(made: list[Any], out: Path, seconds: float) -> None:
+    """Says what became of the files.
+
+    Raises:
+        RuntimeError: If none of them could be made a scene.
+    """
     if not made:
         print_line("every shard was there already")
         return
     scenes, bad = (sum(int(one[name]) for one in made) for name in ("scenes", "bad"))
-    seconds = perf_counter() - begun
     print_line(f"{scenes} scenes in {seconds:.1f} s, {bad} files that could not be read")
     if bad:
         print_line(f"which and why: {out}/bad-*.jsonl")

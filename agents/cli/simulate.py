@@ -180,42 +180,50 @@ def _small_scene(scene: Scene, weights: str, depth: str, cache: bool) -> Scene:
     return networks.denoised(small)
 
 
+# -- refocus --------------------------------------------------------------------------------------
+
+DepthMap = Annotated[
+    Path | None,
+    typer.Option(
+        help="Depth map of the developed picture, upright, or half its size: PNG, EXR or .npy; "
+        "by default the blur is estimated."
+    ),
+]
+DepthKindName = Annotated[
+    str | None,
+    typer.Option(help="distance (default), or disparity: larger numbers are nearer."),
+]
+DepthScale = Annotated[
+    float | None,
+    typer.Option(
+        help="Metres for each unit (by default 0.001 in a PNG, else 1), or 1 / metres for "
+        "each unit of disparity."
+    ),
+]
+Focus = Annotated[
+    str | None,
+    typer.Option(
+        help="Where the lens is focused: a distance such as 2.5 [m], or a pixel of the depth "
+        "map such as 640,480; by default its middle."
+    ),
+]
+FocalLength = Annotated[float | None, typer.Option(help="Of the lens [mm]; by default the file's.")]
+PixelPitch = Annotated[
+    float | None, typer.Option(help="Of the sensor [um]; by default the camera's, if known.")
+]
+
+
 def refocus(
     raw: Raw,
     aperture: Annotated[str, typer.Option(help="Wider f-number, such as 1.4 or f/1.4.")],
     out: OutDng = Path("out.dng"),
     png: Png = None,
-    depth: Annotated[
-        Path | None,
-        typer.Option(
-            help="Depth map of the developed picture, upright, or half its size: PNG, EXR or .npy; "
-            "by default the blur is estimated."
-        ),
-    ] = None,
-    depth_kind: Annotated[
-        str | None,
-        typer.Option(help="distance (default), or disparity: larger numbers are nearer."),
-    ] = None,
-    depth_scale: Annotated[
-        float | None,
-        typer.Option(
-            help="Metres for each unit (by default 0.001 in a PNG, else 1), or 1 / metres for "
-            "each unit of disparity."
-        ),
-    ] = None,
-    focus: Annotated[
-        str | None,
-        typer.Option(
-            help="Where the lens is focused: a distance such as 2.5 [m], or a pixel of the depth "
-            "map such as 640,480; by default its middle."
-        ),
-    ] = None,
-    focal_length: Annotated[
-        float | None, typer.Option(help="Of the lens [mm]; by default the file's.")
-    ] = None,
-    pixel_pitch: Annotated[
-        float | None, typer.Option(help="Of the sensor [um]; by default the camera's, if known.")
-    ] = None,
+    depth: DepthMap = None,
+    depth_kind: DepthKindName = None,
+    depth_scale: DepthScale = None,
+    focus: Focus = None,
+    focal_length: FocalLength = None,
+    pixel_pitch: PixelPitch = None,
     source_iso: SourceIso = None,
     source_shutter: SourceShutter = None,
     source_aperture: SourceAperture = None,
@@ -236,15 +244,13 @@ def refocus(
 
     f_number = parse_f_number(aperture)
     if depth is None:
-        for name, value in (
-            ("depth-kind", depth_kind),
-            ("depth-scale", depth_scale),
-            ("focus", focus),
-            ("focal-length", focal_length),
-            ("pixel-pitch", pixel_pitch),
-        ):
-            if value is not None:
-                raise ValueError(f"`{name}` (={value}) is an option of a known `--depth`")
+        _check_unused(
+            depth_kind=depth_kind,
+            depth_scale=depth_scale,
+            focus=focus,
+            focal_length=focal_length,
+            pixel_pitch=pixel_pitch,
+        )
     if pixel_pitch is not None and not 0.1 <= pixel_pitch <= 100.0:
         raise ValueError(f"`pixel-pitch` (={pixel_pitch:g}) must be in [0.1, 100] micrometres")
     check_outputs(raw, depth, out=(out, ".dng"), png=(png, ".png"))
@@ -271,6 +277,14 @@ def refocus(
     for line in _refocus_remarks(source, result):
         print_line(line)
     _write(result, out, png)
+
+
+def _check_unused(**options: object) -> None:
+    """Raises a `ValueError` if an option of a known depth is there without one."""
+    for name, value in options.items():
+        if value is not None:
+            option = name.replace("_", "-")
+            raise ValueError(f"`{option}` (={value}) is an option of a known `--depth`")
 
 
 def _lens(

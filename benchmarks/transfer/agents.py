@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ae_env.scenes.scene import Crop
 from agents.cli.console import progress_bars
 from agents.evaluation.engine import evaluate
 from agents.evaluation.intervals import Interval, difference_interval, score_interval
@@ -41,6 +42,8 @@ from benchmarks.transfer.worlds import (
 
 #: Name of the hyperparameter that counts frames, by agent.
 _FRAMES = {"regression": "frames", "ppo": "total_timesteps"}
+#: Of the scenes that agents are trained and judged on: pixels are averaged to frames.
+CROP: Crop = "box"
 #: What the agents together are called.
 TOGETHER = "agents together"
 #: The trainings of each agent and world, one for each seed.
@@ -50,10 +53,7 @@ Jobs = dict[tuple[str, str], list[TrainingJob]]
 def agent_rows(plan: TransferPlan, folder: Path, *, seed: int = 0) -> list[Row]:
     """Trains what `folder` does not have, judges all agents; a row for each agent and world.
 
-    Args:
-        plan: The plan.
-        folder: Of the trained agents.
-        seed: Of the evaluation; the training seeds are the plan's.
+    `seed` is that of the evaluation; the training seeds are the plan's.
     """
     jobs = training_jobs(plan, folder)
     train(jobs)
@@ -83,7 +83,7 @@ def training_jobs(plan: TransferPlan, folder: Path) -> Jobs:
 
 def _config(plan: TransferPlan, agent: str, world: str) -> AgentConfig:
     config = load_config(ROOT / "configs" / f"{agent}.yaml")
-    options = WORLDS[world].options(training_set(plan), plan.crop) | common_options(plan)
+    options = WORLDS[world].options(training_set(plan)) | common_options(plan)
     return AgentConfig.model_validate(
         {
             **config.model_dump(),
@@ -95,7 +95,7 @@ def _config(plan: TransferPlan, agent: str, world: str) -> AgentConfig:
 
 def common_options(plan: TransferPlan) -> dict[str, Any]:
     """Arguments of the environment that are the same in training and judging."""
-    return {"resolution": RESOLUTION, "crop": plan.crop, "scorer": plan.scorer}
+    return {"resolution": RESOLUTION, "crop": CROP, "scorer": plan.scorer}
 
 
 def train(jobs: Jobs) -> None:
@@ -146,7 +146,7 @@ def _seconds_file(out: Path) -> Path:
 
 def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult:
     """Every agent on the same episodes on held-out scenes, in the truth."""
-    scenes = held_out(plan, plan.judged_scenes, plan.crop)
+    scenes = held_out(plan, plan.judged_scenes, CROP)
     options = {"scenes": scenes, "split": "test", **common_options(plan)}
     envs = make_envs(options, num_envs=1, frames=1)
     context = PolicyContext.from_envs(envs)
@@ -162,11 +162,7 @@ def judged(plan: TransferPlan, jobs: Jobs, *, seed: int = 0) -> EvaluationResult
 
 
 def policy_name(agent: str, world: str) -> str:
-    """Name of an agent in the evaluation.
-
-    >>> policy_name("ppo", "compact")
-    'ppo in compact'
-    """
+    """Name of an agent in the evaluation."""
     return f"{agent} in {world}"
 
 
@@ -175,10 +171,7 @@ def result_rows(
 ) -> list[Row]:
     """A row for each agent and world, and for all agents of a world together.
 
-    Args:
-        result: Of `judged`.
-        minutes: That each seed took to train, by agent and world.
-        plan: The plan.
+    `minutes` is what each seed took to train, by agent and world.
     """
     gains = {}
     for agent, world in minutes:  # the span is the same for all
@@ -188,7 +181,7 @@ def result_rows(
         errors = result.episode_metrics(policy_name(agent, world))
         row: Row = {"agent": agent, "world": world, "high_iso": WORLDS[world].high_iso}
         row |= {"simulator": WORLDS[world].simulator, "frames": plan.frames}
-        row |= {"crop": plan.crop, "scorer": plan.scorer}
+        row |= {"crop": CROP, "scorer": plan.scorer}
         row |= comparison(gains, span, agent, world)
         row |= {"num_scenes": len(set(result.scene_ids.tolist()))}
         row |= {"regret": float(errors["regret"].mean())}

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness import Cell, Row, bullets, cell, origin, pivot, table
+import pandas as pd
+
+from benchmarks.harness import Cell, Row, cell, filled_page, origin, pivot, sections, table
 from simulator.utils.files import write_atomically
 
 TITLE = "Transfer: trained on the simulator, judged in the truth"
@@ -16,31 +18,24 @@ FILES = {"agents": "transfer.json", "tables": "transfer_tables.json"}
 #: Largest drop that is asked for.
 MOST_DROP = 0.015
 
-_WORLD = (
-    "A world is what an agent is trained in: the light itself (`truth`), or what is simulated from "
-    "one raw of each scene, taken by the reference camera at ISO 100 to 6400 (`-iso1600`: 1600 to "
-    "6400) within a stop of the meter. `EXP` changes exposure and noise level only; `compact`, "
-    "`large` and `paper` are networks. Everything else is the same."
-)
-
 
 def write_page(out: Path) -> Path:
     """Writes ``transfer.md`` of those result files that are in `out`."""
-    blocks = [f"# {TITLE}", _WORLD]
-    for part, show in (("agents", agents_section), ("tables", tables_section)):
-        path = out / FILES[part]
-        if path.is_file():
-            content = json.loads(path.read_text(encoding="utf-8"))
-            blocks += show(content["rows"], content["meta"])
-    return write_atomically(out / "transfer.md", "\n\n".join(blocks) + "\n")
+    found = dict.fromkeys((*FILES, *(f"{part}-origin" for part in FILES), "verdicts"), "")
+    for part, name in FILES.items():
+        if (out / name).is_file():
+            content = json.loads((out / name).read_text(encoding="utf-8"))
+            found[f"{part}-origin"] = origin(content["meta"])
+            found |= (agent_tables if part == "agents" else score_tables)(content["rows"])
+    shown = {name: text or "Not measured in this run." for name, text in found.items()}
+    return write_atomically(out / "transfer.md", filled_page("transfer", TITLE, shown))
 
 
 # -- agents ---------------------------------------------------------------------------------------
 
 
-def agents_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
-    """Blocks about the agents."""
-    first = rows[0]
+def agent_tables(rows: Sequence[Row]) -> dict[str, str]:
+    """Whether what was asked for holds, and a table for each agent."""
     columns: dict[str, Cell] = {
         "trained in": "`{world}`",
         "normalised score": lambda r: with_ends(r, "normalised_score", "ci95", sign=""),
@@ -49,49 +44,28 @@ def agents_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
         "within 1/3 EV": "{ev_within_third:.0%}",
         "minutes to train": "{minutes:.1f}",
     }
-    blocks = [
-        "## Agents",
-        origin(meta),
-        f"{first['frames']} frames of training, {first['num_seeds']} training seeds, judged on "
-        f"{first['num_scenes']} held-out scenes ({first['num_groups']} source groups) in the "
-        f"truth; scorer `{first['scorer']}`, frames {_CROPS[first['crop']]}. In brackets: 95 % "
-        "intervals, differences paired over source groups, training seeds drawn too. *More than in "
-        "`EXP`*: the score less that of the agent trained in EXP on sources of the same ISO. "
-        "*Agents together*: all trainings of a world as if they were seeds of one agent. Minutes "
-        "are those of one training with the loading of its scenes and their networks, the median "
-        "over the seeds.",
-        bullets(verdicts(rows)),
-    ]
-    for agent in dict.fromkeys(row["agent"] for row in rows):
-        own = [row for row in rows if row["agent"] == agent]
-        blocks += [f"### {agent}", table(own, columns)]
-    return [*blocks, *_left_out(meta)]
+    asked: dict[str, Cell] = {
+        "agent": "{agent}",
+        "trained in": "`{world}`",
+        "asked": "{asked}",
+        "measured": "{measured}",
+        "met": lambda r: "**yes**" if r["met"] else "**no**",
+    }
+    blocks = sections(rows, "{agent}", lambda own: table(own, columns))
+    return {"verdicts": table(verdicts(rows), asked), "agents": "\n\n".join(blocks)}
 
 
-def _left_out(meta: Mapping[str, Any]) -> list[str]:
-    names = ", ".join(f"`{name}`" for name in meta.get("left_out", ()))
-    why = "its weights do not come with the package and were not trained here."
-    return [f"Not measured: {names}; {why}"] if names else []
-
-
-def verdicts(rows: Sequence[Row]) -> list[str]:
+def verdicts(rows: Sequence[Row]) -> Iterator[Row]:
     """What was asked for, and whether it holds, for each agent."""
-    lines = []
-    for row in rows:
-        if row["simulator"] != "compact":
-            continue
-        name, drop = f"{row['agent']} in `{row['world']}`", row["drop"]
+    for row in (row for row in rows if row["simulator"] == "compact"):
         if not row["high_iso"]:
-            answer = "yes" if drop < MOST_DROP else "no"
-            lines.append(f"{name}: drop below {MOST_DROP}: **{answer}** ({with_ends(row, 'drop')})")
+            answer = {"asked": f"drop below {MOST_DROP}", "met": row["drop"] < MOST_DROP}
+            yield row | answer | {"measured": with_ends(row, "drop")}
         elif row.get("more_than_exp") is not None:
             ends = row["more_than_exp_ci95"]
-            answer = "yes" if ends is not None and ends[0] > 0.0 else "no"
-            more = with_ends(row, "more_than_exp")
-            lines.append(
-                f"{name}: drop smaller than EXP's beyond the interval: **{answer}** ({more})"
-            )
-    return lines
+            answer = {"asked": "drop smaller than EXP's beyond the interval"}
+            answer |= {"met": ends is not None and ends[0] > 0.0}
+            yield row | answer | {"measured": with_ends(row, "more_than_exp")}
 
 
 def with_ends(row: Row, name: str, ends: str = "", *, sign: str = "+") -> str | None:
@@ -107,34 +81,7 @@ def with_ends(row: Row, name: str, ends: str = "", *, sign: str = "+") -> str | 
     return text if pair is None else f"{text} [{pair[0]:{sign}.3f}, {pair[1]:{sign}.3f}]"
 
 
-# -- tables ---------------------------------------------------------------------------------------
-
-
-def tables_section(rows: Sequence[Row], meta: Mapping[str, Any]) -> list[str]:
-    """Blocks about the score tables."""
-    blocks = [
-        "## Score tables from one raw",
-        origin(meta),
-        "Every held-out scene is photographed at every ISO and exposure; the truth is the table of "
-        "its own light. *Rank correlation*: Spearman's, of the 64 predicted scores with the true "
-        "ones. *Regret*: what the state that looks best loses in the true table. *Error*: mean "
-        "absolute error of a score. Means over source groups; intervals are in the JSON file. A "
-        "star: the interval leaves out zero. *Where the error enters*: the error if only that part "
-        "of the scorer is predicted, and all others are true.",
-    ]
-    for scorer, crop in dict.fromkeys((row["scorer"], row["crop"]) for row in rows):
-        own = [row for row in rows if (row["scorer"], row["crop"]) == (scorer, crop)]
-        blocks += [
-            f"### `{scorer}`, frames {_CROPS[crop]}",
-            f"{own[0]['num_scenes']} scenes in {own[0]['num_groups']} source groups.",
-            _times(own),
-        ]
-        for heading, content in _MEASURES.items():
-            blocks += [f"{heading}, by ISO and exposure of the source:", _pivot(own, content)]
-        if len(own[0]["terms"]) > 1:
-            blocks += ["*Where the error enters*:", _terms(own)]
-    return [*blocks, *_left_out(meta)]
-
+# -- score tables ---------------------------------------------------------------------------------
 
 _CROPS = {
     "box": "averaged to 64 x 64 pixels",
@@ -149,6 +96,37 @@ _MEASURES: dict[str, Cell] = {
 }
 
 
+def score_tables(rows: Sequence[Row]) -> dict[str, str]:
+    """Tables of each scorer and crop."""
+    blocks = sections(rows, lambda r: f"`{r['scorer']}`, frames {_CROPS[r['crop']]}", _of_set)
+    return {"tables": "\n\n".join(blocks)}
+
+
+def _of_set(rows: list[Row]) -> str:
+    frame = pd.DataFrame(rows)
+    # Of an even number of settings the upper of the two in the middle.
+    times = frame.groupby("simulator", sort=False)["ms"].quantile(0.5, interpolation="higher")
+    shown = [{"name": name, "ms": ms} for name, ms in times.items()]
+    blocks = [
+        f"{rows[0]['num_scenes']} scenes in {rows[0]['num_groups']} source groups.",
+        table(shown, {"simulator": "`{name}`", "ms per table": "{ms:.1f}"}),
+    ]
+    line: tuple[str, Cell] = "source", _source
+    for heading, content in _MEASURES.items():
+        own = [row for row in rows if cell(row, content)]  # EXP has no difference to itself
+        shown_by = pivot(own, line=line, columns="`{simulator}`", contents={"": content})
+        blocks += [f"{heading}, by ISO and exposure of the source:", shown_by]
+    if len(rows[0]["terms"]) > 1:
+        columns: dict[str, Any] = {"source": _source, "simulator": "`{simulator}`"}
+        columns["saturated"] = "{saturated:.1%}"
+        columns |= {name: f"{{terms[{name}]:.4f}}" for name in rows[0]["terms"]}
+        columns["worst term"] = "{worst_term}"
+        isos, evs = (frame[name].agg(["min", "max"]).tolist() for name in ("iso", "ev"))
+        ends = [r for r in rows if r["iso"] in isos and r["ev"] in (*evs, 0)]
+        blocks += ["*Where the error enters*:", table(ends, columns)]
+    return "\n\n".join(blocks)
+
+
 def _stars(row: Row, name: str) -> str | None:
     """A difference with a star where its interval leaves out zero."""
     if row.get(name) is None:
@@ -157,37 +135,5 @@ def _stars(row: Row, name: str) -> str | None:
     return f"{row[name]:+.4f}" + "*" * (ends is not None and (ends[0] > 0.0 or ends[1] < 0.0))
 
 
-def _pivot(rows: Sequence[Row], content: Cell) -> str:
-    shown = [row for row in rows if cell(row, content)]  # EXP has no difference to itself
-    line: tuple[str, Cell] = ("source", _source)
-    return pivot(shown, line=line, columns="`{simulator}`", contents={"": content})
-
-
 def _source(row: Row) -> str:
     return f"ISO {row['iso']}, {row['ev']:+d} EV"
-
-
-def _terms(rows: Sequence[Row]) -> str:
-    """Error that each term makes, of every simulator, at the ends of the source's exposure."""
-    columns: dict[str, Cell] = {
-        "source": _source,
-        "simulator": "`{simulator}`",
-        "saturated": "{saturated:.1%}",
-    }
-    columns |= {name: f"{{terms[{name}]:.4f}}" for name in rows[0]["terms"]}
-    columns["worst term"] = "{worst_term}"
-    isos, evs = ({row[name] for row in rows} for name in ("iso", "ev"))
-    ends = [r for r in rows if r["iso"] in _ends(isos) and r["ev"] in {*_ends(evs), 0}]
-    return table(ends, columns)
-
-
-def _ends(values: set[int]) -> set[int]:
-    return {min(values), max(values)}
-
-
-def _times(rows: Sequence[Row]) -> str:
-    by_name: dict[str, list[float]] = {}
-    for row in rows:
-        by_name.setdefault(row["simulator"], []).append(row["ms"])
-    medians = [{"name": n, "ms": sorted(own)[len(own) // 2]} for n, own in by_name.items()]
-    return table(medians, {"simulator": "`{name}`", "ms per table": "{ms:.1f}"})

@@ -29,8 +29,6 @@ SIMULATORS: dict[str, str | None] = {
     "large": "large",
 }
 TRUTH, EXP, PAPER = "truth", "EXP", "paper"
-
-
 #: Bundled scenes and views of real places together.
 BOTH = "both"
 
@@ -48,32 +46,21 @@ def scenes_of(
 
 
 def at_high_iso(
-    name: str, crop: Crop, split: Split, camera: CameraProfile, resolution: int | None
+    name: str, split: Split, camera: CameraProfile, resolution: int | None
 ) -> list[Scene]:
     """Scenes of a set, each photographed once at an ISO of 1600 to 6400, drawn by its name.
 
     What `source="raw"` makes of them but for the ISO: exposure and noise are drawn alike.
-
-    Args:
-        name: Of the set, see `load_scenes`.
-        crop: See `Scene.resized`.
-        split: ``"train"``, ``"test"`` or ``"all"``.
-        camera: The body.
-        resolution: Packed pixels a side.
     """
-    scenes = scenes_of(name, crop, split, camera, resolution)
+    scenes = scenes_of(name, "box", split, camera, resolution)
     return [simulate_source_raw(scene, iso_range=HIGH_ISO) for scene in scenes]
 
 
 #: What the environment's `scenes` names, as ``"benchmarks.transfer.worlds:high_iso_both_box"``.
 both_box: Callable[..., list[Scene]] = partial(scenes_of, BOTH, "box")
-both_native: Callable[..., list[Scene]] = partial(scenes_of, BOTH, "native")
-high_iso_both_box: Callable[..., list[Scene]] = partial(at_high_iso, BOTH, "box")
-high_iso_both_native: Callable[..., list[Scene]] = partial(at_high_iso, BOTH, "native")
-high_iso_bundled_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled", "box")
-high_iso_bundled_native: Callable[..., list[Scene]] = partial(at_high_iso, "bundled", "native")
-high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small", "box")
-high_iso_small_native: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small", "native")
+high_iso_both_box: Callable[..., list[Scene]] = partial(at_high_iso, BOTH)
+high_iso_bundled_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled")
+high_iso_small_box: Callable[..., list[Scene]] = partial(at_high_iso, "bundled:small")
 
 
 # -- worlds ---------------------------------------------------------------------------------------
@@ -97,20 +84,16 @@ class World:
         """In tables and file names."""
         return f"{self.simulator}-iso1600" if self.high_iso else self.simulator
 
-    def options(self, scenes: str, crop: Crop = "box") -> dict[str, Any]:
-        """Arguments of the environment that differ between the worlds.
-
-        Args:
-            scenes: The set of scenes.
-            crop: See `Scene.resized`.
+    def options(self, scenes: str) -> dict[str, Any]:
+        """Arguments of the environment that differ between the worlds, of a set of scenes.
 
         Raises:
             FileNotFoundError: If the world needs weights that were not trained.
         """
         if self.high_iso:
-            scenes = f"{__name__}:high_iso_{scenes.split(':')[-1]}_{crop}"
+            scenes = f"{__name__}:high_iso_{scenes.split(':')[-1]}_box"
         elif scenes == BOTH:
-            scenes = f"{__name__}:{BOTH}_{crop}"
+            scenes = f"{__name__}:{BOTH}_box"
         if self.simulator == TRUTH:
             return {"scenes": scenes, "source": "light"}
         return {"scenes": scenes, "source": "raw", "simulator": simulator_argument(self.simulator)}
@@ -192,7 +175,6 @@ class TransferPlan:
         agents: Names of configurations.
         seeds: Training seeds.
         frames: Frames of each training; PPO takes whole updates of 1024.
-        crop: Of the scenes that agents are trained and judged on, see `TableSet`.
         episodes: Episodes on each held-out scene that agents are judged in.
         judged_scenes: Held-out scenes that agents are judged on, groups in turn; None for all.
         scorer: What agents are trained for and judged by.
@@ -204,7 +186,6 @@ class TransferPlan:
     agents: tuple[str, ...] = ("regression", "ppo")
     seeds: tuple[int, ...] = (0, 1, 2)
     frames: int = 16_384
-    crop: Crop = "box"
     episodes: int = 2
     judged_scenes: int | None = None
     scorer: str = "balanced"
@@ -236,13 +217,7 @@ def training_set(plan: TransferPlan) -> str:
 
 
 def held_out(plan: TransferPlan, count: int | None, crop: Crop) -> list[Scene]:
-    """Test scenes of the truth: the bundled ones and, where they are, views into panoramas.
-
-    Args:
-        plan: The plan.
-        count: How many, kinds and source groups in turn; None for all.
-        crop: See `Scene.resized`.
-    """
+    """`count` test scenes of the truth, kinds and source groups in turn; None for all of them."""
     options = EnvOptions(split="test", resolution=RESOLUTION, crop=crop)
     found = scenes_of(training_set(plan), crop, "test", options.make_camera(), RESOLUTION)
     return groups_in_turn(found, count)

@@ -454,16 +454,12 @@ def _record(  # type: ignore[no-untyped-def]
     light,
     remaining_variance,
     exposure,
-    keys,
-    drawn,
-    bank,
+    noise_source,
     sensor,
-    codes,
-    numbers,
-    signals,
-    counts,
+    outputs,
 ):
     """Units `first` to `last` of a batch: pieces of the planes of frames, in this order."""
+    (keys, drawn, bank), (codes, numbers, signals, counts) = noise_source, outputs
     part, made = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     words, clipped = np.empty((4, BLOCK // 4), np.uint32), np.empty(BLOCK, np.int32)
     blocks = (samples + BLOCK - 1) // BLOCK
@@ -483,8 +479,7 @@ def _record(  # type: ignore[no-untyped-def]
         share = numba.carray(as_pointer(remaining_variance[frame]), (shares,))
         clipped[:] = 0
         for block in range(piece * _UNIT_BLOCKS, min((piece + 1) * _UNIT_BLOCKS, blocks)):
-            start = block * BLOCK
-            end = min(start + BLOCK, samples)
+            start, end = block * BLOCK, min((block + 1) * BLOCK, samples)
             size, at, number = end - start, plane * samples + start, plane * blocks + block
             exposed, normals, sign = frame_light[at : at + size], made, _ONE
             if drawn == _BANK:
@@ -539,14 +534,18 @@ def _record_fused(
         addresses(light),
         np.zeros(frames, np.uintp) if remaining is None else addresses(remaining),
         transitions.table,
-        np.zeros(frames, np.uint64) if keys is None else keys,
-        drawn,
-        noise_bank() if drawn == _BANK else _NO_BANK,
+        (
+            np.zeros(frames, np.uint64) if keys is None else keys,
+            drawn,
+            noise_bank() if drawn == _BANK else _NO_BANK,
+        ),
         sensor_table(camera),
-        np.empty(empty, np.uint8) if codes is None else codes.reshape(flat),
-        np.empty(empty, np.uint16) if numbers is None else numbers.reshape(flat),
-        np.empty(empty, np.float32) if signals is None else signals.reshape(flat),
-        counts,
+        (
+            np.empty(empty, np.uint8) if codes is None else codes.reshape(flat),
+            np.empty(empty, np.uint16) if numbers is None else numbers.reshape(flat),
+            np.empty(empty, np.float32) if signals is None else signals.reshape(flat),
+            counts,
+        ),
     )
     least = max(1, _WORTH_A_THREAD // min(samples, _UNIT_BLOCKS * BLOCK))
     parallel_ranges(lambda first, last: _record(first, last, *fixed), units, least=least)

@@ -197,13 +197,10 @@ def write_results(
         ValueError: If a value is NaN or infinite (JSON has no such number; write None) or of a
             type that JSON cannot hold.
     """
+    encode = functools.partial(json.dumps, allow_nan=False, default=_plain)
     try:
-        text = json.dumps(
-            {"meta": dict(meta), "rows": [dict(row) for row in rows]},
-            indent=1,
-            allow_nan=False,
-            default=_plain,
-        )
+        lines = ",\n".join(encode(dict(row)) for row in rows)  # a row a line: differences are short
+        text = f'{{"meta": {encode(dict(meta))},\n"rows": [\n{lines}\n]}}'
     except (TypeError, ValueError) as error:
         raise ValueError(f"`rows` and `meta` must hold finite JSON values: {error}") from None
     return write_atomically(path, text + "\n")

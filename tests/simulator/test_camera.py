@@ -8,6 +8,7 @@ from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -102,6 +103,23 @@ def test_a_segment_begins_at_its_iso_not_at_its_first_calibration() -> None:
         scaled = (iso / base) ** 2 * (read - ROUNDING) + ROUNDING
         assert camera.nlf(iso).read[1] == pytest.approx(scaled)
     assert camera.nlf(750).shot[1] == pytest.approx(750 / 800 * 6.19623102159152e-05)
+
+
+@pytest.mark.parametrize("name", list_cameras())
+def test_noise_at_every_iso_is_the_nearest_calibrations(name: str) -> None:
+    """From ISO 50 to 409600: interpolated by NumPy, scaled beyond, the rounding apart."""
+    camera = get_camera(name)
+    edges = [0.0, *camera.segments, math.inf]
+    rounding = np.repeat([0.0, 1.0], 4) / 12 / camera.span[0] ** 2
+    for iso in np.geomspace(50.0, 409_600.0, 60).tolist():
+        low, high = max(e for e in edges if e <= iso), min(e for e in edges if e > iso)
+        own = [i for i in sorted(camera.nlf_by_iso) if low <= i < high]
+        known = np.array([[*n.shot, *n.read] for n in map(camera.nlf, own)])
+        logs = [np.interp(math.log(iso), np.log(own), column) for column in np.log(known).T]
+        beyond = iso / min(max(iso, own[0]), own[-1])
+        wanted = (np.exp(logs) - rounding) * np.repeat([beyond, beyond**2], 4) + rounding
+        found = camera.nlf(iso)
+        assert [*found.shot, *found.read] == pytest.approx(wanted.tolist(), rel=1e-12)
 
 
 def test_one_measurement_calibrates_a_camera() -> None:

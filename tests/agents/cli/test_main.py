@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from agents.cli import bench, console
+from agents.cli import console
+from agents.cli import main as bench
 from agents.cli import main as cli
 from simulator.capture.plan import DEFAULT_TOLERANCE
 from tests.simulator.training.captures import write_dataset
@@ -220,7 +221,7 @@ def test_an_installed_package_says_that_it_has_none(ae_env, folders, tmp_path, m
 
 @pytest.mark.parametrize(
     ("name", "part", "words"),
-    [("throughput", "agents", "an option of transfer only"), ("transfer", "table", "tables")],
+    [("throughput", "agents", "`part`"), ("transfer", "table", "tables")],
 )
 def test_parts_are_those_of_transfer(ae_env, name, part, words):
     code, _, error = ae_env("bench", name, "--part", part)
