@@ -43,8 +43,7 @@ NAMES = ("quality", "log_error", "unseen", "frames", "seconds")
 
 def known_light(context: Any, envs: Any) -> Any:
     """The planner with the light and the speed of the episodes of `envs`."""
-    from agents.bracketing.policies import Planner
-    from agents.bracketing.schedules import BINS, bin_of
+    from agents.bracketing.policies import BINS, Planner, bin_of
 
     base = envs.unwrapped
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from agents.cli.bench import BENCHMARKS
+from agents.cli.main import BENCHMARKS
 from benchmarks import harness
 from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.harness import Benchmark, FinishedParts, Part, Report, cell, pivot, rounded, table

@@ -196,16 +196,16 @@ def _summary(name: str, by_name: Mapping[str, Sequence[Measured]]) -> Row:
 def _mean_and_gain(
     measure: str, own: Sequence[Measured], exp: Sequence[Measured] | None, groups: np.ndarray
 ) -> Row:
-    values = group_means(np.array([m[measure] for m in own]), groups)[0]
+    values = group_means(np.array([m[measure] for m in own]), groups)
     alike = np.ones(len(values))
     mean = score_interval(values, alike)
     row: Row = {measure: mean.value, f"{measure}_ci95": mean.pair}
     if exp is not None:
-        other = group_means(np.array([m[measure] for m in exp]), groups)[0]
+        other = group_means(np.array([m[measure] for m in exp]), groups)
         difference = difference_interval(values, other, alike)
         row |= {f"{measure}_to_exp": difference.value, f"{measure}_to_exp_ci95": difference.pair}
     return row
 
 
 def _mean(of: Callable[..., float], own: Sequence[Measured], groups: np.ndarray) -> float:
-    return float(group_means(np.array([of(m) for m in own]), groups)[0].mean())
+    return float(group_means(np.array([of(m) for m in own]), groups).mean())
