@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -256,12 +256,12 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
             [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()],
             {"published, of the authors' own split": "{camera}", "PSNR [dB] / SSIM": "{text}"},
         ),
-        "networks": table(times, columns),
+        "networks": table(times.to_dict("records"), columns),
     }
     return Report([*means, *rows], tables, figures={"paper.png": _picture(means)})
 
 
-def _label(row: Row) -> str:
+def _label(row: Mapping[str, Any]) -> str:
     return row["method"] if row["preset"] in ("pc", "dl") else f"{row['method']} `{row['preset']}`"
 
 
