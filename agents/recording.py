@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ def record_dataset(
 
     Args:
         policy: The policy, for one environment.
-        name: The policy's name, which the dataset has as that of its algorithm.
+        name: Its name, which the dataset has as that of its algorithm.
         task: Id of the environment, such as ``"ae_env/AutoExposure-v0"``.
         options: Arguments of the environment, JSON values.
         dataset_id: Name of the dataset in Minari's folder (MINARI_DATASETS_PATH names another). It
@@ -86,19 +86,10 @@ def record_dataset(
         closing(gym.make(f"ae_env:{task}", **{**options, **oracle})) as env,
         tempfile.TemporaryDirectory(dir=root, prefix=".unfinished-") as folder,
     ):
-
-        def recorded() -> Iterator[Any]:
-            for episode in range(episodes):
-                if progress is not None:
-                    progress(episode, episodes)
-                columns = _record_episode(env, policy, name, seed + episode)
-                yield minari.data_collector.EpisodeBuffer(id=episode, **columns)
-
-        with _datasets_in(folder), warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that there is no author's address
+        with _datasets_in(folder):
             minari.create_dataset_from_buffers(
                 dataset_id,
-                recorded(),
+                _episodes(env, policy, name, range(seed, seed + episodes), progress),
                 env=env,
                 algorithm_name=name,
                 description=f"{episodes} episodes of {name} in {task}, seeds from {seed}",
@@ -106,13 +97,17 @@ def record_dataset(
                 data_format="hdf5",
                 jpeg_encoding=False,
             )
-        namespace = dataset_id.rpartition("/")[0]
-        if namespace and namespace not in minari.namespace.list_local_namespaces():
-            minari.namespace.create_namespace(namespace)
-        Path(folder, dataset_id).rename(root / dataset_id)
-    if progress is not None:
-        progress(episodes, episodes)
+        _publish(Path(folder, dataset_id), root, dataset_id)
     return minari.load_dataset(dataset_id)
+
+
+def _publish(finished: Path, root: Path, dataset_id: str) -> None:
+    """Moves a dataset to its place, in its namespace."""
+    namespaces = _minari().namespace
+    namespace = dataset_id.rpartition("/")[0]
+    if namespace and namespace not in namespaces.list_local_namespaces():
+        namespaces.create_namespace(namespace)
+    finished.rename(root / dataset_id)
 
 
 @contextmanager
@@ -121,20 +116,37 @@ def _datasets_in(folder: str) -> Iterator[None]:
     before = os.environ.get(_ROOT)
     os.environ[_ROOT] = folder
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that there is no author's address
+            yield
     finally:
         os.environ.pop(_ROOT)
         if before is not None:
             os.environ[_ROOT] = before
 
 
+def _episodes(
+    env: gym.Env[Any, Any],
+    policy: Policy,
+    name: str,
+    seeds: Sequence[int],
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[Any]:
+    buffer = _minari().data_collector.EpisodeBuffer
+    for i, seed in enumerate(seeds):
+        if progress is not None:
+            progress(i, len(seeds))
+        yield buffer(id=i, **_record_episode(env, policy, name, seed))
+    if progress is not None:
+        progress(len(seeds), len(seeds))
+
+
 def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int) -> dict[str, Any]:
-    """What `minari.data_collector.EpisodeBuffer` holds of one episode."""
+    """What an `EpisodeBuffer` of Minari holds of one episode."""
     observation, info = env.reset(seed=seed)
     seen = {key: [value] for key, value in observation.items()}
     scene: str = info["scene_id"]
-    steps: dict[str, list[Any]]
-    steps = {"actions": [], "rewards": [], "terminations": [], "truncations": []}
+    steps: list[tuple[Any, ...]] = []
     with errors_of(name, "reset"):
         policy.reset(1, seed=seed)
     done = False
@@ -149,13 +161,12 @@ def _record_episode(env: gym.Env[Any, Any], policy: Policy, name: str, seed: int
         state = checked_states(name, actions, masks)[0]
         observation, reward, terminated, truncated, info = env.step(state)
         done = terminated or truncated
-        for values, value in zip(
-            steps.values(), (state, reward, terminated, truncated), strict=True
-        ):
-            values.append(value)
+        steps.append((state, reward, terminated, truncated))
         for key, value in observation.items():
             seen[key].append(value)
-    return {"seed": seed, "options": {"scene": scene}, "observations": seen, **steps}
+    columns = ("actions", "rewards", "terminations", "truncations")
+    own = dict(zip(columns, map(list, zip(*steps, strict=True)), strict=True))
+    return {"seed": seed, "options": {"scene": scene}, "observations": seen, **own}
 
 
 def _minari() -> Any:

@@ -12,7 +12,6 @@ import os
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -114,10 +113,7 @@ class ShardWriter:
         self._camera = get_camera(plan.camera)
         self._scorer = make_scorer(plan.scorer)
         self._tables: dict[str, ScoreTables] = {}
-
-    @cached_property
-    def _networks(self) -> SceneNetworks:
-        return SceneNetworks(self.plan.weights)
+        self._networks = None if plan.weights == "none" else SceneNetworks(plan.weights)
 
     def write(self, shard: int) -> dict[str, Any]:
         """Writes one shard.
@@ -158,21 +154,18 @@ class ShardWriter:
         sink = pa.BufferOutputStream()
         pq.write_table(pa.table(columns), sink)
         write_atomically(plan.table(shard), sink.getvalue().to_pybytes())
-        seconds = perf_counter() - begun
         return {
             "shard": shard,
             "scenes": scenes,
             "bad": len(bad),
-            "seconds": seconds,
+            "seconds": perf_counter() - begun,
             "node": socket.gethostname(),
             "process": os.getpid(),
         }
 
     def _scenes(self, path: str) -> list[Scene]:
         scenes = load_scenes(path, "all", camera=self._camera, resolution=self.plan.resolution)
-        if self.plan.weights == "none":
-            return scenes
-        return [self._networks.denoised(scene) for scene in scenes]
+        return [self._networks.denoised(s) for s in scenes] if self._networks else scenes
 
     def _score_tables(self, scene: Scene) -> ScoreTables:
         key = repr(scene.camera)
@@ -225,7 +218,8 @@ def run(
     if not todo:
         return []
     made = []
-    for told in _local(plan, todo) if on == _LOCAL else _on_ray(plan, todo, on, workers):
+    local = on == _LOCAL
+    for told in map(ShardWriter(plan).write, todo) if local else _on_ray(plan, todo, on, workers):
         made.append(told)
         progress(len(plan.shards) - len(todo) + len(made), len(plan.shards))
     return made
@@ -244,12 +238,6 @@ def check_engine(on: str) -> None:
         raise ImportError(
             "a cluster needs the extra ray, in an environment of its own: pip install 'ae-env[ray]'"
         )
-
-
-def _local(plan: ShardPlan, todo: list[int]) -> Iterator[dict[str, Any]]:
-    writer = ShardWriter(plan)
-    for shard in todo:
-        yield writer.write(shard)
 
 
 class _RayWorker:

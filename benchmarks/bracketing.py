@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from agents.evaluation.intervals import difference_interval
-from benchmarks.harness import Benchmark, Part, Report, Row, sections, table
+from benchmarks.harness import Benchmark, Part, Report, Row, table
 from simulator.utils.files import data_folder as data_root
 
 #: Policies, and what a page calls them.
@@ -31,6 +32,8 @@ POLICIES = {
 }
 #: The policy that the others are compared with.
 BASELINE = "bracket:hasinoff"
+#: Sets of scenes; the second needs real files.
+SETS = ("bundled", "polyhaven")
 #: Time of all frames together [s].
 BUDGETS = (0.05, 0.3)
 #: Episodes of each scene, and scenes of a quick run.
@@ -40,8 +43,7 @@ NAMES = ("quality", "log_error", "unseen", "frames", "seconds")
 
 def known_light(context: Any, envs: Any) -> Any:
     """The planner with the light and the speed of the episodes of `envs`."""
-    from agents.bracketing.policies import Planner
-    from agents.bracketing.schedules import BINS, bin_of
+    from agents.bracketing.policies import BINS, Planner, bin_of
 
     base = envs.unwrapped
 
@@ -94,9 +96,7 @@ def measure(scenes: str, budget: float, policy: str, seed: int, most: int | None
 
 def parts(seed: int, quick: bool) -> list[Part]:
     """One part for each set of scenes, budget and policy."""
-    sets = ["bundled"]
-    if data_root() is not None:
-        sets.append("polyhaven")
+    sets = SETS if data_root() is not None else SETS[:1]
     most = QUICK_SCENES if quick else None
     return [
         Part(
@@ -105,9 +105,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
             {"scenes": scenes, "budget": budget, "policy": policy, "seed": seed, "most": most},
             threads=1,
         )
-        for scenes in sets
-        for budget in BUDGETS
-        for policy in POLICIES
+        for scenes, budget, policy in product(sets, BUDGETS, POLICIES)
     ]
 
 
@@ -158,6 +156,12 @@ def distributions(rows: Sequence[Row]) -> Figure:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the rows of all parts."""
     rows = rows_of(results)
+    each = [{name: value for name, value in row.items() if name != "each"} for row in rows]
+    return Report(each, tables_of(rows), figures={"bracketing.png": distributions(rows)})
+
+
+def tables_of(rows: Sequence[Row]) -> dict[str, str]:
+    """A table for each set of scenes and budget, and one of what was fitted to each."""
     columns: dict[str, Any] = {
         "policy": lambda row: POLICIES[row["policy"]],
         "quality": "{quality:.4f}",
@@ -168,27 +172,16 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
         "frames": "{frames:.2f}",
         "ms per decision": "{ms:.2f}",
     }
-    fitted = "; ".join(
-        f"{row['scenes']}, {row['budget']:g} s: {row['headroom']:g} EV, {row['longest']:.3g} s"
-        for row in rows
-        if "headroom" in row
-    )
-    page = [
-        "`ExposureBracket-v0`, test scenes, the same episodes for all: up to three frames within "
-        "the time, merged, against the light of the scene. *Quality* is 1 - mean error / 2 EV; "
-        "*error* is that of the samples that a frame shows, *unseen* the share that is white in "
-        "all. Means over source groups; intervals are paired bootstraps over these.",
-        *sections(rows, "{scenes}, {budget} s", lambda own: table(own, columns)),
-        "![loss of quality of the source groups](bracketing.png)",
-        "Hasinoff's schedule maximises the signal-to-noise ratio in the worst light and knows no "
-        "motion; how far it looks above white, and its longest exposure, were fitted on the "
-        f"training scenes of each set ({fitted}). What blur costs was measured on `mixed`; which "
-        "frames to take then follows in closed form.",
-        "Published for a similar task, on other data and with another measure: AdaptiveAE (ICCV "
-        "2025) 39.70 dB on HDRV, Hasinoff's schedule 37.59 dB.",
-    ]
-    each = [{name: value for name, value in row.items() if name != "each"} for row in rows]
-    return Report(each, page, {}, {"bracketing.png": distributions(rows)})
+    fitted_columns = {
+        "scenes": "{scenes}, {budget:g} s",
+        "looks above white by": "{headroom:g} EV",
+        "longest exposure": "{longest:.3g} s",
+    }
+    tables = {"fitted": table((row for row in rows if "headroom" in row), fitted_columns)}
+    for scenes, budget in product(SETS, BUDGETS):
+        own = [row for row in rows if (row["scenes"], row["budget"]) == (scenes, budget)]
+        tables[f"{scenes}-{1e3 * budget:.0f}ms"] = table(own, columns)
+    return tables
 
 
 BENCHMARK = Benchmark(

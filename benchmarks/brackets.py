@@ -24,7 +24,7 @@ from skimage.metrics import structural_similarity
 from skimage.registration import phase_cross_correlation
 
 from benchmarks.denoising import behind_anscombe, non_local_means
-from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, pivot, sections, table
+from benchmarks.harness import Benchmark, Part, Report, Row, data_folder, pivot, table
 from benchmarks.isolated import timed
 from simulator import (
     BayerPattern,
@@ -38,9 +38,11 @@ from simulator import (
     exposure_ratio,
 )
 from simulator.networks.noise_module import SIZES
+from simulator.noise.noise_level_function import noise_variance
 from simulator.raw.image import PLANES
 
-SCENES = {"left_c0": "static", "left_c5": "moving"}
+#: The first is static, the second moves.
+SCENES = ("left_c0", "left_c5")
 #: Timed runs of each simulation.
 REPEATS = 5
 TIMES_MS = (1, 2, 4, 8, 16, 32)
@@ -167,7 +169,7 @@ def transition_rows(
 ) -> list[Row]:
     """Simulated and real frame of one transition, beside the baselines that bound the figures."""
     target, bare = pair.target.settings, CameraSimulator(device="cpu")
-    real, noise = pair.target.data.numpy(), pair.target.noise
+    real = pair.target.data.numpy()
     known = {"exposure only": bare.prepare(pair.source), **denoised}
     found: dict[str, tuple[torch.Tensor, float]] = {
         "simulated": timed_result(
@@ -179,11 +181,14 @@ def transition_rows(
         },
     }
     exposed = found["exposure only"][0]
-    shift = image_shift(real, exposed.numpy())
+    # Rows and columns [packed pixel] by which the simulation must move to lie on the real frame.
+    greens = (np.sqrt(np.clip(frame[1], 0.0, 1.0)) for frame in (real, exposed.numpy()))
+    shift = phase_cross_correlation(*greens, upsample_factor=20)[0]
     whole = round(float(shift[0])), round(float(shift[1]))
-    source_variance = exposed_variance(pair.source, exposure_ratio(pair.source.settings, target))
-    target_variance = variance(real, noise)
-    top_up = np.maximum(source_variance, variance(exposed.numpy(), pair.source.noise))
+    ratio = exposure_ratio(pair.source.settings, target)
+    source_variance = ratio**2 * noise_variance(pair.source.data, pair.source.noise)
+    target_variance = noise_variance(pair.target.data, pair.target.noise)
+    top_up = torch.maximum(source_variance, noise_variance(exposed, pair.source.noise))
     usable = np.broadcast_to(~pair.masked, real.shape)
     limits = {"simulated": top_up + target_variance}
     head = {"kind": "transition", "scene": pair.scene, "source_ms": pair.source_ms}
@@ -197,28 +202,10 @@ def transition_rows(
         ):
             scores = compare(image.numpy(), real, pair, moved)
             limit = limits.get(variant, source_variance + target_variance)
-            scores["psnr_noise_limit_db"] = decibel(float(limit[usable].mean()))
+            scores["psnr_noise_limit_db"] = _decibel(limit.numpy()[usable].mean(dtype=np.float64))
             name = variant + ", registered" * (moved is whole)
             rows.append({**head, "variant": name, **scores, "ms": ms})
     return rows
-
-
-def variance(signal: np.ndarray, nlf: NoiseLevelFunction) -> np.ndarray:
-    """Noise variance of (4, H, W) `signal` under `nlf`."""
-    shot, read = (np.array(v)[:, None, None] for v in (nlf.shot, nlf.read))
-    return read + shot * np.maximum(signal, 0.0)
-
-
-def exposed_variance(source: RawImage, ratio: float) -> np.ndarray:
-    """Noise variance that the source brings after its exposure was multiplied by `ratio`."""
-    return ratio**2 * variance(source.data.numpy(), source.noise)
-
-
-def image_shift(real: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """(rows, columns) in packed pixels by which `predicted` must move to lie on `real`."""
-    a, b = (np.sqrt(np.clip(x[1], 0.0, 1.0)) for x in (real, predicted))
-    shift, _, _ = phase_cross_correlation(a, b, upsample_factor=20)
-    return shift
 
 
 def compare(
@@ -244,8 +231,8 @@ def compare(
         full=True,
     )
     error, power = square[use].mean(), (real[use].astype(np.float64) ** 2).mean()
-    scores = {"psnr_db": decibel(float(error)), "ssim": float(similarity[use].mean())}
-    scores |= {"psnr_linear_range_db": decibel(float(square[linear].mean()))}
+    scores = {"psnr_db": _decibel(error), "ssim": float(similarity[use].mean())}
+    scores |= {"psnr_linear_range_db": _decibel(square[linear].mean())}
     scores |= {"relative_rmse": float(np.sqrt(error / power))}
     return scores | {"texture_ratio": _texture(image, use) / _texture(real, use)}
 
@@ -256,7 +243,7 @@ def _texture(image: np.ndarray, use: np.ndarray) -> float:
     return float((((a - b - c + d) / 2)[use[:, 1:, 1:]] ** 2).mean(dtype=np.float64))
 
 
-def decibel(mean_square: float) -> float | None:
+def _decibel(mean_square: float) -> float | None:
     """PSNR against 1, None for a perfect match."""
     return -10 * float(np.log10(mean_square)) if mean_square > 0 else None
 
@@ -284,38 +271,25 @@ def parts(seed: int, quick: bool) -> list[Part]:
     repeats = 1 if quick else REPEATS
     return [
         Part(scene, measure, {"scene": scene, "repeats": repeats, "seed": seed}, threads=1)
-        for scene in list(SCENES)[: 1 if quick else None]
+        for scene in SCENES[: 1 if quick else None]
     ]
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by scene."""
     rows = [row for own in results.values() for row in own["rows"]]
-    first = next(iter(results.values()))
     estimates = {scene: own["estimates"] for scene, own in results.items()}
-    more = {"blind_nlf_of_green": {"exposure_ms": list(TIMES_MS), **estimates}}
-    more["frame"] = first["frame"]
-    ratios = [row for row in rows if row["kind"] == "ratio"]
+    more: dict[str, Any] = {"blind_nlf_of_green": {"exposure_ms": list(TIMES_MS), **estimates}}
+    more["frame"] = next(iter(results.values()))["frame"]
+    ratios = pivot(
+        (row for row in rows if row["kind"] == "ratio"),
+        line=("scene, frames, levels", "{scene}, {source_ms} to {target_ms} ms, {levels}"),
+        columns="{plane}",
+        contents={"": "{median:.3f} ({least_squares:.3f})"},
+    )
     transitions = [row for row in rows if row["kind"] == "transition"]
-    page = [
-        f"Frames of {' x '.join(map(str, first['frame']))} packed, one thread. `docs/colour.md` "
-        "says how to read it.",
-        "## Exposure ratio between consecutive frames (`exposure_ratio` says 2)",
-        "Median over blocks (least squares through the origin), per plane.",
-        pivot(
-            ratios,
-            line=("scene, frames, levels", "{scene}, {source_ms} to {target_ms} ms, {levels}"),
-            columns="{plane}",
-            contents={"": "{median:.3f} ({least_squares:.3f})"},
-        ),
-        "## Simulated against real frames",
-        *sections(
-            transitions,
-            lambda row: f"{row['scene']} ({SCENES[row['scene']]})",
-            lambda own: table(own, _COLUMNS),
-        ),
-    ]
-    return Report(rows, page, more)
+    tables = {s: table((r for r in transitions if r["scene"] == s), _COLUMNS) for s in SCENES}
+    return Report(rows, {"ratios": ratios, **tables}, meta=more)
 
 
 _COLUMNS: dict[str, Any] = {

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.stats import linregress
 from skimage.color import deltaE_ciede2000, lab2xyz, xyz2lab
@@ -169,7 +170,10 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
     unclipped = linear_srgb_to_lab(linear * scale)
     error = deltaE_ciede2000(shown, lab)
     error_unclipped = deltaE_ciede2000(unclipped, lab)
-    even = unclipped_at_published_luminance(linear, lab)
+    # Each patch scaled to its published Y, which leaves errors of hue and chroma only: uneven
+    # light, vignetting and the camera's linearity drop out; veiling glare does not.
+    luminance = lab_to_luminance(linear_srgb_to_lab(linear))
+    even = linear_srgb_to_lab(linear * (lab_to_luminance(lab) / luminance)[:, None])
     error_even = deltaE_ciede2000(even, lab)
     rows = []
     for k, i in enumerate(order):
@@ -180,15 +184,6 @@ def measure(raw: RawImage, chart: Chart, white_balance: str) -> list[Row]:
         row |= {"lab_measured": shown[k].round(2), "lab_published": lab[k]}
         rows.append(rounded(row | {"linear_srgb": linear[k] * scale, "exposure_scale": scale}))
     return rows
-
-
-def unclipped_at_published_luminance(linear: np.ndarray, lab: np.ndarray) -> np.ndarray:
-    """Lab of `linear` with each patch scaled to its published Y: leaves hue and chroma errors only.
-
-    Uneven light, vignetting and the camera's linearity drop out; veiling glare does not.
-    """
-    luminance = lab_to_luminance(linear_srgb_to_lab(linear))
-    return linear_srgb_to_lab(linear * (lab_to_luminance(lab) / luminance)[:, None])
 
 
 def paper_range(raw: RawImage) -> Row:
@@ -218,11 +213,11 @@ def linearity(raw: RawImage, chart: Chart) -> list[Row]:
 
 def summary(rows: list[Row]) -> Row:
     """Mean, median and maximum of dE2000 over `rows`."""
-    names = ("", "_without_gamut_clip", "_at_published_luminance")
-    errors, *others = (np.array([row[f"delta_e_2000{name}"] for row in rows]) for name in names)
-    found: Row = {"patches": len(rows), "mean": errors.mean(), "median": np.median(errors)}
-    found |= {"max": errors.max(), "worst": rows[int(errors.argmax())]["patch"]}
-    found |= {f"mean{name}": own.mean() for name, own in zip(names[1:], others, strict=True)}
+    frame = pd.DataFrame(rows).set_index("patch").filter(like="delta_e")
+    errors, means = frame["delta_e_2000"], frame.mean()
+    found: Row = {"patches": len(rows), "mean": errors.mean(), "median": errors.median()}
+    found |= {"max": errors.max(), "worst": errors.idxmax()}
+    found |= {f"mean{name.removeprefix('delta_e_2000')}": means[name] for name in frame.columns[1:]}
     return {k: round(float(v), 2) if isinstance(v, float) else v for k, v in found.items()}
 
 
@@ -254,26 +249,21 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     lines = [row for own in results.values() for row in own["linearity"]]
     paper = {file: own["paper"] for file, own in results.items() if own["paper"]}
     more = {"summary": summaries, "linearity": lines, "paper": paper}
-    first = [row for row in rows if row["file"] == next(iter(FILES))]
-    page = [
-        "How to read it: [colour](../colour.md). Colour difference dE2000 of whole charts:",
-        _plain_table(summaries),
-        "Patches of the first file, L* a* b* by white balance:",
-        pivot(
-            first,
-            line=("patch", "{patch}"),
-            columns="{white_balance}",
-            contents={
-                "published": lambda row: " ".join(map(str, row["lab_published"])),
-                "measured": lambda row: " ".join(map(str, row["lab_measured"])),
-                "dE2000": "{delta_e_2000:.2f}",
-            },
-        ),
-        "Linearity of the neutral row:",
-        _plain_table(lines),
-        f"White paper around the chart, share of sensor white: {paper}.",
-    ]
-    return Report(rows, page, more)
+    first = (row for row in rows if row["file"] == next(iter(FILES)))
+    patches = pivot(
+        first,
+        line=("patch", "{patch}"),
+        columns="{white_balance}",
+        contents={
+            "published": lambda row: " ".join(map(str, row["lab_published"])),
+            "measured": lambda row: " ".join(map(str, row["lab_measured"])),
+            "dE2000": "{delta_e_2000:.2f}",
+        },
+    )
+    tables = {"patches": patches, "charts": _plain_table(summaries)}
+    tables["linearity"] = _plain_table(lines)
+    tables["paper"] = _plain_table([{"file": file, **ends} for file, ends in paper.items()])
+    return Report(rows, tables, meta=more)
 
 
 def _plain_table(rows: list[Row]) -> str:

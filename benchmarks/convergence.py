@@ -44,13 +44,6 @@ def parts(seed: int, quick: bool) -> list[Part]:
 
 def watch(stops: float, seed: int) -> dict[str, Any]:
     """Rows of all policies at one step of the light, and the median curve of each."""
-    result = _watched(stops, seed)
-    curves = {name: np.median(_departure(result, name), axis=0).tolist() for name in POLICIES}
-    scenes = len(set(result.scene_ids.tolist()))
-    return {"rows": list(_rows(result, stops)), "curves": curves, "scenes": scenes}
-
-
-def _watched(stops: float, seed: int) -> EvaluationResult:
     options: dict[str, Any] = {
         "scenes": "bundled:small",
         "split": "test",
@@ -62,7 +55,10 @@ def _watched(stops: float, seed: int) -> EvaluationResult:
     context = PolicyContext.from_envs(envs)
     envs.close()
     policies = {name: make_policy(name, context) for name in POLICIES}
-    return evaluate(policies, options, frames=FRAMES, seed=seed, batch=20)
+    result = evaluate(policies, options, frames=FRAMES, seed=seed, batch=20)
+    curves = {name: np.median(_departure(result, name), axis=0).tolist() for name in POLICIES}
+    scenes = len(set(result.scene_ids.tolist()))
+    return {"rows": list(_rows(result, stops)), "curves": curves, "scenes": scenes}
 
 
 def _departure(result: EvaluationResult, policy: str) -> np.ndarray:

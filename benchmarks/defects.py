@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from scipy.optimize import nnls
 from scipy.stats import spearmanr
@@ -20,7 +21,7 @@ from ae_env.scenes import Scene, load_scenes, reference_settings
 from ae_env.scorers.defects import DEFECTS, KNOTS, SIGNS, mapped
 from ae_env.scorers.measures import luma_of
 from agents.cli.console import console
-from benchmarks.harness import Benchmark, Part, Report, Row, bullets, cell, pivot, table
+from benchmarks.harness import Benchmark, Part, Report, Row, pivot, table
 from simulator import develop, exposure_ratio, get_camera
 from simulator.optics.blur import disc_blur
 from simulator.raw.develop import GREY_CARD_SIGNAL
@@ -35,16 +36,6 @@ NUM_KNOTS = 9
 RESAMPLES = 2000
 #: What severity 1 is.
 EXPOSURE_EV, CARD_NOISE, GAIN_STOPS, AIRLIGHT, DISC_PX = 4.0, 0.5, 1.0, 0.8, 8.0
-RENDERED = {
-    "exposure": f"light {EXPOSURE_EV:g} EV too much or too little, at random by scene",
-    "noise": f"photon noise, standard deviation of {CARD_NOISE:.0%} of the signal at an 18 % card",
-    "white_balance": f"gains of red and blue {GAIN_STOPS:g} stop off, towards amber, blue, magenta "
-    "or green, at random by scene",
-    "saturation": "distance of each sRGB pixel from its luma doubled; -1: none of it left",
-    "haze": f"{AIRLIGHT:.0%} of the light is neutral airlight as bright as the scene's 90th "
-    "percentile of green, between 0.12 and 0.66 of white; the same at all depths",
-    "blur": f"disc of {DISC_PX:g} pixels of the frame in diameter, on light before the clip",
-}
 _TINTS = ((1.0, -1.0), (-1.0, 1.0), (1.0, 1.0), (-1.0, -1.0))
 
 
@@ -122,18 +113,14 @@ def fit(scenes: list[Scene], seed: int) -> dict[str, list[list[float]]]:
         if defect != "exposure":
             maps[defect] = fit_map(signs[defect].ravel(), rendered.ravel())
             continue
-        # Each side is zero where the light is off to the other side.
-        brighter = _brighter(signs)
+        # Each side is zero where the light is off to the other side: where the last rendering is
+        # brighter than the first, and the other way round.
+        more = signs["over_exposure"] - signs["under_exposure"]
+        brighter = more[:, -1] > more[:, 0]
         for name, own in (("over_exposure", brighter), ("under_exposure", ~brighter)):
             target = np.where(own[:, None], rendered, 0.0)
             maps[name] = fit_map(signs[name].ravel(), target.ravel())
     return maps
-
-
-def _brighter(signs: dict[str, np.ndarray]) -> np.ndarray:
-    """(scenes,) bool, whether the last rendering is brighter than the first."""
-    more = signs["over_exposure"] - signs["under_exposure"]
-    return more[:, -1] > more[:, 0]
 
 
 def severities_of(scenes: list[Scene], defect: str, seed: int) -> dict[str, np.ndarray]:
@@ -152,8 +139,8 @@ def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str,
     chosen = [which == "all" or s.hard == (which == "hard") for s in scenes]
     rendered = np.broadcast_to(levels(defect), estimated.shape)[chosen]
     values = estimated[chosen]
-    groups = [s.group for s, is_chosen in zip(scenes, chosen, strict=True) if is_chosen]
-    errors = by_group(np.abs(values - rendered).mean(axis=1), groups)
+    groups = np.array([scene.group for scene in scenes])[chosen]
+    errors = pd.Series(np.abs(values - rendered).mean(axis=1)).groupby(groups).mean().to_numpy()
     guesses = np.abs(rendered - np.median(levels(defect))).mean()
     draws = np.random.default_rng(seed).integers(len(errors), size=(RESAMPLES, len(errors)))
     within = [_spearman(v, r) for v, r in zip(values, rendered, strict=True)]
@@ -163,12 +150,6 @@ def own_row(defect: str, estimated: np.ndarray, scenes: list[Scene], which: str,
     row |= {"spearman_within_scene": float(np.mean(within)), "mae": float(errors.mean())}
     row |= {"mae_ci95": np.quantile(errors[draws].mean(axis=1), [0.025, 0.975]).tolist()}
     return row | {"mae_of_a_constant": float(guesses)}
-
-
-def by_group(values: np.ndarray, groups: list[str]) -> np.ndarray:
-    """Mean (G,) of `values` (N,) over the scenes of each source group."""
-    _, which = np.unique(groups, return_inverse=True)
-    return np.bincount(which, values) / np.bincount(which)
 
 
 def _spearman(first: np.ndarray, second: np.ndarray) -> float:
@@ -233,13 +214,6 @@ def tested(resolution: int, seed: int, quick: bool) -> dict[str, Any]:
     return {"rows": rows, "scenes": len(scenes)}
 
 
-def _same(maps: dict[str, list[list[float]]]) -> bool:
-    return all(
-        np.shape(knots) == np.shape(KNOTS[name]) and np.allclose(knots, KNOTS[name], atol=2e-3)
-        for name, knots in maps.items()
-    )
-
-
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report; prints the maps as the scorers' source has them."""
     maps, tests = results["maps"]["maps"], [results[f"test {n}"] for n in (128, 64)]
@@ -250,25 +224,30 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     fits = [
         {"part": "map", "name": n, "knots": knots, "in_use": KNOTS[n]} for n, knots in maps.items()
     ]
+    in_use = all(
+        np.shape(knots) == np.shape(KNOTS[name]) and np.allclose(knots, KNOTS[name], atol=2e-3)
+        for name, knots in maps.items()
+    )
     more = {"training_scenes": results["maps"]["scenes"], "test_scenes": tests[0]["scenes"]}
-    more |= {"rendered": RENDERED, "in_use_is_fitted": _same(maps), "camera": CAMERA}
+    more |= {"in_use_is_fitted": in_use, "camera": CAMERA}
     own = [row for row in rows if row["part"] == "own"]
     cross = [row for row in rows if row["part"] == "cross_talk"]
-    clean = [row | {"defect": "no defect"} for row in cross if row["defect"] == DEFECTS[0]]
-    page = [
-        "Bundled scenes, well exposed, noise-free and sharp, are rendered with one defect at 11 "
-        f"severities (saturation: 21). Maps are fitted on {more['training_scenes']} training "
-        f"scenes and tested, with the constants in use, on {more['test_scenes']} test scenes; the "
-        f"constants that this run fitted are {'' if _same(maps) else 'not '}those in use.",
-        "Severity 1 is:",
-        bullets(f"{defect.replace('_', ' ')}: {text}" for defect, text in RENDERED.items()),
-        "## Own defect",
-        "*Rank correlation*: Spearman, over all scenes and severities together, and within a scene "
-        "(mean over scenes). *Error*: mean absolute error of the severity, with its 95 % bootstrap "
-        "interval over source groups. *Constant*: the error of always saying the middle severity; "
-        "a measure that is no better cannot tell a defect from another scene. *Hard*: back light, "
-        "snow, night, spot light and motion.",
-        table(
+    clean = [
+        row | {"defect": "no defect", "shown": f"{row['clean']:.2f}"}
+        for row in cross
+        if row["defect"] == DEFECTS[0]
+    ]
+    changes = [row | {"shown": f"{row['change']:+.2f}"} for row in cross]
+    tables = {
+        "fitted": table(
+            [more],
+            {
+                "training scenes": "{training_scenes}",
+                "test scenes": "{test_scenes}",
+                "the constants in use are those of this run": lambda _: "yes" if in_use else "no",
+            },
+        ),
+        "own": table(
             [r for r in own if r["scenes"] == "all" or r["resolution"] == RESOLUTION],
             {
                 "measure": "`{measure}`",
@@ -280,21 +259,14 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
                 "constant": "{mae_of_a_constant:.3f}",
             },
         ),
-        "## Cross-talk",
-        f"Mean |severity| at {RESOLUTION} x {RESOLUTION} without a defect, and how much each "
-        "defect at severity 1 (row) changes each measure (column). Ideally only its own changes.",
-        pivot(
-            [*clean, *cross],
+        "cross_talk": pivot(
+            [*clean, *changes],
             line=("defect", "{defect}"),
             columns="`{measure}`",
-            contents={"": _cross_cell},
+            contents={"": "{shown}"},
         ),
-    ]
-    return Report([*fits, *rows], page, more)
-
-
-def _cross_cell(row: Row) -> str:
-    return cell(row, "{clean:.2f}" if row["defect"] == "no defect" else "{change:+.2f}")
+    }
+    return Report([*fits, *rows], tables, meta=more)
 
 
 BENCHMARK = Benchmark(

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import itertools
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from skimage.restoration import denoise_nl_means
 from torch import Tensor
@@ -250,73 +251,29 @@ def parts(seed: int, quick: bool) -> list[Part]:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by name of the part."""
     rows = [row for own in results.values() for row in own]
-    all_cases = [row for row in rows if row["part"] == "cases"]
-    flat = [row for row in rows if row["part"] == "flat"]
-    summary = [_summary(name, all_cases) for name in dict.fromkeys(r["method"] for r in all_cases)]
-    for row in summary:
-        own = [r["mean_shift"] for r in flat if r["method"] == row["method"]]
-        row["flat"] = max(own) if own else None
-    by_iso = [
-        {"method": row["method"], "iso": iso, "ev": ev, "gain_db": np.mean(found)}
-        for row in summary
-        for iso in ISOS
-        for ev in LEVELS
-        if (
-            found := [
-                r["gain_db"]
-                for r in all_cases
-                if (r["method"], r["iso"], r["ev"]) == (row["method"], iso, ev)
-            ]
-        )
-    ]
-    count = len({row["source"] for row in all_cases})
-    page = [
-        f"{count} sources that no training saw, one crop of {SIZE} x {SIZE} packed pixels each, "
-        "sampled through the colour filter array behind a lens blur of half a pixel (standard "
-        "deviation); Nikon Z6 and Canon 70D in turn, each source at every other of the "
-        "combinations of ISO and light. Light: the brightest 1 % at 2^EV of white. "
-        "Gain of PSNR over the noisy input. BM3D is the package `bm3d` on the four planes "
-        "jointly, non-local means are scikit-image's; both behind the generalised Anscombe "
-        "transform and its unbiased inverse. Differences to BM3D are paired by source, with the "
-        "95 % bootstrap interval over sources. The mean shift is the largest over flat fields of "
-        f"every calibrated ISO and light from 2^{FLAT_LEVELS[0]} to 2^{FLAT_LEVELS[-1]}.",
-        table(summary, _COLUMNS),
-        "## By ISO and light",
-        pivot(
-            by_iso,
-            line=("method", "{method}"),
-            columns="ISO {iso}, EV {ev}",
-            contents={"": "{gain_db:.2f}"},
-        ),
-    ]
-    return Report([*summary, *rows], page, {"sources": count})
-
-
-def _summary(name: str, rows: Sequence[Row]) -> Row:
-    own = [row for row in rows if row["method"] == name]
-    gains = np.array([row["gain_db"] for row in own])
-    differences = _by_source(own) - _by_source([r for r in rows if r["method"] == REFERENCE])
-    drawn = np.random.default_rng(0).integers(len(differences), size=(10_000, len(differences)))
-    low, high = np.quantile(differences[drawn].mean(axis=1), [0.025, 0.975])
-    return {
-        "part": "summary",
-        "method": name,
-        "gain_db": gains.mean(),
-        "cases": len(gains),
-        "gain_db_10_percent": np.quantile(gains, 0.1),
-        "gain_db_worst": gains.min(),
-        "to_bm3d_db": differences.mean(),
-        "ci95": [low, high],
-        "green_kept": np.median([row["green_kept"] for row in own]),
-        "milliseconds": np.median([row["milliseconds"] for row in own]),
-    }
-
-
-def _by_source(rows: Sequence[Row]) -> np.ndarray:
-    gains: dict[str, list[float]] = {}
-    for row in rows:
-        gains.setdefault(row["source"], []).append(row["gain_db"])
-    return np.array([np.mean(gains[source]) for source in sorted(gains)])
+    frame = pd.DataFrame(rows)
+    cases, flat = frame[frame["part"] == "cases"], frame[frame["part"] == "flat"]
+    by_source = cases.pivot_table("gain_db", "source", "method")
+    drawn = np.random.default_rng(0).integers(len(by_source), size=(10_000, len(by_source)))
+    shifts, summary = flat.groupby("method")["mean_shift"].max(), []
+    for name, own in cases.groupby("method", sort=False):
+        differences = (by_source[name] - by_source[REFERENCE]).to_numpy()
+        row: Row = {"part": "summary", "method": name, "gain_db": own["gain_db"].mean()}
+        row |= {"cases": len(own), "gain_db_10_percent": own["gain_db"].quantile(0.1)}
+        row |= {"gain_db_worst": own["gain_db"].min(), "to_bm3d_db": differences.mean()}
+        row |= {"ci95": np.quantile(differences[drawn].mean(axis=1), [0.025, 0.975]).tolist()}
+        row |= {k: own[k].median() for k in ("green_kept", "milliseconds")}
+        summary.append(row | {"flat": shifts.get(name)})
+    means = cases.groupby(["iso", "ev", "method"], sort=False)["gain_db"].mean().reset_index()
+    means = means.sort_values(["iso", "ev"], ascending=[True, False], kind="stable")
+    by_iso = pivot(
+        means.to_dict("records"),
+        line=("method", "{method}"),
+        columns="ISO {iso:.0f}, EV {ev:.0f}",
+        contents={"": "{gain_db:.2f}"},
+    )
+    tables = {"methods": table(summary, _COLUMNS), "by_iso": by_iso}
+    return Report([*summary, *rows], tables, meta={"sources": len(by_source)})
 
 
 _COLUMNS: dict[str, Any] = {

@@ -194,7 +194,9 @@ def write_report(
         files[f"picture {path.stem}"] = write_picture(path, figure)
     if report.tables:
         tables = {"origin": origin(meta), **report.tables}
-        files["page"] = write_atomically(out / f"{stem}.md", filled_page(stem, title, tables))
+        files["page"] = write_atomically(
+            out / f"{stem}.md", filled_page(stem, title, tables, report.figures)
+        )
     if report.page:
         blocks = [f"# {title}", origin(meta), *report.page]
         text = "\n\n".join(block.strip() for block in blocks if block.strip()) + "\n"
@@ -202,8 +204,12 @@ def write_report(
     return files
 
 
-def filled_page(stem: str, title: str, tables: Mapping[str, str]) -> str:
-    """The page ``docs/results/STEM.md`` with new tables between its marks; else a bare one.
+def filled_page(
+    stem: str, title: str, tables: Mapping[str, str], figures: Iterable[str | Path] = ()
+) -> str:
+    """The page ``docs/results/STEM.md`` with new tables between its marks.
+
+    Where there is no such page, one of the title, the tables and the figures beside it.
 
     Raises:
         ValueError: If the page and the benchmark do not name the same tables.
@@ -212,7 +218,8 @@ def filled_page(stem: str, title: str, tables: Mapping[str, str]) -> str:
     if path.is_file():
         page = path.read_text(encoding="utf-8")
     else:
-        page = "\n\n".join([f"# {title}", *(f"<!-- {n} -->\n<!-- end -->" for n in tables)]) + "\n"
+        blocks = [f"# {title}", *(f"<!-- {name} -->\n<!-- end -->" for name in tables)]
+        page = "\n\n".join([*blocks, *(f"![{name}]({name})" for name in figures)]) + "\n"
     marked = re.findall(r"^<!-- ([\w-]+) -->$", page, re.MULTILINE)
     if sorted(name for name in marked if name != "end") != sorted(tables):
         raise ValueError(f"{path} must have the marks of {sorted(tables)}, not of {marked}")

@@ -9,16 +9,16 @@ training that was stopped continues. Published numbers are of another split of t
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from skimage.metrics import structural_similarity
@@ -106,21 +106,16 @@ def parts(
     if weights is None:
         names = dict.fromkeys(TRAINED)
     else:
-        card = _checked(load_modules(weights)[1], weights)
+        card = load_modules(weights)[1]
+        if card["preset"] not in ("compact", "paper", "ncs"):
+            wrong = f"`weights` (={str(weights)!r}) must be of all three modules"
+            raise ValueError(f"{wrong}, not {card['preset']!r}")
         names, depends = {str(weights.resolve()): None}, depends | {"weights": card["sha256"]}
     longer = {"depends": depends, "timeout": LONGEST}
     return [
         Part(name, measure, {"name": name, **arguments}, **longer)  # type: ignore[arg-type]
         for name in (*names, "compact")
     ]
-
-
-def _checked(card: dict[str, Any], weights: Path) -> dict[str, Any]:
-    if card["preset"] not in ("compact", "paper", "ncs"):
-        raise ValueError(
-            f"`weights` (={str(weights)!r}) must be of all three modules, not {card['preset']!r}"
-        )
-    return card
 
 
 def _digest(folder: Path) -> str:
@@ -188,40 +183,36 @@ def cases(held_out: list[CapturedSequence], seed: int, quick: bool) -> Iterator[
         pairs = [pairs[i] for i in sorted(rng.choice(len(pairs), count, replace=False))]
     for pair in pairs:
         sequence = held_out[pair.sequence]
-        raws = (_middle(sequence.captures[i].read(), size) for i in (pair.source, pair.target))
-        yield Case(sequence.name, *raws)
-
-
-def _middle(raw: RawImage, size: int) -> RawImage:
-    top, left = (max(n - size, 0) // 2 for n in raw.data.shape[1:])
-    data = raw.data[:, top : top + size, left : left + size]
-    return RawImage(data, raw.settings, raw.camera, raw.nlf, raw.white_balance)
+        middles = []
+        for raw in (sequence.captures[i].read() for i in (pair.source, pair.target)):
+            top, left = (max(n - size, 0) // 2 for n in raw.data.shape[1:])
+            middle = raw.data[:, top : top + size, left : left + size]
+            middles.append(replace(raw, data=middle))
+        yield Case(sequence.name, *middles)
 
 
 def _methods(
     modules: nn.ModuleDict, preset: str, weights: str | Path
 ) -> Callable[[Case], dict[str, Tensor]]:
     """Maps a case to the estimate of each stage."""
-    if "baseline" in modules:
-        return functools.partial(_baseline, modules["baseline"], preset.upper())
     # The w and b of our own weights are those of a body that did not take these pictures.
-    simulator = CameraSimulator.from_pretrained(
-        weights, device="auto", body_correction=preset != "compact", cache=None
-    )
-    return functools.partial(_stages, simulator)
+    simulator = None
+    if "baseline" not in modules:
+        simulator = CameraSimulator.from_pretrained(
+            weights, device="auto", body_correction=preset != "compact", cache=None
+        )
 
+    @torch.no_grad()
+    def estimate(case: Case) -> dict[str, Tensor]:
+        if simulator is None:
+            settings = case.source.settings, case.target.settings
+            parameters = torch.tensor([[v for s in settings for v in settings_parameters(s)]])
+            return {preset.upper(): modules["baseline"](case.source.data[None], parameters)[0]}
+        stages = simulator.stages(case.source, case.target.settings)
+        images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
+        return {name: image.cpu() for name, image in images.items()}
 
-def _stages(simulator: CameraSimulator, case: Case) -> dict[str, Tensor]:
-    stages = simulator.stages(case.source, case.target.settings)
-    images = {"EXP": stages.exposed, "NS": stages.denoised, "Full": stages.opened}
-    return {name: image.cpu() for name, image in images.items()}
-
-
-@torch.no_grad()
-def _baseline(network: nn.Module, name: str, case: Case) -> dict[str, Tensor]:
-    settings = case.source.settings, case.target.settings
-    parameters = torch.tensor([[v for s in settings for v in settings_parameters(s)]])
-    return {name: network(case.source.data[None], parameters)[0]}
+    return estimate
 
 
 def _scores(estimate: Tensor, case: Case) -> Row:
@@ -241,42 +232,33 @@ def _scores(estimate: Tensor, case: Case) -> Row:
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """Means over the pairs of each group, beside what the paper publishes."""
     rows = [row for own in results.values() for row in own]
-    means = list(_means(rows))
-    presets = dict.fromkeys((row["preset"], row["sha256"]) for row in rows)
-    times = {name: np.median([r["ms"] for r in rows if r["preset"] == name]) for name, _ in presets}
-    page = [
-        "Pairs of real captures of held-out sequences. An estimate is what a method makes of the "
-        "source before the output's noise is added; it is compared with the noisy capture, as in "
-        "the paper. PSNR [dB] and SSIM are means over pairs; images are clipped to what a capture "
-        "can show. `compact` comes with this package and was not trained on these captures.",
-        pivot(
+    frame = pd.DataFrame(rows)
+    times = frame.groupby(["preset", "sha256"], sort=False)["ms"].median().reset_index()
+    by_group, means = frame.explode("groups"), []
+    for group in GROUPS:
+        own = by_group[by_group["groups"] == group].groupby(["preset", "method"], sort=False)
+        for (preset, method), scores in own:
+            head: Row = {"group": group, "preset": preset, "method": method, "pairs": len(scores)}
+            means.append(head | dict(scores[["psnr_db", "ssim"]].mean()))
+    columns: dict[str, Any] = {
+        "network": "`{preset}`",
+        "weights": lambda row: f"`{row['sha256'][:12]}`",
+        "ms a pair (median)": "{ms:.0f}",
+    }
+    tables = {
+        "means": pivot(
             means,
             line=("PSNR [dB] / SSIM", _label),
             columns="{group} ({pairs})",
             contents={"": "{psnr_db:.2f} / {ssim:.3f}"},
         ),
-        "Published, of the authors' own split: "
-        + "; ".join(f"{camera}: {text}" for camera, text in PUBLISHED.items())
-        + ".",
-        table(
-            ({"preset": name, "sha": sha, "ms": times[name]} for name, sha in presets),
-            {"network": "`{preset}`", "weights": "`{sha:.12}`", "ms a pair (median)": "{ms:.0f}"},
+        "published": table(
+            [{"camera": camera, "text": text} for camera, text in PUBLISHED.items()],
+            {"published, of the authors' own split": "{camera}", "PSNR [dB] / SSIM": "{text}"},
         ),
-        "![PSNR of each method by transition](paper.png)",
-    ]
-    return Report([*means, *rows], page, figures={"paper.png": _picture(means)})
-
-
-def _means(rows: list[Row]) -> Iterator[Row]:
-    methods = dict.fromkeys((row["preset"], row["method"]) for row in rows)
-    for group in GROUPS:
-        for preset, method in methods:
-            chosen = [r for r in rows if (r["preset"], r["method"]) == (preset, method)]
-            chosen = [row for row in chosen if group in row["groups"]]
-            if chosen:
-                head: Row = {"group": group, "preset": preset, "method": method}
-                scores = {n: float(np.mean([r[n] for r in chosen])) for n in ("psnr_db", "ssim")}
-                yield {**head, "pairs": len(chosen), **scores}
+        "networks": table(times, columns),
+    }
+    return Report([*means, *rows], tables, figures={"paper.png": _picture(means)})
 
 
 def _label(row: Row) -> str:
@@ -309,6 +291,6 @@ BENCHMARK = Benchmark(
     title="The paper's table on real captures",
     parts=parts,
     report=report,
-    code=("simulator", "benchmarks/paper", "benchmarks/captures"),
+    code=("simulator", "benchmarks/paper", "benchmarks/harness"),
 )
 run = BENCHMARK.run

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -164,33 +166,17 @@ class GeneratedConvolution(nn.Module):
         if self.upsample:
             x = F.conv_transpose2d(x, kernels, stride=2, padding=1, groups=batch)
         else:
-            x = F.conv2d(
-                x,
-                kernels,
-                stride=self.stride,
-                padding=self.dilation,
-                dilation=self.dilation,
-                groups=batch,
-            )
+            spread = {"padding": self.dilation, "dilation": self.dilation}
+            x = F.conv2d(x, kernels, stride=self.stride, groups=batch, **spread)
         return x.reshape(batch, -1, *x.shape[-2:])
 
 
 class _NormalisedGenerated(nn.Module):
     """`GeneratedConvolution` and instance normalisation with learnt scale and shift."""
 
-    def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        *,
-        stride: int = 1,
-        dilation: int = 1,
-        upsample: bool = False,
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, **convolution: Any) -> None:
         super().__init__()
-        self.convolution = GeneratedConvolution(
-            inputs, outputs, stride=stride, dilation=dilation, upsample=upsample
-        )
+        self.convolution = GeneratedConvolution(inputs, outputs, **convolution)
         self.scale = nn.Parameter(torch.ones(outputs))
         self.shift = nn.Parameter(torch.zeros(outputs))
 
@@ -253,20 +239,10 @@ class DecoupledNet(nn.Module):
     ) -> None:
         super().__init__()
         _check(width, dilations)
-        self.head = nn.ModuleList(
-            [
-                _NormalisedGenerated(5, width),
-                _NormalisedGenerated(width, width),
-                _NormalisedGenerated(width, width, stride=2),
-            ]
-        )
+        layer = partial(_NormalisedGenerated, width, width)
+        self.head = nn.ModuleList([_NormalisedGenerated(5, width), layer(), layer(stride=2)])
         self.blocks = nn.ModuleList(_ResidualBlock(width, dilation) for dilation in dilations)
-        self.neck = nn.ModuleList(
-            [
-                _NormalisedGenerated(width, width, upsample=True),
-                _NormalisedGenerated(width, width),
-            ]
-        )
+        self.neck = nn.ModuleList([layer(upsample=True), layer()])
         self.tail = GeneratedConvolution(width, 4)
 
     def forward(self, image: Tensor, parameters: Tensor) -> Tensor:

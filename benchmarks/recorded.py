@@ -13,12 +13,13 @@ held-out radiance maps, written to files and read back, and the real bracket of
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from ae_env.grid import ExposureGrid
@@ -39,12 +40,11 @@ from benchmarks.harness import (
     clipped,
     data_root,
     psnr,
-    quartiles,
     table,
 )
 from simulator import RawImage, exposure_ratio, get_camera, write_dng
 from simulator.radiance.light import MEAN_SIGNAL
-from simulator.reference.camera import ReferenceCamera, ReferenceScene
+from simulator.reference.camera import ReferenceCamera
 from simulator.training.scenes import reference_scenes
 
 CAMERA = "nikon_z6"
@@ -72,25 +72,19 @@ REFERENCE, BOREAL = "reference camera", "boreal_brackets"
 # -- grids ----------------------------------------------------------------------------------------
 
 
-def write_grid(folder: Path, scene: ReferenceScene, grid: ExposureGrid, *, seed: int = 0) -> None:
-    """Photographs every state of `grid` with the reference camera: one DNG a state in `folder`."""
+def _reference_grids(quick: bool, seed: int) -> list[Scene]:
+    """Grids that the reference camera photographs, written to DNGs and read back."""
     camera = get_camera(CAMERA)
     body = ReferenceCamera(camera)
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, settings in enumerate(grid):
-        sample = body.capture(scene, settings, seed).sample
-        raw = RawImage(sample, settings, camera, white_balance=scene.white_balance)
-        write_dng(folder / f"state_{number:02d}.dng", raw)
-
-
-def _reference_grids(quick: bool, seed: int) -> list[Scene]:
-    camera = get_camera(CAMERA)
     found = reference_scenes("test", camera, number=0, size=RESOLUTION, data=data_root())
     groups = {s.group: s for s in reversed(found) if s.kind == "radiance" and s.pitch == 2}
-    grid = ExposureGrid.default()
     with tempfile.TemporaryDirectory() as folder:
         for name, scene in list(groups.items())[: 2 if quick else None]:
-            write_grid(Path(folder) / name, scene, grid, seed=seed)
+            Path(folder, name).mkdir()
+            for number, settings in enumerate(ExposureGrid.default()):
+                sample = body.capture(scene, settings, seed).sample
+                raw = RawImage(sample, settings, camera, white_balance=scene.white_balance)
+                write_dng(Path(folder, name, f"state_{number:02d}.dng"), raw)
         return _of_folder(folder)
 
 
@@ -108,10 +102,8 @@ def _of_folder(folder: str) -> list[Scene]:
     return load_scenes(_options(folder), "all", **options)
 
 
-def _boreal() -> list[Scene]:
-    folder = data_root() / BOREAL
-    grid = ExposureGrid((100,), tuple(t / 1000 for t in brackets.TIMES_MS), (4,))
-    scenes = []
+def _boreal(grid: ExposureGrid) -> list[Scene]:
+    folder, scenes = data_root() / BOREAL, []
     for name in brackets.SCENES:
         frames, _ = brackets.calibrated(
             {t: brackets.load(folder, name, t)[0] for t in brackets.TIMES_MS}
@@ -132,18 +124,11 @@ def measure(source: str, seed: int, quick: bool, folder: str | None = None) -> l
     elif source == REFERENCE:
         scenes, grid = _reference_grids(quick, seed), ExposureGrid.default()
     else:
-        scenes, linear_below = _boreal(), brackets.LINEAR_BELOW
         grid = ExposureGrid((100,), tuple(t / 1000 for t in brackets.TIMES_MS), (4,))
+        scenes, linear_below = _boreal(grid), brackets.LINEAR_BELOW
     networks = SceneNetworks(DEFAULT_SIMULATOR, cache=False)
     found = [(s, _Comparison(s, grid, networks, seed, linear_below).rows()) for s in scenes]
     return [{"source": source, "scene": s.scene_id, **row} for s, rows in found for row in rows]
-
-
-def source_state(scene: Scene) -> int:
-    """The recorded state whose mean of green is nearest to a right exposure's."""
-    assert scene.recorded is not None
-    means = scene.recorded[:, 1:3].mean(dim=(1, 2, 3)).numpy()
-    return int(np.where(scene.allowed, np.abs(means - MEAN_SIGNAL), np.inf).argmin())
 
 
 class _Comparison:
@@ -161,7 +146,9 @@ class _Comparison:
         assert scene.allowed is not None
         self.scene, self.grid, self.networks, self.seed = scene, grid, networks, seed
         self.real, self.allowed = scene.recorded, scene.allowed
-        self.source = source_state(scene)
+        # Of the recorded states the one whose mean of green is nearest to a right exposure's.
+        means = self.real[:, 1:3].mean(dim=(1, 2, 3)).numpy()
+        self.source = int(np.where(self.allowed, np.abs(means - MEAN_SIGNAL), np.inf).argmin())
         self.others = [s for s in np.flatnonzero(self.allowed).tolist() if s != self.source]
         self.tables = ScoreTables(grid, scene.camera, make_scorer("balanced"))
         self.true = self.tables.table(scene)
@@ -289,9 +276,6 @@ def parts(seed: int, quick: bool, folder: Path | None = None) -> list[Part]:
 
 
 _COLUMNS: dict[str, Any] = {
-    "scenes": "{source}",
-    "method": "{title}",
-    "number": "{number}",
     "PSNR, all pixels [dB]": "{psnr_all_db:.1f}",
     "PSNR, known [dB]": "{psnr_db:.1f}",
     "two real captures [dB]": "{ceiling_db:.1f}",
@@ -304,86 +288,39 @@ _COLUMNS: dict[str, Any] = {
 }
 
 
-def _summary(rows: Sequence[Row]) -> list[Row]:
-    """Means over the scenes of a set, for each method."""
-    found = []
-    for source in dict.fromkeys(row["source"] for row in rows):
-        for method, title in METHODS.items():
-            own = [r for r in rows if r["source"] == source and r["method"] == method]
-            numbers: Row = {"source": source, "title": title, "number": len(own)}
-            for name in own[0]:
-                numbers.setdefault(name, _mean([row[name] for row in own]))
-            found.append(numbers)
-    return found
-
-
-def _mean(values: Sequence[Any]) -> Any:
-    """Mean of numbers, or of the mappings' numbers by name; None of anything else."""
-    if isinstance(values[0], Mapping):
-        return {name: _mean([value[name] for value in values]) for name in values[0]}
-    numbers = [value for value in values if isinstance(value, int | float)]
-    return float(np.mean(numbers)) if numbers else None
-
-
-def _stops(rows: Sequence[Row]) -> list[Row]:
-    """The summary's PSNR by stops, after each set what two real captures have."""
-    found = []
-    for source in dict.fromkeys(row["source"] for row in rows):
-        own = [row for row in _summary(rows) if row["source"] == source]
-        found += [{"source": source, "title": r["title"], **r["psnr_by_stops"]} for r in own]
-        ceiling = own[0]["ceiling_by_stops"]
-        found.append({"source": source, "title": "two real captures", **ceiling})
-    return found
-
-
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
-    """The page: one row a set and method, PSNR by stops, then the scenes."""
+    """One row a set and method, PSNR by stops, then the scenes."""
     rows = [row for own in results.values() for row in own]
-    regrets = [r["oracle_regret"] for r in rows if r["method"] == "simulated"]
-    page = [
-        "One capture of each recorded grid is kept, the one whose mean is nearest to a right "
-        "exposure, and every other state is simulated from it and compared with the capture that "
-        f"was really taken. Frames of at most {RESOLUTION} x {RESOLUTION} packed pixels; "
-        "`balanced` scores. PSNR, against white, is the median over the states, first of all "
-        f"pixels, then of those that are known: below {KNOWN_BELOW} of white in the source, as "
-        "nothing tells how bright a clipped highlight is. Both frames have noise, each its own, so "
-        "that two real captures of one light reach only what the camera's noise allows; *without "
-        "its noise* is the simulation before noise is added, against the real frame. A frame with "
-        "too little noise has a higher PSNR than one with the right noise: *noise off by* compares "
-        "the texture (diagonal differences of neighbours). The score error is the root mean square "
-        "over the states, the oracle's regret what is lost in the real scores where the best state "
-        "is chosen by the simulated ones. Where a network would err more than the noise that the "
-        "source brought, the plan leaves that noise in: such frames are noisier than real ones, "
-        "and their scores count it. The scores of scaled frames do not: they take whatever noise "
-        "is in a frame for the camera's.",
-        table(_summary(rows), _COLUMNS),
-        f"The simulated oracle loses {np.mean(regrets):.3f} in the mean, "
-        f"{quartiles(regrets)[2]:.3f} at the upper quartile, {max(regrets):.3f} at most.",
-        "## By the distance from the source",
-        "PSNR of known pixels [dB], by the stops between the source and the state.",
-        table(
-            _stops(rows),
-            {"scenes": "{source}", "method": "{title}"}
-            | {name: f"{{{name}:.1f}}" for name in STOPS},
+    frame = pd.json_normalize(rows)  # columns such as "psnr_by_stops.as bright"
+    sets, stops = [], []
+    for (source, method), own in frame.groupby(["source", "method"], sort=False):
+        head = {"source": source, "method": method, "number": len(own)}
+        means = own.drop(columns=["source", "method"]).mean(numeric_only=True)
+        sets.append({**head, **means})
+        stops.append(head | {name: means.get(f"psnr_by_stops.{name}") for name in STOPS})
+        if method == list(METHODS)[-1]:
+            ceilings = {name: means.get(f"ceiling_by_stops.{name}") for name in STOPS}
+            stops.append(head | {"method": "two real captures"} | ceilings)
+    regrets = frame.loc[frame["method"] == "simulated", "oracle_regret"]
+    regret = {"mean": regrets.mean(), "upper": regrets.quantile(0.75), "most": regrets.max()}
+    heads: dict[str, Any] = {"scenes": "{source}", "method": _title}
+    each = {"scene": "{scene}", "from": "{source_state}", "states": "{states}"}
+    each |= {"known": "{known_share:.1%}", "method": _title, **_COLUMNS}
+    del each["same oracle"]
+    tables = {
+        "sets": table(sets, heads | {"number": "{number}"} | _COLUMNS),
+        "regret": table(
+            [regret],
+            {"mean": "{mean:.3f}", "upper quartile": "{upper:.3f}", "largest": "{most:.3f}"},
         ),
-        "## Scenes",
-        table(
-            [{**row, "title": METHODS[row["method"]]} for row in rows],
-            {"scene": "{scene}", "from": "{source_state}", "states": "{states}"}
-            | {"known": "{known_share:.1%}"}
-            | {k: v for k, v in _COLUMNS.items() if k not in ("scenes", "number", "same oracle")},
-        ),
-    ]
-    if BOREAL in results:
-        page.insert(
-            3,
-            f"Of `{BOREAL}` pixels above {brackets.LINEAR_BELOW} in either frame are not compared, "
-            "because the published response is not linear there ([brackets](brackets.md)); they do "
-            "count in the first PSNR and in the scores. `left_c5` was taken in motion: its frames "
-            "do not lie on each other. Averaged over 4 x 4 pixels, both have so little noise that "
-            "no network runs.",
-        )
-    return Report(rows, page)
+        "by_stops": table(stops, heads | {name: f"{{{name}:.1f}}" for name in STOPS}),
+        "scenes": table(rows, each),
+    }
+    return Report(rows, tables)
+
+
+def _title(row: Row) -> str:
+    return METHODS.get(row["method"], row["method"])
 
 
 BENCHMARK = Benchmark(

@@ -10,7 +10,8 @@ exposed for its incident light. Each pixel carries the noise of one sensor pixel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -27,7 +28,7 @@ from ae_env.scenes import Scene, reference_settings
 from ae_env.scorers import Captures, CompositeScorer, list_scorers, make_scorer
 from ae_env.scorers.captures import describe_captures
 from ae_env.scorers.score_table import prepare_scene
-from benchmarks.harness import Benchmark, Part, Report, Row, cell, pivot, recorded, table
+from benchmarks.harness import Benchmark, Part, Report, Row, pivot, recorded, rounded, table
 from benchmarks.isolated import timed
 from simulator import CameraProfile, CameraSettings, develop
 
@@ -42,16 +43,6 @@ STOPS, F_NUMBER = 6, 5.6
 #: Scores nearer than this are equal.
 _EQUAL = 1e-9
 SCORERS = ("brightness", "highlights", "shadows", "noise", "sharpness", "balanced")
-#: Error of each scorer's own aspect, measured on captures with no other fault than that one.
-ASPECTS = {
-    "brightness": "mean of the developed picture against the reference's, no noise or blur",
-    "highlights": "excess over the reference in its brightest quarter, no noise or blur",
-    "shadows": "shortfall against the reference in its darkest quarter, no noise or blur",
-    "noise": "mean relative deviation from the noise-free capture over the pixels below white; "
-    "states with fewer than a tenth of those are left out",
-    "sharpness": "RMSE of the blurred against the sharp picture, both well exposed, no noise",
-    "balanced": "RMSE of the developed capture, all faults together",
-}
 #: Below this signal [of white] a relative deviation means nothing: the scale of black.
 DARK = 2.0**-10
 #: Noise on samples above this is cut off by the clip.
@@ -71,6 +62,7 @@ def parts(seed: int, quick: bool) -> list[Part]:
     ]
 
 
+@functools.cache
 def available() -> tuple[dict[str, CompositeScorer], dict[str, str]]:
     """The known scorers, and why those that cannot be made here cannot."""
     made, missing = {}, {}
@@ -117,33 +109,18 @@ def _described(scene: Scene, states: list[CameraSettings], camera: CameraProfile
 
 def best_ev(seed: int) -> list[Row]:
     """A row per scorer: in how many stops above incident light each scene scores best."""
-    scorers, scenes, camera = _small()
-    best: dict[str, dict[str, float | None]] = {name: {} for name in scorers}
-    for i, scene in enumerate(scenes):
+    best: dict[str, dict[str, float | None]] = {}
+    for scene, camera, seeded in _small(seed):
         states = [_state(scene, 100.0, offset) for offset in OFFSETS]
-        for name, scores in _scores(scorers, scene, states, camera, seed + i).items():
-            best[name][scene.scene_id] = _best(scores)
-    return [_best_row(name, own) for name, own in best.items()]
-
-
-def gain(seed: int) -> list[Row]:
-    """A row per scorer: its change as the gain rises by 6 stops and the time falls by as many.
-
-    Each pixel carries the noise of one pixel of the sensor, whatever the scene was averaged from.
-    """
-    scorers, scenes, camera = _small()
-    changes: dict[str, list[tuple[float, float]]] = {name: [] for name in scorers}
-    for i, scene in enumerate(scenes):
-        native = replace(scene, box_factor=1)
-        states = [_state(scene, 100.0, 0.0), _state(scene, 100.0 * 2.0**STOPS, 0.0)]
-        for name, scores in _scores(scorers, native, states, camera, seed + i).items():
-            changes[name].append((float(scores[0]), float(scores[1])))
-    return [_gain_row(name, np.array(pairs)) for name, pairs in changes.items()]
-
-
-def _small() -> tuple[dict[str, CompositeScorer], list[Scene], CameraProfile]:
-    options = EnvOptions(scenes="bundled:small", split="test", resolution=SIZE)
-    return available()[0], options.load_scenes(), options.make_camera()
+        for name, scores in _scores(scene, states, camera, seeded).items():
+            best.setdefault(name, {})[scene.scene_id] = _best(scores)
+    rows = []
+    for name, by_scene in best.items():
+        known = [value for value in by_scene.values() if value is not None]
+        row: Row = {"scorer": name, "median": float(np.median(known)) if known else None}
+        row |= {"lowest": min(known, default=None), "highest": max(known, default=None)}
+        rows.append(row | {"by_scene": by_scene})
+    return rows
 
 
 def _best(scores: np.ndarray) -> float | None:
@@ -154,28 +131,33 @@ def _best(scores: np.ndarray) -> float | None:
     return float(best[np.argmin(np.abs(best))])
 
 
-def _best_row(name: str, by_scene: dict[str, float | None]) -> Row:
-    known = [value for value in by_scene.values() if value is not None]
-    return {
-        "scorer": name,
-        "median": float(np.median(known)) if known else None,
-        "lowest": min(known, default=None),
-        "highest": max(known, default=None),
-        "by_scene": by_scene,
-    }
+def gain(seed: int) -> list[Row]:
+    """A row per scorer: its change as the gain rises by 6 stops and the time falls by as many.
+
+    Each pixel carries the noise of one pixel of the sensor, whatever the scene was averaged from.
+    """
+    found: dict[str, list[np.ndarray]] = {}
+    for scene, camera, seeded in _small(seed):
+        states = [_state(scene, iso, 0.0) for iso in (100.0, 100.0 * 2.0**STOPS)]
+        native = replace(scene, box_factor=1)
+        for name, scores in _scores(native, states, camera, seeded).items():
+            found.setdefault(name, []).append(scores.astype(np.float64))
+    rows = []
+    for name, scores in found.items():
+        low, high = np.array(scores).T
+        change = high - low
+        row: Row = {"scorer": name, "low_gain": low.mean(), "high_gain": high.mean()}
+        row |= {"change": change.mean(), "change_sd": change.std()}
+        rows.append(row | {"rises": (change > _EQUAL).mean(), "num_scenes": len(scores)})
+    return [rounded(row) for row in rows]
 
 
-def _gain_row(name: str, pairs: np.ndarray) -> Row:
-    change = pairs[:, 1] - pairs[:, 0]
-    return {
-        "scorer": name,
-        "low_gain": float(pairs[:, 0].mean()),
-        "high_gain": float(pairs[:, 1].mean()),
-        "change": float(change.mean()),
-        "change_sd": float(change.std()),
-        "rises": float((change > _EQUAL).mean()),
-        "num_scenes": len(pairs),
-    }
+def _small(seed: int) -> Iterator[tuple[Scene, CameraProfile, int]]:
+    """The small bundled test scenes, their camera, and a seed for each."""
+    options = EnvOptions(scenes="bundled:small", split="test", resolution=SIZE)
+    camera = options.make_camera()
+    for number, scene in enumerate(options.load_scenes()):
+        yield scene, camera, seed + number
 
 
 def _state(scene: Scene, iso: float, offset: float) -> CameraSettings:
@@ -186,16 +168,12 @@ def _state(scene: Scene, iso: float, offset: float) -> CameraSettings:
 
 
 def _scores(
-    scorers: Mapping[str, CompositeScorer],
-    scene: Scene,
-    states: list[CameraSettings],
-    camera: CameraProfile,
-    seed: int,
+    scene: Scene, states: list[CameraSettings], camera: CameraProfile, seed: int
 ) -> dict[str, np.ndarray]:
     """(S,) of each scorer, on noisy captures without blur."""
     captures = _described(scene, states, camera)
     images = prepare_scene(scene, camera).expose(states, seed=seed).clamp_(0.0, 1.0)
-    return {name: scorer(images, captures).numpy() for name, scorer in scorers.items()}
+    return {name: scorer(images, captures).numpy() for name, scorer in available()[0].items()}
 
 
 # -- good and bad captures ------------------------------------------------------------------------
@@ -216,7 +194,13 @@ def correlation(scenes: str, seed: int) -> dict[str, Any]:
             for target in ("rmse", "ssim", "exposed", f"aspect:{scorer}"):
                 pair = _correlations(scores[scorer], closeness[target])
                 samples.setdefault((scorer, target.partition(":")[0]), []).append(pair)
-    rows = [_correlation_row(scorer, target, own) for (scorer, target), own in samples.items()]
+    rows = []
+    for (scorer, target), pairs in samples.items():
+        values = np.array([pair for pair in pairs if np.isfinite(pair[0])])
+        row: Row = {"scorer": scorer, "reference": target, "num_scenes": len(values)}
+        for name, column in zip(("spearman", "pearson"), values.T, strict=True):
+            row |= {name: float(column.mean()), f"{name}_sd": float(column.std())}
+        rows.append(row | {"positive": float((values[:, 0] > 0).mean())})
     return {"rows": rows, "scenes": len(env.scenes), "states": len(env.grid)}
 
 
@@ -236,7 +220,9 @@ def _closeness(
     exposed = recorded(torch.stack([sharp.expected(s) for s in states]), camera)
     pictures = _developed(captures, scene, camera)
     faultless = _developed(exposed, scene, camera)
-    smeared = _developed(torch.stack([_at(blurred, s, proper) for s in states]), scene, camera)
+    ratios = [2.0 ** (proper.log2_exposure - s.log2_exposure) for s in states]
+    as_proper = [own * ratio for own, ratio in zip(expected, ratios, strict=True)]
+    smeared = _developed(torch.stack(as_proper), scene, camera)
 
     luminance = reference.mean(axis=-1)
     bright = luminance >= np.quantile(luminance, 0.75)
@@ -262,12 +248,6 @@ def _closeness(
     return {"rmse": rmse, "ssim": np.array(ssim), "exposed": exposed_rmse, **aspects}
 
 
-def _at(prepared: Any, state: Any, proper: Any) -> torch.Tensor:
-    """Light with the blur of `state` and the exposure of `proper`."""
-    ratio = 2.0 ** (proper.log2_exposure - state.log2_exposure)
-    return prepared.expected(state) * ratio
-
-
 def _developed(signal: torch.Tensor, scene: Scene, camera: CameraProfile) -> np.ndarray:
     """(B, H, W, 3) float32 sRGB of captures (B, 4, H, W), clipped at white."""
     clipped = signal.clamp(max=1.0)
@@ -290,73 +270,25 @@ def _correlations(scores: np.ndarray, closeness: np.ndarray) -> tuple[float, flo
     return spearman, float(pearsonr(scores, closeness).statistic)
 
 
-def _correlation_row(scorer: str, target: str, pairs: list[tuple[float, float]]) -> Row:
-    values = np.array(pairs)
-    values = values[np.isfinite(values[:, 0])]
-    row: Row = {"scorer": scorer, "reference": target, "num_scenes": len(values)}
-    for name, column in zip(("spearman", "pearson"), values.T, strict=True):
-        row |= {name: float(column.mean()), f"{name}_sd": float(column.std())}
-    return row | {"positive": float((values[:, 0] > 0).mean())}
-
-
 # -- report ---------------------------------------------------------------------------------------
 
 
 def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
     """The report, of the results by question."""
     correlations, missing = results["correlation"], available()[1]
-    rows = [
-        {"measure": name, **row}
-        for name, own in (*results.items(), ("correlation", correlations["rows"]))
-        if isinstance(own, list)
-        for row in own
-    ]
-    numbers = {key: correlations[key] for key in ("scenes", "states")}
-    more = {**numbers, "not_measured": missing, "aspects": ASPECTS}
-    page = [
-        "## Gain at fixed brightness",
-        f"The reward-hacking table. The gain rises by {STOPS} stops and the exposure time falls by "
-        "as many: the picture is as bright as before and has only more noise. A scorer that rises "
-        "takes noise for detail, contrast or information, and an agent that is rewarded by it "
-        "learns to raise the ISO: pair it with `noise` or `snr`. Means over "
-        f"{results['gain'][0]['num_scenes']} small bundled test scenes, exposed for their incident "
-        "light, without blur; each pixel has the noise of one pixel of the sensor.",
-        table(
-            sorted(results["gain"], key=lambda row: -row["change"]),
-            {
-                "scorer": "`{scorer}`",
-                "ISO 100": "{low_gain:.3f}",
-                "ISO 6400": "{high_gain:.3f}",
-                "change": "{change:+.3f} ± {change_sd:.3f}",
-                "scenes in which it rises": "{rises:.0%}",
-            },
-        ),
-        "## Best exposure",
-        *_best_ev_section(results["best_ev"]),
-        "## Cost",
-        f"Milliseconds per batch of {BATCH} captures, median and half the range, on "
-        f"{meta['machine']['threads']} threads. Scorers of sRGB need developing, which is in their "
-        "times. Those with a closed form on noise-free light are computed once per episode "
-        "in an environment whose light is static, not per frame.",
-        pivot(
+    named = {**results, "correlation": correlations["rows"]}
+    rows = [{"measure": name, **row} for name, own in named.items() for row in own]
+    best = [row for row in results["best_ev"] if row["median"] is not None]
+    tables = {
+        "gain": table(sorted(results["gain"], key=lambda row: -row["change"]), _GAIN),
+        "best_exposure": table(sorted(best, key=lambda row: row["median"]), _BEST),
+        "cost": pivot(
             results["milliseconds"],
             line=("scorer", "`{scorer}`"),
             columns="{size} x {size} [ms]",
             contents={"": "{ms:.1f} ± {ms_spread:.1f}"},
         ),
-        "## Do they tell good captures from bad ones?",
-        f"Over the {numbers['states']} states of each of {numbers['scenes']} bundled test scenes, "
-        "with motion and defocus drawn as in an episode: the correlation of the default scorer and "
-        "its parts with the closeness of the developed capture to the reference, the same scene "
-        "noise-free, blur-free and exposed for its incident light. Mean and standard deviation "
-        "over the scenes.",
-        "*Whole picture* (`rmse`, `ssim`): all faults together, as minus the RMSE of the sRGB "
-        "values and as SSIM. *Own aspect*: minus an error on captures that have no other fault, "
-        "because a scorer of one aspect should not follow the others: bright shadows cost blown "
-        f"highlights. *Exposed*: whole picture over the states within {NEAR_EV:g} EV of the "
-        "incident light only, where the split between the controls decides. *Positive*: share of "
-        "the scenes with a positive Spearman coefficient.",
-        pivot(
+        "correlation": pivot(
             correlations["rows"],
             line=("scorer", "`{scorer}`"),
             columns="{reference}",
@@ -366,46 +298,35 @@ def report(results: dict[str, Any], meta: dict[str, Any]) -> Report:
                 "positive": "{positive:.0%}",
             },
         ),
-        table(
-            [{"scorer": name, "error": text} for name, text in ASPECTS.items()],
-            {"scorer": "`{scorer}`", "error of its own aspect": "{error}"},
+        "missing": table(
+            [{"scorer": name, "why": why} for name, why in missing.items()],
+            {"scorer": "`{scorer}`", "why": "{why}"},
         ),
-    ]
-    if missing:
-        absent = [{"scorer": name, "why": why} for name, why in missing.items()]
-        columns = {"scorer": "`{scorer}`", "why": "{why}"}
-        page += ["## Not measured", table(absent, columns)]
-    return Report(rows, page, more)
+    }
+    more = {key: correlations[key] for key in ("scenes", "states")} | {"not_measured": missing}
+    return Report(rows, tables, meta=more)
 
 
-def _best_ev_section(rows: list[Row]) -> list[str]:
-    same = ", ".join(cell(row, "`{scorer}`") for row in rows if row["median"] is None)
-    known = sorted((r for r in rows if r["median"] is not None), key=lambda r: r["median"])
-    return [
-        f"The exposure, of a sweep from {OFFSETS[0]:+g} to {OFFSETS[-1]:+g} EV around the incident "
-        f"light in half stops at ISO 100 and f/{F_NUMBER:g}, at which each scene scores best; "
-        "noisy captures without blur. A scorer whose best exposure is at an end of the sweep "
-        f"cannot stand alone. To {same} all exposures are equal without blur and flicker. Scenes, "
-        "in this order: " + ", ".join(f"`{name}`" for name in rows[0]["by_scene"]) + ".",
-        table(
-            known,
-            {
-                "scorer": "`{scorer}`",
-                "median [EV]": "{median:+.1f}",
-                "range": "{lowest:+.1f} to {highest:+.1f}",
-                "scene by scene": lambda row: " ".join(
-                    "=" if v is None else f"{v:+g}" for v in row["by_scene"].values()
-                ),
-            },
-        ),
-    ]
-
-
+_GAIN: dict[str, Any] = {
+    "scorer": "`{scorer}`",
+    "ISO 100": "{low_gain:.3f}",
+    "ISO 6400": "{high_gain:.3f}",
+    "change": "{change:+.3f} ± {change_sd:.3f}",
+    "scenes in which it rises": "{rises:.0%}",
+}
+_BEST: dict[str, Any] = {
+    "scorer": "`{scorer}`",
+    "median [EV]": "{median:+.1f}",
+    "range": "{lowest:+.1f} to {highest:+.1f}",
+    "scene by scene": lambda row: " ".join(
+        "=" if v is None else f"{v:+g}" for v in row["by_scene"].values()
+    ),
+}
 BENCHMARK = Benchmark(
     name="scorers",
     title="The scorers, measured",
     parts=parts,
     report=report,
-    code=("simulator", "ae_env", "benchmarks/scorers", "benchmarks/captures"),
+    code=("simulator", "ae_env", "benchmarks/scorers", "benchmarks/harness"),
 )
 run = BENCHMARK.run

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from agents.cli.bench import BENCHMARKS
+from agents.cli.main import BENCHMARKS
 from benchmarks import harness
 from benchmarks.denoising import anscombe, inverse_anscombe
 from benchmarks.harness import Benchmark, FinishedParts, Part, Report, cell, pivot, rounded, table
@@ -91,10 +91,14 @@ def test_a_run_that_was_stopped_continues(tmp_path: Path, monkeypatch: pytest.Mo
     assert list((tmp_path / "runs" / "mine").iterdir()) == []
 
 
-def test_every_benchmark_of_the_command_can_be_imported() -> None:
+def test_every_benchmark_of_the_command_can_be_imported_and_names_its_code() -> None:
     for name in BENCHMARKS:
         stem = {"simulator": "fidelity"}.get(name, name.replace("-", "_"))
-        assert callable(importlib.import_module(f"benchmarks.{stem}").run)
+        module = importlib.import_module(f"benchmarks.{stem}")
+        assert callable(module.run)
+        for code in module.BENCHMARK.code if hasattr(module, "BENCHMARK") else ():
+            path = harness.ROOT / code
+            assert path.is_dir() or path.with_suffix(".py").is_file(), code
 
 
 def test_the_front_of_time_and_error() -> None:

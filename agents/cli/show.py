@@ -111,7 +111,7 @@ def film(
     from agents.evaluation.engine import fit_policies
     from agents.policy import PolicyContext
     from agents.policy_names import make_policy
-    from agents.report.plots import film as write
+    from agents.report.plots import record, write_film
     from simulator.utils.checks import check_word
 
     check_outputs(out=(out, ".gif"))
@@ -134,7 +134,8 @@ def film(
         with progress("fitting") as task:
             fit_policies(policies, {"scenes": "bundled", "grid": "video"}, progress=task)
         with progress("film") as task:
-            write(policies, envs, out, frames=frames, seed=seed, scene=scene, progress=task)
+            episodes = [record(n, p, envs, frames, seed, scene) for n, p in policies.items()]
+            write_film(out, episodes, task)
     print_files({"film": out})
 
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import astuple, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import gymnasium as gym
@@ -48,6 +49,7 @@ from simulator.utils.checks import check_integer, check_number
 
 if TYPE_CHECKING:
     from ae_env.scenes import Scene
+    from simulator.camera import CameraProfile
 
 VectorEnv = gym.vector.VectorEnv[Any, Any, Any]
 Ints = NDArray[np.int64]
@@ -103,6 +105,33 @@ def evaluate(
     check_integer("frames", frames, 1)
     check_integer("batch", batch, 1)
     check_integer("seed", seed, 0, MAX_SEED + 1 - episodes_per_scene)
+    trained = _trained_policies(policies)
+    check_scorers(other_scorers)
+    plan = _plan_of(env_options, frames, range(seed, seed + episodes_per_scene), other_scorers)
+    run = EvaluationRun(plan, batch=batch)
+    (condition,) = plan.all_conditions.values()
+    total = frames * (run.num_tables + len(trained) * len(run.episodes))
+    done = 0.0
+
+    def report(name: str, count: float) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(int(done), total, name)
+
+    with run:
+        light = run.score_light(condition, partial(report, "score tables"))
+        tracks = {
+            one: run.run_policy(one.name, policy, condition, light, partial(report, one.name))
+            for one, policy in trained
+        }
+    result = run.result(condition, light, tracks)
+    return replace(result, other_scores=other_scores(result))
+
+
+def _trained_policies(
+    policies: Mapping[str, Policy | Sequence[Policy]],
+) -> list[tuple[TrainedPolicy, Policy]]:
     trained = [
         (TrainedPolicy(name, name, k), policy)
         for name, entry in policies.items()
@@ -112,35 +141,21 @@ def evaluate(
         raise ValueError(f"`policies` (={policies!r}) must hold at least one policy")
     for one, policy in trained:
         check_captures(one.name, policy)
-    for name in other_scorers:
-        make_scorer(name)  # raises before any work
-    plan = _plan_of(env_options, frames, range(seed, seed + episodes_per_scene))
-    plan = plan.model_copy(update={"other_scorers": tuple(other_scorers)})
-    run = EvaluationRun(plan, batch=batch)
-    (condition,) = plan.all_conditions.values()
-    total = frames * (run.num_tables + len(trained) * len(run.episodes))
-    done = 0.0
-
-    def reporter(name: str) -> Report:
-        def report(count: float) -> None:
-            nonlocal done
-            done += count
-            if progress is not None:
-                progress(int(done), total, name)
-
-        return report
-
-    with run:
-        light = run.score_light(condition, reporter("score tables"))
-        tracks = {
-            one: run.run_policy(one.name, policy, condition, light, reporter(one.name))
-            for one, policy in trained
-        }
-    result = run.result(condition, light, tracks)
-    return replace(result, other_scores=other_scores(result))
+    return trained
 
 
-def _plan_of(env_options: Mapping[str, Any], frames: int, seeds: Sequence[int]) -> EvaluationPlan:
+def check_scorers(names: Sequence[str]) -> None:
+    """Raises a `ValueError` where one of the scorers is unknown."""
+    for name in names:
+        try:
+            make_scorer(name)
+        except ValueError as error:
+            raise ValueError(f"`other_scorers` (={name!r}): {error}") from error
+
+
+def _plan_of(
+    env_options: Mapping[str, Any], frames: int, seeds: Sequence[int], scorers: Sequence[str]
+) -> EvaluationPlan:
     from ae_env.options import EnvOptions
 
     given = {k: v for k, v in env_options.items() if k not in ("with_oracle", "autoreset_mode")}
@@ -156,6 +171,7 @@ def _plan_of(env_options: Mapping[str, Any], frames: int, seeds: Sequence[int]) 
         starts=("random",),
         frames=frames,
         seeds=tuple(seeds),
+        other_scorers=tuple(scorers),
     )
 
 
@@ -233,11 +249,7 @@ class EvaluationRun:
     ) -> VectorEnv:
         """Environments of a condition, which stay open until those of another are needed.
 
-        Args:
-            condition: Light and delay, or budget.
-            num_envs: Episodes at a time.
-            frames: Actions that an episode must allow.
-            scored: Whether they have the plan's scorer: policies see environments without.
+        Only those that are `scored` have the plan's scorer: policies see environments without.
         """
         if condition != self._open_for:
             self._close()
@@ -246,8 +258,7 @@ class EvaluationRun:
         if key in self._envs:
             return self._envs[key]
         if condition.budget is not None:
-            options = {**self.plan.environment, "scenes": self.scenes, "split": "all"}
-            self._envs[key] = self._make_bracket_envs(condition, options)
+            self._envs[key] = self._make_bracket_envs(condition, scenes=self.scenes, split="all")
             return self._envs[key]
         unused = ("costs",) if scored else ("costs", "reward")
         options = {k: v for k, v in self.plan.arguments(condition).items() if k not in unused}
@@ -257,14 +268,14 @@ class EvaluationRun:
         self._envs[key] = make_envs(options, num_envs=num_envs, frames=frames)
         return self._envs[key]
 
-    def _make_bracket_envs(self, condition: Condition, options: Mapping[str, Any]) -> VectorEnv:
+    def _make_bracket_envs(self, condition: Condition, **options: Any) -> VectorEnv:
         return gym.make_vec(
             self.plan.env_id,
             num_envs=BRACKET_BATCH,
             autoreset_mode="DISABLED",
             budget=condition.budget,
             max_frames=self.plan.max_frames,
-            **options,
+            **{**self.plan.environment, **options},
         )
 
     def score_light(self, condition: Condition, report: Report) -> Arrays:
@@ -307,20 +318,21 @@ class EvaluationRun:
     def fitted(self, trained: TrainedPolicy, condition: Condition) -> Policy:
         """The policy `trained`, fitted on training scenes: in static light, or to the budget."""
         policy = self.make(trained, condition)
-        if getattr(type(policy), "fit", Policy.fit) is Policy.fit:
+        if not _learns(policy):
             return policy
-        own, seed = {trained.name: policy}, self.plan.seeds[0]
-        if condition.budget is not None:
-            options = {**self.plan.environment, "split": "train"}
-            with closing(self._make_bracket_envs(condition, options)) as envs:
-                fit_policies(own, options, seed=seed, training=envs)
-            return policy
-        base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
-        base = fitting_arguments(base, self.plan.options().resolution)
-        if self._training is None:
-            self._training = training_envs(base)
-        fit_policies(own, base, seed=seed, training=self._training)
+        with self._training_envs(condition) as envs, errors_of(trained.name, "fit"):
+            policy.fit(envs, self.plan.seeds[0])
         return policy
+
+    def _training_envs(self, condition: Condition) -> AbstractContextManager[VectorEnv]:
+        """Environments to fit policies on; of frames the same ones, which share score tables."""
+        if condition.budget is not None:
+            return closing(self._make_bracket_envs(condition, split="train"))
+        if self._training is None:
+            base = {k: v for k, v in self.plan.environment.items() if k != "costs"}
+            base = fitting_arguments(base, self.plan.options().resolution)
+            self._training = _training_envs(base)
+        return nullcontext(self._training)
 
     def run_policy(
         self,
@@ -340,8 +352,7 @@ class EvaluationRun:
             report: Called with the frames done since the last call.
 
         Returns:
-            The track, which has the state of each episode's reset frame too, ``start_states``
-            ``(1, E)``.
+            The track, with ``start_states`` (1, E), the states of the reset frames.
         """
         if condition.budget is not None:
             return self._run_brackets(name, policy, condition, report)
@@ -362,12 +373,12 @@ class EvaluationRun:
             first = replace(episodes, seeds=[0], scene=episodes.scene[:1], starts=[None])
             single = self._make_envs(condition, 1, TIMED_FRAMES)
             best = None if oracle is None else oracle[:1]
-            alone = milliseconds_alone(name, policy, single, first, best)
+            alone = _milliseconds_alone(name, policy, single, first, best)
         seconds = sum(float(part.pop("seconds").sum()) for part in parts)
         return Track(
             {key: np.concatenate([part[key] for part in parts])[None] for key in parts[0]},
             ms_per_decision=1000.0 * seconds / (frames * len(episodes)),
-            captures_per_decision=float(getattr(policy, "captures_per_decision", 1.0)),
+            captures_per_decision=check_captures(name, policy),
             privileged=oracle is not None,
             ms_alone=alone,
         )
@@ -391,12 +402,8 @@ class EvaluationRun:
     def result(
         self, condition: Condition, light: Arrays, tracks: Mapping[TrainedPolicy, Track]
     ) -> EvaluationResult:
-        """Everything measured in `condition`.
-
-        Args:
-            condition: Light and delay, or budget.
-            light: What `score_light` returns; empty for brackets.
-            tracks: What `run_policy` returns.
+        """Everything measured in `condition`: what `score_light` (empty for brackets) and
+        `run_policy` returned.
         """
         scenes = [self.scenes[i] for i in self.episodes.scene]
         table = np.arange(len(scenes)) % max(self.num_tables, 1)
@@ -431,9 +438,8 @@ def fit_policies(
     env_options: Mapping[str, Any],
     *,
     seed: int = 0,
-    batch: int = 64,
+    batch: int = BATCH,
     progress: Progress | None = None,
-    training: VectorEnv | None = None,
 ) -> None:
     """Call `fit` of every policy that has one, on the training split.
 
@@ -443,33 +449,26 @@ def fit_policies(
         seed: Decides the training episodes.
         batch: Episodes at a time.
         progress: Called before and after each fit.
-        training: Environments to use, see `training_envs`, which stay open; by default new ones.
     """
-    learners = {n: p for n, p in policies.items() if getattr(type(p), "fit", None)}
-    learners = {n: p for n, p in learners.items() if type(p).fit is not Policy.fit}
+    learners = {name: policy for name, policy in policies.items() if _learns(policy)}
     if not learners:
         return
-    envs = training_envs(env_options, batch) if training is None else training
-    try:
+    with closing(_training_envs(env_options, batch)) as envs:
         for i, (name, policy) in enumerate(learners.items()):
             if progress is not None:
                 progress(i, len(learners), name)
             with errors_of(name, "fit"):
                 policy.fit(envs, seed)
-        if progress is not None:
-            progress(len(learners), len(learners), "")
-    finally:
-        if training is None:
-            envs.close()
+    if progress is not None:
+        progress(len(learners), len(learners), "")
 
 
-def training_envs(env_options: Mapping[str, Any], batch: int = 64) -> VectorEnv:
-    """Environments to fit policies on; fits that follow each other share their score tables.
+def _learns(policy: Policy) -> bool:
+    """Whether a policy has a `fit` of its own."""
+    return getattr(type(policy), "fit", Policy.fit) is not Policy.fit
 
-    Args:
-        env_options: As of `fit_policies`.
-        batch: As of `fit_policies`.
-    """
+
+def _training_envs(env_options: Mapping[str, Any], batch: int = BATCH) -> VectorEnv:
     return make_envs({**env_options, "split": "train"}, num_envs=batch, frames=16)
 
 
@@ -518,22 +517,24 @@ def run_batch(
         seconds.append(time.perf_counter() - begin)
         observations, _, _, _, info = envs.step(checked_states(name, actions, masks))
         masks = action_masks(envs)  # the next frame of a sequence is another scene
-        shown = {
-            "states": np.array(info["state"], dtype=np.int64),  # with a delay, an older choice
-            "image_mean": linear_signal(observations["raw"], base.camera).mean(axis=(1, 2, 3)),
-            "code_mean": signal_codes(observations["raw"], base.camera).mean(
-                axis=(1, 2, 3), dtype=np.float64
-            )
-            / 255.0,
-            "clipped_high": np.array(info["clipped_high"], dtype=np.float64),
-            "clipped_low": np.array(info["clipped_low"], dtype=np.float64),
-        }
-        for key, value in shown.items():
+        for key, value in _measured(base.camera, observations["raw"], info).items():
             seen.setdefault(key, []).append(value)
     return {
         **{key: np.stack(values, axis=1)[batch.valid] for key, values in seen.items()},
         "start_states": start[batch.valid],
         "seconds": np.array(seconds),
+    }
+
+
+def _measured(camera: CameraProfile, raw: NDArray[Any], info: Mapping[str, Any]) -> Arrays:
+    """What a `Track` has of one frame, ``(N,)`` each."""
+    codes = signal_codes(raw, camera).mean(axis=(1, 2, 3), dtype=np.float64)
+    return {
+        "states": np.array(info["state"], dtype=np.int64),  # with a delay, an older choice
+        "image_mean": linear_signal(raw, camera).mean(axis=(1, 2, 3)),
+        "code_mean": codes / 255.0,
+        "clipped_high": np.array(info["clipped_high"], dtype=np.float64),
+        "clipped_low": np.array(info["clipped_low"], dtype=np.float64),
     }
 
 
@@ -544,22 +545,10 @@ def _oracle_info(base: Any, oracle: Ints, frame: int) -> dict[str, Ints]:
     return {"oracle_state": oracle[:, frame], "clairvoyant_state": base.grid.mixed(*decided)}
 
 
-def milliseconds_alone(
-    name: str,
-    policy: Policy,
-    envs: VectorEnv,
-    episodes: RolloutPlan,
-    oracle: Ints | None = None,
+def _milliseconds_alone(
+    name: str, policy: Policy, envs: VectorEnv, episodes: RolloutPlan, oracle: Ints | None
 ) -> float:
-    """Median time in `act` for one camera alone [ms].
-
-    Args:
-        name: The policy's name in errors.
-        policy: The policy.
-        envs: One environment, of `TIMED_FRAMES` or more.
-        episodes: The episode.
-        oracle: (1, T) best state of every frame, for a privileged policy; the last one stays.
-    """
+    """Median time in `act` for one camera alone [ms]; the last (1, T) state of `oracle` stays."""
     if oracle is not None:
         last = np.repeat(oracle[:, -1:], TIMED_FRAMES, axis=1)
         oracle = np.concatenate([oracle, last], axis=1)
@@ -569,11 +558,7 @@ def milliseconds_alone(
 
 
 def check_captures(name: str, policy: Policy) -> float:
-    """`captures_per_decision` of a policy.
-
-    Raises:
-        ValueError: Unless it is a number.
-    """
+    """`captures_per_decision` of a policy; a `ValueError` unless it is a number."""
     captures = getattr(policy, "captures_per_decision", 1.0)
     return check_number(f"captures_per_decision` of policy `{name}", captures, 0.0, 1e9)
 

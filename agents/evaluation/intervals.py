@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 RESAMPLES = 10_000
+#: Coverage of the intervals.
+LEVEL = 0.95
 #: Below this many source groups an interval would promise too much: values only.
 MIN_GROUPS = 15
 #: Standard errors below this are rounding: the two policies do the same.
@@ -46,19 +48,9 @@ class Interval:
         """Whether the interval leaves out zero."""
         return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
 
-    def __str__(self) -> str:
-        if self.low is None or self.high is None:
-            return f"{self.value:+.3f} ({self.num_groups} groups: no interval)"
-        return f"{self.value:+.3f} [{self.low:+.3f}, {self.high:+.3f}]"
-
 
 def score_interval(
-    gains: Floats,
-    span: Floats,
-    *,
-    resamples: int = RESAMPLES,
-    level: float = 0.95,
-    seed: int = 0,
+    gains: Floats, span: Floats, *, resamples: int = RESAMPLES, seed: int = 0
 ) -> Interval:
     """Normalised score of a policy and its interval.
 
@@ -70,21 +62,14 @@ def score_interval(
         gains: ``q - q_random`` per training seed and source group, ``(K, G)`` or ``(G,)``.
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
-        level: Coverage.
         seed: Seed of the resampling; policies compared under one seed see the same groups.
     """
     zero = np.zeros_like(np.atleast_2d(gains)[:1])
-    return difference_interval(gains, zero, span, resamples=resamples, level=level, seed=seed)
+    return difference_interval(gains, zero, span, resamples=resamples, seed=seed)
 
 
 def difference_interval(
-    gains: Floats,
-    other: Floats,
-    span: Floats,
-    *,
-    resamples: int = RESAMPLES,
-    level: float = 0.95,
-    seed: int = 0,
+    gains: Floats, other: Floats, span: Floats, *, resamples: int = RESAMPLES, seed: int = 0
 ) -> Interval:
     """Paired difference of two policies' normalised scores and its interval.
 
@@ -96,7 +81,6 @@ def difference_interval(
         other: The same of the second policy, ``(K2, G)`` or ``(G,)``.
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
-        level: Coverage.
         seed: Seed of the resampling.
 
     Raises:
@@ -114,39 +98,22 @@ def difference_interval(
     if groups < MIN_GROUPS:
         return Interval(value, None, None, groups, seeds)
     rng = np.random.default_rng([seed, 1])
-    weights = group_weights(groups, resamples, seed)
+    weights = _group_weights(groups, resamples, seed)
     totals = _resampled(first, weights, rng) - _resampled(second, weights, rng)
     statistic = totals / (weights @ span)
-    tail = 50.0 * (1.0 - level)
+    tail = 50.0 * (1.0 - LEVEL)
     low, high = np.percentile(statistic, [tail, 100.0 - tail])
     return Interval(value, float(low), float(high), groups, seeds)
 
 
 @lru_cache(maxsize=16)
-def group_weights(groups: int, resamples: int, seed: int) -> Floats:
+def _group_weights(groups: int, resamples: int, seed: int) -> Floats:
     """How often each group is drawn, ``(R, G)``; the same for all that are compared."""
     rng = np.random.default_rng(seed)
     weights = rng.multinomial(groups, np.full(groups, 1 / groups), size=resamples)
     found = weights.astype(np.float64)
     found.setflags(write=False)
     return found
-
-
-def resampled_scores(
-    gains: Floats, span: Floats, *, resamples: int = RESAMPLES, seed: int = 0, stream: int = 0
-) -> Floats:
-    """Normalised score of a policy in every resample, ``(R,)``.
-
-    Args:
-        gains: ``(K, G)`` or ``(G,)``, as of `score_interval`.
-        span: ``(G,)``.
-        resamples: Number of resamples.
-        seed: Policies compared under one seed see the same groups.
-        stream: Of the draws of training seeds: another for each policy compared.
-    """
-    weights = group_weights(len(span), resamples, seed)
-    rng = np.random.default_rng([seed, 1, stream])
-    return _resampled(np.atleast_2d(gains), weights, rng) / (weights @ span)
 
 
 def _resampled(values: Floats, weights: Floats, rng: np.random.Generator) -> Floats:
@@ -183,19 +150,12 @@ class Rank:
     to_next: Interval | None
 
 
-def rank(
-    gains: Mapping[str, Floats],
-    span: Floats,
-    *,
-    resamples: int = RESAMPLES,
-    level: float = 0.95,
-    seed: int = 0,
-) -> list[Rank]:
+def rank(gains: Mapping[str, Floats], span: Floats, *, resamples: int = RESAMPLES) -> list[Rank]:
     """Policies from the best to the worst, with the differences that are significant.
 
     Differences of all pairs are bootstrapped together (source groups are drawn once for all
     policies, training seeds for each), divided by their standard errors, and the largest of all
-    pairs gives the half width of every interval: with the probability `level` all of them cover
+    pairs gives the half width of every interval: with the probability `LEVEL` all of them cover
     the truth at once (single-step max-t: Westfall and Young 1993; Hothorn, Bretz and Westfall
     2008). A tier begins with the best policy that is left, and has those below it that are not
     significantly worse than that one.
@@ -204,17 +164,12 @@ def rank(
         gains: ``q - q_random`` by policy, ``(K, G)`` per training seed and source group.
         span: ``q_oracle - q_random`` per source group, ``(G,)``.
         resamples: Number of resamples.
-        level: Coverage of all intervals together.
-        seed: Seed of the resampling.
     """
-    scores = {
-        name: score_interval(own, span, resamples=resamples, level=level, seed=seed)
-        for name, own in gains.items()
-    }
+    scores = {name: score_interval(own, span, resamples=resamples) for name, own in gains.items()}
     names = sorted(scores, key=lambda name: -scores[name].value)  # ties keep the given order
     widths = None
     if len(span) >= MIN_GROUPS and len(names) > 1:
-        widths = _half_widths([gains[name] for name in names], span, resamples, level, seed)
+        widths = _half_widths([gains[name] for name in names], span, resamples)
 
     def difference(i: int, j: int) -> Interval:
         value = scores[names[i]].value - scores[names[j]].value
@@ -236,16 +191,13 @@ def rank(
     ]
 
 
-def _half_widths(
-    gains: list[Floats], span: Floats, resamples: int, level: float, seed: int
-) -> Floats:
+def _half_widths(gains: list[Floats], span: Floats, resamples: int) -> Floats:
     """Half widths of the simultaneous intervals of all differences, ``(P, P)``."""
-    drawn = np.stack(
-        [
-            resampled_scores(own, span, resamples=resamples, seed=seed, stream=i)
-            for i, own in enumerate(gains)
-        ]
-    )  # (P, R)
+    weights = _group_weights(len(span), resamples, 0)
+    drawn = [  # training seeds are drawn for each policy
+        _resampled(np.atleast_2d(own), weights, np.random.default_rng([0, 1, i])) / (weights @ span)
+        for i, own in enumerate(gains)
+    ]
     errors = np.zeros((len(gains), len(gains)))
     largest = np.zeros(resamples)
     for i in range(len(gains)):
@@ -255,7 +207,7 @@ def _half_widths(
             errors[i, j] = errors[j, i] = error
             if error > _ROUNDING:
                 np.maximum(largest, np.abs(change - change.mean()) / error, out=largest)
-    return errors * float(np.quantile(largest, level))
+    return errors * float(np.quantile(largest, LEVEL))
 
 
 def _tiers(count: int, difference: Callable[[int, int], Interval]) -> list[int | None]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.util import find_spec
@@ -17,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ae_env.scorers import make_scorer
 from ae_env.scorers.registry import scorer_fingerprint
 from agents.evaluation.engine import (
     Arrays,
@@ -25,6 +25,7 @@ from agents.evaluation.engine import (
     Progress,
     Report,
     TrainedPolicy,
+    check_scorers,
     other_scores,
 )
 from agents.evaluation.plan import Condition, EvaluationPlan
@@ -146,8 +147,7 @@ class Jobs(EvaluationRun):
         """Does the work that is left; see `run_plan`."""
         if not self.plan.policies:
             raise ValueError("`policies` (=[]) must hold at least one policy")
-        for scorer in self.plan.other_scorers:
-            _check_scorer(scorer)
+        check_scorers(self.plan.other_scorers)
         privileged = self.privileged
         jobs = self._left()
         total = max(sum(job.cost for job in jobs), 1.0)
@@ -172,7 +172,11 @@ class Jobs(EvaluationRun):
             self.do(job, partial(report, job))
         if progress is not None:
             progress(int(total), int(total), "")
-        return self._finished()
+        conditions, static = self.plan.all_conditions, self.plan.static_condition
+        results = {name: self._finished(condition) for name, condition in conditions.items()}
+        if self.plan.other_scorers:
+            results[static] = self._rated(results[static], conditions[static])
+        return results
 
     def _left(self) -> list[Job]:
         """The jobs that are left: light first, and the longest first of each, so that processes end
@@ -231,22 +235,15 @@ class Jobs(EvaluationRun):
             raise FileNotFoundError(f"{self.store.path(key)} was removed while the evaluation ran")
         return found
 
-    def _track(self, trained: TrainedPolicy, condition: Condition) -> Track:
-        """The finished part of a policy."""
-        stored = self._stored(self.policy_key(trained, condition))
-        arrays = {k: v for k, v in stored.items() if isinstance(v, np.ndarray)}
-        return Track(arrays, **{k: v for k, v in stored.items() if k not in arrays})
-
-    def _finished(self) -> dict[str, EvaluationResult]:
-        """The results of all conditions, from the finished parts."""
-        results = {}
-        for name, condition in self.plan.all_conditions.items():
-            tracks = {trained: self._track(trained, condition) for trained in self.trained}
-            results[name] = self.result(condition, self.light(condition), tracks)
-        static = self.plan.static_condition
-        if self.plan.other_scorers:
-            results[static] = self._rated(results[static], self.plan.all_conditions[static])
-        return results
+    def _finished(self, condition: Condition) -> EvaluationResult:
+        """The result of a condition, from the finished parts."""
+        tracks = {}
+        for trained in self.trained:
+            stored = self._stored(self.policy_key(trained, condition))
+            arrays = {k: v for k, v in stored.items() if isinstance(v, np.ndarray)}
+            others = {k: v for k, v in stored.items() if k not in arrays}
+            tracks[trained] = Track(arrays, **others)
+        return self.result(condition, self.light(condition), tracks)
 
     def _rated(self, result: EvaluationResult, condition: Condition) -> EvaluationResult:
         """`result` with other scorers' means, which are a part too: image scorers take a while."""
@@ -296,13 +293,6 @@ def run_plan(
     """
     with Jobs(plan, Path(folder), scenes, device=device) as run:
         return run.run(workers=workers, progress=progress)
-
-
-def _check_scorer(name: str) -> None:
-    try:
-        make_scorer(name)
-    except ValueError as error:
-        raise ValueError(f"`other_scorers` (={name!r}): {error}") from error
 
 
 #: In a worker, which serves one run: the run, made by its first job.
@@ -360,36 +350,28 @@ def policy_content(name: str) -> str:
         files += _named_files(str(value))
         if value == LEARNT:
             files += [Path(f"{file}.safetensors") for file in weight_files(FORECASTERS)]
-    if not files:
-        return ""
     found = hashlib.sha256()
     for file in files:
         content = file.read_bytes() if file.is_file() else b""
         found.update(f"{file.name}\0{len(content)}\0".encode() + content)
-    return found.hexdigest()
+    return found.hexdigest() if files else ""
 
 
 def _own_files(base: str) -> list[Path]:
+    """Files of a name's own kind; of a module, the first `_MAX_NEIGHBOURS` beside it, too."""
     head, tail = split_class(base)
-    if head.endswith(".py"):
-        return _with_neighbours(Path(head).expanduser())
     if head in ("ppo", "regression"):
         names = training_seeds(base)
         return [file for name in names for file in _named_files(name.partition(":")[2])]
     if head == "recorded":
         return _named_files(tail)
-    if tail and "." in head:
-        try:
+    file: Path | None = Path(head).expanduser() if head.endswith(".py") else None
+    if file is None and tail and "." in head:
+        with suppress(ImportError, ValueError):
             found = find_spec(head)
-        except (ImportError, ValueError):
-            found = None
-        if found is not None and found.origin is not None:
-            return _with_neighbours(Path(found.origin))
-    return []
-
-
-def _with_neighbours(file: Path) -> list[Path]:
-    """A Python file, and the first `_MAX_NEIGHBOURS` others of its folder by name."""
+            file = Path(found.origin) if found is not None and found.origin else None
+    if file is None:
+        return []
     others = sorted(other for other in file.parent.glob("*.py") if other.name != file.name)
     return [file, *others[:_MAX_NEIGHBOURS]]
 

@@ -233,30 +233,14 @@ def delayed_states(states: Ints, start_states: Ints, delay: int) -> Ints:
     return np.concatenate([waiting, states], axis=1)[:, : states.shape[1]]
 
 
-def normalised_score(score: Floats, random: Floats, oracle: Floats) -> float:
-    """``sum(q - q_random) / sum(q_oracle - q_random)``: 0 is random, 1 the oracle.
-
-    Args:
-        score: Mean q per source group, ``(G,)``.
-        random: Mean q of a random policy per source group.
-        oracle: Mean q of the oracle per source group.
-
-    >>> round(normalised_score(np.array([0.8, 0.6]), np.array([0.2, 0.2]), np.array([1.0, 0.8])), 3)
-    0.714
-    """
-    return float(np.sum(score - random) / np.sum(oracle - random))
-
-
-def group_means(values: NDArray[Any], groups: NDArray[Any]) -> tuple[Floats, NDArray[Any]]:
-    """Means over the episodes of each source group.
+def group_means(values: NDArray[Any], groups: NDArray[Any]) -> Floats:
+    """Means over the episodes of each source group, ``(..., G)``; groups in sorted order.
 
     Args:
         values: ``(..., E)``.
         groups: Source group of each episode, ``(E,)``.
-
-    Returns:
-        ``(..., G)`` and the names of the groups, sorted.
     """
     names, index = np.unique(groups, return_inverse=True)
     member = (index[:, None] == np.arange(len(names))).astype(np.float64)
-    return np.asarray(values, np.float64) @ (member / member.sum(axis=0)), names
+    means: Floats = np.asarray(values, np.float64) @ (member / member.sum(axis=0))
+    return means

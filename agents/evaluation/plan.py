@@ -323,16 +323,13 @@ def groups_in_turn(scenes: Sequence[Scene], count: int | None) -> list[Scene]:
     """At most `count` of `scenes`: kinds in turn, and within a kind source groups in turn."""
     if count is None or count >= len(scenes):
         return list(scenes)
-    ranks: list[tuple[int, int, int]] = []
-    seen: dict[str, int] = {}
-    groups: dict[str, dict[str, int]] = {}
-    for i, scene in enumerate(scenes):
-        repeat = seen[scene.group] = seen.get(scene.group, -1) + 1
-        of_kind = groups.setdefault(scene.kind, {})
-        rank = of_kind.setdefault(scene.group, len(of_kind))
-        ranks.append((repeat, rank, i))
-    chosen = sorted(sorted(range(len(scenes)), key=lambda i: ranks[i])[:count])
-    return [scenes[i] for i in chosen]
+    import pandas as pd
+
+    names = pd.DataFrame({"kind": [s.kind for s in scenes], "group": [s.group for s in scenes]})
+    repeat = names.groupby("group").cumcount()
+    rank = names.groupby("kind").group.transform(lambda own: pd.factorize(own)[0])
+    chosen = np.lexsort((rank, repeat))[:count]  # equal ones stay in order
+    return [scenes[i] for i in np.sort(chosen)]
 
 
 def plan_episodes(plan: EvaluationPlan, scenes: Sequence[Scene], grid: ExposureGrid) -> RolloutPlan:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from agents.evaluation import metrics
 from agents.evaluation.intervals import (
     RESAMPLES,
+    Interval,
     Rank,
     difference_interval,
     rank,
@@ -267,7 +268,7 @@ class EvaluationResult:
         """
         members = self.condition("all") if episodes is None else episodes
         values = self.episode_metrics(policy)[key][:, members]
-        return float(metrics.group_means(values, self.groups[members])[0].mean())
+        return float(metrics.group_means(values, self.groups[members]).mean())
 
     def group_gains(
         self, policy: str, condition: str | NDArray[np.bool_] = "all"
@@ -284,7 +285,7 @@ class EvaluationResult:
         gains = (self.episode_metrics(policy)[self.measure] - self.random)[:, members]
         span = (self.oracle - self.random)[members]
         groups = self.groups[members]
-        return metrics.group_means(gains, groups)[0], metrics.group_means(span, groups)[0]
+        return metrics.group_means(gains, groups), metrics.group_means(span, groups)
 
 
 # -- rows -----------------------------------------------------------------------------------------
@@ -536,26 +537,29 @@ def overall_ranking(results: Results, *, resamples: int = RESAMPLES) -> list[Ran
 def ranking_rows(ranking: Sequence[Rank]) -> list[dict[str, Any]]:
     """A ranking as JSON values."""
     names = [one.policy for one in ranking]
-    rows = []
-    for i, one in enumerate(ranking):
-        row: dict[str, Any] = {
+
+    def change(interval: Interval | None, other: int) -> dict[str, Any] | None:
+        if interval is None:
+            return None
+        return {
+            "other": names[other],
+            "difference": interval.value,
+            "simultaneous_ci95": interval.pair,
+            "significant": interval.significant,
+        }
+
+    return [
+        {
             "place": i + 1,
             "policy": one.policy,
             "tier": one.tier,
             "normalised_score": one.score.value,
             "ci95": one.score.pair,
+            "to_best": change(one.to_best, 0),
+            "to_next": change(one.to_next, i + 1),
         }
-        for key, change, other in (("to_best", one.to_best, 0), ("to_next", one.to_next, i + 1)):
-            row[key] = None
-            if change is not None:
-                row[key] = {
-                    "other": names[other],
-                    "difference": change.value,
-                    "simultaneous_ci95": change.pair,
-                    "significant": change.significant,
-                }
-        rows.append(row)
-    return rows
+        for i, one in enumerate(ranking)
+    ]
 
 
 def training_seed_rows(result: EvaluationResult) -> list[dict[str, Any]]:
@@ -593,10 +597,10 @@ def scores_by_kind(result: EvaluationResult) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     for kind in dict.fromkeys(result.kinds.tolist()):
         own = result.kinds == kind
-        span = metrics.group_means((result.oracle - result.random)[own], result.groups[own])[0]
+        span = metrics.group_means((result.oracle - result.random)[own], result.groups[own])
         found[kind] = {"groups": len(span)}
         for name in result.tracks:
             score = result.episode_metrics(name)["score"].mean(axis=0)
-            gain = metrics.group_means((score - result.random)[own], result.groups[own])[0]
+            gain = metrics.group_means((score - result.random)[own], result.groups[own])
             found[kind][name] = float(gain.sum() / span.sum())
     return found

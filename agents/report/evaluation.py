@@ -271,37 +271,18 @@ def write_report(
     result = results[static_condition(results)]
     ranking = overall_ranking(results, resamples=resamples)
     if result.measure == "quality":
-        assert result.plan is not None
-        rows = bracket_rows(results, ranking)
-        meta = result_meta(command, result.seed) | {"plan": result.plan.protocol()}
-        text = _bracket_report(result.plan, rows, command)
-        return {
-            "results.json": write_results(folder / "results.json", _records(rows), meta),
-            "report.md": write_atomically(folder / "report.md", text),
-        }
+        return _write_brackets(folder, results, ranking, command)
     rows = result_rows(results, source=source, split=split, resamples=resamples)
     meta = _meta(results, ranking, command, resamples) | dict(extra_meta or {})
     title = f"{rows.source[0]}, {rows.split[0]} split"
     title = title if result.plan is None else result.plan.name
-    order = [one.policy for one in ranking]
-    order += [name for name in result.tracks if name not in order]
     contract = _records(rows[list(ROW_COLUMNS)])
     files = {
         "results.json": write_results(folder / "results.json", contract, meta),
         "scenes.csv": _write_csv(folder / "scenes.csv", scene_rows(result)),
         "metrics.csv": _write_csv(folder / "metrics.csv", _metrics(rows)),
     }
-    shown = pd.concat([rows, _overall_rows(ranking)]) if len(results) > 1 else rows
-    pictures = {
-        "scores.png": plot_scores(folder / "scores.png", shown, title),
-        "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
-    }
-    costs = {n: t.ms_alone for n, t in result.tracks.items() if t.ms_alone}
-    scores = {r.policy: r.score.value for r in ranking if r.policy in costs}
-    if scores:
-        costs = {name: costs[name] for name in scores}
-        pictures["cost.png"] = plot_cost(folder / "cost.png", costs, scores)
-    pictures |= path_sheets(folder, result, order)
+    pictures = _write_pictures(folder, results, rows, ranking, title)
     text = _Report(results, rows, meta, ranking, list(pictures)).markdown(title, next_commands)
     page = html_report(text, pictures, f"Exposure policies compared: {title}")
     return {
@@ -310,6 +291,39 @@ def write_report(
         "report.md": write_atomically(folder / "report.md", text),
         "report.html": write_atomically(folder / "report.html", page),
     }
+
+
+def _write_brackets(
+    folder: Path, results: Results, ranking: Sequence[Rank], command: str
+) -> dict[str, Path]:
+    first = next(iter(results.values()))
+    assert first.plan is not None
+    rows = bracket_rows(results, ranking)
+    meta = result_meta(command, first.seed) | {"plan": first.plan.protocol()}
+    text = _bracket_report(first.plan, rows, command)
+    return {
+        "results.json": write_results(folder / "results.json", _records(rows), meta),
+        "report.md": write_atomically(folder / "report.md", text),
+    }
+
+
+def _write_pictures(
+    folder: Path, results: Results, rows: pd.DataFrame, ranking: Sequence[Rank], title: str
+) -> dict[str, Path]:
+    result = results[static_condition(results)]
+    order = [one.policy for one in ranking]
+    order += [name for name in result.tracks if name not in order]
+    shown = pd.concat([rows, _overall_rows(ranking)]) if len(results) > 1 else rows
+    pictures = {
+        "scores.png": plot_scores(folder / "scores.png", shown, title),
+        "ev_error.png": plot_convergence(folder / "ev_error.png", results, order),
+    }
+    known = {name: track.ms_alone for name, track in result.tracks.items() if track.ms_alone}
+    scores = {one.policy: one.score.value for one in ranking if one.policy in known}
+    if scores:
+        costs = {name: known[name] for name in scores}
+        pictures["cost.png"] = plot_cost(folder / "cost.png", costs, scores)
+    return pictures | path_sheets(folder, result, order)
 
 
 def _records(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -495,8 +509,7 @@ class _Report:
         names = [*self.scores, *(p for p in self.result.tracks if p not in self.scores)]
         parts = ["## Conditions", picture]
         for title, key, form in _BY_CONDITION:
-            table = self.by.pivot(index="condition", columns="policy", values=key)
-            parts += [f"### {title}", _wide(table.loc[list(self.results), names], form)]
+            parts += [f"### {title}", _wide(self._by_condition(key)[names], form)]
         for title, key, reduce, form in (
             ("Frames until the exposure stays, median", "frames_to_settle", np.median, ".1f"),
             ("Share of episodes that converge", "converged", np.mean, ".0%"),
@@ -508,6 +521,11 @@ class _Report:
             table = pd.DataFrame(values, index=pd.Index(self.results, name="condition"))
             parts += [f"### {title}", _wide(table, form)]
         return parts
+
+    def _by_condition(self, key: str) -> pd.DataFrame:
+        """A column of the rows: a line per condition as a whole, a column per policy."""
+        table = self.by.pivot(index="condition", columns="policy", values=key)
+        return table.loc[list(self.results)]
 
     def _cost(self) -> list[str]:
         columns: dict[str, Cell] = {
@@ -524,27 +542,15 @@ class _Report:
         return ["## Score against time", text, *picture, to_markdown(own, columns)]
 
     def _clipping(self) -> list[str]:
-        rows = []
-        for name in self.result.tracks:
-            own = self.by[self.by.policy == name].set_index("condition")
-            row: dict[str, Any] = {"policy": name}
-            for key in ("clipped_high", "clipped_low"):
-                worst: Any = own[key].idxmax()
-                row[key] = own.loc[self.static, key]
-                row[f"{key}_worst"] = f"{own.loc[worst, key]:.2%} ({worst})"
-            rows.append(row)
-        columns = {
-            "policy": "{policy}",
-            f"white, {self.static}": "{clipped_high:.2%}",
-            "white, worst": "{clipped_high_worst}",
-            f"black, {self.static}": "{clipped_low:.2%}",
-            "black, worst": "{clipped_low_worst}",
-        }
-        return [
-            "## Clipping",
-            "Share of the pixels at white and at black.",
-            to_markdown(rows, columns),
-        ]
+        table = pd.DataFrame(index=pd.Index(self.result.tracks, name="policy"))
+        for shade, key in (("white", "clipped_high"), ("black", "clipped_low")):
+            shares = self._by_condition(key)[table.index]
+            table[f"{shade}, {self.static}"] = shares.loc[self.static].map("{:.2%}".format)
+            table[f"{shade}, worst"] = [
+                f"{shares[name].max():.2%} ({escape(shares[name].idxmax())})"
+                for name in table.index
+            ]
+        return ["## Clipping", "Share of the pixels at white and at black.", _wide(table, "")]
 
     def _kinds(self) -> list[str]:
         kinds = self.meta["by_kind"]

@@ -111,7 +111,7 @@ def plot_convergence(
         lines = []
         for i, policy in enumerate(order):
             errors = result.episode_metrics(policy)["ev_error"].mean(axis=0)  # (E, T)
-            means = metrics.group_means(errors.T, result.groups)[0].mean(axis=-1)
+            means = metrics.group_means(errors.T, result.groups).mean(axis=-1)
             frames = np.arange(1, len(means) + 1)
             lines += panel.plot(frames, means, lw=1.3, **line_style(i))
         panel.set_title(name, fontsize=9)
@@ -426,18 +426,3 @@ def _panel(recording: Recording, frame: int) -> Image.Image:
     if frame:
         draw.line(points(recording.ev100[: frame + 1]), fill=_CHOSEN, width=2)
     return panel
-
-
-def film(
-    policies: Mapping[str, Policy],
-    envs: gym.vector.VectorEnv[Any, Any, Any],
-    path: Path,
-    *,
-    frames: int,
-    seed: int = 0,
-    scene: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Path:
-    """Films one episode by each of `policies`; see `record` and `write_film`."""
-    found = [record(name, p, envs, frames, seed, scene) for name, p in policies.items()]
-    return write_film(path, found, progress)

@@ -70,6 +70,6 @@ BENCHMARK = Benchmark(
     title="The camera simulator, measured",
     parts=parts,
     report=report,
-    code=("simulator", "ae_env/scenes", "benchmarks/fidelity", "benchmarks/captures"),
+    code=("simulator", "ae_env/scenes", "benchmarks/fidelity", "benchmarks/harness"),
 )
 run = BENCHMARK.run

@@ -46,7 +46,7 @@ BENCHMARK = Benchmark(
     title="Error against run time",
     parts=parts,
     report=report,
-    code=("simulator", "ae_env/scenes", "benchmarks/work_precision", "benchmarks/captures"),
+    code=("simulator", "ae_env/scenes", "benchmarks/work_precision", "benchmarks/harness"),
     file="work_precision",
 )
 run = BENCHMARK.run

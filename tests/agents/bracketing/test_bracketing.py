@@ -14,8 +14,14 @@ from ae_env import ExposureGrid
 from ae_env.merging import log_error, merge
 from ae_env.observation import encode_sensors
 from ae_env.utils.user_files import UserCodeError
-from agents.bracketing.policies import FixedBracket, blur_error, describe, run_brackets
-from agents.bracketing.schedules import BINS, Schedules
+from agents.bracketing.policies import (
+    BINS,
+    FixedBracket,
+    Schedules,
+    blur_error,
+    describe,
+    run_brackets,
+)
 from agents.policy import Policy, PolicyContext
 from agents.policy_names import make_policy
 from simulator.camera import get_camera

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from agents.cli import bench, console
+from agents.cli import console
+from agents.cli import main as bench
 from agents.cli import main as cli
 from simulator.capture.plan import DEFAULT_TOLERANCE
 from tests.simulator.training.captures import write_dataset

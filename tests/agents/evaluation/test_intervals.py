@@ -87,7 +87,6 @@ def test_more_policies_widen_the_intervals_as_tukeys_range_does():
 def test_below_fifteen_groups_there_is_an_order_but_no_interval():
     found = score_interval(*_data(MIN_GROUPS - 1))
     assert (found.low, found.high, found.pair) == (None, None, None)
-    assert "no interval" in str(found)
     assert score_interval(*_data(MIN_GROUPS)).pair is not None
     gains = {"a": np.full((1, MIN_GROUPS - 1), 0.9), "b": np.zeros((1, MIN_GROUPS - 1))}
     found = rank(gains, np.ones(MIN_GROUPS - 1))
